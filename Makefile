@@ -27,7 +27,7 @@ test-all: $(VENV)/.test  ## run all tests, the slow ones too, and check annotate
 test-processors: $(VENV)/.test  ## run the tests as other processors and a busy machine do; goes on where it ended
 	$(BIN)/python tests/processors.py $(ARGS)
 
-mutants: $(VENV)/.mutants  ## put faults into the source, one at a time, and see whether the tests notice; goes on where it ended
+mutants: $(VENV)/.test  ## put faults into the source, one at a time, and see whether the tests notice
 	$(BIN)/python -m tests.mutants $(ARGS)
 
 test-browser: $(VENV)/.browser  ## look at reports in a headless Chromium, which must be installed
@@ -51,7 +51,7 @@ bench: $(VENV)/.test  ## measure; benchmarks/README.md says what
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m benchmarks $(ARGS)
 
 clean:  ## remove .venv, caches and builds; keeps what runs and demos wrote
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis .processors .mutants
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis .processors
 	find src tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
 
 help:  ## list the targets
@@ -68,11 +68,9 @@ $(VENV)/.browser: EXTRAS := sim,test,logs,browser
 $(VENV)/.browser: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.browser
 $(VENV)/.docs: EXTRAS := sim,test,logs,docs
 $(VENV)/.docs: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.docs
-$(VENV)/.mutants: EXTRAS := sim,test,logs,mutants
-$(VENV)/.mutants: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.mutants
 
 # torch first and alone, because only torch may come from TORCH_INDEX; where that index is out of reach, pip goes on without it.
-$(VENV)/.demo $(VENV)/.test $(VENV)/.check $(VENV)/.browser $(VENV)/.docs $(VENV)/.mutants: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
+$(VENV)/.demo $(VENV)/.test $(VENV)/.check $(VENV)/.browser $(VENV)/.docs: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
 	@echo "Installing forcegp[$(EXTRAS)] in $(VENV): one to two minutes the first time."
 	$(BIN)/python -m pip install --quiet --quiet --retries 0 --no-deps --extra-index-url $(TORCH_INDEX) --constraint constraints.txt torch
 	$(BIN)/python -m pip install --quiet --quiet --constraint constraints.txt --editable '.[$(EXTRAS)]'

@@ -1,8 +1,7 @@
 """The dynamics of a robot by CasADi: scalar C that it generates, compiled with `gcc -O3 -march=native`, a loop in C.
 
-Recursive Newton-Euler, composite rigid bodies and LDL' in CasADi's scalar expressions (SX) and operations, with
-`casadi.cse`. (What forcegp traces for its own code, as CasADi expressions, takes as long: 0.9 to 1.03 times.) Serial
-chains of revolute joints only.
+What forcegp traces for its own code, as CasADi's scalar expressions (SX), with `casadi.cse`. (Recursive Newton-Euler,
+composite rigid bodies and LDL' written by hand in CasADi take as long: 0.96 to 1.03 times.)
 """
 
 from __future__ import annotations
@@ -16,8 +15,9 @@ from typing import Any
 import casadi as untyped
 import numpy as np
 
+from forcegp.posterior.casadi_export import expressed
 from forcegp.robots import Robot
-from forcegp.robots.compiled import UnrolledRobot
+from forcegp.robots.compiled import UnrolledRobot, trace_dynamics
 
 ca: Any = untyped
 QUANTITIES = ("mass_bias", "fd")
@@ -39,13 +39,15 @@ class CasadiLoops:
     """Loops over given states (count, nv); a call returns the results."""
 
     def __init__(self, robot: Robot, folder: Path, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> None:
-        self.unrolled, self.folder, self.nv = UnrolledRobot(robot), folder, robot.nv
-        self.standard = standard_parameters(self.unrolled)
-        given = {"mass_bias": (q, v), "fd": (q, v, tau)}
-        self.mass_bias, self.fd = (self._loop(name, *given[name]) for name in QUANTITIES)
+        self.robot, self.folder = UnrolledRobot(robot), folder
+        self.mass_bias = self._loop("mass_bias", "mass_matrix_and_bias", q, v)
+        self.fd = self._loop("fd", "forward_dynamics", q, v, tau)
 
-    def _loop(self, quantity: str, *given: np.ndarray) -> Callable[[], list[np.ndarray]]:
-        inputs, outputs = self._expressions(quantity)
+    def _loop(self, quantity: str, traced: str, *given: np.ndarray) -> Callable[[], list[np.ndarray]]:
+        program = trace_dynamics(self.robot, traced)
+        inputs = [ca.SX.sym(name, size) for name, size in program.inputs.items()]
+        entries = [entry for vector in inputs for entry in ca.vertsplit(vector)]
+        outputs = [ca.vertcat(*expressed(ca, program.graph, nodes, entries)) for nodes in program.outputs.values()]
         function = ca.Function("f", inputs, ca.cse(outputs))
         code = ca.CodeGenerator(f"{quantity}.c")
         code.add(function)
@@ -70,79 +72,3 @@ class CasadiLoops:
             return results
 
         return call
-
-    def _expressions(self, quantity: str) -> tuple[list, list]:
-        q, v, tau = (ca.SX.sym(name, self.nv) for name in ("q", "v", "tau"))
-        parameters = ca.SX(ca.sparsify(ca.DM(self.standard.T)))
-        M, bias = self._mass_matrix(q, parameters), self._bias(q, v, parameters)
-        if quantity == "mass_bias":
-            return [q, v], [ca.densify(ca.vec(M)), bias]
-        D, LT, permutation = ca.ldl(M)
-        return [q, v, tau], [ca.ldl_solve(tau - bias, D, LT, permutation)]
-
-    def _poses(self, q: Any) -> list[tuple[Any, Any]]:
-        """Body axes to the parent's, and the body's origin there."""
-        poses = []
-        for k, joint in enumerate(self.unrolled.joints):
-            c, s = ca.cos(q[k]), ca.sin(q[k])
-            turn = ca.vertcat(ca.horzcat(c, -s, 0), ca.horzcat(s, c, 0), ca.horzcat(0, 0, 1))
-            fixed = ca.SX(ca.sparsify(ca.DM(joint.rotation.astype(float))))
-            poses.append((fixed @ turn, ca.SX(ca.DM(joint.origin.astype(float)))))
-        return poses
-
-    def _bias(self, q: Any, v: Any, parameters: Any) -> Any:
-        poses, axis, n = self._poses(q), ca.SX(ca.DM([0, 0, 1])), self.nv
-        w, dw, linear = ca.SX.zeros(3), ca.SX.zeros(3), -ca.SX(ca.DM(self.unrolled.gravity.astype(float)))
-        wrenches = []
-        for k, (R, p) in enumerate(poses):  # a chain: the parent of each is the one before
-            linear = R.T @ (linear + ca.cross(dw, p) + ca.cross(w, ca.cross(w, p)))
-            w, dw = R.T @ w, R.T @ dw
-            dw = dw + ca.cross(w, axis * v[k])
-            w = w + axis * v[k]
-            mass, first, inertia = _body(parameters[:, k])
-            force = mass * linear + ca.cross(dw, first) + ca.cross(w, ca.cross(w, first))
-            wrenches.append((force, inertia @ dw + ca.cross(w, inertia @ w) + ca.cross(first, linear)))
-        out = [ca.SX(0)] * n
-        force, moment = ca.SX.zeros(3), ca.SX.zeros(3)
-        for k in reversed(range(n)):
-            force, moment = force + wrenches[k][0], moment + wrenches[k][1]
-            out[k] = moment[2]
-            R, p = poses[k]
-            force = R @ force
-            moment = R @ moment + ca.cross(p, force)
-        return ca.vertcat(*out)
-
-    def _mass_matrix(self, q: Any, parameters: Any) -> Any:
-        poses, n = self._poses(q), self.nv
-        M = ca.SX(n, n)
-        mass, first, inertia = ca.SX(0), ca.SX.zeros(3), ca.SX(3, 3)
-        for k in reversed(range(n)):
-            own = _body(parameters[:, k])
-            mass, first, inertia = mass + own[0], first + own[1], inertia + own[2]
-            force, moment = ca.vertcat(-first[1], first[0], 0), inertia[:, 2]
-            for i in reversed(range(k + 1)):
-                M[i, k] = M[k, i] = moment[2]
-                force = poses[i][0] @ force
-                moment = poses[i][0] @ moment + ca.cross(poses[i][1], force)
-            M[k, k] += float(self.unrolled.armature[k])
-            R, p = poses[k]
-            turned = R @ first
-            arm = turned + 0.5 * mass * p
-            inertia = R @ inertia @ R.T + 2 * ca.dot(arm, p) * ca.SX.eye(3) - arm @ p.T - p @ arm.T
-            first = turned + mass * p
-        return M
-
-
-def _body(p: Any) -> tuple[Any, Any, Any]:
-    """Mass, first moment and inertia about the joint."""
-    rows = ca.horzcat(p[4], p[5], p[7]), ca.horzcat(p[5], p[6], p[8]), ca.horzcat(p[7], p[8], p[9])
-    return p[0], p[1:4], ca.vertcat(*rows)
-
-
-def standard_parameters(unrolled: UnrolledRobot) -> np.ndarray:
-    """Of all bodies (nv, 10): [m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz], about the joint, as Pinocchio orders them."""
-    pseudo = np.stack([body.astype(float) for body in unrolled.inertias])
-    second = pseudo[:, :3, :3]
-    inertia = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
-    rows, columns = [0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]
-    return np.hstack([pseudo[:, 3, 3, None], pseudo[:, :3, 3], inertia[:, rows, columns]])

@@ -12,7 +12,6 @@ the first result of forward dynamics, with torch and the robot loaded (wall-cloc
 
 from __future__ import annotations
 
-import ctypes
 import subprocess
 import sys
 import tempfile
@@ -20,52 +19,15 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pinocchio as pin
 import torch
 from threadpoolctl import threadpool_limits
 
 from benchmarks.casadi_dynamics import QUANTITIES, CasadiLoops
-from benchmarks.rigid_body import SOURCE, URDF, States, compiled, in_turn
+from benchmarks.rigid_body import URDF, Loops, Ours, States, agreement, in_turn, largest_error
 from forcegp.robots import Robot
-from forcegp.robots.compiled import CompiledRobot
 
 BATCH, REPETITIONS, EAGER_REPETITIONS = 10_000, 50, 5
-
-
-class Loops:
-    """The C++ loops over given states; results in ``M``, ``bias`` and ``a``."""
-
-    def __init__(self, states: States, folder: Path) -> None:
-        library = compiled(folder, SOURCE)
-        count, n = states.q.shape
-        self.M, self.bias, self.a = np.zeros((count, n, n)), np.zeros((count, n)), np.zeros((count, n))
-        handles = ctypes.py_object(states.model), ctypes.py_object(states.data)
-        given = states.q, states.v, states.tau, self.M, self.bias, self.a
-        q, v, tau, M, bias, a = (x.ctypes.data_as(ctypes.c_void_p) for x in given)
-        self.mass_and_bias: list[Callable[[], object]] = [
-            lambda world=world: library.mass_and_bias(*handles, count, world, q, v, M, bias) for world in (0, 1)
-        ]
-        self.forward: Callable[[], object] = lambda: library.forward_dynamics(*handles, count, q, v, tau, a)
-
-
-class Ours:
-    """The same questions to a robot, compiled or not."""
-
-    def __init__(self, states: States, of: Robot | CompiledRobot) -> None:
-        self.of, self.states = of, states
-
-    def mass_and_bias(self) -> tuple[torch.Tensor, torch.Tensor]:
-        return self.of.mass_matrix_and_bias(*self.states.tensors[:2])
-
-    def forward(self) -> torch.Tensor:
-        return self.of.forward_dynamics(*self.states.tensors)
-
-
-def largest_error(ours: torch.Tensor, theirs: np.ndarray | torch.Tensor) -> float:
-    """Largest deviation in units of the largest value."""
-    expected = torch.as_tensor(theirs)
-    return float((ours - expected).abs().max() / expected.abs().max())
 
 
 def against_casadi(states: States, mine: Ours, folder: Path) -> dict[str, float]:
@@ -86,19 +48,6 @@ def against_casadi(states: States, mine: Ours, folder: Path) -> dict[str, float]
         times = f"{1e6 * own:8.0f} us, CasADi's C {1e6 * theirs:8.0f} us, {own / theirs:.2f}"
         print(f"{quantity:20s}{count:7d} states: {times}")
     return found
-
-
-def agreement(mine: Ours, loops: Loops) -> float:
-    """Largest error of all results."""
-    mass, bias = mine.mass_and_bias()
-    errors = []
-    for loop in loops.mass_and_bias:
-        loop()
-        errors += [largest_error(mass.tril(), np.tril(loops.M)), largest_error(bias, loops.bias)]
-    loops.forward()
-    errors.append(largest_error(mine.forward(), loops.a))
-    assert max(errors) < 1e-9, errors
-    return max(errors)
 
 
 def seconds(function: Callable[[], object]) -> float:

@@ -78,10 +78,8 @@ def links(robot: Robot, q: np.ndarray) -> np.ndarray:
     return torch.stack([kinematics.frame_pose(name)[..., :3, 3] for name in names], dim=1).numpy()
 
 
-CURVES = (0, 1, 3)
-"""Joints whose friction is drawn beside the arms: those with the largest."""
-ARROW = 0.06
-"""Metres that stand for 1 Nm of learned friction, along the axis of its joint."""
+CURVES = (0, 1, 3)  # joints whose friction is drawn beside the arms: those with the largest
+ARROW = 0.06  # metres that stand for 1 Nm of learned friction, along the axis of its joint
 PALETTE, PIXELS = 64, 100
 
 
@@ -177,46 +175,21 @@ def draw_friction(
     return lambda frame: dot.set_data(velocity[frame : frame + 1], now[frame : frame + 1])
 
 
-def contacts() -> tuple[Figure, Figure]:
-    """Pushes of 5 N over 8 s, and what every monitor finds of 3 N at any rate of false alarms."""
+def contacts() -> Figure:
+    """Pushes of 5 N over 8 s."""
     found = recordings(SEED)
-    made = monitors(SEED, found["calibration"])
-    rows, monitor = slice(0, round(8.0 * RATE)), made["learned"]
-    some = {name: x[rows] for name, x in found["5 N"].items()}
+    monitor = monitors(SEED, found["calibration"])["learned"]
+    some = {name: x[: round(8.0 * RATE)] for name, x in found["5 N"].items()}
     state, time = monitor.run(*qvu(some)), np.arange(len(some["q"])) / RATE
     pushes = [(start, start + LASTING) for start in np.arange(0.0, 8.0, EVERY)]
     arrays = time, state.distance.numpy(), monitor.threshold, state.torque.numpy()
-    one = contacts_figure(*arrays, pushes, monitor.robot.joint_names, "KUKA iiwa, pushed with 5 N at the elbow")
-    curves = new_figure(6.4, 3.6)
-    axes = curves.subplots()
-    period, window = round(EVERY * RATE), round(LASTING * RATE)
-    for name in (name for name in COLORS if name in made):
-        each = made[name]
-        free = each.run(*qvu(found["free"])).distance.numpy()
-        pushed = each.run(*qvu(found["3 N"])).distance.numpy()
-        largest = pushed[: len(pushed) // period * period].reshape(-1, period)[:, : window + 1].max(axis=1)
-        blocks = free[: len(free) // RATE * RATE].reshape(-1, RATE).max(axis=1)  # of one second
-        limits = np.sort(np.concatenate([blocks, largest]))
-        rate = [3600.0 * (blocks > limit).mean() for limit in limits]
-        share = [(largest > limit).mean() for limit in limits]
-        style = "--" if name == "true model" else "-"
-        axes.plot(np.maximum(rate, 6.0), share, style, color=COLORS[name], linewidth=1.6, label=name)
-    axes.set(xscale="log", xlim=(6.0, 3600.0), ylim=(0.0, 1.02))
-    quiet(
-        axes,
-        title="Pushes of 3 N at the elbow, half a second each",
-        x="false alarms per hour (6: none in 10 min)",
-        y="found",
-    )
-    curves.legend(fontsize=SMALL, frameon=False, loc="outside lower center", ncols=4)
-    return one, curves
+    return contacts_figure(*arrays, pushes, monitor.robot.joint_names, "KUKA iiwa, pushed with 5 N at the elbow")
 
 
 if __name__ == "__main__":
     FOLDER.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
-    for name, figure in zip(("monitor", "monitor-rates"), contacts(), strict=True):
-        save_figure(figure, FOLDER / f"{name}.png")
+    save_figure(contacts(), FOLDER / "monitor.png")
     arm, model, found = motions()
     first, *others = film(arm, model, found)
     more = {"duration": 1000 // FRAMES_PER_SECOND, "loop": 0, "optimize": True}

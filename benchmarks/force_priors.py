@@ -19,7 +19,7 @@ from forcegp.forces import parse_forces
 from forcegp.jobs import machine
 from forcegp.scores import Scores
 from forcegp.scores.accuracy import ACCELERATION, ALL_JOINTS, CONTACT_FORCE, TRUE_ACCELERATION
-from forcegp.scores.tables import formatted, markdown_table
+from forcegp.scores.page import formatted, markdown_table
 from forcegp.simulation import simulate_kuka_surface
 from forcegp.simulation.scenarios import Surface
 

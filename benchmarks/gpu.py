@@ -41,10 +41,8 @@ from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 RESULTS = Path(__file__).resolve().parent / "gpu_results.json"
 JOINTS, RANK = 7, 6
-ROWS = (200, 500, 1000, 2000, 4000, 8000)
-STATES = (1, 100, 1000, 10_000, 100_000)
-STATES_TO_PREDICT = (1, 100, 1000, 10_000)
-MOTIONS = (1, 100, 1000, 10_000)
+ROWS, MANY = (200, 500, 1000, 2000, 4000, 8000), (1, 100, 1000, 10_000)
+LARGE = {"rows": ROWS, "states": (*MANY, 100_000), "states_to_predict": MANY, "motions": MANY}
 SMALL = {"rows": (20, 40), "states": (1, 50), "states_to_predict": (1, 50), "motions": (1, 5)}
 ROWS_TO_PREDICT_FROM, STEPS = 1000, 20
 REPEATS = 3
@@ -111,13 +109,7 @@ class Questions:
 
     def prediction(self, posterior: Posterior, count: int) -> Callable[[], Tensor]:
         states = self.states(count)
-
-        def predict() -> Tensor:
-            with torch.no_grad():
-                prediction = posterior.predict(*states)
-            return prediction.mean
-
-        return predict
+        return torch.no_grad()(lambda: posterior.predict(*states).mean)
 
     def rollout(self, posterior: Posterior, motions: int) -> Callable[[], Tensor]:
         q, v, u = self.states(motions)
@@ -127,9 +119,7 @@ class Questions:
 
 def measure(devices: list[torch.device], small: bool, cpu_rows: int) -> dict[str, dict[str, float]]:
     """Print the tables; gives seconds by device and question."""
-    sizes = (
-        SMALL if small else {"rows": ROWS, "states": STATES, "states_to_predict": STATES_TO_PREDICT, "motions": MOTIONS}
-    )
+    sizes = SMALL if small else LARGE
     longest = max(sizes["rows"])
     seconds = max(5.0, 1.2 * longest / 240.0)
     data = simulate_kuka_surface(KukaSurfaceConfig(seconds=seconds, seed=1))
@@ -178,19 +168,15 @@ def measure(devices: list[torch.device], small: bool, cpu_rows: int) -> dict[str
         what = f"prediction with covariance of {count} states, N = {from_rows}"
         row(f"predict_{count}", what, _always, lambda name, asked, n=count: asked.prediction(posteriors[name], n))
     for count in sizes["states"]:
-        row(
-            f"dynamics_{count}",
-            f"constrained dynamics of {count} states",
-            _always,
-            lambda _, asked, n=count: asked.dynamics(n),
-        )
+        what = f"constrained dynamics of {count} states"
+        row(f"dynamics_{count}", what, _always, lambda _, asked, n=count: asked.dynamics(n))
     for count in sizes["motions"]:
         what = f"rollout of {count} motions, {STEPS} steps, N = {from_rows}"
         row(f"rollout_{count}", what, _always, lambda name, asked, n=count: asked.rollout(posteriors[name], n))
     return found
 
 
-def _always(questions: Questions) -> bool:
+def _always(_: Questions) -> bool:
     return True
 
 
@@ -200,7 +186,6 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--device", default="cuda", help="cuda (default), cuda:K, or cpu for the CPU alone")
     parser.add_argument("--small", action="store_true", help="few rows and states, for trying this script")
     parser.add_argument("--cpu-rows", type=int, default=2000, help="most rows for the likelihood on the CPU")
-    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1, help="of the CPU; default: all cores")
     given = parser.parse_args(arguments)
     try:
         device = usable_device(given.device)
@@ -208,7 +193,7 @@ def main(arguments: list[str] | None = None) -> int:
         needs = ", ".join(f"N = {rows} {gib(required_bytes(rows))}" for rows in ROWS[2:])
         print(f"benchmarks.gpu: {error} The likelihood needs about this much GPU memory: {needs}.", file=sys.stderr)
         return 2
-    threads = 1 if given.small else given.threads
+    threads = 1 if given.small else os.cpu_count() or 1
     torch.set_num_threads(threads)
     cpu = torch.device("cpu")
     processor = f"{machine()}; {threads} threads used"
@@ -219,15 +204,8 @@ def main(arguments: list[str] | None = None) -> int:
     with threadpool_limits(threads):  # LAPACK's own; entered after the libraries are loaded
         found = measure([cpu] if device.type == "cpu" else [cpu, device], given.small, given.cpu_rows)
     if device.type == "cuda":
-        document = {
-            "gpu": torch.cuda.get_device_name(device),
-            "gpu_memory_bytes": torch.cuda.get_device_properties(device).total_memory,
-            "torch": torch.__version__,
-            "cuda": torch.version.cuda,
-            "cpu": processor,
-            "small": given.small,
-            "results": found,
-        }
+        card = {"gpu": torch.cuda.get_device_name(device), "torch": torch.__version__, "cuda": torch.version.cuda}
+        document = card | {"cpu": processor, "small": given.small, "results": found}
         write_text(RESULTS, json.dumps(document, indent=1, sort_keys=True) + "\n")
     return 0
 

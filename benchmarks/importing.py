@@ -6,12 +6,11 @@ differentiated. `forcegp import` runs in a process of its own with the threads t
 time and its largest resident memory are measured from outside.
 
     python -m benchmarks importing
-    python -m benchmarks.importing mcap --bytes 1e8        one of the files, smaller
+    python -m benchmarks.importing mcap 1e8        one of the files, smaller
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -163,8 +162,4 @@ def run() -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("kind", choices=[*LOGS])
-    parser.add_argument("--bytes", type=float, default=BYTES)
-    given = parser.parse_args()
-    imported(given.kind, int(given.bytes))
+    imported(sys.argv[1], int(float(sys.argv[2])))

@@ -8,8 +8,7 @@ from jaxtyping import Float
 from forcegp.robots import Robot
 from forcegp.simulation import KukaSurfaceConfig
 
-OF_PLANTS = ("exponential", "asymmetric", "load", "lugre", "drift")
-"""Joint friction that no model has (`JointFrictionLaw`)."""
+OF_PLANTS = ("exponential", "asymmetric", "load", "lugre", "drift")  # joint friction that no model has
 ASYMMETRY = 0.7  # Coulomb friction backwards over that forwards
 LOAD = 0.04, 0.015  # per torque of a joint that drives, that is driven back
 PRESLIDING = 0.01  # rad that a joint gives before it slides

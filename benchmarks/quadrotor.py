@@ -33,19 +33,29 @@ def acting(dataset: Dataset, lag: float) -> Dataset:
     return replace(dataset, u=late).rows(keep)
 
 
-def scores(posterior: Posterior, dataset: Dataset) -> tuple[float, float]:
-    """nRMSE of accelerations (mean over the six), and RMSE of the position after .5 s in m."""
-    rows = np.arange(60, len(dataset))  # the observer has begun
-    a = posterior.predict(dataset.q, dataset.v, dataset.u, covariance=False).mean.numpy()
-    error = (a - dataset.truth["a"])[rows]
-    starts = np.arange(60, len(dataset) - HORIZON, STRIDE)
-    u = np.stack([dataset.u[k : k + HORIZON] for k in starts])
-    moved = posterior.rollout(dataset.q[starts], dataset.v[starts], u, 1.0 / 240.0)
-    last = moved.q.shape[-2] - 1
-    away = moved.q[:, -1, :3].numpy() - dataset.q[starts + last][:, :3]
+def scores(
+    posterior: Posterior,
+    dataset: Dataset,
+    a: np.ndarray | None = None,
+    *,
+    horizon: int = HORIZON,
+    stride: int = STRIDE,
+    begin: int = 60,
+    dt: float = 1.0 / 240.0,
+) -> tuple[float, float]:
+    """nRMSE of accelerations (mean over the columns of `a`, the truth), and RMSE of the position at the end in m.
+
+    From row `begin` on, where the observer has begun.
+    """
+    a = dataset.truth["a"] if a is None else a
+    error = posterior.predict(dataset.q, dataset.v, dataset.u, covariance=False).mean.numpy()[:, : a.shape[1]] - a
+    starts = np.arange(begin, len(dataset) - horizon, stride)
+    u = np.stack([dataset.u[k : k + horizon] for k in starts])
+    moved = posterior.rollout(dataset.q[starts], dataset.v[starts], u, dt)
+    away = moved.q[:, -1, :3].numpy() - dataset.q[starts + moved.q.shape[-2] - 1][:, :3]
     return (
-        float(np.mean(np.sqrt(np.square(error).mean(0)) / dataset.truth["a"][rows].std(0))),
-        float(np.sqrt(np.nanmean(np.square(away).sum(1)))) if np.isfinite(away).all() else float("nan"),
+        float(np.mean(np.sqrt(np.square(error[begin:]).mean(0)) / a[begin:].std(0))),
+        float(np.sqrt(np.square(away).sum(1).mean())) if np.isfinite(away).all() else float("nan"),
     )
 
 

@@ -24,13 +24,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks import quadrotor
 from benchmarks.quadrotor import TIMES, training_error
 from forcegp import AerodynamicForce, Dataset, Model, Robot, fit
 from forcegp.data import Preparation, differentiate
 from forcegp.forces import Actuation, RigidBodies, Thrusters
 from forcegp.posterior import Posterior, observing
 
-GRAVITY, HORIZON, STRIDE, BEGUN = 9.81, 25, 5, 10  # m/s^2, rows: of .5 s, between starts, of the observer's begin
+GRAVITY = 9.81  # m/s^2
 STRETCH = 200  # rows
 
 
@@ -71,14 +72,7 @@ def joined(flights: list[Dataset]) -> Dataset:
 
 
 def scores(posterior: Posterior, dataset: Dataset) -> tuple[float, float]:
-    rows = np.arange(BEGUN, len(dataset))
-    error = posterior.predict(dataset.q, dataset.v, dataset.u, covariance=False).mean.numpy() - dataset.a
-    starts = np.arange(BEGUN, len(dataset) - HORIZON, STRIDE)
-    u = np.stack([dataset.u[k : k + HORIZON] for k in starts])
-    moved = posterior.rollout(dataset.q[starts], dataset.v[starts], u, 0.02)
-    away = moved.q[:, -1, :3].numpy() - dataset.q[starts + moved.q.shape[-2] - 1][:, :3]
-    share = np.sqrt(np.square(error[rows, :3]).mean(0)) / dataset.a[rows, :3].std(0)
-    return float(share.mean()), float(np.sqrt(np.square(away).sum(1).mean()))
+    return quadrotor.scores(posterior, dataset, dataset.a[:, :3], horizon=25, stride=5, begin=10, dt=0.02)
 
 
 def compared(model: Model, train: Dataset, test: Dataset, points: int) -> dict[str, tuple[float, float]]:

@@ -9,8 +9,7 @@ processor; instantiated with the loop instead, they took minutes to compile and 
 Where it cannot be compiled (no g++, no Python or Eigen headers), there is no ratio.
 
 glibc gives the memory of large tensors back to the system after each call until a process has freed a larger one, and
-taking it again costs page faults. Any process that has fitted a model is past that, and this one is made so; "in a
-fresh process" is the time before.
+taking it again costs page faults. Any process that has fitted a model is past that, and this one is made so.
 
     python -m benchmarks.rigid_body
 """
@@ -34,6 +33,7 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from forcegp.robots import Robot
+from forcegp.robots.compiled import CompiledRobot
 
 BATCH, REPETITIONS = 1000, 200
 URDF = Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"
@@ -140,86 +140,85 @@ def in_turn(*functions: Callable[[], object], repetitions: int = REPETITIONS) ->
     return [statistics.median(taken) for taken in times]
 
 
-def compiled_loops(states: States, folder: Path) -> tuple[list[Callable[[], object]], Callable[[], object]]:
-    """C++ loops for mass matrix and bias (two conventions), and for forward dynamics, checked against ours."""
-    library, robot = compiled(folder), states.robot
-    count, n = states.q.shape
-    M, b, a = np.zeros((count, n, n)), np.zeros((count, n)), np.zeros((count, n))
-    handles = ctypes.py_object(states.model), ctypes.py_object(states.data), count
-    # data_as, unlike the address alone, keeps the array alive
-    q, v, tau, *out = (x.ctypes.data_as(ctypes.c_void_p) for x in (states.q, states.v, states.tau, M, b, a))
+class Loops:
+    """The C++ loops over given states; results in ``M``, ``bias`` and ``a``."""
 
-    def mass_and_bias(world: int) -> Callable[[], object]:
-        return lambda: library.mass_and_bias(*handles, world, q, v, *out[:2])
+    def __init__(self, states: States, folder: Path) -> None:
+        library = compiled(folder)
+        count, n = states.q.shape
+        self.M, self.bias, self.a = np.zeros((count, n, n)), np.zeros((count, n)), np.zeros((count, n))
+        handles = ctypes.py_object(states.model), ctypes.py_object(states.data)
+        given = states.q, states.v, states.tau, self.M, self.bias, self.a
+        q, v, tau, M, bias, a = (x.ctypes.data_as(ctypes.c_void_p) for x in given)
+        self.mass_and_bias: list[Callable[[], object]] = [
+            lambda world=world: library.mass_and_bias(*handles, count, world, q, v, M, bias) for world in (0, 1)
+        ]
+        self.forward: Callable[[], object] = lambda: library.forward_dynamics(*handles, count, q, v, tau, a)
 
-    def forward() -> object:
-        return library.forward_dynamics(*handles, q, v, tau, out[2])
 
-    mass, bias = robot.mass_matrix_and_bias(*states.tensors[:2])
-    for world in (0, 1):
-        mass_and_bias(world)()
-        np.testing.assert_allclose(np.tril(M), np.tril(mass), rtol=1e-9, atol=1e-9)  # column-major: theirs is the upper
-        np.testing.assert_allclose(b, bias, rtol=1e-9, atol=1e-9)
-    forward()
-    np.testing.assert_allclose(a, robot.forward_dynamics(*states.tensors), rtol=1e-9, atol=1e-9)
-    return [mass_and_bias(0), mass_and_bias(1)], forward
+class Ours:
+    """The same questions to a robot, compiled or not."""
+
+    def __init__(self, states: States, of: Robot | CompiledRobot) -> None:
+        self.of, self.states = of, states
+
+    def mass_and_bias(self) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.of.mass_matrix_and_bias(*self.states.tensors[:2])
+
+    def forward(self) -> torch.Tensor:
+        return self.of.forward_dynamics(*self.states.tensors)
+
+
+def largest_error(ours: torch.Tensor, theirs: np.ndarray | torch.Tensor) -> float:
+    """Largest deviation in units of the largest value."""
+    expected = torch.as_tensor(theirs)
+    return float((ours - expected).abs().max() / expected.abs().max())
+
+
+def agreement(mine: Ours, loops: Loops) -> float:
+    """Largest error of all results."""
+    mass, bias = mine.mass_and_bias()
+    errors = []
+    for loop in loops.mass_and_bias:
+        loop()
+        errors += [largest_error(mass.tril(), np.tril(loops.M)), largest_error(bias, loops.bias)]
+    loops.forward()
+    errors.append(largest_error(mine.forward(), loops.a))
+    assert max(errors) < 1e-9, errors
+    return max(errors)
 
 
 def run() -> dict[str, float]:
     """Measure and print; the ratio at batch 1000 (only to a C++ loop), and the ms of a single forward dynamics."""
-    command = [sys.executable, "-m", "benchmarks.rigid_body", "fresh"]
-    fresh = subprocess.run(command, check=True, capture_output=True, text=True, cwd=Path(__file__).parents[1])
     torch.empty(30 * 2**20, dtype=torch.uint8)  # freed at once: see above
     states = States(BATCH)
-    robot, (q, v, tau) = states.robot, states.tensors
-
-    def ours() -> object:
-        return robot.mass_matrix_and_bias(q, v)
-
-    def our_forward() -> object:
-        return robot.forward_dynamics(q, v, tau)
-
-    aba = pinocchio = None
+    mine, one = Ours(states, states.robot), tuple(x[0] for x in states.tensors)
     with tempfile.TemporaryDirectory() as folder:
         try:
-            theirs, their_forward = compiled_loops(states, Path(folder))
-            mine, local, world = in_turn(ours, *theirs)
-            mine_forward, aba = in_turn(our_forward, their_forward)
-            pinocchio = min(local, world)
+            loops = Loops(states, Path(folder))
+            agreement(mine, loops)
+            mass, *theirs = in_turn(mine.mass_and_bias, *loops.mass_and_bias)
+            forward, aba = in_turn(mine.forward, loops.forward)
         except (OSError, subprocess.CalledProcessError) as error:
             why = getattr(error, "stderr", None)
             print(f"no C++ loop ({error}); {why.decode()[-500:] if why else ''}")
-            mine, mine_forward = in_turn(ours, our_forward)
-
-    one = q[0], v[0], tau[0]
-    single, single_mass = in_turn(lambda: robot.forward_dynamics(*one), lambda: robot.mass_matrix_and_bias(*one[:2]))
+            (mass, forward), theirs, aba = in_turn(mine.mass_and_bias, mine.forward), [], None
+    (single,) = in_turn(lambda: states.robot.forward_dynamics(*one))
+    pinocchio = min(theirs, default=None)
     print(f"\n{'CPU ms, medians':52s}{'forcegp':>10s}{'C++ loop':>28s}{'ratio':>8s}")
-    rows = [
-        (f"mass matrix + bias, {BATCH} states", mine, pinocchio),
-        (f"forward dynamics, {BATCH} states", mine_forward, aba),
-        ("mass matrix + bias, 1 state", single_mass, None),
+    for label, forcegp, other in (
+        (f"mass matrix + bias, {BATCH} states", mass, pinocchio),
+        (f"forward dynamics, {BATCH} states", forward, aba),
         ("forward dynamics, 1 state", single, None),
-        (f"mass matrix + bias, {BATCH} states, in a fresh process", float(fresh.stdout), None),
-    ]
-    for label, forcegp, other in rows:
+    ):
         compared = f"{1e3 * other:28.3f}{forcegp / other:8.2f}" if other else ""
         print(f"{label:52s}{1e3 * forcegp:10.3f}{compared}")
-    measured = {"forward_dynamics_single_ms": 1e3 * single}
-    if pinocchio is None:
-        return measured
-    return {"mass_bias_vs_pinocchio_b1000": mine / pinocchio} | measured
-
-
-def main(arguments: list[str]) -> None:
-    torch.set_num_threads(1)
-    if arguments == ["fresh"]:
-        states = States(BATCH)
-        print(in_turn(lambda: states.robot.mass_matrix_and_bias(*states.tensors[:2]))[0])
-        return
-    with threadpool_limits(1):
-        for key, value in run().items():
-            print(f"{key}: {value:.3g}")
+    ratio = {} if pinocchio is None else {"mass_bias_vs_pinocchio_b1000": mass / pinocchio}
+    return ratio | {"forward_dynamics_single_ms": 1e3 * single}
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    torch.set_num_threads(1)
+    with threadpool_limits(1):
+        for key, value in run().items():
+            print(f"{key}: {value:.3g}")

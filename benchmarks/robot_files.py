@@ -40,8 +40,7 @@ from forcegp.robots.urdf_file import read_robot_file
 
 mujoco: Any = untyped
 CLOSE = 1e-9
-ASKED = "not bolted"
-"""What the message of an UnstatedBase says, also beside other problems."""
+ASKED = "not bolted"  # what the message of an UnstatedBase says, also beside other problems
 SUFFIXES = (".urdf", ".xacro", ".xml", ".mjcf")
 
 

@@ -26,7 +26,7 @@ CALLS = [
     (lambda d, p: score(d, d), "models is a Dataset; give a Posterior, a mapping from names, or names"),
     (
         lambda d, p: score({"a": 5}, d, split=split_named(d, "blocks:2:1", 0.0), points=3),
-        "model 'a' is a int; give a name, a Model, a Posterior or a function",
+        "model 'a' is a int; give a name, a Model or a Posterior",
     ),
     (lambda d, p: check(d.model, d), "dataset is a Model; give a Dataset"),
     (lambda d, p: check(d, d.model.robot), "model is a Robot; give a Model"),

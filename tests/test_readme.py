@@ -5,7 +5,6 @@ import re
 import shlex
 from pathlib import Path
 
-from benchmarks.force_pictures import PICTURES
 from benchmarks.paper import published
 from benchmarks.paper.fits import MODELS
 from tests.examples import run_example
@@ -132,14 +131,6 @@ def test_the_commands_and_forces_of_the_page_on_forces_exist(repository: Path):
                 count += 1
                 model.with_forces(force)
     assert count > 8
-
-
-def test_the_pictures_and_pages_that_the_page_on_forces_names_exist(repository: Path):
-    page = (repository / "docs" / "how-to" / "forces.md").read_text(encoding="utf-8")
-    links = re.findall(r"\]\(([^)#]+)\)", page)
-    assert not [link for link in set(links) if not (repository / "docs" / "how-to" / link).exists()]
-    drawn = re.findall(r"\]\(forces/(.*)\.png\)", page)
-    assert set(drawn) == set(PICTURES)
 
 
 def test_the_reproduced_numbers_are_those_of_the_reproduction(repository: Path):

@@ -47,7 +47,7 @@ FACTS = {
     "Posterior": ["model: analytical mean", "learned from: 20 rows", "search: not converged"],
     "Prediction": ["batch: (20,)", "entries: 3", "forces: multiplier, contact_force, unknown_force"],
     "Gaussian": ["batch: (20,)", "largest std"],
-    "Scores": ["mae: ", "noise floor: 0.0399", "coverage 95: ", "warnings: "],
+    "Scores": ["mae of acceleration: ", "noise_floor of acceleration: 0.0399", "warnings: "],
     "Robot": ["name: 'arm'", "nv: 3", "pan (revolute), lift (revolute), bend (revolute)"],
     "Model": ["contacts: hand on Plane", "forces: Actuation, RigidBodies", "omega=5.0"],
     "Estimates": ["estimated: viscous.pan", "from: 20 rows, "],

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from forcegp.errors import InvalidInput
 from forcegp.jobs import Job, JobStore
-from forcegp.scores.tables import median_and_range
+from forcegp.scores.accuracy import median_and_range
 
 Row = dict[str, str | int | float | None]
 SIMULATION_COST = 0.1  # CPU seconds per simulated second, about

@@ -22,7 +22,7 @@ from benchmarks.paper.fits import (
     fit_to_all,
 )
 from forcegp.jobs import Job, JobStore
-from forcegp.scores.tables import formatted, rendered
+from forcegp.scores.page import formatted, rendered
 
 SCORES = {
     "mae": "MAE against noisy accelerations [rad/s²]",

@@ -11,7 +11,8 @@ from benchmarks.paper.experiment import Experiment, Row
 from benchmarks.paper.fig2c_jobs import CENTER_BOUND, CENTER_OFFSET, MASS_BOUND, MASS_OFFSET, MODELS, NAMES
 from benchmarks.paper.fits import fit_cost
 from forcegp.jobs import Job, JobStore
-from forcegp.scores.tables import formatted, median_and_range, rendered
+from forcegp.scores.accuracy import median_and_range
+from forcegp.scores.page import formatted, rendered
 
 _estimate_name = "fig2c/{}/seed{}".format  # model, seed
 

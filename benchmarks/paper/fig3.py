@@ -16,8 +16,8 @@ from benchmarks.paper.fits import GAUSSIAN_PROCESSES, MODEL, MODELS, FitSettings
 from forcegp.errors import InvalidInput
 from forcegp.jobs import Job, JobStore
 from forcegp.posterior import load_posterior
-from forcegp.scores.predicted_rows import interval_coverage
-from forcegp.scores.tables import markdown_table, number
+from forcegp.scores.accuracy import metrics
+from forcegp.scores.page import markdown_table, number
 
 ARRAYS = "prediction.npz"
 
@@ -98,6 +98,11 @@ def predict(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[st
         "rows": len(rows),
         "mae_noise_free": float(np.abs(mean - truth).mean()),
         "mean_std": float(std.mean()),
-        "coverage_95_noise_free": float(interval_coverage(mean, std**2, truth).mean()),
-        "coverage_95": float(interval_coverage(mean, noisy**2, rows.a).mean()),
+        "coverage_95_noise_free": mean_coverage(mean, std, truth),
+        "coverage_95": mean_coverage(mean, noisy, rows.a),
     }
+
+
+def mean_coverage(mean: np.ndarray, std: np.ndarray, target: np.ndarray) -> float:
+    """Of 95 % intervals, over all joints."""
+    return float(np.mean(np.array(metrics(mean, std**2, target)["coverage_95"], dtype=float)))

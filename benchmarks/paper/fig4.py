@@ -16,7 +16,8 @@ from benchmarks.paper.fig4_jobs import ARRAYS, CONTROLS, FREQUENCY, VARIANTS
 from benchmarks.paper.figures import rollouts_figure
 from benchmarks.paper.fits import GAUSSIAN_PROCESSES, MODELS, FitSettings, fit_series
 from forcegp.jobs import Job, JobStore
-from forcegp.scores.tables import median_and_range, number, rendered
+from forcegp.scores.accuracy import median_and_range
+from forcegp.scores.page import number, rendered
 
 TASKS = "benchmarks.paper.fig4_jobs"
 _name = "fig4/{}/{}/{}/seed{}".format  # control, variant, model, seed

@@ -47,7 +47,8 @@ def roll(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, 
         feedback=recorded.feedback() if spec["control"] == "closed-loop" else None,
     )
     error = (rollout.q - recorded.q).abs().mean(-1).numpy()
-    c = rollout.constraint.abs().amax(-1).numpy()
+    contact, kinematics = recorded.model.contacts[0], recorded.model.robot.kinematics(rollout.q)
+    c = contact.distance(kinematics).abs().numpy()  # also of a model that knows no contact
     np.savez_compressed(folder / ARRAYS, time=rollout.time.numpy(), joint_error=error, constraint=c)
     scores = {f"{second:g}": _scores(error, c, round(second / recorded.dt)) for second in spec["seconds"]}
     return {"scores": scores, "diverged": int((rollout.diverged_at >= 0).sum())}

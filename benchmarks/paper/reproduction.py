@@ -19,7 +19,8 @@ from forcegp.errors import InvalidInput, require_known
 from forcegp.jobs import JobStore, Progress, run_jobs
 from forcegp.parallel import Jobs
 from forcegp.scores import save_figure
-from forcegp.scores.tables import alike, markdown_table
+from forcegp.scores.page import markdown_table
+from forcegp.scores.scores import alike
 
 PAPER_DATA = DataSettings(train_seconds=200.0, rows=10_000, test_seconds=100.0, every=12)
 SMOKE_DATA = DataSettings(train_seconds=10.0, rows=400, test_seconds=12.0, every=12)

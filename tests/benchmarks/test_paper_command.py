@@ -61,7 +61,7 @@ def test_forcegp_reproduce_is_the_same(tmp_path, monkeypatch, capfd):
     for words, message in (("fig9", "no figure 'fig9'"), ("fig2b --preset huge", "no preset 'huge'")):
         assert forcegp(["reproduce", *words.split(), "--out", "new"]) == 2
         assert message in capfd.readouterr().err
-    monkeypatch.setattr("forcegp.cli.reproduce.EXPERIMENTS", Path("nowhere.py"))
+    monkeypatch.setattr("forcegp.cli.simulated.EXPERIMENTS", Path("nowhere.py"))
     assert forcegp(["reproduce", "all"]) == 2
     assert "git clone" in capfd.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -8,7 +8,8 @@ from benchmarks.paper.reproduction import NAME, PRESETS, as_csv, experiments_of,
 
 from forcegp.errors import InvalidInput
 from forcegp.jobs import Job
-from forcegp.scores.tables import formatted, markdown_table, median_and_range, number
+from forcegp.scores.accuracy import median_and_range
+from forcegp.scores.page import formatted, markdown_table, number
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "paper"
 

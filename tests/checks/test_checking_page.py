@@ -6,8 +6,7 @@ import shlex
 import pytest
 from tests.examples import run_example
 
-from forcegp.cli.check import Check
-from forcegp.cli.import_log import Import
+from forcegp.cli.logs import Check, Import
 from forcegp.cli.main import parse_arguments
 
 

@@ -62,7 +62,7 @@ def workshop(forcegp, tmp_path_factory) -> Path:
         assert made.returncode == 0, made.stderr
         (folder / f"{name}.json").write_text(made.stdout)
     fitted = forcegp(
-        *("fit", "train.h5", "--forces", "gp:joint", "--points", 15, "--iterations", 8, "--restarts", 2, "--seed", 3),
+        *("fit", "train.h5", "--forces", "gp:joint", "--points", 15, "--iterations", 8, "--restarts", 2),
         *("--out", "run"),
         folder=folder,
     )

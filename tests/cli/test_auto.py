@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from forcegp import Dataset, Robot, load_posterior
-from forcegp.cli.auto import best_sentence, far_worse
+from forcegp.cli.auto import best_sentence
 from forcegp.cli.main import parse_arguments
 from forcegp.evidence import motion_residuals
 from forcegp.scores import Scores
 from forcegp.simulation import FreeArmConfig
 from forcegp.simulation.free_arms import simulate_free_arm
 
-COLUMNS = (
+COLUMNS = [
     "--time",
     "Zeit",
     "--q",
@@ -27,7 +27,7 @@ COLUMNS = (
     "Moment_{1..2}",
     "--robot",
     "arm.urdf",
-)
+]
 
 
 @pytest.fixture(scope="module")
@@ -86,9 +86,7 @@ def test_the_answer_holds_what_was_simulated(answered):
         assert values[f"viscous.{joint}"]["value"] == pytest.approx(0.2, rel=0.1)
     answer = "\n".join(content["answer"])
     assert "payload: none" in answer
-    assert re.search(
-        r"u was logged 2\.\d ms early", answer
-    )  # of steps of 4.2 ms, in which the simulated controller holds it
+    assert re.search(r"u was logged 2\.\d ms early", answer)  # of steps of 4.2 ms, in which a controller holds it
     assert 8 <= len(content["answer"]) <= 11
 
 
@@ -128,13 +126,10 @@ def test_the_printed_command_keeps_every_option():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("auto log.csv --robot nowhere.urdf --out x", "nowhere.urdf: no such file"),
         ("auto log.csv --robot arm.urdf --out log.csv", "log.csv"),
-        ("auto nothing.csv --robot arm.urdf --out x", "nothing.csv does not exist"),
         ("auto log.csv --out x", "--robot"),
         ("auto log.csv --robot arm.urdf --out deep/er", "the folder deep does not exist"),
         ("auto log.csv --robot arm.urdf --q Wnkel_{1..2} --u Moment_{1..2} --time Zeit --out x", "Wnkel_1"),
-        ("auto log.csv --robot arm.urdf --every 0 --out x", "--every 0 must be an integer of at least 1"),
         ("auto log.csv --robot arm.urdf --out mine", "mine was not written by forcegp auto"),
     ],
 )
@@ -167,8 +162,6 @@ def test_a_model_that_is_worse_than_none_is_not_trusted():
         about = {"given": {"kind": "given", "summary": ""}}
         return Scores(models=about, runs={"given": [run]}, joint_names=names, units={})
 
-    assert far_worse(scores([0.1, 0.1, 0.5], 0.01, 1e-4), "given").startswith("; wrist is predicted far worse")
-    assert far_worse(scores([0.1, 0.1, 0.3], 0.01, 1e-4), "given") == ""
     lost = scores([328.2] * 3, None, 1.0)  # motions are there, and none of them lasted
     assert best_sentence(lost, dataset).startswith("Trust none of these models: on unseen time, accelerations")
     told = best_sentence(scores([0.1, 0.16, 2.8], 0.01, 1e-4), dataset)  # noise of a alone

@@ -69,11 +69,8 @@ def test_a_model_becomes_casadi_functions(forcegp, folder):
     ("words", "message"),
     [
         (("run", "--steps", 0), "dt is 0.0; give the time step as a positive number of seconds"),
-        (("run", "--steps", "nan"), "dt is nan; give the time step as a positive number of seconds"),
-        (("run", "--steps", -0.1), "dt is -0.1; give the time step as a positive number of seconds"),
         (("run", "--integrator", "rk4"), "--integrator was given without --steps"),
         (("run", "--steps", 0.1, "--integrator", "leap"), "no integrator 'leap'"),
-        (("run", "--steps", 0.1, "--integrator", "rk"), "integrator 'rk'"),
         (("nowhere",), "nowhere does not exist; give the folder that `forcegp fit --out` wrote"),
     ],
 )
@@ -121,8 +118,3 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_program(forcegp, folder, mon
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "No space left on device" in done.stderr
     assert {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()} == before
-
-
-def test_another_target_is_refused(forcegp, folder):
-    done = forcegp("export", "run", "--to", "onnx", "--out", "never", folder=folder)
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1)

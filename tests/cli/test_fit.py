@@ -8,7 +8,7 @@ import pytest
 import torch
 from tests.cli.one_line import assert_refused
 from tests.fit.test_motion_fit import line, recording
-from tests.posterior.arm import URDF, arm_data
+from tests.posterior.arm import arm_data
 
 from forcegp import Dataset, JointFriction, Model, Robot, Viscous, load_posterior
 from forcegp.evidence import motion_residuals
@@ -27,8 +27,6 @@ def folder(tmp_path_factory):
         data = simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=seconds, seed=seed, noise=0.05))
         data.rows(slice(None, None, 4)).save(place / f"{name}.h5")
     arm_data(40, seed=0).save(place / "arm.h5")
-    friction = '<dynamics damping="0.2" friction="0.4"/></joint>'
-    (place / "damped.urdf").write_text(URDF.replace("</joint>", friction, 1))
     return place
 
 
@@ -86,23 +84,6 @@ def test_functions_beside_what_was_identified(forcegp, folder, identified):
     assert any(isinstance(law, Viscous) for law in posterior.model.laws)
 
 
-def test_numbers_and_functions_together(forcegp, folder):
-    words = ("fit", "pendulum.h5", "--forces", "viscous,gp:joint", "--noise", 0.05, *QUICK)
-    done = forcegp(*words, "--out", "both", "--json", folder=folder)
-    assert done.returncode == 0, done.stderr
-    assert set(json.loads(done.stdout)["estimates"]) == {f"viscous.{joint}" for joint in JOINTS}
-    assert (folder / "both" / "identified.urdf").exists()
-
-
-def test_friction_of_a_file_is_among_the_forces(forcegp, folder):
-    words = ("fit", "arm.h5", "--robot", "damped.urdf", "--forces", "none", "--noise", 0.1, "--no-checks", *QUICK)
-    done = forcegp(*words, "--out", "damped", folder=folder)
-    assert done.returncode == 0, done.stderr
-    assert "forces: actuation, rigid-bodies, viscous, coulomb" in done.stderr
-    titles = [law.title for law in load_posterior(folder / "damped").model.laws]
-    assert titles == ["actuation", "rigid-bodies", "viscous", "coulomb"]
-
-
 @pytest.mark.parametrize(
     ("forces", "description"),
     [
@@ -137,32 +118,22 @@ def test_motions_refine_what_was_found(forcegp, folder):
     assert posterior.parameters["coulomb.level.x"].value == pytest.approx(4.0, rel=0.05)
 
 
-def test_measured_torques_are_stored_with_the_model(forcegp, folder):
-    words = ("fit", "arm.h5", "--measured-torque", "--force-noise", 0.3, "--forces", "gp:joint", *QUICK)
-    done = forcegp(*words, "--out", "measured", folder=folder)
+def test_the_engine_is_said_and_stored(forcegp, folder):
+    done = forcegp("fit", "arm.h5", *QUICK, "--engine", "inducing", "--out", "inducing", folder=folder)
     assert done.returncode == 0, done.stderr
-    noise = load_posterior(folder / "measured").model.noise
-    assert (noise.measured_torque, noise.force) == (True, 0.3)
+    assert "inducing: as asked for" in done.stdout
+    assert load_posterior(folder / "inducing").engine.name == "inducing"
 
 
 WRONG = [
     ("--forces jont", "no force 'jont' in 'jont'"),
-    ("--forces joint", "write gp:joint"),
-    ("--forces gp:viscous", "write viscous"),
-    ("--forces viscous:colour=red", "force 'viscous' cannot take 'colour=red'"),
     ("--forces none,viscous", "forces are none and viscous; leave one of both out"),
     ("--forces gp:independent,viscous", "no other force can stand beside it"),
-    ("--forces payload:hnd", "no link 'hnd' in arm; did you mean 'hand'?"),
-    ("--forces rigid-bodies:learn=base", "'base' does not move"),
     ("--forces gp:joint --evidence torques", "functions are learned from accelerations"),
     ("--forces viscous --evidence acceleration", "did you mean 'accelerations'?"),
     ("--evidence torques,accelerations --forces viscous", "the same rows twice"),
-    ("--evidence motions:0", "Motions seconds is 0.0; give the length of windows in s"),
-    ("--evidence torques:loud", "Torques noisy is 'loud'"),
     ("--forces gp:independent --evidence motions:1", "motions refine physics, and gp:independent has none"),
-    ("--measured-torque", "--measured-torque needs the noise of the torque sensors; add --force-noise SIGMA."),
     ("--forces gp:joint --baseline arm.h5", "a baseline is for payloads"),
-    ("--forces gp:joint --learning-points 1", "learning_points is 1"),
     ("--jobs 0", "jobs is 0; give"),
     ("--engine fast", "engine"),
 ]

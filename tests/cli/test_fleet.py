@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from forcegp.cli.fleet import fleet, lines_of, numbers_of
+from forcegp.cli.fleet import fleet
 from forcegp.cli.main import main
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
@@ -94,21 +94,6 @@ def test_words_without_a_list_are_refused(listed):
         fleet(["fit", "--out", "out", "--logs-from"])
     with pytest.raises(InvalidInput, match="name no list of logs"):
         fleet(["fit", "a.h5", "--out", "out"])
-
-
-def test_logs_of_one_name_and_of_the_folder_of_rows_have_folders_of_their_own(listed, logs):
-    options = ["--robot", "a.urdf"]
-    text = "--robot b.urdf x/a.h5\ny/a.h5\na-2.h5\njobs.h5"
-    listed.write_text(text)
-    found = lines_of("fit", options, listed, Path("out"))
-    assert list(found) == ["a", "a-2", "a-2-3", "jobs-4"]
-    assert found["a"] == ["--robot", "b.urdf", "x/a.h5"]
-    assert found["a-2"] == [*options, "y/a.h5"]
-
-
-def test_numbers_of_a_result_are_flat():
-    content = {"a": {"b": 1.5, "settings": {"c": 2}}, "estimates": {"m": {"value": 0.7, "interval": [0, 1]}}, "t": "x"}
-    assert numbers_of(content) == {"a.b": 1.5, "estimates.m": 0.7, "t": "x"}
 
 
 def test_a_cluster_whose_worker_is_killed_gives_the_same_rows(listed):

@@ -1,10 +1,8 @@
 """`forcegp import`: what it makes, what it says, and what it refuses."""
 
-import json
-
 import numpy as np
 import pytest
-from tests.recordings.broken_logs import BROKEN, urdf
+from tests.recordings.broken_logs import BROKEN
 from tests.recordings.log_files import JOINTS, motion, table, write_text
 
 from forcegp import Dataset
@@ -30,31 +28,15 @@ def test_what_cannot_be_imported_is_one_line_and_leaves_nothing(forcegp, tmp_pat
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_robot_orders_the_joints_and_the_dataset_carries_it(forcegp, tmp_path):
-    (tmp_path / "arm.urdf").write_text(urdf("elbow", "shoulder"))
+def test_a_mapping_beside_the_log_is_found_and_changed_by_flags(forcegp, tmp_path):
     write_text(tmp_path / "log.csv", table(motion()))
-    done = forcegp("import", "log.csv", "--robot", "arm.urdf", "--out", "log.h5", "--json", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
-    data = Dataset.load(tmp_path / "log.h5")
-    assert data.joint_names == ("elbow", "shoulder")
-    assert data.model is not None
-    assert data.model.robot.joint_names == data.joint_names
-    np.testing.assert_array_equal(data.q, motion()["q"][:, ::-1])
-    np.testing.assert_array_equal(data.u, motion()["u"][:, ::-1])
-    assert "found by name: q = q_elbow, q_shoulder" in done.stderr
-    assert json.loads(done.stdout)["rows"] == len(data) == 200
-    assert data.metadata["import"]["files"][0]["bytes"] == (tmp_path / "log.csv").stat().st_size
-
-
-def test_a_mapping_is_written_found_again_and_changed_by_flags(forcegp, tmp_path):
-    write_text(tmp_path / "log.csv", table(motion()))
-    written = forcegp("import", "log.csv", *FLAGS, "--out", "a.h5", "--write-mapping", "log.yaml", folder=tmp_path)
-    assert written.returncode == 0, written.stderr
-    again = forcegp("import", "log.csv", "--out", "b.h5", folder=tmp_path)
-    assert again.returncode == 0, again.stderr
-    assert "the columns are mapped by log.yaml" in again.stderr
-    other = forcegp("import", "log.csv", "--sign=u=-1", "--unit", "q=deg", "--out", "c.h5", folder=tmp_path)
-    assert other.returncode == 0, other.stderr
+    (tmp_path / "log.yaml").write_text(
+        "time: time\nq: q_{joints}\nv: v_{joints}\nu: u_{joints}\njoints: " + ",".join(JOINTS)
+    )
+    for name, words in (("a", FLAGS), ("b", ()), ("c", ("--sign=u=-1", "--unit", "q=deg"))):
+        done = forcegp("import", "log.csv", *words, "--out", f"{name}.h5", folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert "the columns are mapped by log.yaml" in done.stderr
     a, b, c = (Dataset.load(tmp_path / f"{name}.h5") for name in "abc")
     for name in ("q", "v", "u", "a", "time", "episode"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))

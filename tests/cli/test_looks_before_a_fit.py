@@ -1,30 +1,12 @@
 """`forcegp fit` looks at its data: one line of what would spoil the model, none for a clean log, and none if asked."""
 
-from importlib import import_module
-
 import numpy as np
 import pytest
 from tests.checks.corruptions import at, clean, on_a_line, two_links
 from tests.checks.logs import column
 
-import forcegp as package
-from forcegp.doubts import Doubts, look
-from forcegp.errors import ContactWarning
-from forcegp.fit import fit
-
-FIT = (
-    "--points",
-    12,
-    "--iterations",
-    2,
-    "--restarts",
-    1,
-    "--forces",
-    "gp:joint-friction",
-    "--overwrite",
-    "--out",
-    "run",
-)
+QUICK = ("--points", 12, "--iterations", 2, "--restarts", 1)
+FIT = (*QUICK, "--forces", "gp:joint-friction", "--overwrite", "--out", "run")
 
 
 def looked(stderr: str) -> list[str]:
@@ -59,16 +41,7 @@ def test_one_line_names_what_is_wrong_and_the_next_step(forcegp, folder):
     assert not looked(forcegp("fit", "sign.h5", *FIT, "--no-checks", folder=folder).stderr)
 
 
-def test_in_python_a_fit_warns_of_contacts_that_the_rows_contradict(folder, monkeypatch):
-    doubt = look(about="contact", what="its force acts beside the point.")
-    monkeypatch.setattr(import_module("forcegp.fit.doubts"), "contact_doubts", lambda *_: Doubts([doubt]))
-    data = package.Dataset.load(folder / "line.h5")
-    few = package.inference.OptimizerOptions(iterations=1)
-    with pytest.warns(ContactWarning, match="beside the point"):
-        fit(data.model.with_forces(package.JointFriction()), data, points=12, restarts=1, options=few)
-
-
-@pytest.mark.parametrize("columns", ["40", "80"])
+@pytest.mark.parametrize("columns", ["40"])
 def test_the_table_of_check_is_never_cut(forcegp, folder, monkeypatch, columns):
     monkeypatch.setenv("COLUMNS", columns)
     done = forcegp("check", "clean.h5", folder=folder)

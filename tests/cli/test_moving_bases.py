@@ -113,11 +113,6 @@ def test_feet_whose_stance_no_column_states(folder, forcegp):
     [
         (f"{DOG} --feet front_left_foot", "--feet needs --robot ROBOT.urdf"),
         (f"{DOG} --feet front_left_foot --identified drone.json", "brings its contacts along; leave --feet out"),
-        (f"{DOG} --robot dog.urdf --base floating --feet paw", "paw"),
-        (
-            f"{DOG} --robot dog.urdf --base floating --feet paw@1,2",
-            "is not FRAME, FRAME@x,y,z (m) or FRAME:flat",
-        ),
         (f"{DOG} --robot dog.urdf --feet front_left_foot", "base='floating'"),
         ("auto flight.csv --out x", "give --robot ARM.urdf, or --identified"),
     ],

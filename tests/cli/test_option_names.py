@@ -22,9 +22,8 @@ OF_A_PROGRAM = re.compile(r"(forcegp [a-z]+|xcode-select|start one with)[^;)`]* 
     ("message", "words"),
     [
         ("`points=61` must be an integer", "--points 61 must be an integer"),
-        ("`seed=-1` must", "--seed=-1 must"),
+        ("`jobs=-1` must", "--jobs=-1 must"),
         ("give `engine='exact'`, or fewer `points`", "give --engine exact, or fewer --points"),
-        ("use `learning_points=600`", "use --learning-points 600"),
         ("add `overwrite=True` or another `folder`", "add --overwrite or another --out"),
         ("another `model` or its `contacts`", "another --robot or its --contact"),
         ("a `tolerance` that only Python has, `forcegp fit`", "a `tolerance` that only Python has, `forcegp fit`"),

@@ -8,12 +8,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests.cli.one_line import assert_refused
 from tests.posterior.arm import URDF, arm_data
 
 import forcegp
 import forcegp.scores
-from forcegp import Dataset, load_posterior
+from forcegp import Dataset
 from forcegp.atomic_files import write_digests
 from forcegp.cli.main import main, parse_arguments
 
@@ -22,15 +21,11 @@ IMPORT = "import log.csv --time time --q q_a --u u_a --joints a"
 FILES = {
     "simulate": "simulate kuka-surface --overwrite --out OUT",
     "import": f"{IMPORT} --overwrite --out OUT",
-    "mapping": f"{IMPORT} --overwrite --out x.h5 --write-mapping OUT",
-    "excite": "excite run --overwrite --out OUT",
     "prepare": "import arm.h5 --every 2 --overwrite --out OUT",
 }
 FOLDERS = {
     "fit": "fit arm.h5 --overwrite --out OUT",
-    "payload": "payload arm.h5 --overwrite --out OUT",
     "export": "export run --to c --overwrite --out OUT",
-    "check": "check arm.h5 --overwrite --out OUT",
     "demo": "demo --overwrite --out OUT",
 }
 STORES = {
@@ -60,8 +55,7 @@ def no_work(monkeypatch) -> None:
 
     monkeypatch.setattr("forcegp.jobs._compute_all", begun)
     monkeypatch.setattr("forcegp.recordings.importing._sources", begun)
-    monkeypatch.setattr("forcegp.cli.simulate.simulate_with_progress", begun)
-    monkeypatch.setattr("forcegp.cli.demo.simulate_with_progress", begun)
+    monkeypatch.setattr("forcegp.cli.simulated.simulate_with_progress", begun)
     monkeypatch.setattr("forcegp.scores.learn", begun)
     own = Dataset.load
     monkeypatch.setattr(Dataset, "load", lambda path: own(path) if "score" in sys.argv else begun())
@@ -103,9 +97,8 @@ def test_two_commands_do_not_write_to_one_place(folder, no_work, monkeypatch, ca
     Path("link").symlink_to("new")
     with parse_arguments(filled(name, "link")).alone():
         assert "another command of forcegp is writing" in refused(filled(name, "new"), capfd)
-        if name != "mapping":  # its other output is the same
-            with parse_arguments(filled(name, "elsewhere")).alone():
-                pass
+        with parse_arguments(filled(name, "elsewhere")).alone():
+            pass
     with parse_arguments(filled(name, "new")).alone():
         pass
     assert not hidden(folder)
@@ -150,21 +143,6 @@ def test_files_that_a_user_put_there_are_never_deleted(folder, no_work, monkeypa
     assert Path("out/notes.txt").read_text() == "mine"
 
 
-def test_a_file_that_appears_while_the_model_is_fitted_is_not_deleted(folder, capfd, monkeypatch):
-    assert main(["fit", "arm.h5", *QUICK.split(), "--out", "out"]) == 0
-    own = forcegp.scores.learn
-
-    def fit(*given, **more):
-        Path("out/notes.txt").write_text("mine")
-        return own(*given, **more)
-
-    monkeypatch.setattr("forcegp.scores.learn", fit)
-    assert "(notes.txt)" in refused(["fit", "arm.h5", *QUICK.split(), "--out", "out", "--overwrite"], capfd)
-    assert Path("out/notes.txt").read_text() == "mine"
-    load_posterior("out")
-    assert not hidden(folder)
-
-
 @pytest.mark.parametrize("written", ["a file", "a folder"])
 def test_what_another_process_wrote_meanwhile_stays(folder, capfd, monkeypatch, written):
     def meanwhile(own, make):
@@ -191,8 +169,6 @@ OVER_INPUTS = [
     "import log.csv --time time --q q_a --u u_a --joints a --out ./run/../log.csv",
     "import log.csv --time time --q q_a --u u_a --joints a --out link.csv",
     "import log.csv --time time --q q_a --u u_a --joints a --out hard.csv",
-    "import log.csv --mapping log.yaml --out x.h5 --write-mapping log.yaml",
-    "import log.csv --out x.h5 --write-mapping log.yaml",
     "import log.csv --time time --q q_a --u u_a --robot arm.urdf --out arm.urdf",
     "import arm.h5 --every 2 --out arm.h5",
     "fit arm.h5 --robot arm.urdf --out arm.urdf",
@@ -201,8 +177,6 @@ OVER_INPUTS = [
     "fit arm.h5 --robot run/inner.urdf --forces bodies --out run",
     "payload arm.h5 --baseline run/inner.h5 --out run",
     "score run arm.h5 --out run",
-    "score run arm.h5 --report arm.h5",
-    "check arm.h5 --out arm.h5",
     "score arm.h5 --out arm.h5",
 ]
 
@@ -211,7 +185,6 @@ OVER_INPUTS = [
 def test_no_command_writes_over_what_it_reads(folder, capfd, words):
     Path("link.csv").symlink_to("log.csv")
     os.link("log.csv", "hard.csv")
-    Path("log.yaml").write_text("time: time\nq: q_a\nu: u_a\njoints: a  # of the user\n")
     for name in ("inner.h5", "inner.urdf"):
         os.link("arm." + name.partition(".")[2], f"run/{name}")
     before = {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()}
@@ -221,17 +194,6 @@ def test_no_command_writes_over_what_it_reads(folder, capfd, words):
     assert {file: file.read_bytes() for file in folder.rglob("*") if file.is_file()} == before
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        f"{IMPORT} --out x.h5 --write-mapping x.h5",
-        f"{IMPORT} --out x.h5 --write-mapping ./run/../x.h5",
-    ],
-)
-def test_two_outputs_are_two_places(folder, capfd, words):
-    assert_refused(words, "which this command writes, too; choose another name", folder, capfd)
-
-
 @pytest.mark.parametrize("name", ["thesis.txt", "arm.urdf", "log.csv"])
 def test_overwriting_is_for_files_of_the_same_kind(folder, capfd, name):
     Path("thesis.txt").write_text("years of work")
@@ -239,8 +201,6 @@ def test_overwriting_is_for_files_of_the_same_kind(folder, capfd, name):
     for words in (FILES["simulate"], FILES["prepare"]):
         told = refused([name if word == "OUT" else word for word in words.split()], capfd)
         assert f"{name} is not a dataset of forcegp, so it is not overwritten" in told
-    told = refused([*IMPORT.split(), "--out", "x.h5", "--overwrite", "--write-mapping", "arm.h5"], capfd)
-    assert "arm.h5 is not a mapping, so it is not overwritten" in told
     assert Path(name).read_bytes() == before
 
 

@@ -72,20 +72,11 @@ def test_a_payload_that_may_be_none_has_no_place(folder, forcegp):
     assert "centre of mass and inertia mean nothing" in " ".join(nothing.stderr.split())
 
 
-def test_it_is_a_fit_with_a_payload(folder, forcegp, held):
-    words = ("--forces", "payload:tool0,viscous,stribeck,offset,rotor", "--evidence", "torques:mean=.4", "--no-checks")
-    done = forcegp("fit", "loaded.h5", *words, "--out", "run", "--json", folder=folder)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["estimates"] == json.loads(held.stdout)["parameters"]
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         ("payload nothing.h5", "nothing.h5 is not a file"),
         ("payload loaded.h5 --link tool9", "tool9"),
-        ("payload loaded.h5 --baseline nothing.h5", "nothing.h5 is not a file"),
-        ("payload loaded.h5 --forces sticky", "sticky"),
         ("payload loaded.h5 --cutoff high", "--cutoff is 'high'"),
     ],
 )

@@ -5,7 +5,6 @@ import json
 import pytest
 from tests.robots.mjcf_models import FOUR_BAR
 from tests.robots.robot_models import CHAIN
-from tests.robots.test_base import LOOSE
 from tests.robots.test_mimic import CHAIN_MIMICS, with_mimics
 from tests.robots.test_remedies import MANY
 
@@ -27,26 +26,6 @@ def test_the_tree_and_the_numbers_are_printed(forcegp, file):
     assert "chain: 3 joints, 7.9 kg that move" in shown.stdout
     row = next(line for line in shown.stdout.splitlines() if line.strip().startswith("spin"))
     assert row.split() == ["spin", "–", "–", "–", "–", "0", "0", "0.25"]
-
-
-def test_json_holds_the_same(forcegp, file):
-    content = json.loads(forcegp("robot", file, "--lock", "skew=0.5", "--json").stdout)
-    assert content["mimics"] == {"slide": {"joint": "tilt", "multiplier": 0.4, "offset": 0.1}}
-    assert [joint["name"] for joint in content["joints"]] == ["spin", "tilt"]
-    assert content["locked"] == {"skew": 0.5}
-    assert (content["base"], content["repaired"]) == ("fixed", [])
-
-
-def test_joints_that_stand_still_are_shown_as_locked(forcegp, file):
-    hung = (
-        '<link name="odom"/><joint name="root" type="floating"><parent link="odom"/><child link="{}"/></joint></robot>'
-    )
-    root = CHAIN.split('<link name="')[1].split('"')[0]
-    file.write_text(CHAIN.replace("</robot>", hung.format(root)))
-    assert "root (floating)" in forcegp("robot", file).stdout
-    shown = forcegp("robot", file, "--base", "fixed").stdout
-    assert "root (locked)" in shown
-    assert shown.count("(locked)") == 1
 
 
 def test_one_error_and_its_options_take_the_file(forcegp, file):
@@ -71,17 +50,6 @@ def test_the_page_is_not_overwritten(forcegp, file):
     assert "<iframe" in out.read_text()
     assert "add --overwrite" in forcegp("robot", file, "--out", out).stderr
     assert "over" in forcegp("robot", file, "--out", file, "--overwrite").stderr  # never the robot itself
-
-
-def test_every_command_with_a_robot_takes_its_base(tmp_path):
-    path = tmp_path / "dog.urdf"
-    path.write_text(LOOSE["legs"])
-    command = parse_arguments(["fit", "log.h5", "--out", "run", "--robot", str(path), "--base", "fixed"])
-    recorded = command.robot.chosen()
-    assert recorded.robot.base == "fixed"
-    again = parse_arguments(["fit", "log.h5", "--out", "run", "--robot", str(path)]).robot.chosen(recorded).robot
-    assert again.base == "fixed"  # as recorded
-    assert isinstance(again, Robot)
 
 
 @pytest.mark.filterwarnings("ignore::forcegp.errors.RobotFileWarning")

@@ -69,19 +69,3 @@ def test_options_reach_the_dataset(forcegp, tmp_path, options, expected):
     assert expected.items() <= data.metadata["config"].items()
     assert ("Q_U.joint-friction" in data.truth) == ("--joint-friction" in options)
     assert isinstance(data.model.contacts[0].surface, Sphere) == ("sphere" in options)
-
-
-@SURFACES
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--tool-friction coulomb:much", "'much' is no number"),
-        ("--tool-friction wet", "wet"),
-    ],
-)
-def test_options_that_do_not_fit_end_in_one_line(forcegp, tmp_path, options, message):
-    failed = forcegp("simulate", "kuka-surface", "--out", "log.h5", *options.split(), folder=tmp_path)
-    assert failed.returncode == 2
-    assert message in failed.stderr
-    assert len(failed.stderr.strip().splitlines()) == 1
-    assert not (tmp_path / "log.h5").exists()

@@ -50,7 +50,6 @@ COMMANDS = {
     "prepare": Writing("import train.h5 --cutoff 20 --out OUT", "file"),
     "fit": Writing(f"fit train.h5 {FEW} --out OUT"),
     "identification": Writing("fit air.h5 --forces bodies,viscous --no-checks --out OUT"),
-    "check": Writing("check train.h5 --out OUT"),
     "demo": Writing("demo --seconds 2 --points 10 --iterations 2 --out OUT"),
     "score": Writing(f"score train.h5 {SCORE} --out OUT", "store", again=""),
 }

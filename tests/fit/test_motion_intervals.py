@@ -13,7 +13,7 @@ from forcegp.data.views import recorded_motions
 from forcegp.errors import InvalidInput
 from forcegp.fit import calibrated as with_intervals
 from forcegp.posterior.fitted import DEVIATIONS, MotionIntervals
-from forcegp.scores.motions import inside_interval
+from forcegp.scores.held_out import inside_interval
 
 HORIZONS = (0.1, 0.25, 0.5)
 

@@ -6,7 +6,7 @@ import shlex
 import pytest
 from tests.examples import run_example
 
-from forcegp.cli.import_log import Import
+from forcegp.cli.logs import Import
 from forcegp.cli.main import parse_arguments
 from forcegp.recordings import read_mapping
 from forcegp.recordings.mapping import UNITS

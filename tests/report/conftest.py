@@ -6,7 +6,6 @@ from tests.posterior.arm import arm_data, arm_model
 from forcegp import JointForces, JointFriction, Viscous, fit, score
 from forcegp.inference import OptimizerOptions
 from forcegp.report import model_page, scores_sentence, scores_table
-from forcegp.scores import model_pictures
 from forcegp.simulation import FreeArmConfig, simulate_free_arm
 
 QUICK = OptimizerOptions(iterations=10)
@@ -35,5 +34,4 @@ def page(swinging, friction):
     """A page about the pendulum."""
     scores = score(friction, swinging)
     best = scores_sentence(scores)
-    pictures, _ = model_pictures(friction, swinging)
-    return model_page(friction, swinging, pictures, title="pendulum", best=best, tables=[scores_table(scores)])
+    return model_page(friction, swinging, title="pendulum", best=best, tables=[scores_table(scores)])

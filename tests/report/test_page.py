@@ -19,7 +19,6 @@ from forcegp.report import (
     scores_sentence,
     write_page,
 )
-from forcegp.scores import model_pictures
 
 
 def test_a_page_needs_no_network_is_small_and_shows_everything(page, tmp_path):
@@ -63,8 +62,7 @@ def test_own_pages_are_recognised_and_kept(page, tmp_path):
 def test_what_cannot_be_drawn_is_named(swinging, friction):
     keep = np.sort(np.random.default_rng(0).choice(len(swinging), 300, replace=False))
     uneven = swinging.rows(keep)
-    pictures, missing = model_pictures(friction, uneven)
-    page = model_page(friction, uneven, pictures, missing=missing, title="t", best="b")
+    page = model_page(friction, uneven, title="t", best="b")
     assert len(page.pictures) == 2
     assert any(note.startswith("motions ahead: not drawn, because") for note in page.scene_notes)
 

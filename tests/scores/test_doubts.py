@@ -1,7 +1,6 @@
 """What stands beside the scores of a model, so that nobody has to find it out."""
 
 import dataclasses
-import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,13 +10,11 @@ from scipy.stats import multivariate_normal
 from tests.posterior.arm import NOISE, arm_data
 
 from forcegp import score
-from forcegp.errors import DataWarning
 from forcegp.fit import fit
 from forcegp.forces import JointForces, JointFriction
 from forcegp.inference import OptimizerOptions
-from forcegp.noise import Noise
-from forcegp.scores import predict_rows, unfinished_search
-from forcegp.scores.doubts import poor_scores, rows_outside
+from forcegp.scores import unfinished_search
+from forcegp.scores.accuracy import poor_scores, predict_rows, rows_outside
 
 TRUE = "true acceleration"
 QUICK = {"restarts": 1, "options": OptimizerOptions()}
@@ -70,16 +67,6 @@ def test_a_model_that_is_worse_than_its_known_forces_is_named(friction):
     assert f"noise-free MAE {found.value('mae', TRUE):.3g} against 0" in sentence
 
 
-def test_intervals_that_miss_are_named(friction):
-    """Measurements five times as noisy as is stated."""
-    data = arm_data(60, 1)
-    noisy = dataclasses.replace(data, a=data.a + 5.0 * NOISE * np.random.default_rng(0).normal(size=data.a.shape))
-    found = scored(friction, noisy)
-    assert found.value("coverage_95") < 0.8
-    (sentence,) = about(found.warnings, "95 % intervals")
-    assert f"hold {found.value('coverage_95'):.0%} of the measurements" in sentence
-
-
 def test_a_joint_that_hides_in_the_mean_is_named(friction):
     """One joint lacks the friction that was learned, and another is as noisy as five times what is stated."""
     data = arm_data(200, 1)
@@ -99,19 +86,6 @@ def test_a_joint_that_hides_in_the_mean_is_named(friction):
     assert found.value("coverage_95") > 0.85
     (sentence,) = about(found.warnings, "95 % intervals")
     assert f"of the measurements ({names[2]} {found.columns('coverage_95')[2]:.0%}):" in sentence
-
-
-def test_noise_that_nobody_stated_is_learned_and_said_so():
-    data = dataclasses.replace(arm_data(60, 0), noise_std=None)
-    model = data.model.with_forces(JointFriction())
-    with pytest.warns(DataWarning, match="does not state the noise of its accelerations, so it is learned.*`noise`"):
-        posterior = fit(model, data, **QUICK)
-    assert posterior.model.noise.learn
-    np.testing.assert_allclose(posterior.noise_std.numpy(), NOISE, rtol=0.5)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        asked = fit(dataclasses.replace(model, noise=Noise(None, learn=True)), data, **QUICK)
-    torch.testing.assert_close(asked.noise_std, posterior.noise_std)
 
 
 # ---------------------------------------------------------------- rows, noise and contacts that differ
@@ -142,16 +116,10 @@ def test_the_constraint_is_that_of_the_data_and_a_model_without_it_is_named(with
     assert "contact force" not in found.quantities()
 
 
-def test_rows_and_recordings_that_were_trained_on_are_named(posterior, train, test_data):
+def test_rows_that_were_trained_on_are_named(posterior, train, test_data):
     mixed = {name: np.vstack([getattr(test_data, name)[:-2], getattr(train, name)[:2]]) for name in "qvua"}
     (warning,) = about(scored(posterior, dataclasses.replace(test_data, **mixed)).warnings, "training rows")
     assert "2 of 60 test rows have the very (q, v, u) of training rows (the first: row 58)" in warning
-    recorded = posterior.with_settings(data={"metadata": {"log": "monday"}, "episodes": [0]})
-    same = dataclasses.replace(test_data, metadata={"log": "monday"})
-    assert len(about(scored(recorded, same).warnings, "same recording")) == 1
-    tuesday = dataclasses.replace(test_data, metadata={"log": "tuesday"})
-    elsewhere = dataclasses.replace(same, episode=np.ones(60, int))
-    assert [about(scored(recorded, other).warnings, "same recording") for other in (tuesday, elsewhere)] == [[], []]
 
 
 # ---------------------------------------------------------------- from where on something is said

@@ -1,20 +1,17 @@
 """Plots of friction curves and normal forces: what is drawn is what the model and the truth say."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
 from matplotlib.collections import PolyCollection
 from matplotlib.image import imread
-from tests.posterior.arm import arm_model
-from tests.scores.friction import VISCOUS, fitted, friction_data, joint_law
+from tests.scores.friction import fitted, friction_data, joint_law
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointFriction, JointPositionForces
-from forcegp.scores import curve_panels, friction_curves_figure, normal_force_figure, save_figure
+from forcegp.scores import friction_curves_figure, normal_force_figure, save_figure
 
 
 @pytest.fixture(scope="module")
@@ -80,44 +77,15 @@ def test_a_panel_shows_the_curve_its_band_the_training_velocities_and_the_truth(
     everywhere, _ = line(axes, "beyond the training data")
     assert everywhere.min() < trained.min()
     assert everywhere.max() > trained.max()
+    assert line(friction_curves_figure(friction).axes[3], "beyond the training data")[0].min() >= 0.0  # a speed
     at, truth = line(axes, "true")
     np.testing.assert_allclose(truth, joint_law(at), atol=1e-12)
     assert len(at) > 60
 
 
-def test_sliding_friction_is_drawn_over_speeds_that_are_never_negative(friction, data):
-    axes = friction_curves_figure(friction, data).axes[3]
-    speed, force = line(axes, "true")
-    np.testing.assert_allclose(force, VISCOUS * speed, rtol=1e-6)
-    assert line(axes, "beyond the training data")[0].min() >= 0.0
-
-
-@pytest.mark.filterwarnings("ignore:the normal forces of load-dependent friction")  # two iterations do not settle them
-@pytest.mark.filterwarnings("ignore:the expected friction nearly jams")  # nor keep the friction that was found small
-def test_a_coefficient_is_the_true_force_per_true_load(data):
-    model = fitted(ContactFriction(load=True), iterations=2)
-    axes = friction_curves_figure(model, data).axes[0]
-    assert axes.get_ylabel() == "force / normal force"
-    _, coefficient = line(axes, "true")
-    dynamics = data.model.dynamics(*(torch.tensor(x[:1]) for x in (data.q, data.v, data.u)))
-    size = torch.linalg.vector_norm(dynamics.normals)
-    load = float(size) * np.abs(data.truth["lambda"][:, 0])
-    expected = np.linalg.norm(data.truth["force.tool-friction"], axis=1) / load
-    assert set(np.round(coefficient, 9)) <= set(np.round(expected, 9))
-
-
-def test_without_truth_there_are_no_dots_and_without_curves_no_figure(friction, posterior, data):
-    for given in (None, dataclasses.replace(data, truth={})):
-        figure = friction_curves_figure(friction, given)
-        assert all(line.get_label() != "true" for axes in figure.axes for line in axes.get_lines())
-    assert curve_panels(posterior) == []
-    with pytest.raises(InvalidInput, match="no process that is a curve"):
-        friction_curves_figure(posterior)
-
-
 def test_large_models_say_how_many_curves_are_shown(monkeypatch):
     model = fitted(JointFriction(), JointPositionForces(period=1.0), iterations=1)
-    monkeypatch.setattr("forcegp.scores.figures.friction_curves.LARGEST_GRID", 2)
+    monkeypatch.setattr("forcegp.scores.figures.model.LARGEST_GRID", 2)
     figure = friction_curves_figure(model)
     assert len(figure.axes) == 2
     assert "2 of 6 curves" in figure.get_suptitle()
@@ -139,16 +107,6 @@ def test_the_normal_force_is_drawn_with_its_truth(friction, data, tmp_path):
     assert force.get_ylabel() == "normal force [N]"
     save_figure(figure, tmp_path / "normal.png")
     assert imread(tmp_path / "normal.png")[..., :3].std() > 0.02
-
-
-def test_every_contact_has_a_row_and_without_truth_only_the_prediction_is_drawn(friction, data):
-    bare = dataclasses.replace(data, truth={})
-    assert len(normal_force_figure(friction, bare).axes) == 1
-    two = friction.with_contacts(arm_model(contacts=1).contacts * 2)
-    assert len(normal_force_figure(two, bare).axes) == 2
-    axes = normal_force_figure(two, data).axes[0]  # the truth knows one contact only
-    assert "true" not in {line.get_label() for line in axes.get_lines()}
-    assert normal_force_figure(two, bare).axes[1].get_title(loc="left") == "Contact 1: plane at hand"
 
 
 def test_models_without_normal_force_are_refused(without_contact, data):

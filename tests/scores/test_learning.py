@@ -14,7 +14,6 @@ from forcegp import JointFriction, Model, Noise, fit
 from forcegp.errors import InvalidInput
 from forcegp.evidence import Motions, Torques
 from forcegp.evidence.likelihood import TrainingData
-from forcegp.fit import ALL_ROWS
 from forcegp.forces import Actuation, RigidBodies, Thrusters
 from forcegp.inference import Inducing
 from forcegp.mechanics import fixed_point
@@ -22,12 +21,13 @@ from forcegp.noise import ACCELERATION
 from forcegp.posterior import load_posterior, save_posterior
 from forcegp.robots import Robot
 from forcegp.scores import named_model, summands, usual_forces
-from forcegp.scores.candidates import candidates, default_models, usual_identification
-from forcegp.scores.learning import (
-    _progress,
+from forcegp.scores.models import (
     all_rows_at_once,
     allowing_for_correlation,
+    candidates,
+    default_models,
     learn,
+    usual_identification,
     with_force_noise,
     with_intervals_of_motions,
 )
@@ -110,22 +110,6 @@ def test_noise_of_forces_is_learned_where_rows_show_it():
     q, v, a = (torch.tensor(x) for x in (data.q, data.v, data.a))
     lacking = model.robot.inverse_dynamics(q, v, a).numpy() - data.u
     np.testing.assert_allclose(model.noise.force, lacking.std(axis=0, ddof=1), rtol=1e-8)
-
-
-def test_progress_counts_steps_of_all_starts():
-    told = []
-    progress = _progress(lambda *words: told.append(words), 3, 10)
-    for restart, iteration, value in ((0, 5, 12.345), (2, 99, -0.01234), (ALL_ROWS, 4, 1.0), (ALL_ROWS, 40, 100.0)):
-        progress(restart, iteration, value)
-    assert told == [
-        (5, 30, "start 1 of 3, iteration 5, objective 12.3"),
-        (30, 30, "start 3 of 3, iteration 99, objective -0.0123"),
-        (4, 10, "all rows, step 4: 1"),
-        (10, 10, "all rows, step 40: 100.0"),
-    ]
-    _progress(lambda *words: told.append(words), 1, 10)(0, 1, 2.0)
-    assert told[-1] == (1, 10, "iteration 1, objective 2")
-    assert _progress(None, 1, 10) is None
 
 
 def test_many_equations_are_learned_through_inducing_points():

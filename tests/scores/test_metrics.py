@@ -1,51 +1,70 @@
-"""Every score against scipy, or against what must not change it."""
+"""Every score against scipy, by hand, or against what must not change it."""
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from forcegp.errors import NumericalError
-from forcegp.scores import predicted_rows as metrics
+from forcegp.scores.accuracy import metrics, negative_log_density, over_columns
 
 ROWS, K = 30, 4
 
 
-def gaussians(seed: int, rows: int = ROWS, k: int = K) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def gaussians(seed: int, rows: int = ROWS, k: int = K) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Means, covariances and one target per row that is drawn from them."""
     generator = np.random.default_rng(seed)
     factor = generator.normal(size=(rows, k, k))
     covariance = factor @ factor.swapaxes(-1, -2) + 0.1 * np.eye(k)
     mean = generator.normal(size=(rows, k))
     target = mean + (np.linalg.cholesky(covariance) @ generator.normal(size=(rows, k, 1)))[..., 0]
-    return mean, covariance, target
+    return torch.tensor(mean), torch.tensor(covariance), torch.tensor(target)
 
 
 def test_joint_density_is_that_of_scipy():
     mean, covariance, target = gaussians(0)
     expected = [-multivariate_normal(m, S).logpdf(y) for m, S, y in zip(mean, covariance, target, strict=True)]
-    np.testing.assert_allclose(metrics.negative_log_density(mean, covariance, target), expected, rtol=1e-10)
+    np.testing.assert_allclose(negative_log_density(mean, covariance, target), expected, rtol=1e-10)
 
 
 @given(st.integers(0, 2**32 - 1))
 def test_density_follows_a_change_of_units(seed):
     mean, covariance, target = gaussians(seed, rows=4)
-    T = np.random.default_rng(seed + 1).normal(size=(K, K)) + 3.0 * np.eye(K)
-    before = metrics.negative_log_density(mean, covariance, target)
-    after = metrics.negative_log_density(mean @ T.T, T @ covariance @ T.T, target @ T.T)
+    T = torch.tensor(np.random.default_rng(seed + 1).normal(size=(K, K)) + 3.0 * np.eye(K))
+    after = negative_log_density(mean @ T.mT, T @ covariance @ T.mT, target @ T.mT)
+    before = negative_log_density(mean, covariance, target)
     np.testing.assert_allclose(after, before + np.linalg.slogdet(T)[1], rtol=1e-6, atol=1e-8)
 
 
 def test_a_constrained_covariance_without_noise_has_no_density():
-    singular = np.stack([np.eye(2), np.diag([1.0, 0.0])])
+    singular = torch.stack([torch.eye(2), torch.diag(torch.tensor([1.0, 0.0]))]).double()
     with pytest.raises(NumericalError, match=r"row 1 .* not positive definite"):
-        metrics.negative_log_density(np.zeros((2, 2)), singular, np.zeros((2, 2)))
+        negative_log_density(torch.zeros(2, 2).double(), singular, torch.zeros(2, 2).double())
 
 
-@pytest.mark.parametrize("level", [0.5, 0.95, 0.99])
-def test_coverage_of_the_true_distribution_is_the_level(level):
-    rows = 20_000
-    mean, covariance, target = gaussians(4, rows=rows)
-    coverage = metrics.interval_coverage(mean, np.diagonal(covariance, axis1=1, axis2=2), target, level)
-    np.testing.assert_allclose(coverage, level, atol=4 * np.sqrt(level * (1 - level) / rows))
+def test_coverage_of_the_true_distribution_is_the_level():
+    mean, covariance, target = (x.numpy() for x in gaussians(4, rows=20_000))
+    found = metrics(mean, np.diagonal(covariance, axis1=1, axis2=2), target)
+    for level in (0.5, 0.95):
+        tolerance = 4 * np.sqrt(level * (1 - level) / 20_000)
+        np.testing.assert_allclose(found[f"coverage_{100 * level:.0f}"], level, atol=tolerance)
+
+
+def test_errors_done_by_hand():
+    mean, variance = np.array([[1.0, 0.0], [3.0, 0.0], [0.0, 0.0]]), np.array([[1.0, 0.0], [0.01, 0.0], [4.0, 0.0]])
+    found = metrics(mean, variance, np.array([[0.0, 0.0], [4.0, 0.0], [3.0, 0.0]]))
+    assert found["mae"] == [pytest.approx(5.0 / 3.0), 0.0]
+    assert found["rmse"] == [pytest.approx(np.sqrt(11.0 / 3.0)), 0.0]
+    assert found["largest"] == [3.0, 0.0]
+    assert found["relative_rmse"] == [pytest.approx(np.sqrt(11.0 / 25.0))]
+    assert found["coverage_95"] == [pytest.approx(2.0 / 3.0), None]  # the second column has no width
+    assert set(metrics(mean, None, np.zeros((3, 2)))) == {"mae", "rmse", "largest"}
+
+
+def test_over_all_joints():
+    assert over_columns("acceleration", "nrmse", [1.0, None, 3.0]) == 2.0
+    assert over_columns("true acceleration", "rmse", [3.0, 4.0]) == 3.5
+    assert over_columns("force", "rmse", [3.0, 4.0]) == pytest.approx(np.sqrt(12.5))
+    assert over_columns("acceleration", "nrmse", [None]) is None

@@ -3,15 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from tests.checks.corruptions import clean, two_links
 
-from forcegp import Dataset, JointFriction, Viscous, check, fit
+from forcegp import Dataset, JointFriction, Viscous, fit
 from forcegp.errors import InvalidInput
 from forcegp.inference import OptimizerOptions
 from forcegp.posterior import Posterior
-from forcegp.scores import check_figure, contacts_figure, model_pictures
-from forcegp.scores.figures.friction_curves import curve_panels, friction_curves_figure
-from forcegp.scores.figures.model import motion_bands_figure, prediction_figure
+from forcegp.scores import model_pictures
+from forcegp.scores.figures.model import curve_panels, friction_curves_figure, motion_bands_figure, prediction_figure
 from forcegp.simulation import FreeArmConfig, simulate_free_arm
 
 QUICK = OptimizerOptions(iterations=10)
@@ -116,39 +114,3 @@ def test_every_picture_of_a_model_is_drawn_or_named(swinging, friction):
     assert [each.name for each in pictures] == ["forces", "prediction"]
     assert len(missing) == 1
     assert missing[0].startswith("motions ahead: not drawn, because ")
-
-
-def test_a_check_draws_torques_beside_inverse_dynamics():
-    log = clean(two_links(), 0, seconds=5.0)
-    report = check(log)
-    figure = check_figure(report)
-    compared, robot = report.inputs.compared, log.model.robot
-    needed = robot.inverse_dynamics(*(torch.tensor(getattr(compared, x)) for x in "qva")).numpy()
-    for joint, axes in enumerate(figure.axes[:2]):
-        left = report.comparison.fit.unexplained[joint]
-        assert axes.get_title(loc="left").endswith(f": {100 * left:.2g} % unexplained")
-        (line,) = lines(axes, "inverse dynamics")
-        rows = np.searchsorted(compared.time, line.get_xdata() - 1e-9)
-        np.testing.assert_allclose(line.get_ydata(), needed[rows, joint], atol=1e-9)
-        np.testing.assert_allclose(lines(axes, "measured, filtered")[0].get_ydata(), compared.u[rows, joint])
-        fitted = lines(axes, "with factor, armature, friction")[0].get_ydata()
-        residual = compared.u[rows, joint] - fitted
-        assert residual.std() < 0.05 * compared.u[rows, joint].std()
-    spectra = figure.axes[2]
-    cutoff = report.inputs.cutoff
-    assert spectra.get_title(loc="left").endswith("no filter" if cutoff is None else f"cut-off at {cutoff:.3g} Hz")
-
-
-def test_pushes_stand_over_their_distances():
-    time = np.arange(5.0)
-    distance, torque = np.array([1.0, 2.0, 90.0, 3.0, 1e-9]), np.arange(10.0).reshape(5, 2)
-    figure = contacts_figure(time, distance, 20.0, torque, [(2.0, 3.0)], ["a_1", "a_2"], "title")
-    above, below = figure.axes
-    np.testing.assert_array_equal(lines(above, "distance from free motion")[0].get_ydata(), [1, 2, 90, 3, 1e-3])
-    np.testing.assert_array_equal(lines(above, "threshold")[0].get_ydata(), [20.0] * 5)
-    for joint in range(2):
-        np.testing.assert_array_equal(lines(below, f"joint {joint + 1}")[0].get_ydata(), torque[:, joint])
-    for axes in (above, below):
-        (span,) = axes.patches
-        assert (span.get_x(), span.get_x() + span.get_width()) == (2.0, 3.0)
-    assert above.get_yscale() == "log"

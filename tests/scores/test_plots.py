@@ -36,11 +36,6 @@ def test_a_figure_that_cannot_be_drawn_leaves_the_old_file_and_nothing_else(tmp_
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_missing_folder_is_named(tmp_path):
-    with pytest.raises(InvalidInput, match="does not exist; create it first"):
-        save_figure(new_figure(1.0, 1.0), tmp_path / "nowhere" / "a.png")
-
-
 def test_a_window_holds_the_rows_of_one_episode_in_order_of_time(test_data):
     shuffled = test_data.rows(np.random.default_rng(0).permutation(len(test_data)))
     rows = window(shuffled, 0.1, 0.2)

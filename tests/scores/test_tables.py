@@ -2,9 +2,8 @@
 
 import pytest
 
-from forcegp.scores import Scores, joint_table, overall, quantity_table, winner_table
-from forcegp.scores.page import columns_of, page, preparation_lines
-from forcegp.scores.tables import formatted, number
+from forcegp.scores import Scores, model_table, overall, winner_table
+from forcegp.scores.page import columns_of, formatted, number, page, preparation_lines
 
 UNITS = {"q": "rad", "v": "rad/s", "u": ("Nm", "N"), "a": "rad/s^2"}
 
@@ -20,7 +19,7 @@ def run(seed: int, factor: float, diverged: int = 0, error: str | None = None) -
     table = {
         "acceleration": acceleration,
         "all joints": {"nlpd": [5.0 * factor]},
-        "force": {"mae": [3.0, 5.0], "rmse": [3.0 * factor, 4.0 * factor], "rmse_at_rest": [30.0, 0.0]},
+        "force": {"mae": [3.0, 5.0], "rmse": [3.0 * factor, 4.0 * factor]},
         "contact force": {"mae": [7.0], "rmse": [8.0], "relative_rmse": [0.125], "coverage_95": [None]},
         "position after 0.5 s": {"rmse": [3e-6 * factor, 4e-6 * factor]},
     }
@@ -47,27 +46,24 @@ def scores() -> Scores:
     return Scores(models=models, runs=runs, joint_names=("a", "b"), units=UNITS, about=about)
 
 
-def test_one_model_by_joint(scores):
+def test_one_model_by_joint_and_by_quantity(scores):
     alone = Scores(models={"gp": scores.models["gp"]}, runs={"gp": [run(0, 0.5)]}, joint_names=("a", "b"), units=UNITS)
-    assert joint_table(alone) == (
-        ["joint", "MAE", "noise-free", "RMSE", "NLPD", "in 95 %", "known physics"],
+    assert model_table(alone) == (
+        ["", "MAE", "RMSE", "RMSE / size", "NLPD", "in 95 %", "known physics"],
         [
-            ["a", "0.0500", "–", "0.1000", "0.50", "90.0 %", "0.5000"],
-            ["b", "0.1500", "–", "0.2000", "1.00", "100.0 %", "1.0000"],
-            ["all joints", "0.1000", "–", "0.1500", "2.50", "95.0 %", "0.7500"],
+            ["a", "0.0500", "0.1000", "–", "0.50", "90.0 %", "0.5000"],
+            ["b", "0.1500", "0.2000", "–", "1.00", "100.0 %", "1.0000"],
+            ["acceleration", "0.1000", "0.1500", "–", "0.75", "95.0 %", "0.7500"],
+            ["all joints", "–", "–", "–", "2.50", "–", "–"],
+            ["force", "4.0000", "1.7678", "–", "–", "–", "–"],  # the root of the mean of squares
+            ["contact force", "7.0000", "8.0000", "0.125", "–", "–", "–"],
+            ["position after 0.5 s", "–", "1.8e-06", "–", "–", "–", "–"],
         ],
     )
-    header, rows = quantity_table(alone)
-    assert header == ["of all joints", "MAE", "RMSE", "RMSE / size", "in 95 %"]
-    assert rows == [
-        ["force", "4.0000", "1.7678", "–", "–"],  # the root of the mean of squares
-        ["contact force", "7.0000", "8.0000", "0.125", "–"],
-        ["position after 0.5 s", "–", "1.8e-06", "–", "–"],
-    ]
 
 
 def test_models_side_by_side(scores):
-    header, rows = overall(scores, "**")
+    header, rows = overall(scores)
     assert header == [
         "model", "MAE [rad/s²]", "nRMSE", "force error [Nm or N]", "NLPD [nats]", "in 95 %", "in 50 %",
         "q after 0.5 s [rad]",
@@ -77,9 +73,9 @@ def test_models_side_by_side(scores):
     assert ls[1:3] == ["0.4400 (0.4000–0.4800)", "0.066 (0.060–0.072)"]
     assert ls[-1].endswith(", 1 of 6 diverged")
     assert gp[0] == "gp (2 of 3 runs)"
-    assert gp[1] == "**0.1100** (0.1000–0.1200)"
-    assert gp[4] == "**2.75** (2.50–3.00)"
-    assert [row[5] for row in rows] == ["**95.0** %"] * 3, "the nearest to the level is the best"
+    assert gp[1] == "0.1100 (0.1000–0.1200)"
+    assert gp[4] == "2.75 (2.50–3.00)"
+    assert [row[5] for row in rows] == ["95.0 %"] * 3
 
 
 def test_the_model_to_take_stands_with_what_it_was_compared_with(scores):
@@ -105,25 +101,19 @@ def test_much_better_on_too_little_time_is_not_sure(scores):
 
 
 def test_the_page_holds_all_of_it(scores):
-    text = page(scores, [("errors", "Errors by joint.")])
+    text = page(scores, [("motions", "Errors of motions.")])
     assert "| ls | 0.4400 (0.4000–0.4800) |" in text
-    assert "errors.png" in text
+    assert "motions.png" in text
     assert "gp failed in 1 of 3 runs (s, seed 1): no luck" in text
-    assert "| gp | **1.650** | **2.200** |" in text
+    assert "| gp | 1.650 | 2.200 |" in text
     assert len(columns_of(scores)) == 7
 
 
 def test_what_was_done_with_a_log_is_told_the_last_step_first():
     earlier = {"cutoff": 20.0, "every": 1, "earlier": None, "rows": [9, 8], "why": {}}
-    why = {"delay": {"a": "shown", "b": "not shown"}, "every": "x"}
-    last = {"cutoff": None, "every": 4, "delay": [0.0], "rows": [8, 2], "why": why}
-    lines = preparation_lines({"preparation": {**last, "earlier": earlier}})
-    assert lines == [
-        "Preparation: cutoff None, every 4.",
-        "Chosen automatically, delay: a shown; b not shown",
-        "Chosen automatically, every: x",
-        "Preparation: cutoff 20.0, every 1.",
-    ]
+    last = {"cutoff": None, "every": 4, "delay": [0.0], "rows": [8, 2], "why": {"every": "x"}, "earlier": earlier}
+    lines = preparation_lines({"preparation": last})
+    assert lines == ["Preparation: cutoff None, every 4.", "Preparation: cutoff 20.0, every 1."]
     assert preparation_lines({})[0].startswith("Preparation: none stated")
 
 

@@ -43,9 +43,15 @@ COMMANDS: Mapping[str, str] = {
     "export": "write a fitted model as a C program",
     "reproduce": "figures of the paper beside the published values, in a clone of the repository",
 }
-"""A new command is an entry here, and a module of that name with a subclass of Command of that name."""
-MODULES = {"import": "import_log"}
-"""Names that Python does not allow for a module."""
+"""A new command is an entry here, and a subclass of Command of that name."""
+MODULES = {
+    "logs": ("import", "check"),
+    "fit": ("payload",),
+    "shown": ("robot", "view"),
+    "deploy": ("export", "monitor", "excite"),
+    "simulated": ("simulate", "demo", "reproduce"),
+}
+"""Where commands stand that have no module of their own name."""
 NOT_NUMBERS = {
     r"invalid literal for int\(\) with base 10": "a whole number",
     "could not convert string to float": "a number",
@@ -55,7 +61,8 @@ NOT_NUMBERS = {
 
 def command_class(name: str) -> type[Command]:
     """The class of a command; only its own module is imported, so that --help and errors come at once."""
-    module = importlib.import_module(f"forcegp.cli.{MODULES.get(name, name)}")
+    place = next((module for module, held in MODULES.items() if name in held), name)
+    module = importlib.import_module(f"forcegp.cli.{place}")
     return getattr(module, name.capitalize())
 
 
@@ -66,10 +73,7 @@ def front_page() -> str:
 
 
 def parsed(words: Sequence[str]) -> Command:
-    """The command that the words ask for. --help prints and raises SystemExit(0).
-
-    Raises InvalidInput, with a message of one line, for words that make no command.
-    """
+    """The command that the words ask for. --help prints and raises SystemExit(0)."""
     name, *others = words or [""]
     if name in ("-h", "--help"):
         print(front_page())
@@ -113,27 +117,15 @@ def _check_options(name: str, kind: type[Command], words: Sequence[str]) -> None
 
 
 def one_line(box: str) -> str:
-    """The sentence inside a box that tyro draws about wrong arguments: without frame, headings and repeated help.
-
-    ╭─ Unrecognized options ─────────────────╮
-    │ Unrecognized options: --pionts         │
-    │ ────────────────────────────────────── │
-    │ Perhaps you meant:                     │
-    │     --points N                         │
-    │         Train on so many rows.         │
-    ╰────────────────────────────────────────╯
-
-    becomes "Unrecognized options: --pionts. Perhaps you meant: --points N." Without such letters the heading stands
-    above a line of its own.
-    """
+    """The sentence inside a box that tyro draws about wrong arguments: without frame, headings and repeated help."""
     lines = [line.strip("│|")[1:].rstrip() for line in box.splitlines() if not line.startswith(("╭", "╰", "+"))]
     sections: list[list[str]] = [[]]
-    for line in lines:
-        if line.strip() and not line.strip(" ─-"):
+    for line in filter(str.strip, lines):
+        if not line.strip(" ─-"):
             sections.append([])
-        elif line.strip() and not line.startswith(" " * 8):  # what is indented so far is the help of an option
+        elif not line.startswith(" " * 8):  # what is indented so far is the help of an option
             sections[-1].append(line.strip())
-    sections = sections if "╭" in box else sections[1:]
-    sentences = [" ".join(section) for section in sections if section]
-    sentences = [section for section in sentences if not section.startswith(("For full helptext", "Argument helptext"))]
-    return " ".join(section if section.endswith(".") else f"{section}." for section in sentences)
+    # without such letters the heading stands above a line of its own
+    sentences = [" ".join(section) for section in sections["╭" not in box :] if section]
+    told = [each for each in sentences if not each.startswith(("For full helptext", "Argument helptext"))]
+    return " ".join(each if each.endswith(".") else f"{each}." for each in told)

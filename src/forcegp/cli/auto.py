@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import statistics
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -22,15 +21,13 @@ import forcegp.report
 import forcegp.scores
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json
 from forcegp.cli.command import CONFIG, LOG, Command, options_of, unless_given
-from forcegp.cli.fit import write_estimates
-from forcegp.cli.import_log import stance_text
-from forcegp.cli.log_options import ColumnOptions, FilterOptions, with_delay_that_shows
-from forcegp.cli.payload import DRY, LAWS, payload_dict, with_payload
+from forcegp.cli.fit import DRY, LAWS, payload_dict, with_payload, write_estimates
+from forcegp.cli.logs import ColumnOptions, FilterOptions, prepared_rows, stance_text, with_delay_that_shows
 from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal, doubts_table, facts
 from forcegp.doubts import Doubt, Doubts, wrong
 from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUnit, NumericalError
-from forcegp.scores.tables import number
+from forcegp.scores.page import number
 
 MOST_CORRECTIONS = 8
 SCORES = ("models", "joint_names", "units", "recommended", "winners", "rival", "against_rival", "failures")
@@ -48,7 +45,6 @@ class Auto(Command):
 
     For example:
       forcegp auto run.csv --time t --q 'pos{1..6}' --u 'tau{1..6}' --robot arm.urdf --out answer
-      forcegp auto run1.csv run2.csv --robot arm.urdf --mapping columns.yaml --correct --out answer
       forcegp auto walk.csv --mapping columns.yaml --robot dog.urdf --base floating --feet FL_foot,FR_foot --out answer
       forcegp auto flight.csv --mapping columns.yaml --identified drone.json --out answer
     """
@@ -82,7 +78,7 @@ class Auto(Command):
         if self.robot.robot is None and self.robot.identified is None:
             raise InvalidInput("give --robot ARM.urdf, or --identified with a system that carries its robot.")
         begin = time.process_time()
-        preparation = (self.filter if self.filter.lag != "auto" else replace(self.filter, lag="0")).preparation()
+        self.filter.preparation()  # refused now, not after minutes
         present = {each.name for each in self.out.iterdir()} if self.out.is_dir() else set()
         if self.out.is_file() or (present and "log.h5" not in present):
             raise InvalidInput(f"{self.out} was not written by forcegp auto; choose another name.")
@@ -113,13 +109,8 @@ class Auto(Command):
         with atomic_file(self.out / "log.h5", overwrite=True) as temporary:
             dataset.save(temporary)
         with terminal.progress("preparing"):
-            if self.filter.lag != "auto" or not forcegp.data.thruster_columns(dataset.model):
-                timed = with_delay_that_shows(terminal, preparation, dataset)
-            else:
-                delay = 0.0 if self.filter.delay == "auto" else preparation.delay
-                timed = replace(preparation, lag="auto", delay=delay)
-            timed = replace(timed, stance="auto") if done["open_switches"] else timed
-            rows, recording, settings = self._prepared_rows(terminal, dataset, timed)
+            rows, recording = self._prepared_rows(terminal, dataset, bool(done["open_switches"]))
+        settings = dict(rows.metadata["preparation"])
         named = forcegp.scores.named_model
         assert recording.model is not None, "it has one"
         expression, _, evidence = identification(model).partition("@")
@@ -127,12 +118,13 @@ class Auto(Command):
         with terminal.progress("identifying") as progress:
             how: dict[str, Any] = {"evidence": forcegp.evidence.parse_evidence(evidence), "report": progress}
             identified: Any = forcegp.scores.learn(named(recording.model, laws), recording, **how)[0]
+        payload: dict[str, Any] = {}
         with terminal.progress("looking for a payload") as progress:
             try:
-                payload = with_payload(named(recording.model, laws[1:]), recording, self.link, report=progress)
-                held = payload_text(payload)
+                found = with_payload(named(recording.model, laws[1:]), recording, self.link, report=progress)
+                payload, held = payload_dict(found, False), payload_text(found)
             except DatasetError as error:
-                payload, held = None, f"not estimated: {error}"
+                held = f"not estimated: {error}"
         scores, posterior = self._scored(terminal, rows, recording, model)
         content: dict[str, Any] = {
             "out": str(self.out),
@@ -141,17 +133,16 @@ class Auto(Command):
             "mistakes": [doubt.to_dict() for doubt in mistakes],
             "check": report.to_dict(),
             "preparation": settings,
-            "payload": None if payload is None else payload_dict(payload, False),
+            "payload": payload or None,
             "identified": identified.estimates.to_dict(),
             **{name: value for name, value in scores.to_dict().items() if name in SCORES},
             "code": self._code(terminal, posterior),
         }
-        answer = answer_lines(content, dataset, identified, held, scores)
-        best = best_sentence(scores, dataset)
+        answer, best = answer_lines(content, dataset, identified, held, scores), best_sentence(scores, dataset)
         content |= {"answer": [": ".join(line) for line in answer], "best": best}
         self._write_report(terminal, posterior, recording, content, answer, scores)
         content |= {"cpu_seconds": time.process_time() - begin}
-        write_json(self.out / "payload.json", content["payload"] or {})
+        write_json(self.out / "payload.json", payload)
         write_estimates(self.out, identified)
         write_json(self.out / CONFIG, {"kind": self.kind, "command": corrected, **content})
         terminal.show(facts("", dict(answer)), best)
@@ -196,24 +187,29 @@ class Auto(Command):
         return shlex.join([*words, "--out", str(self.out)])
 
     def _prepared_rows(
-        self, terminal: Terminal, raw: forcegp.Dataset, wanted: forcegp.data.Preparation
-    ) -> tuple[forcegp.Dataset, forcegp.Dataset, dict[str, Any]]:
-        """Rows to learn from, the same at the full rate, and what was done."""
+        self, terminal: Terminal, raw: forcegp.Dataset, open_switches: bool
+    ) -> tuple[forcegp.Dataset, forcegp.Dataset]:
+        """Rows to learn from, and the same at the full rate."""
+        wanted, flies, lag = self.filter.preparation(), forcegp.data.thruster_columns(raw.model), self.filter.lag
+        if lag == "auto" and flies:
+            wanted = replace(wanted, delay=0.0 if wanted.delay == "auto" else wanted.delay)
+        else:
+            wanted = with_delay_that_shows(terminal, replace(wanted, lag=0.0 if lag == "auto" else wanted.lag), raw)
         first = replace(wanted, every=1, stance="log")
         try:
             numbers = first.resolved(raw)
         except DatasetError as error:
-            if self.filter.lag != "auto" or wanted.lag != "auto":
+            if lag != "auto" or not flies:
                 raise
             terminal.note(f"rotors are taken to follow at once: {error}")
             numbers = replace(first, lag=0.0).resolved(raw)
         period = 0.0 if numbers.cutoff is None else 1.0 / float(numbers.cutoff)  # in which a filter spoils the ends
-        numbers = replace(numbers, trim=max(self.filter.trim, period), stance=wanted.stance)
-        every = numbers.thinning(raw) if self.filter.every is None else wanted.every
-        rows = replace(numbers, every=every).apply(raw)
+        stance, every = "auto" if open_switches else "log", wanted.every
+        numbers = replace(numbers, trim=max(self.filter.trim, period), stance=stance, every=every)
+        rows, recording = prepared_rows(numbers, raw, thin=self.filter.every is None)
         with atomic_file(self.out / "prepared.h5", overwrite=True) as temporary:
             rows.save(temporary)
-        return rows, numbers.apply(raw), dict(rows.metadata["preparation"])
+        return rows, recording
 
     def _scored(
         self, terminal: Terminal, rows: forcegp.Dataset, recording: forcegp.Dataset, model: forcegp.Model
@@ -250,24 +246,21 @@ class Auto(Command):
         """The page to send around."""
         posterior, recording = forcegp.posterior.observing(posterior, recording)
         command = dict(answer)["record next"].partition(" (")[0]
-        names = {name: short_name(name) for name in scores.models}
-        following = [("Record the most informative motion:", command)]
+        following = [("Record the most informative motion:", command)] if command.startswith("forcegp") else []
+        details = {name: content[name] for name in ("import", "mistakes", "preparation", "recommended", "payload")}
         with terminal.progress("writing the report") as progress:
-            pictures, missing = forcegp.scores.model_pictures(posterior, recording, progress)
             page = forcegp.report.model_page(
                 posterior,
                 recording,
-                [*forcegp.scores.scores_pictures(scores), *pictures],
+                pictures=forcegp.scores.scores_pictures(scores),
                 title=f"forcegp auto {' '.join(path.name for path in self.logs)}, {posterior.model.robot.name}",
                 best=content["best"],
                 findings=answer,
-                tables=[forcegp.report.scores_table(scores, names)],
-                next_steps=following if command.startswith("forcegp") else [],
-                details={
-                    name: content[name] for name in ("import", "mistakes", "preparation", "recommended", "payload")
-                },
+                tables=[forcegp.report.scores_table(scores, {name: short_name(name) for name in scores.models})],
+                next_steps=following,
+                details=details,
                 shapes=self.robot.robot,
-                missing=missing,
+                progress=progress,
             )
             forcegp.report.write_page(self.out / "report.html", page)
 
@@ -282,8 +275,6 @@ class Auto(Command):
         return str(self.out / "c")
 
 
-INERTIA = {"rad": "kg m²", "m": "kg"}  # by the unit of q
-FAR_WORSE = 4.0  # times the error of the joint in the middle, from which a joint is named
 SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
 
 
@@ -312,11 +303,11 @@ def answer_lines(
     content: Mapping[str, Any], dataset: forcegp.Dataset, identified: Any, held: str, scores: forcegp.scores.Scores
 ) -> list[tuple[str, str]]:
     """What was found, in ten lines."""
-    names, values, robot = dataset.joint_names, identified.estimates, identified.model.robot
-    import_, prepared = content["import"], content["preparation"]
-    deviation = max(each["largest_deviation_of_a_step"] for each in import_["recordings"])
-    jitter = f", steps up to {deviation:.0%} off (evened out)" if import_["resampled_to_step"] is not None else ""
-    seconds = content["seconds"]
+    values, robot, best = identified.estimates, identified.model.robot, scores.recommended
+    assert best is not None, "a model was scored"
+    done, prepared, seconds, out = content["import"], content["preparation"], content["seconds"], content["out"]
+    deviation = max(each["largest_deviation_of_a_step"] for each in done["recordings"])
+    jitter = f", steps up to {deviation:.0%} off (evened out)" if done["resampled_to_step"] is not None else ""
     rate = (len(dataset) - len(dataset.episodes)) / seconds
     # `q=deg`, `sign u=1,-1`, or what was wrong where an order was corrected
     flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
@@ -327,32 +318,30 @@ def answer_lines(
     shifted = f"u was logged {1e3 * abs(late):.1f} ms {when} (shifted)" if late else on_time
     shifted += f", rotors follow within {1e3 * lag:.0f} ms" if lag else ""
     filtered = "no filter" if prepared["cutoff"] is None else f"filter at {prepared['cutoff']:g} Hz"
-
-    def each(field: str, pattern: str = "{:.3g}") -> str:
-        return ", ".join(pattern.format(values[f"{field}.{name}"].value) for name in joints)
-
     joints, moving = robot.single_joint_names, robot.base != "fixed"
-    freedoms = f"a base that moves and {len(joints)} joints" if moving else f"{len(names)} joints"
-    kinds = [robot.joint(name).type == "prismatic" for name in joints]
-    q, force = (" or ".join(dict.fromkeys(two[kind] for kind in kinds)) for two in (("rad", "m"), ("Nm", "N")))
+    freedoms = f"a base that moves and {len(joints)} joints" if moving else f"{len(dataset.joint_names)} joints"
+    q, force, inertia = (
+        " or ".join(dict.fromkeys(two[robot.joint(name).type == "prismatic"] for name in joints))
+        for two in (("rad", "m"), ("Nm", "N"), ("kg m²", "kg"))
+    )
+
+    def each(field: str) -> str:
+        return ", ".join(f"{values[f'{field}.{name}'].value:.3g}" for name in joints)
+
     of_joints = [
         ("dry friction", f"{each(f'{DRY}.level')} {force}, near rest {each(f'{DRY}.breakaway')} more"),
         ("viscous", f"{each('viscous')} {force} per {q}/s"),
-        ("rotors", f"{each('rotor')} {INERTIA.get(q, 'kg m² or kg')}"),
-    ]
-    mass, error = values.total_mass
+        ("rotors", f"{each('rotor')} {inertia}"),
+    ] if joints else []  # fmt: skip
     by = ", if thrust coefficients are right" if forcegp.data.thruster_columns(identified.model) else ""
-    q = "rad or m" if moving else q
+    mass, error = values.total_mass
     errors = "; ".join(
         f"{short_name(name)} {number(_motion(scores, name))} / {number(_acceleration(scores, name))}"
         for name in scores.models
     )
-    best = scores.recommended
-    assert best is not None, "a model was scored"
     covered = scores.value("coverage_95", model=best)
     intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered:.0f} % of unseen rows"
     weak = ", ".join(list(values.by_body or {})[:3])
-    out = content["out"]
     command = f"forcegp excite {out}/model --seconds 10 --out next.csv"
     command = "faster and larger motions, also of what hardly moved" if moving else command
     return [
@@ -360,24 +349,15 @@ def answer_lines(
         ("corrected", mistakes),
         ("timing", f"{shifted}; {filtered}, every {prepared['every']}. row"),
         *([("stance", stance_text(prepared))] if "stance" in prepared else []),
-        *(of_joints if joints else []),
+        *of_joints,
         *([("whole mass", f"{mass:.4g} ± {1.96 * error:.1g} kg{by}")] if moving else []),
         ("payload", held + by),
-        ("models", f"error of q after 1 s [{q}] / nRMSE of the acceleration, on unseen time: {errors}"),
-        ("trust", f"{short_name(best)}{intervals}{far_worse(scores, best)}"),
+        ("models", f"error of q after 1 s [{'rad or m' if moving else q}] / nRMSE of the acceleration, on unseen time: "
+                   f"{errors}"),
+        ("trust", f"{short_name(best)}{intervals}"),
         ("record next", command + (f" (least is known of {weak})" if weak else "")),
         ("wrote", f"{out}/report.html, {out}/model, {out}/identified.urdf, {out}/validation/report.md"),
-    ]
-
-
-def far_worse(scores: forcegp.scores.Scores, model: str) -> str:
-    """The joint whose acceleration is predicted far worse than that of the joint in the middle, if there is one."""
-    errors = zip(scores.joint_names, scores.columns("nrmse", model=model), strict=True)
-    known = {name: error for name, error in errors if error is not None}
-    worst = max(known, key=known.__getitem__, default="")
-    if not known or known[worst] <= FAR_WORSE * statistics.median(known.values()):
-        return ""
-    return f"; {worst} is predicted far worse than the others (nRMSE {known[worst]:.2g}): look at it"
+    ]  # fmt: skip
 
 
 def best_sentence(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> str:
@@ -392,13 +372,10 @@ def best_sentence(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> st
             f"Trust none of these models: on unseen time, accelerations of the best one, “{name}”, are {wrong}. "
             "Forces, flags of stance, units or the robot's file are wrong."
         )
-    if motion is None:
-        urdf = _acceleration(scores, "given")
-        against = "" if urdf is None or best == "given" else f", with the URDF alone by {urdf:.2g}"
-        trust = f": on unseen time, accelerations are {wrong}{against}" if wrong else ""
-        return f"Trust the model “{name}”{trust}."
-    urdf = _motion(scores, "given")
+    urdf = (_acceleration if motion is None else _motion)(scores, "given")
     against = "" if urdf is None or best == "given" else f", with the URDF alone by {urdf:.2g}"
+    if motion is None:
+        return f"Trust the model “{name}”{f': on unseen time, accelerations are {wrong}{against}' if wrong else ''}."
     if urdf is None and "given" in scores.models:
         against = "; with the URDF alone they diverge"
     unit = dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m"
@@ -409,15 +386,17 @@ def best_sentence(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> st
 
 def _motion(scores: forcegp.scores.Scores, model: str) -> float | None:
     """Error of q at the longest horizon; None where all motions diverge, or none was scored."""
-    if model not in scores.models or not scores.finished(model) or not scores.horizons:
-        return None
-    return scores.value("rmse", f"position after {scores.horizons[-1]:g} s", model)
+    quantity = f"position after {scores.horizons[-1]:g} s" if scores.horizons else ""
+    return _known(scores, "rmse", quantity, model)
 
 
 def _acceleration(scores: forcegp.scores.Scores, model: str) -> float | None:
-    if model not in scores.models or not scores.finished(model):
-        return None
-    return scores.value("nrmse", model=model)
+    return _known(scores, "nrmse", "acceleration", model)
+
+
+def _known(scores: forcegp.scores.Scores, score: str, quantity: str, model: str) -> float | None:
+    there = model in scores.models and quantity in scores.quantities(model)
+    return scores.value(score, quantity, model) if there else None
 
 
 def payload_text(found: Any) -> str:

@@ -31,11 +31,7 @@ def unless_given(metavar: str, default: str, constructor: type | None = None) ->
 
 
 def split_list(text: str, goes_on: str | None = None) -> list[str]:
-    """The entries of a list that is written with commas.
-
-    What matches the regular expression `goes_on` cannot begin an entry: it belongs to the entry before it, with the
-    comma. So does what stands in parentheses. Raises ValueError for an empty entry.
-    """
+    """Entries between commas. What matches `goes_on`, or is in parentheses, continues an entry. Raises ValueError."""
     entries: list[str] = []
     for piece in text.split(","):
         open_ = bool(entries) and entries[-1].count("(") > entries[-1].count(")")
@@ -71,8 +67,7 @@ NUMBERS = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(:.*)?"
 """What continues an entry that holds numbers: FRAME@x,y,z:SURFACE:n,n,n,n, or WHAT=X,X."""
 
 
-FIELDS = r"\w+ *=.*"
-"""What continues a force: NAME:FIELD=VALUE,FIELD=VALUE."""
+FIELDS = r"\w+ *=.*"  # what continues a force: NAME:FIELD=VALUE,FIELD=VALUE
 
 
 def numbers_of(text: str, complaint: str, *, one: bool = False) -> list[float]:
@@ -93,8 +88,6 @@ class InputPath:
 
 CONFIG = "config.json"
 LIBRARIES = ("forcegp", "torch", "gpytorch", "numpy", "scipy")
-OUTPUTS = ("out", "write_mapping", "report")
-"""Names of the fields with what a command writes: never an input, nor another output."""
 DATASET = InputPath(" is not a file; give the path of a dataset written by forcegp (.h5).")
 MODEL = InputPath(" does not exist; give the folder that `forcegp fit --out` wrote", Path.exists)
 URDF = InputPath(": no such file; give the path of a URDF file.", Path.exists)
@@ -178,10 +171,7 @@ class Command(ABC):
     """Show the traceback of an error."""
 
     def check_paths(self) -> None:
-        """Refuse inputs that do not exist and outputs that would destroy an input or another output.
-
-        At once: `run` imports torch, which takes seconds. Raises FileFormatError and InvalidInput.
-        """
+        """Refuse at once inputs that do not exist, and an output that would destroy one."""
         inputs: list[Path] = []
         values = values_of(self)
         for name, option in options_of(type(self)).items():
@@ -191,46 +181,46 @@ class Command(ABC):
                     if not mark.is_there(path):
                         raise FileFormatError(f"{path}{mark.refusal}")
                     inputs.append(path)
-        outputs = self.outputs
-        for path in (*inputs, *outputs):
-            if any("\ud800" <= letter <= "\udfff" for letter in str(path)):  # bytes that Python could not decode
-                raise InvalidInput(f"the name {str(path)!r} is not UTF-8, so it could not be reported; rename it.")
-        for place, path in enumerate(outputs):
-            for other in (*inputs, *outputs[:place], *outputs[place + 1 :]):
-                within = Path(os.path.realpath(other)).is_relative_to(os.path.realpath(path))
-                if _same(path, other) or (self.replaces and within):
-                    does = "reads" if other in inputs else "writes, too"
-                    raise InvalidInput(
-                        f"{path} would be written over {other}, which this command {does}; choose another name."
-                    )
+        path = self.output
+        for given in (*inputs, *([] if path is None else [path])):
+            if any("\ud800" <= letter <= "\udfff" for letter in str(given)):  # bytes that Python could not decode
+                raise InvalidInput(f"the name {str(given)!r} is not UTF-8, so it could not be reported; rename it.")
+        for other in inputs:
+            if path is None:
+                break
+            within = Path(os.path.realpath(other)).is_relative_to(os.path.realpath(path))
+            if _same(path, other) or (self.replaces and within):
+                raise InvalidInput(
+                    f"{path} would be written over {other}, which this command reads; choose another name."
+                )
 
     @property
-    def outputs(self) -> list[Path]:
-        """Files and folders that this command writes."""
-        values = values_of(self)
-        return [path for name in OUTPUTS if (path := values.get(name)) is not None]
+    def output(self) -> Path | None:
+        """The file or folder that this command writes: never an input."""
+        return getattr(self, "out", None)
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[None]:
-        """No other command of this user and machine writes to the same outputs meanwhile. Raises InvalidInput."""
+        """No other command of this user and machine writes to the same place meanwhile. Raises InvalidInput."""
         from filelock import FileLock, Timeout  # which --help does without
 
-        # not beside the outputs: a lock would stay there, and the folder may not exist yet
+        # not beside the output: a lock would stay there, and the folder may not exist yet
         user = os.getuid() if hasattr(os, "getuid") else None  # Windows has a folder for each user
         place = Path(tempfile.gettempdir(), f"forcegp-locks-{user}")
         place.mkdir(mode=0o700, exist_ok=True)
         if user is not None and place.lstat().st_uid != user:
             raise InvalidInput(f"{place} belongs to another user; set TMPDIR to a folder of your own.")
-        with contextlib.ExitStack() as locks:
-            for path in self.outputs:
-                name = hashlib.sha256(os.path.realpath(path).encode()).hexdigest()
-                try:
-                    locks.enter_context(FileLock(place / name).acquire(blocking=False))
-                except Timeout:
-                    raise InvalidInput(
-                        f"another command of forcegp is writing {path}; wait for it, or choose another name."
-                    ) from None
+        if self.output is None:
             yield
+            return
+        name = hashlib.sha256(os.path.realpath(self.output).encode()).hexdigest()
+        try:
+            with FileLock(place / name).acquire(blocking=False):
+                yield
+        except Timeout:
+            raise InvalidInput(
+                f"another command of forcegp is writing {self.output}; wait for it, or choose another name."
+            ) from None
 
     def words(self, *names: str) -> list[str]:
         """The options of these names that are not left at their defaults, as words of a command."""
@@ -260,10 +250,7 @@ class Command(ABC):
         return f"forcegp {self.name}"
 
     def require_free(self, path: Path | None) -> None:
-        """Refuse what exists, unless it is an empty folder, or one that only this command wrote to, with --overwrite.
-
-        None is no folder. Raises InvalidInput, or OSError where nothing can be written, before any work is done.
-        """
+        """Refuse what exists, but empty folders, and with --overwrite what only this command wrote."""
         if path is None:
             return
         if path.exists() and not (path.is_dir() and not any(path.iterdir())):
@@ -285,10 +272,7 @@ class Command(ABC):
     def require_free_file(
         self, path: Path | None, own: Callable[[Path], bool] | None = None, what: str = "a dataset of forcegp"
     ) -> None:
-        """Refuse what exists, but `own` or empty with --overwrite, or cannot be written. None is no file.
-
-        `own` is whether a file is `what` forcegp writes. Raises InvalidInput and OSError.
-        """
+        """Refuse what exists, but with --overwrite an empty file, or one that is `own`: `what` forcegp writes."""
         if path is None:
             return
         if path.is_dir():
@@ -305,11 +289,7 @@ class Command(ABC):
 
     @contextlib.contextmanager
     def folder(self, path: Path, content: Mapping[str, Any]) -> Iterator[Path]:
-        """A new folder to write into, there once all is in it.
-
-        It gets a `config.json` with this content, versions and the list of its files, and the digests of all. Raises as
-        `require_free`, also for what appeared meanwhile.
-        """
+        """A new folder, there once all is in it, with a config.json of this content, and digests of all files."""
         with atomic_folder(path) as folder:
             folder.mkdir()
             yield folder

@@ -1,8 +1,9 @@
-"""`forcegp fit`: find what a model leaves open, from a log, and write the model to a folder."""
+"""`forcegp fit` and `payload`: find what a model leaves open, from a log."""
 
 from __future__ import annotations
 
 import math
+import re
 import shlex
 import time
 import warnings
@@ -33,6 +34,7 @@ from forcegp.cli.command import (
     unless_given,
     values_of,
 )
+from forcegp.cli.logs import FilterOptions, with_delay_that_shows
 from forcegp.cli.robot_options import (
     CONTACTS,
     SYSTEM_FILE,
@@ -43,12 +45,12 @@ from forcegp.cli.robot_options import (
     parse_contacts,
 )
 from forcegp.cli.terminal import Terminal, columns, facts, with_option_names
-from forcegp.errors import ContactError, ContactWarning, InvalidInput
+from forcegp.errors import ContactError, ContactWarning
+from forcegp.summary import listed as in_words
 
 NEARLY_ALL = 0.995
 """Share of rows in contact from which on the contacts count as closed all the time (impacts and noise take a few)."""
-HARDLY_ANY = 0.2
-"""Share below which something is wrong with the contact, rather than the tool in the air."""
+HARDLY_ANY = 0.2  # share below which something is wrong with the contact, rather than the tool in the air
 USUAL_FORCES = "gp:joint-friction, in contact gp:tool-friction, in flight gp:aerodynamic"
 LEARNED_FROM = "accelerations with gp:, else torques, of a base that moves torques:both"
 
@@ -64,7 +66,6 @@ class Fit(Command):
       forcegp fit train.h5 --points 100 --out run
       forcegp fit log.h5 --forces bodies,viscous,coulomb,offset,rotor --out identified
       forcegp fit log.h5 --identified identified --forces gp:joint-friction --evidence accelerations,motions:1 --out run
-      forcegp fit log.h5 --forces viscous,gp:joint-friction --robot arm.urdf --noise learned --out run
       forcegp fit train.h5 --forces gp:independent --points 100 --out baseline
     """
 
@@ -83,26 +84,16 @@ class Fit(Command):
     baseline: Annotated[Path | None, DATASET, unless_given("LOG", "none", Path)] = None
     """A second log, of the same robot without the payloads that are estimated."""
     contact: Annotated[tuple[str, ...], listed(goes_on=NUMBERS), unless_given(CONTACTS, "the dataset's")] = ()
-    """Points that stay on surfaces, instead of the dataset's contacts; m, in the axes of the link FRAME.
-    SURFACE is plane:nx,ny,nz,offset or sphere:cx,cy,cz,radius.
-    none is no contact at all."""
+    """Points that stay on surfaces, instead of the dataset's contacts; m, in the axes of the link FRAME. SURFACE is
+    plane:nx,ny,nz,offset or sphere:cx,cy,cz,radius. none is no contact at all."""
     noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
     """Noise of the measured acceleration: a standard deviation in rad/s², learned, or as the dataset states it (learned
     where it does not)."""
     force_noise: Annotated[float | None, unless_given("SIGMA", "none", float)] = None
     """Noise of the joint forces as well: a standard deviation in Nm, where the search begins with --noise learned."""
-    measured_torque: bool = False
-    """u comes from sensors as noisy as --force-noise, and predictions account for it. Not for commanded torques."""
     engine: Literal["auto", "exact", "inducing"] = "auto"
     """How the posterior is computed. exact: from the covariance of all points. inducing: through fewer points. auto: by
     their number, the features and the free memory, with the reason. See docs/how-to/large-data.md."""
-    learning_points: Annotated[int | None, unless_given("N", "all points up to 1500, else 600", int)] = None
-    """Find the hyper-parameters on N of the points; the posterior is that of all points."""
-    seed: Annotated[int, arg(metavar="K")] = 0
-    """Draws the starts of the search after the first."""
-    rows: Literal["auto", "in-contact", "all"] = "auto"
-    """in-contact: learn from rows in which positions, velocities and accelerations show the contact to act. all: from
-    every row. auto: in-contact where the tool leaves the surface at times, with a note."""
     checks: Annotated[bool, arg(help_behavior_hint="")] = True
     """Do not look for wrong units, signs, joints, contacts, masses and drop-outs first, as forcegp check does."""
     device: Annotated[str, arg(metavar="cpu|cuda|cuda:K")] = "cpu"
@@ -142,7 +133,7 @@ class Fit(Command):
                 baseline=None if self.baseline is None else forcegp.Dataset.load(self.baseline),
                 report=report,
                 **vars(self.search),
-                **{name: getattr(self, name) for name in ("engine", "learning_points", "seed")},
+                engine=self.engine,
             )
         summary = fit_summary(posterior, time.monotonic() - start)
         tables = fit_report(self.out, posterior, summary)
@@ -156,15 +147,13 @@ class Fit(Command):
 
     def _noise(self) -> forcegp.Noise | None:
         """The noise that the options ask for; None where the dataset states it. Raises InvalidInput."""
-        if self.measured_torque and self.force_noise is None:
-            raise InvalidInput("--measured-torque needs the noise of the torque sensors; add --force-noise SIGMA.")
-        how = {"measured_torque": self.measured_torque}
-        if self.noise == "learned":
-            return forcegp.Noise(None, self.force_noise, learn=True, **how)
-        if self.noise == "dataset":
-            return None if self.force_noise is None else forcegp.Noise(None, self.force_noise, **how)
-        complaint = f"--noise is {self.noise!r}; give learned, dataset or a number such as 0.1."
-        return forcegp.Noise(numbers_of(self.noise, complaint, one=True)[0], self.force_noise, **how)
+        if self.noise == "dataset" and self.force_noise is None:
+            return None
+        level = None
+        if self.noise not in ("learned", "dataset"):
+            complaint = f"--noise is {self.noise!r}; give learned, dataset or a number such as 0.1."
+            [level] = numbers_of(self.noise, complaint, one=True)
+        return forcegp.Noise(level, self.force_noise, learn=self.noise == "learned")
 
     def _known(self, dataset: forcegp.Dataset) -> forcegp.Model:
         """The dataset's own model, with the robot and contacts that the options give."""
@@ -183,27 +172,20 @@ class Fit(Command):
         warnings.simplefilter("ignore", ContactWarning)
 
     def _rows(self, dataset: forcegp.Dataset, model: forcegp.Model) -> tuple[forcegp.Dataset, str | None]:
-        """The rows in which all contacts act (`forcegp.data.rows_in_contact`), or all, as --rows asks.
-
-        And a note to print after the fit, so that an error before it stands alone. Raises ContactError with in-contact
-        if there are none.
-        """
-        if self.rows == "all" or not model.contacts:
+        """The rows in which all contacts act where the tool leaves a surface at times, and a note for after the fit."""
+        if not model.contacts:
             return dataset, None
         try:
             touching = forcegp.data.rows_in_contact(replace(dataset, model=model))
         except ContactError:
-            if self.rows == "in-contact":
-                raise
             return dataset, None  # the fit raises a clearer error
         share = len(touching) / len(dataset)
-        if self.rows == "auto" and share >= NEARLY_ALL:
+        if share >= NEARLY_ALL:
             return dataset, None
         text = f"{len(touching)} of {len(dataset)} rows move as a contact demands ({share:.1%})"
-        if self.rows == "auto" and share < HARDLY_ANY:
-            return dataset, f"{text}; all were learned from. Check the contact, or give --rows in-contact."
-        note = f"{text}; these alone were learned from (--rows all takes every row)"
-        return replace(touching, model=dataset.model), note
+        if share < HARDLY_ANY:
+            return dataset, f"{text}; all were learned from. Check the contact."
+        return replace(touching, model=dataset.model), f"{text}; these alone were learned from"
 
     def _write(self, posterior: forcegp.posterior.Posterior) -> None:
         """The model, how it was made and what was estimated; what is known also as a robot's file."""
@@ -259,26 +241,22 @@ def fit_summary(posterior: forcegp.posterior.Posterior, wall_seconds: float) -> 
 
 def fit_report(run: Path, posterior: Any, found: Mapping[str, Any]) -> list[Any]:
     """What was learned from what, and the numbers that were estimated."""
-    settings, air = posterior.settings, found["wind"]
-    refined = " and refined on all" if "refined" in settings else ""
-    fewer = "" if found["learning_points"] == found["points"] else (
-        f" (parameters: from {found['learning_points']} of them{refined})"
-    )  # fmt: skip
-    # the status counts failed evaluations, too, and the starts
-    status = with_option_names(found["status"], ("iterations",))
-    wind = None if air is None else f"{air[0]:.1f} m/s along x, {air[1]:.1f} m/s along y"
-    if found["wind_not_found"]:
-        each = ", with a force in each episode" if settings.get("steady_forces") else ""
-        wind = f"not found; learned as still air{each}"
+    settings, learned, air = posterior.settings, found["learning_points"], found["wind"]
+    starts = f"; {settings['restarts']} starts" if "restarts" in settings else ""
+    fewer = "" if learned == found["points"] else f" (parameters: from {learned} of them{starts})"
+    each = ", with a force in each episode" if settings.get("steady_forces") else ""
+    told = with_option_names(found["status"], ("iterations",))
     values = {
         "engine": settings.get("engine_reason"),
         "negative log likelihood": f"{found['nll']:.1f} nats",
-        "search": f"{found['iterations']} iterations; {'' if found['converged'] else 'not converged: '}{status}",
+        "search": f"{found['iterations']} iterations; {'' if found['converged'] else 'not converged: '}{told}",
         "noise std": _per_joint(found["noise_std"]),
         "noise std of forces": found["force_noise_std"] and _per_joint(found["force_noise_std"]),
-        "wind of these rows": wind,
+        "wind of these rows": None if air is None else f"{air[0]:.1f} m/s along x, {air[1]:.1f} m/s along y",
         "time": f"{found['cpu_seconds']:.1f} s CPU for the search, {found['wall_seconds']:.1f} s in all",
     }
+    if found["wind_not_found"]:
+        values["wind of these rows"] = f"not found; learned as still air{each}"
     title = f"{run}: {found['model']}, learned from {found['points']} points{fewer}"
     shown: list[Any] = [facts(title, {name: text for name, text in values.items() if text is not None})]
     if posterior.estimates:
@@ -297,8 +275,6 @@ def _per_joint(values: list[float]) -> str:
 
 SHOWN = {"m": ("mm", 1e3), "kg m^2": ("kg m²", 1.0)}
 """Units of files, and those that people read, with the factor between them."""
-MOST_OPEN = 5
-"""Combinations that the log does not tell apart, of which the first are named."""
 
 
 def estimates_table(title: str, estimates: Mapping[str, forcegp.posterior.Estimate]) -> Any:
@@ -321,29 +297,121 @@ def estimates_table(title: str, estimates: Mapping[str, forcegp.posterior.Estima
 
 def owner_and_part(name: str) -> tuple[str, str]:
     """Law or body, and number: viscous and elbow, tool0 and center_of_mass.x."""
-    for part in ("mass", "center_of_mass", "inertia"):
-        owner, found, rest = name.partition(f".{part}")
-        if found:
-            return owner, f"{part}{rest}"
-    owner, _, part = name.partition(".")
-    return owner, part
+    found = re.fullmatch(r"(.*?)\.((?:mass|center_of_mass|inertia).*)", name) or re.fullmatch(r"([^.]*)\.?(.*)", name)
+    assert found is not None, "every name matches"
+    return found[1], found[2]
 
 
 def what_is_open(estimates: forcegp.posterior.Estimates) -> list[str]:
     """Sentences about what the prior decides, and what was changed."""
-    lines = []
+    lines, bodies = [], estimates.by_body or {}
     if estimates.open_directions:
-        shown, count = estimates.open_directions[:MOST_OPEN], len(estimates.open_directions)
-        more = f"; and {count - len(shown)} more" if count > len(shown) else ""
-        lines.append(
-            f"Combinations that the prior decides, for no row tells their parts apart: {'; '.join(shown)}{more}."
-        )
-    if estimates.by_body:
-        weak = ", ".join(f"{name} ({number} of 10)" for name, number in estimates.by_body.items())
+        told = in_words(estimates.open_directions, most=5)
+        lines.append(f"Combinations that the prior decides, for no row tells their parts apart: {told}.")
+    if bodies:
+        weak = ", ".join(f"{name} ({number} of 10)" for name, number in bodies.items())
         lines.append(f"Directions of single bodies that the prior decides: {weak}.")
     if estimates.base is not None:
-        rank, condition = estimates.base.rank, estimates.base.condition
-        lines.append(f"{rank} base parameters, condition number {condition:.3g}.")
+        base = estimates.base
+        lines.append(f"{base.rank} base parameters, condition number {base.condition:.3g}.")
     if estimates.thickened:
         lines.append(f"Links that were lines, plates or points got some thickness: {', '.join(estimates.thickened)}.")
     return lines
+
+
+WINDOW = 0.4
+"""Seconds that torques are averaged over: it takes noise of the acceleration, and leaves friction as sharp as it is."""
+DRY = "stribeck"
+LAWS = "viscous", DRY, "offset", "rotor"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Payload(Command):
+    """Estimate mass, centre of mass and inertia of a payload, together with friction and rotors.
+
+    It is `forcegp fit --forces payload:LINK,... --evidence torques:mean=.4` on a log that is filtered first: a motion
+    of 20 s or more that turns every joint in both directions, without contact but for feet that stand. Without
+    --baseline, errors of the URDF's links count as payload. With one, the links are estimated from both logs.
+
+    For example:
+      forcegp payload loaded.h5 --robot arm.urdf
+      forcegp payload loaded.h5 --baseline empty.h5 --link tool0 --out payload
+    """
+
+    log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
+    """The log with the payload (a dataset, raw or prepared)."""
+    baseline: Annotated[Path | None, DATASET, unless_given("LOG", "the URDF", Path)] = None
+    """A log of the same robot without the payload."""
+    link: Annotated[str | None, unless_given("LINK", "the hand or the base that explains most", str)] = None
+    """The link that carries the payload; results are in its frame."""
+    forces: Annotated[tuple[str, ...], listed(goes_on=FIELDS), arg(metavar="FORCE,...")] = LAWS
+    """What is estimated beside it, as for forcegp fit."""
+    out: Annotated[Path | None, unless_given("FOLDER", "nothing is written", Path)] = None
+    """Write payload.json, loaded.urdf (the robot with the payload) and system.json (for --identified) into it."""
+    robot: RobotOptions = RobotOptions()
+    filter: FilterOptions = FilterOptions(cutoff="auto", delay="auto")
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Prepare, estimate, write and show."""
+        self.require_free(self.out)
+        notes: list[str] = []
+        model, rows = self._rows(terminal, self.log, notes)
+        baseline = None if self.baseline is None else self._rows(terminal, self.baseline, notes)[1]
+        notes += forces_of(model)
+        words = [word for word in self.forces if word != "none"]
+        model = forcegp.scores.named_model(model, words)
+        with terminal.progress("identifying") as report:
+            found = with_payload(model, rows, self.link, baseline, report)
+        content = {"data": str(self.log), **payload_dict(found, baseline is not None)}
+        if self.out is not None:
+            given = {"command": self.words("baseline", "link", "forces", "cutoff", "delay")}
+            with self.folder(self.out, {"data": str(self.log), **given}) as folder:
+                write_json(folder / "payload.json", content)
+                write_estimates(folder, found, "loaded")
+        for note in notes:
+            terminal.note(note)
+        if not found.estimates.settled:
+            terminal.warn("the search did not converge: take the numbers with care, and record more or faster motion.")
+        if found.estimates["payload.mass"].interval[0] <= 0.0:
+            terminal.warn("the payload may weigh nothing by this log: centre of mass and inertia mean nothing then.")
+        beside = "the URDF" if baseline is None else "the baseline"
+        title = f"payload in the frame of {content['link']}, beside {beside}; {found.estimates.rows} rows"
+        own = {name: each for name, each in found.estimates.items() if name.startswith("payload.")}
+        others = {name: each for name, each in found.estimates.items() if name not in own and baseline is None}
+        tables = [estimates_table("joints", others)] if others else []
+        terminal.show(estimates_table(title, own), *tables)
+        return content
+
+    def _rows(self, terminal: Terminal, path: Path, notes: list[str]) -> tuple[forcegp.Model, forcegp.Dataset]:
+        """The robot, and rows behind the filter; those of a dataset that was prepared before are as they are."""
+        dataset = forcegp.Dataset.load(path)
+        model = self.robot.chosen_model(dataset, path)
+        if forcegp.data.preparation_report(dataset.metadata):
+            return model, dataset
+        with terminal.progress(f"preparing {path}"):
+            raw = replace(dataset, model=model)
+            prepared = with_delay_that_shows(terminal, self.filter.preparation(), raw).apply(raw)
+        why = forcegp.data.preparation_report(prepared.metadata)["why"]
+        notes += [f"{path}: {name}: {why[name]}" for name in ("cutoff", "delay") if name in why]
+        return model, prepared
+
+
+def with_payload(
+    model: forcegp.Model,
+    rows: forcegp.Dataset,
+    link: str | None,
+    baseline: forcegp.Dataset | None = None,
+    report: Any = None,
+) -> Any:
+    """The posterior of a model that carries something; with a baseline the links are estimated, too."""
+    bodies = () if baseline is None else (forcegp.RigidBodies("all"),)
+    noisy = "u" if model.robot.space.is_vector_space else "both"
+    evidence = (forcegp.Torques(noisy, mean=WINDOW),)
+    loaded = model.with_forces(*bodies, forcegp.Payload(link))
+    return forcegp.scores.learn(loaded, rows, evidence, baseline=baseline, report=report)[0]
+
+
+def payload_dict(found: Any, baseline: bool) -> dict[str, Any]:
+    """Payload and other numbers as plain JSON values, with the link that carries it."""
+    [payload] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
+    return {"link": payload.link, "baseline": baseline, **found.estimates.to_dict()}

@@ -1,7 +1,4 @@
-"""`--logs-from LIST`: one command for many logs or robots, with a row of results for each; a run that ends is resumed.
-
-A line of the list holds words of the command: a log, and what differs for it, such as its robot.
-"""
+"""`--logs-from LIST`: one command for many logs, each a line of words that differ, with a row of results for each."""
 
 from __future__ import annotations
 
@@ -25,14 +22,9 @@ from forcegp.jobs import JOBS, Job, JobStore, run_jobs
 from forcegp.parallel import Jobs
 
 FLAG = "--logs-from"
-OWN = ("--out", "--jobs")
-"""Options that the whole run has; those of each log are its own."""
 SWITCHES = ("--json", "--overwrite", "--debug")
 TABLE = "fleet.csv"
-SHORT = 80
-"""Texts of results that a cell of the table takes."""
-SHOWN = 12
-"""Logs that failed which a terminal shows; the table has all."""
+SHORT = 80  # texts of results that a cell of the table takes
 
 
 class Quiet(Terminal):
@@ -68,10 +60,7 @@ class Fleet(Command):
     jobs: Jobs = 1
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
-        """Run it for each log. One that fails is a row that says so; what is finished, of the same files, stays.
-
-        Raises InvalidInput for a folder of others, and BackendError where a process of this machine died.
-        """
+        """Run it for each log. One that fails is a row that says so; what is finished, of the same files, stays."""
         if not self.out.parent.is_dir():
             raise InvalidInput(f"the folder {self.out.parent} does not exist; create it first.")
         lines, work = lines_of(self.command, self.common, self.logs_from, self.out), []
@@ -87,17 +76,16 @@ class Fleet(Command):
                 shutil.rmtree(store.place(name))  # what was wrong may be mended
         with terminal.progress("running") as report:
             run_jobs(store, work, self.jobs, report)
-        kept = {name: store.load(name) for name in lines}
-        rows = [
-            {"log": name, "folder": str(self.out / name), "cpu_seconds": row["cpu_seconds"]} | row["result"]
-            for name, row in kept.items()
-        ]
+        rows = []
+        for name in lines:
+            row = store.load(name)
+            rows.append(
+                {"log": name, "folder": str(self.out / name), "cpu_seconds": row["cpu_seconds"]} | row["result"]
+            )
         write_text(self.out / TABLE, table_of(rows))
-        failed = [row for row in rows if row["error"]]
-        told = {row["log"]: row["error"] for row in failed[:SHOWN]}
-        more = [f"and {len(failed) - SHOWN} more that failed"] if len(failed) > SHOWN else []
+        failed = {row["log"]: row["error"] for row in rows if row["error"]}
         done = f"{len(rows) - len(failed)} of {len(rows)} logs are done; numbers of each in {self.out / TABLE}"
-        terminal.show(*([facts("failed", told)] if told else []), *more, done)
+        terminal.show(*([facts("failed", failed)] if failed else []), done)
         return {"out": str(self.out), "table": str(self.out / TABLE), "rows": rows}
 
 
@@ -115,11 +103,22 @@ def fleet(words: Sequence[str], jobs: Jobs = 1) -> list[dict[str, Any]]:
 
 
 def command_of(words: Sequence[str]) -> Command:
-    """The command that words ask for, or the fleet of it. Raises as `parsed`."""
-    asked = any(word.partition("=")[0] == FLAG for word in words) and not {"-h", "--help"} & set(words)
-    if asked and words[0] in COMMANDS and "logs_from" in options_of(command_class(words[0])):
-        return fleet_of(words[0], words[1:])
-    return parsed(words)
+    """The command that words ask for, or the fleet of it. Raises InvalidInput, and as `parsed`."""
+    name, asked = words[0] if words else "", any(word.partition("=")[0] == FLAG for word in words)
+    many = asked and name in COMMANDS and "logs_from" in options_of(command_class(name))
+    if not many or {"-h", "--help"} & set(words):
+        return parsed(words)
+    own, common = _split([word for word in words[1:] if word not in SWITCHES], (FLAG, "--out", "--jobs"))
+    if not (own.get("--out") and own.get(FLAG)):
+        raise InvalidInput(
+            f"{FLAG} LIST needs --out FOLDER, which gets a folder for each log. See forcegp {name} --help."
+        )
+    jobs = own.get("--jobs", "1")
+    if not jobs.isdigit() or jobs == "0":
+        raise InvalidInput(f"--jobs is {jobs}; give the number of logs at once, at least 1.")
+    given: dict[str, Any] = {word.removeprefix("--"): word in words for word in SWITCHES}
+    given |= {"logs_from": Path(own[FLAG]), "out": Path(own["--out"]), "jobs": int(jobs)}
+    return Fleet(command=name, common=tuple(common), **given)
 
 
 def one(store: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -167,27 +166,6 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
         cells = [row["numbers"].get(name, "") for name in numbers]
         writer.writerow([*(row[name] for name in own), len(row["warnings"]), *cells])
     return text.getvalue()
-
-
-def fleet_of(command: str, words: Sequence[str]) -> Fleet:
-    """The run that the words of a command ask for with `FLAG`. Raises InvalidInput."""
-    own, common = _split([word for word in words if word not in SWITCHES], (FLAG, *OWN))
-    if not (own.get("--out") and own.get(FLAG)):
-        raise InvalidInput(
-            f"{FLAG} LIST needs --out FOLDER, which gets a folder for each log. See forcegp {command} --help."
-        )
-    jobs = own.get("--jobs", "1")
-    if not jobs.isdigit() or jobs == "0":
-        raise InvalidInput(f"--jobs is {jobs}; give the number of logs at once, at least 1.")
-    switches = {word.removeprefix("--"): word in words for word in SWITCHES}
-    return Fleet(
-        command=command,
-        common=tuple(common),
-        logs_from=Path(own[FLAG]),
-        out=Path(own["--out"]),
-        jobs=int(jobs),
-        **switches,
-    )
 
 
 def lines_of(command: str, common: Sequence[str], path: Path, out: Path) -> dict[str, list[str]]:

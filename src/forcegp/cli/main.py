@@ -23,23 +23,21 @@ ARGUMENTS: Mapping[str, Mapping[str, str]] = {
 
 
 def parse_arguments(words: Sequence[str]) -> Command:
-    """The command that the words ask for, or a fleet of it. --help prints and raises SystemExit(0).
+    """The command that the words ask for, or a fleet of it. --help prints and raises SystemExit(0)."""
+    if any(word.startswith("--logs-from") for word in words):
+        from forcegp.cli.fleet import command_of  # which most calls do without
 
-    Raises InvalidInput, with a message of one line, for words that make no command.
-    """
-    if not any(word.startswith("--logs-from") for word in words):
-        return parsed(words)
-    from forcegp.cli.fleet import command_of  # which most calls do without
-
-    return command_of(words)
+        return command_of(words)
+    return parsed(words)
 
 
 OK, INTERNAL_ERROR, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 
 
-_FULL, _ELSEWHERE = "; free some space, or write elsewhere.", "; write to a folder where you may."
-_REMEDIES = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _FULL)
-_REMEDIES |= dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR), _ELSEWHERE)
+_REMEDIES = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "; free some space, or write elsewhere.")
+_REMEDIES |= dict.fromkeys(
+    (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR), "; write to a folder where you may."
+)
 """What to do about an OSError, by its number."""
 
 

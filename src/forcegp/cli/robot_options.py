@@ -17,8 +17,7 @@ from forcegp.atomic_files import SUMS, require_unchanged
 from forcegp.cli.command import FIELDS, IDENTIFIED, URDF, listed, numbers_of, split_list, unless_given
 from forcegp.errors import FileFormatError, InvalidInput
 
-SYSTEM_FILE = "system.json"
-"""Where a folder that `forcegp fit` wrote holds robot and known forces."""
+SYSTEM_FILE = "system.json"  # where a folder that `forcegp fit` wrote holds robot and known forces
 
 BASES = unless_given("fixed|floating", "fixed; asked where a file looks otherwise")
 
@@ -63,11 +62,7 @@ class RobotOptions(RobotFileOptions):
     """Begin with the robot and the known forces that `forcegp fit` estimated, instead of --robot."""
 
     def chosen(self, recorded: forcegp.Model | None = None) -> forcegp.Model | None:
-        """What the options ask for, else `recorded`, whose contacts and forces stay, and what no URDF holds.
-
-        Closed loops of a file come along. None where there is neither. Raises InvalidInput for options that contradict
-        each other or make no sense, and what `Robot.from_file` raises.
-        """
+        """What the options ask for, else `recorded`, whose contacts and forces stay, and what no URDF holds."""
         if self.identified is not None:
             found = self._identified_system(self.identified)
             kept = {} if recorded is None else {"contacts": recorded.contacts, "baumgarte": recorded.baumgarte}
@@ -127,22 +122,19 @@ class RobotOptions(RobotFileOptions):
                          and getattr(self, each.name)]  # fmt: skip
         if contradicting:
             raise InvalidInput(f"--identified brings its robot along; leave {', '.join(contradicting)} out.")
-        path = place / SYSTEM_FILE if place.is_dir() else place
         if (place / SUMS).exists():  # that of `forcegp auto`, which resumes, and one's own have none
             require_unchanged(place, "fit again")
-        if path != place and not path.exists() and (place / "model.json").exists():
-            from forcegp.posterior import load_posterior  # that of `save_posterior`
-
-            return identified_system(load_posterior(place).model)
-        if path.is_fifo():  # to open it would wait for a writer for ever
-            raise FileFormatError(f"{path} is not a regular file; give a folder that `forcegp fit` wrote.")
+        path = place / SYSTEM_FILE if place.is_dir() else place
+        if not path.exists() and (place / "model.json").exists():
+            return identified_system(forcegp.posterior.load_posterior(place).model)  # that of `save_posterior`
         try:
-            text = path.read_text(encoding="utf-8")
+            if path.is_fifo():  # to open it would wait for a writer for ever
+                raise OSError("it is not a regular file")
+            return forcegp.Model.from_json(path.read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError) as error:
             raise FileFormatError(
                 f"{path}: cannot be read ({error}); give a folder that `forcegp fit` wrote."
             ) from None
-        return forcegp.Model.from_json(text)
 
 
 def identified_system(model: forcegp.Model) -> forcegp.Model:
@@ -206,9 +198,7 @@ class CandidateOptions:
 class SearchOptions:
     """How functions are learned."""
 
-    points: Annotated[
-        int | None, unless_given("N", "200; 100 to compare; all for functions of one or two inputs", int)
-    ] = None
+    points: Annotated[int | None, unless_given("N", "200, 100 to compare; all for few inputs", int)] = None
     """Learn functions from N rows that lie farthest apart (all rows if there are fewer). Time grows with the cube of N
     as far as --engine is exact. Numbers of laws are found from all rows."""
     restarts: Annotated[int | None, unless_given("R", "4 up to 400 points, else 1", int)] = None
@@ -225,10 +215,8 @@ SYNTAX = {"plane": "nx,ny,nz,offset", "sphere": "cx,cy,cz,radius"}
 """Numbers of each surface in m: plane n . p = offset."""
 CONTACTS = "FRAME@x,y,z:SURFACE,..."
 EXAMPLE = "lbr_iiwa_link_7@0,0,0.1:plane:0,0,1,0.055"
-FEET, FLAT = "FRAME@x,y,z,...", ":flat"
-"""FLAT stands behind the frame of a foot that does not turn while it stands."""
-STANDS = "{}_stands"
-"""The input that switches the contact of a foot."""
+FEET, FLAT = "FRAME@x,y,z,...", ":flat"  # FLAT stands behind the frame of a foot that does not turn while it stands
+STANDS = "{}_stands"  # the input that switches the contact of a foot
 
 
 def parse_contacts(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
@@ -243,43 +231,43 @@ def parse_contacts(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
 def parse_contact(text: str) -> forcegp.Contact:
     """`FRAME@x,y,z:SURFACE:numbers`, without `@x,y,z` at the frame's origin. Raises InvalidInput with an example."""
     place, kind, numbers = [*text.rsplit(":", 2), "", ""][:3]
+    forms = ", ".join(f"{name}:{form}" for name, form in SYNTAX.items())
+    needs = f"--contact {text!r} is not FRAME@x,y,z:SURFACE with a SURFACE of {forms} (m); for example {EXAMPLE}"
     if kind not in SYNTAX or not place:
-        forms = ", ".join(f"{name}:{form}" for name, form in SYNTAX.items())
-        raise InvalidInput(
-            f"--contact {text!r} is not FRAME@x,y,z:SURFACE with a SURFACE of {forms} (m); for example {EXAMPLE}"
-        )
-    frame, _, point = place.rpartition("@") if "@" in place else (place, "", "0,0,0")
-    values = []
-    for what, given, form in ((kind, numbers, SYNTAX[kind]), ("the point", point, "x,y,z")):
-        count = form.count(",") + 1
-        needs = f"--contact {text!r}: {what} needs {count} numbers {form} in m, given {given!r}; for example {EXAMPLE}"
-        values.append(numbers_of(given, needs))
-        if len(values[-1]) != count:
-            raise InvalidInput(needs)
-    (*vector, size), (x, y, z) = values
+        raise InvalidInput(needs)
+    frame, point = _frame_and_point(place, needs)
+    values = numbers_of(numbers, needs)
+    if len(values) != SYNTAX[kind].count(",") + 1:
+        raise InvalidInput(needs)
+    *vector, size = values
     surface: Any = {"plane": forcegp.Plane, "sphere": forcegp.Sphere}[kind]
-    return forcegp.Contact(frame, (x, y, z), surface(tuple(vector), size))
+    return forcegp.Contact(frame, point, surface(tuple(vector), size))
 
 
 def parse_feet(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
-    """Points `FRAME@x,y,z` or flat feet `FRAME:flat`, each with a switch.
-
-    Raises InvalidInput.
-    """
+    """Points `FRAME@x,y,z` or flat feet `FRAME:flat`, each with a switch. Raises InvalidInput."""
     feet: dict[str, tuple[forcegp.Contact, ...]] = {}
     for text in texts:
-        flat = text.endswith(FLAT)
-        named = text.removesuffix(FLAT)
-        frame, _, point = named.rpartition("@") if "@" in named else (named, "", "0,0,0")
         complaint = f"--feet {text!r} is not FRAME, FRAME@x,y,z (m) or FRAME{FLAT}; for example FL_foot@0,0,-0.02"
-        place = numbers_of(point, complaint)
-        if not frame or len(place) != 3 or (flat and "@" in named):
+        flat, named = text.endswith(FLAT), text.removesuffix(FLAT)
+        frame, point = _frame_and_point(named, complaint)
+        if not frame or (flat and "@" in named):
             raise InvalidInput(complaint)
         if frame in feet:
             raise InvalidInput(f"--feet names {frame} twice; a frame has one foot.")
-        switch, (x, y, z) = STANDS.format(frame), place
-        if flat:
-            feet[frame] = forcegp.mechanics.fixed_frame(frame, switch)
-        else:
-            feet[frame] = forcegp.mechanics.fixed_point(frame, (x, y, z), switch)
+        switch = STANDS.format(frame)
+        feet[frame] = (
+            forcegp.mechanics.fixed_frame(frame, switch)
+            if flat
+            else forcegp.mechanics.fixed_point(frame, point, switch)
+        )
     return tuple(contact for points in feet.values() for contact in points)
+
+
+def _frame_and_point(place: str, complaint: str) -> tuple[str, tuple[float, float, float]]:
+    """Of `FRAME@x,y,z`, or of a FRAME at its origin. Raises InvalidInput as complained."""
+    frame, _, point = place.rpartition("@") if "@" in place else (place, "", "0,0,0")
+    values = numbers_of(point, complaint)
+    if len(values) != 3:
+        raise InvalidInput(complaint)
+    return frame, (values[0], values[1], values[2])

@@ -16,17 +16,9 @@ import forcegp.posterior
 import forcegp.report
 import forcegp.scores
 from forcegp.atomic_files import file_digest
-from forcegp.cli.command import NUMBERS, THERE, URDF, Command, listed, unless_given
-from forcegp.cli.log_options import FilterOptions
-from forcegp.cli.robot_options import (
-    CONTACTS,
-    CandidateOptions,
-    RobotOptions,
-    SearchOptions,
-    forces_of,
-    parse_contacts,
-    require_same_joints,
-)
+from forcegp.cli.command import THERE, Command, listed, unless_given
+from forcegp.cli.logs import FilterOptions, prepared_rows
+from forcegp.cli.robot_options import CandidateOptions, RobotOptions, SearchOptions, forces_of, require_same_joints
 from forcegp.cli.terminal import Terminal, columns
 from forcegp.errors import InvalidInput
 
@@ -43,7 +35,7 @@ class Score(Command):
     model; see docs/how-to/scoring.md.
 
     For example:
-      forcegp score run test.h5 --horizon .1,1 --report report.html
+      forcegp score run test.h5 --horizon .1,1 --out scores
       forcegp score run test.h5 --json | jq .models.run.scores.acceleration.mae.all.median
       forcegp score log.h5 --robot arm.urdf --split episodes:3,7 --cutoff 20 --trim 0.1 --out results
       forcegp score run log.h5 --forces given --forces gp:joint,viscous@accelerations --out few
@@ -57,16 +49,14 @@ class Score(Command):
     identification: Annotated[str | None, unless_given("FORCES@EVIDENCE", IDENTIFICATION, str)] = None
     """What `identified` is, whose mass matrix turns errors of accelerations into forces."""
     split: Annotated[str | None, unless_given("SPLIT", "auto, where anything is fitted", str)] = None
-    """What is held out. episodes:N,N...: these episodes. leave-one-out: every episode once. fraction:F[:SEED]: a
-    fraction of the episodes. blocks:N:K,K...: of N blocks of time of every episode those of these numbers, from 1.
-    auto: a quarter of the episodes, or with one episode blocks:5:3,5."""
+    """What is held out. episodes:N,N...: these episodes. leave-one-out: every episode once. blocks:N:K,K...: of N
+    blocks of time of every episode those of these numbers, from 1. auto: a quarter of the episodes, or with one episode
+    blocks:5:3,5."""
     guard: Annotated[float, arg(metavar="S")] = 0.25
     """Seconds of training rows left out beside held-out blocks."""
     seeds: Annotated[int, arg(metavar="N")] = 5
     """Number of random choices of the rows that models learn from, among two thirds of the training rows."""
-    horizon: Annotated[
-        tuple[float, ...], listed(float), unless_given("S,...", ".1,.2,.5,1 where anything is fitted")
-    ] = ()
+    horizon: Annotated[tuple[float, ...], listed(float), unless_given("S,...", ".1,.2,.5,1 after a fit")] = ()
     """Lengths of the motions that are predicted from recorded states under recorded forces, in s."""
     starts: Annotated[int, arg(metavar="N")] = 10
     """Motions from every held-out stretch of time."""
@@ -75,14 +65,9 @@ class Score(Command):
     (contacts hold exactly)."""
     system: Literal["model", "data"] = "model"
     """Robot and contacts that a RUN predicts for: model, those that it was trained with; data, those of the log."""
-    contact: Annotated[tuple[str, ...], listed(goes_on=NUMBERS), unless_given(CONTACTS, "those of --system")] = ()
-    """A RUN predicts under these contacts instead, for example a stuck joint; same form as for forcegp fit."""
     out: Annotated[Path | None, unless_given("FOLDER", "no folder")] = None
-    """The folder of results: page, figures, numbers, models. An unfinished run resumes."""
-    report: Annotated[Path | None, unless_given("FILE.html", "no report")] = None
-    """Also write a report on the one RUN in one file: the robot in motion with its forces, figures and errors."""
-    shapes: Annotated[Path | None, URDF, unless_given("ROBOT.urdf", "capsules")] = None
-    """A URDF with visual elements for the links in the report, its meshes beside it."""
+    """The folder of results: page, figures, numbers, models; of one RUN also report.html with the robot in motion. An
+    unfinished run resumes."""
     models: CandidateOptions = CandidateOptions()
     search: SearchOptions = SearchOptions(points=100)
     robot: RobotOptions = RobotOptions()
@@ -96,21 +81,21 @@ class Score(Command):
         fits = bool(self.models.forces or self.split) or not runs
         if data.is_dir():
             raise InvalidInput(f"{data} is a folder; give a dataset (.h5) last.")
-        self.require_free_file(self.report, forcegp.report.is_page, "a report")
         if fits and self.out is None:
             raise InvalidInput(
                 "models are fitted, which takes time; give --out FOLDER, where all that is done is kept."
             )
-        if self.report is not None and len(runs) != 1:
-            raise InvalidInput(f"{len(runs)} runs were given; a report is of one RUN.")
-        start = time.monotonic()
-        raw = forcegp.Dataset.load(data)
+        start, raw = time.monotonic(), forcegp.Dataset.load(data)
         models: dict[str, Any] = {}
         for path in runs:
             models[path.name if path.name not in models else str(path)] = self._loaded(terminal, path, raw, data)
         models |= {name: name for name in self.models.names()}
-        rows, recording, model = self._prepared(terminal, raw, data) if fits else (self._thinned(raw), raw, None)
-        split = forcegp.scores.split_named(rows, self.split or "auto", self.guard) if fits else None
+        rows, recording, model, split = raw, raw, None, None
+        if fits:
+            rows, recording, model = self._prepared(terminal, raw, data)
+            split = forcegp.scores.split_named(rows, self.split or "auto", self.guard)
+        elif self.filter.every is not None:
+            rows = forcegp.data.Preparation(every=self.filter.every).apply(raw)
         with terminal.progress(f"scoring {len(rows)} rows") as report:
             scores = forcegp.score(
                 models or None,
@@ -128,12 +113,11 @@ class Score(Command):
             )
         for warning in scores.warnings if not fits else ():
             terminal.warn(warning)
-        best = scores.recommended
-        if fits and best is not None and self.out is not None:
+        content = scores.to_dict() | {"warnings": [terminal.worded(each) for each in scores.warnings]}
+        if fits and (best := scores.recommended) is not None and self.out is not None:
             with terminal.progress(f"learning {best} from all rows"):
                 forcegp.save_posterior(scores.fitted_on_all_rows(), self.out / "model", overwrite=True)
             terminal.note(f"{best}, learned from all rows: {self.out / 'model'}")
-        content = scores.to_dict() | {"warnings": [terminal.worded(each) for each in scores.warnings]}
         if not fits and len(runs) == 1:
             self._of_one(terminal, next(iter(models.values())), rows, scores, content)
         else:
@@ -144,31 +128,18 @@ class Score(Command):
         return {name: value for name, value in content.items() if name not in ("runs", "identifications")}
 
     def _loaded(self, terminal: Terminal, path: Path, log: forcegp.Dataset, data: Path) -> forcegp.posterior.Posterior:
-        """A fitted model for the chosen system and contacts.
-
-        A robot whose inertias or friction coefficients were identified stays, and only the contacts are those of the
-        log. Raises InvalidInput where the log carries no system, and where the model cannot move there.
-        """
+        """A fitted model for the chosen system; a robot that was identified stays, with contacts of the log."""
         posterior = forcegp.load_posterior(path)
         require_same_joints(posterior, log, data)
-        if self.system == "data":
-            model = log.model
-            if model is None:
-                raise InvalidInput("--system data: the data carry no robot and contacts; leave the option out.")
-            if posterior.parameters:
-                model = replace(posterior.model, contacts=model.contacts, baumgarte=model.baumgarte)
-                terminal.note("--system data: contacts of the data; the robot stays the identified one")
-            posterior = posterior.with_model(model)
-        if self.contact:
-            contacts = [*parse_contacts(self.contact), *posterior.model.loops]
-            posterior = posterior.with_model(posterior.model.with_contacts(contacts))
-        return posterior
-
-    def _thinned(self, log: forcegp.Dataset) -> forcegp.Dataset:
-        every = self.filter.every
-        if every is not None and every < 1:
-            raise InvalidInput(f"--every is {every}; it must be at least 1.")
-        return log.rows(slice(None, None, every))
+        if self.system == "model":
+            return posterior
+        model = log.model
+        if model is None:
+            raise InvalidInput("--system data: the data carry no robot and contacts; leave the option out.")
+        if posterior.parameters:
+            model = replace(posterior.model, contacts=model.contacts, baumgarte=model.baumgarte)
+            terminal.note("--system data: contacts of the data; the robot stays the identified one")
+        return posterior.with_model(model)
 
     def _prepared(
         self, terminal: Terminal, raw: forcegp.Dataset, data: Path
@@ -177,18 +148,12 @@ class Score(Command):
         model = self.robot.chosen_model(raw, data)
         for note in forces_of(model):
             terminal.note(note)
-        raw = replace(raw, model=model)
         preparation = self.filter.preparation()
-        if preparation.changes_nothing:
-            return raw, raw, model
-        preparation = preparation.resolved(raw)
-        if self.filter.every is None:
-            preparation = replace(preparation, every=preparation.thinning(raw))
-        rows = preparation.apply(raw)
-        recording = rows if preparation.every == 1 else replace(preparation, every=1).apply(raw)
-        if preparation.cutoff is not None and (self.split or "auto").startswith(("blocks", "auto")):
+        rows, recording = prepared_rows(preparation, replace(raw, model=model), thin=self.filter.every is None)
+        cutoff = forcegp.data.preparation_report(rows.metadata).get("cutoff")
+        if cutoff is not None and not preparation.changes_nothing and (self.split or "auto")[0] in "ab":
             # a filter mixes what lies on both sides of a border
-            memory = 2.0 * forcegp.data.LowPass(float(preparation.cutoff)).time_constant
+            memory = 2.0 * forcegp.data.LowPass(float(cutoff)).time_constant
             if self.guard < memory:
                 terminal.warn(
                     f"--guard {self.guard:g} s is shorter than two time constants of the filter ({memory:.2g} s), so "
@@ -204,41 +169,30 @@ class Score(Command):
         scores: forcegp.scores.Scores,
         content: Mapping[str, Any],
     ) -> None:
-        """What is shown, drawn and written of a single model."""
+        """What is shown and written of a single model."""
         name = next(iter(scores.models))
         # what an observer reports is neither robot nor contact
         trained, here = ({**each.to_dict(), "forces": None} for each in (posterior.trained, posterior.model))
         where = ", carried to another robot or contacts" if trained != here else ""
         title = f"{scores.models[name]['summary']}{where}; {len(rows)} rows of {self.paths[-1]}"
-        posterior, rows = forcegp.posterior.observing(posterior, rows)
-        pictures, missing = [], []
-        if self.out is not None or self.report is not None:
-            with terminal.progress("drawing") as progress:
-                pictures, missing = forcegp.scores.model_pictures(posterior, rows, progress)
         if self.out is not None:
-            for picture in pictures:
-                picture.save(self.out)
-        if self.report is not None:
-            with terminal.progress("writing the report"):
+            posterior, rows = forcegp.posterior.observing(posterior, rows)
+            with terminal.progress("writing the report") as progress:
                 page = forcegp.report.model_page(
                     posterior,
                     rows,
-                    pictures,
                     title=f"{name} on {self.paths[-1].name}: {posterior.description}",
                     best=forcegp.report.scores_sentence(scores),
                     findings=[("warning", each) for each in content["warnings"]],
                     tables=[forcegp.report.scores_table(scores)],
                     details={key: value for key, value in content.items() if key != "runs"},
-                    missing=missing,
-                    shapes=self.shapes,
+                    progress=progress,
                 )
-                forcegp.report.write_page(self.report, page, overwrite=self.overwrite)
-            terminal.note(f"report: {self.report}")
-        header, joints = forcegp.scores.joint_table(scores)
-        terminal.show(
-            columns(f"{title}; errors in {forcegp.scores.unit_of(scores, 'a')}", header, joints[:-1], last=joints[-1]),
-            columns("", *forcegp.scores.quantity_table(scores)),
-        )
+            forcegp.report.write_page(self.out / "report.html", page)
+            for picture in page.pictures:
+                picture.save(self.out)
+        header, each = forcegp.scores.model_table(scores)
+        terminal.show(columns(f"{title}; accelerations in {forcegp.scores.unit_of(scores, 'a')}", header, each))
 
 
 def comparison(scores: forcegp.scores.Scores, title: str) -> list[Any]:

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -21,26 +21,17 @@ if TYPE_CHECKING:
 
 _ARGUMENT = re.compile(r"`([a-z_.]+)(?:=([^`]*))?`")
 
-OTHERWISE = {
-    "contacts": "contact",
-    "folder": "out",
-    "locked": "lock",
-    "model": "robot",
-}
+OTHERWISE = {"contacts": "contact", "folder": "out", "locked": "lock", "model": "robot"}
 """Options whose argument has another name in Python."""
 
 ELSEWHERE = {
     "`posterior.with_model(dataset.model)`": "--system data",
-    "forcegp.data.rows_in_contact": "--rows in-contact",
 }
 """Calls of Python that an option stands for."""
 
 
 def with_option_names(message: str, options: Collection[str]) -> str:
-    """The message with --points for `points` and --points 5 for `points=5`, where the command has such an option.
-
-    The library marks arguments by backquotes, and options have the same names; those of other commands stay.
-    """
+    """The message with --points 5 for `points=5`, where the command has such an option; those of others stay."""
 
     def option(found: re.Match[str]) -> str:
         name, value = found[1], (found[2] or "").strip("'")
@@ -55,20 +46,22 @@ def with_option_names(message: str, options: Collection[str]) -> str:
     return _ARGUMENT.sub(option, message)
 
 
-PLAIN_SECONDS = 10.0
-"""Between two lines about progress where there is no terminal to draw a bar on."""
+PLAIN_SECONDS = 10.0  # between two lines about progress where there is no terminal to draw a bar on
 
 
-UNLIMITED = 10_000
-"""Columns of a terminal that cuts nothing."""
+UNLIMITED = 10_000  # columns of a terminal that cuts nothing
 
 
-@runtime_checkable
 class ProgressCallback(Protocol):
     """Called as `report(done, total)`, if wished with a note for people."""
 
-    def __call__(self, done: int, total: int, note: str = "") -> None:  # noqa: D102
-        ...
+    def __call__(self, done: int, total: int, note: str = "", /) -> None: ...  # noqa: D102
+
+
+def _console(**how: Any) -> Console:
+    from rich.console import Console
+
+    return Console(highlight=False, **how)
 
 
 class Terminal:
@@ -91,16 +84,12 @@ class Terminal:
     @cached_property
     def out(self) -> Console:
         """What the command found."""
-        from rich.console import Console
-
-        return Console(highlight=False, soft_wrap=False)
+        return _console(soft_wrap=False)
 
     @cached_property
     def err(self) -> Console:
         """What happens meanwhile."""
-        from rich.console import Console
-
-        return Console(stderr=True, highlight=False, soft_wrap=True)
+        return _console(stderr=True, soft_wrap=True)
 
     def __enter__(self) -> Terminal:
         if self.json:
@@ -130,7 +119,6 @@ class Terminal:
     def show(self, *renderables: RenderableType) -> None:
         """Print the result, texts as they are; nothing with --json. A table gets the columns that it needs."""
         if not self.json:
-            from rich.console import Console
             from rich.measure import Measurement
             from rich.text import Text
 
@@ -138,7 +126,7 @@ class Terminal:
                 # cells that must not be folded: a number without its end is a wrong number
                 wide = self.out.options.update(width=UNLIMITED)
                 needed = 0 if isinstance(renderable, Text) else Measurement.get(self.out, wide, renderable).minimum
-                console = self.out if needed <= self.out.width else Console(highlight=False, width=needed)
+                console = self.out if needed <= self.out.width else _console(width=needed)
                 console.print(renderable)
 
     def command(self, words: str) -> None:
@@ -161,29 +149,11 @@ class Terminal:
     @contextmanager
     def progress(self, what: str) -> Iterator[ProgressCallback]:
         """A bar with the remaining time on a terminal, a line now and then elsewhere. Without a report: a spinner."""
-        if self.err.is_terminal:
-            yield from self._bar(what)
-        else:
-            yield self._lines(what)
-
-    def _lines(self, what: str) -> ProgressCallback:
-        """Lines such as `simulating: 40 %`, at most one every few seconds."""
-        reported = time.monotonic()
-        if self.names_stages:
-            self.note(f"{what} ...")
-
-        def report(done: int, total: int, note: str = "") -> None:
-            nonlocal reported
-            now = time.monotonic()
-            if now - reported >= PLAIN_SECONDS and done < total:
-                reported = now
-                self.note(f"{what}: {done / total:.0%}{note and f', {note}'}")
-
-        return report
-
-    def _bar(self, what: str) -> Iterator[ProgressCallback]:
         from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+        if not self.err.is_terminal:
+            yield self._lines(what)
+            return
         of_a_task = TextColumn("{task.description}"), BarColumn(bar_width=30), TimeElapsedColumn()
         left = TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}")
         with Progress(SpinnerColumn(), *of_a_task, *left, console=self.err, transient=True) as bars:
@@ -194,12 +164,25 @@ class Terminal:
 
             yield report
 
+    def _lines(self, what: str) -> ProgressCallback:
+        """Lines such as `simulating: 40 %`, at most one every few seconds."""
+        reported = time.monotonic()
+        if self.names_stages:
+            self.note(f"{what} ...")
+
+        def report(done: int, total: int, note: str = "") -> None:
+            nonlocal reported
+            if time.monotonic() - reported >= PLAIN_SECONDS and done < total:
+                reported = time.monotonic()
+                self.note(f"{what}: {done / total:.0%}{note and f', {note}'}")
+
+        return report
+
 
 NONE = "–"
 
 
-COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}
-"""Of doubts by their level."""
+COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}  # of doubts by their level
 PLAIN: dict[str, Any] = {"title_justify": "left", "title_style": "bold", "pad_edge": False}
 
 
@@ -224,10 +207,7 @@ def columns(
     last: Sequence[str] = (),
     long_names: bool = False,
 ) -> Table:
-    """A table whose first column is text and whose others are numbers; `last` is set apart below.
-
-    Texts of the first column are folded where they are `long_names`, all other cells never.
-    """
+    """A table of text and numbers, `last` set apart; texts of the first column are folded if `long_names`."""
     from rich import box
     from rich.table import Table
     from rich.text import Text

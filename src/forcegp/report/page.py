@@ -2,7 +2,7 @@
 
 import base64
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -17,7 +17,7 @@ from forcegp.errors import MissingExtra
 from forcegp.posterior.posterior import Posterior
 from forcegp.report.motion import RecordedScene, recorded_scene
 from forcegp.report.scene import recording
-from forcegp.scores import Picture, Scores, overall, unit_of
+from forcegp.scores import Picture, Scores, model_pictures, overall, unit_of
 
 
 @dataclass(frozen=True)
@@ -80,28 +80,29 @@ SECONDS = 10.0
 def model_page(
     posterior: Posterior,
     dataset: Dataset,
-    pictures: Sequence[Picture],
     *,
     title: str,
     best: str,
+    pictures: Sequence[Picture] = (),
     findings: Sequence[tuple[str, str]] = (),
     tables: Sequence[Table] = (),
-    missing: Sequence[str] = (),
     next_steps: Sequence[tuple[str, str]] = (),
     details: Mapping[str, Any] | None = None,
     shapes: str | Path | None = None,
+    progress: Callable[[int, int, str], None] | None = None,
 ) -> Page:
-    """A page with the robot in motion, and pictures.
+    """A page with the robot in motion, these pictures, and those of the model (`scores.model_pictures`).
 
-    What is `missing` (`scores.model_pictures`) is named on the page with the reason, and without viser the robot.
-    `shapes` is a URDF with visual elements.
+    What cannot be drawn is named on the page with the reason. `shapes` is a URDF with visual elements.
     """
+    drawn, missing = model_pictures(posterior, dataset, progress)
     try:
         recorded = recorded_scene(dataset, posterior, seconds=SECONDS, shapes=shapes)
         scene, notes = recording(recorded), scene_notes(recorded)
     except MissingExtra as error:
         scene, notes = "", [f"The robot is not shown: {error}."]
-    return Page(title, best, findings, scene, [*notes, *missing], pictures, tables, next_steps, details or {})
+    shown = [*notes, *missing], [*pictures, *drawn]
+    return Page(title, best, findings, scene, *shown, tables, next_steps, details or {})
 
 
 def scene_notes(recorded: RecordedScene) -> list[str]:

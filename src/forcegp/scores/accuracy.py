@@ -1,23 +1,30 @@
-"""One model against the rows of one log: a table by quantity and score, and errors by stretch of time.
+"""One model against the rows of one log: a table by quantity and score, errors by stretch of time, and doubts about it.
 
-A Dataset holds the truth of a force by its name, `Q_U.<name>` and `force.<name>`. Where two components of a model claim
-the same truth none is compared, since only their sum is true then.
+A Dataset holds true forces by name, `Q_U.<name>` and `force.<name>`; one that two components claim is not compared.
 """
 
-from collections.abc import Callable, Sequence
+import statistics
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.special import ndtri
 from scipy.stats import norm
+from torch import Tensor
+from torch.distributions import MultivariateNormal
 
-from forcegp.data import Dataset, time_blocks
+from forcegp.data import Dataset, repeated_rows, time_blocks, with_memory
+from forcegp.data.views import in_blocks
+from forcegp.doubts import Doubt, look
+from forcegp.errors import NumericalError
+from forcegp.inference.memory import blas_threads
 from forcegp.model import Model
 from forcegp.posterior.posterior import Posterior
-from forcegp.posterior.prediction import Gaussian
-from forcegp.scores.predicted_rows import PredictedRows, in_blocks, interval_coverage, predict_rows
-from forcegp.summary import plain
+from forcegp.summary import listed, plain
 
 Rows = Float[np.ndarray, "rows nv"]
 Matrices = Float[np.ndarray, "rows nv nv"]
@@ -28,18 +35,100 @@ ACCELERATION, TRUE_ACCELERATION, ALL_JOINTS = "acceleration", "true acceleration
 FORCE, TRUE_FORCE, UNKNOWN_FORCE = "force", "true force", "unknown force"
 CONTACT_FORCE, CONSTRAINT = "contact force", "constraint"
 
-LEVELS = (0.5, 0.95)
-"""Of the central intervals whose coverage is scored, as `coverage_95`."""
-STRETCHES = 20
-"""Parts of the time in which models are compared by themselves."""
+LEVELS = (0.5, 0.95)  # of the central intervals whose coverage is scored, as `coverage_95`
+STRETCHES = 20  # parts of the time in which models are compared by themselves
 CONSTANT = 1e-6  # of the largest standard deviation: less is rounding
-ROUNDING = 1e-9
-"""Relative to the size of the truth: widths of intervals below it are none."""
-ROWS_PER_BLOCK = 4096
+ROUNDING = 1e-9  # relative to the size of the truth: widths of intervals below it are none
 
 AT_THE_TOOL = ("tool-friction", "tool-forces", "contact-friction", "load-friction")
 TRUE_NAMES: dict[str, str] = dict.fromkeys(AT_THE_TOOL, "tool-friction")
 """Component of a model -> what a Dataset calls that force (`Q_U.<name>`, `force.<name>`), where it is not the same."""
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedRows:
+    """What a model predicts for every row, and the mechanics there.
+
+    `mean` and `variance` of the acceleration without noise, `measurement_variance` with that of the model, or of the
+    Dataset where that is larger; `negative_log_density` of the measured rows [nats]; `known_physics`, the acceleration
+    of the known forces alone; `residual` |A a - b| of the mean; the mass matrix `mass`. Of models with forces Q_U
+    (`unknown_force`), what of it is known (`carried_force`, Q_K without an analytical mean, else 0), and lambda.
+    """
+
+    mean: Rows
+    variance: Rows
+    measurement_variance: Rows
+    negative_log_density: Float[np.ndarray, " rows"]
+    known_physics: Rows
+    residual: Float[np.ndarray, "rows c"]
+    mass: Matrices
+    unknown_force: Rows | None = None
+    unknown_force_variance: Rows | None = None
+    multiplier: Float[np.ndarray, "rows m"] | None = None
+    multiplier_variance: Float[np.ndarray, "rows m"] | None = None
+    carried_force: Rows | None = None
+
+
+def predict_rows(
+    posterior: Posterior, dataset: Dataset, progress: Callable[[int, int], None] | None = None
+) -> PredictedRows:
+    """Predict all rows, some at a time. The constraint is that of the Dataset's own system, else the model's."""
+    dataset = with_memory(dataset, posterior.model)
+    device, held, done = posterior.model.robot.device, list(posterior.model.held_inputs), 0
+    names: list[str] = []
+
+    def predicted(q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, ...]:
+        nonlocal done, names
+        prediction, dynamics = posterior.predict(q, v, u), posterior.dynamics(q, v, u)
+        own = dynamics if dataset.model is None else dataset.model.to(device).dynamics(q, v, u)
+        covariance, mean = prediction.covariance, prediction.mean
+        assert covariance is not None, "predict computes the covariance unless asked not to"
+        noise = prediction.noise_covariance
+        if dataset.noise_std is not None:  # rows may be noisier than those learned from
+            missing = torch.tensor(np.square(dataset.noise_std), device=device) - noise.diagonal(dim1=-2, dim2=-1)
+            noise = noise + torch.diag_embed(missing.clamp_min(0.0))
+        alone = u.clone()
+        alone[:, held] = 0.0  # what an observer reports is no part of the known physics
+        known = (posterior.dynamics(q, v, alone) if held else dynamics).acceleration_map().offset
+        found = {
+            "mean": mean,
+            "variance": prediction.variance,
+            "measurement_variance": (covariance + noise).diagonal(dim1=-2, dim2=-1),
+            "negative_log_density": negative_log_density(mean, covariance + noise, a),
+            "known_physics": known,
+            "residual": ((own.A @ mean[..., None])[..., 0] - own.b).abs(),
+            "mass": dynamics.M,
+        }
+        for name in ("unknown_force", "multiplier"):
+            force = getattr(prediction, name)
+            found |= {} if force is None else {name: force.mean, f"{name}_variance": force.variance}
+        if prediction.unknown_force is not None:
+            found["carried_force"] = own.Q_K if posterior.carries_known_forces else torch.zeros_like(own.Q_K)
+        names, done = list(found), done + len(q)
+        if progress is not None:
+            progress(done, len(dataset))
+        return tuple(found.values())
+
+    with blas_threads(posterior.training.q.numel()):
+        arrays: Any = in_blocks(dataset, predicted, device)
+    return PredictedRows(**dict(zip(names, arrays, strict=True)))
+
+
+def negative_log_density(
+    mean: Float[Tensor, "rows k"], covariance: Float[Tensor, "rows k k"], target: Float[Tensor, "rows k"]
+) -> Float[Tensor, " rows"]:
+    """-log N(target; mean, covariance) of every row, all columns jointly, in nats.
+
+    Its mean over test rows is the negative log predictive density (Rasmussen & Williams 2006, eq. A.23). Raises
+    NumericalError, naming the row, for a covariance that is not positive definite: that of a measurement always is.
+    """
+    lower, failed = torch.linalg.cholesky_ex(covariance)
+    if bool(failed.any()):
+        raise NumericalError(
+            f"the predicted covariance of row {int(failed.argmax())} is not positive definite, so it has no density; "
+            "add the covariance of the measurement noise."
+        )
+    return -MultivariateNormal(mean, scale_tril=lower, validate_args=False).log_prob(target)
 
 
 def row_scores(
@@ -50,29 +139,76 @@ def row_scores(
 ) -> tuple[Table, dict[str, list[float | None]]]:
     """The table, and errors in about `STRETCHES` stretches of time, over all joints, where lower is better.
 
-    acceleration: `mae`, `rmse` and, over the standard deviation of the measured one, `nrmse`; `nlpd` in nats and
-        `coverage_95` of a measurement, with the noise of the model, or of the Dataset where that is larger;
-        `known_physics_mae` of the known forces alone; `noise_std` of the model, and `noise_floor`, the `mae` of a
-        perfect prediction. All joints together have one `nlpd`.
-    force: M (predicted - measured acceleration) in Nm or N; `rmse_at_rest` is that of no acceleration. `mass` (rows of
-        kg m^2, kg m or kg) is the same for every model that is compared, None takes the model's own.
-    constraint: |A a - b| of the mean by contact, of the Dataset's own system if it has one.
-    true acceleration, true force (M times its error), unknown force, contact force, `<component> at the joints` and
-        `... at its point`: against the truth, as far as the Dataset holds it and the model has them. Coverage is that
-        of entries whose interval has a width.
+    Quantities are those of `_pairs`, each with `mae`, `rmse`, `relative_rmse` (over the size of what was there, all
+    columns together) and `largest` error, and with `coverage_95` and `coverage_50` of intervals. That of a measurement
+    is with the noise of the model, or of the Dataset where that is larger. Accelerations also have the mean negative
+    log density `nlpd` [nats], `known_physics_mae` of the known forces alone, and as measured `nrmse` over their
+    standard deviation, `noise_std` of the model, and `noise_floor`, the `mae` of a perfect prediction. All joints
+    together have one `nlpd`. `mass` (rows of kg m^2, kg m or kg) turns errors of accelerations into those of forces; it
+    is the same for every model that is compared, None takes the model's own.
     """
-    predicted = predict_rows(posterior, test, progress)
-    mass = predicted.mass if mass is None else mass
-    forces = force_errors(predicted.mean, test.a, mass)
-    table = _against_measurements(posterior, predicted, test, forces, mass) | _against_truth(predicted, test)
-    return table | _components(posterior, test), _by_stretch(predicted, test, forces)
+    rows = predict_rows(posterior, test, progress)
+    mass = rows.mass if mass is None else mass
+    pairs = _pairs(rows, test, mass) | _components(posterior, test)
+    table = {name: metrics(*each) for name, each in pairs.items() if each[0].shape == each[2].shape and each[2].size}
+    table[ALL_JOINTS] = {"nlpd": [float(rows.negative_log_density.mean())]}
+    measured = table[ACCELERATION]
+    measured["nrmse"] = plain(np.array(measured["rmse"], dtype=float) / _spread(test.a))
+    density = norm.logpdf(test.a, rows.mean, np.sqrt(rows.measurement_variance))
+    measured["nlpd"] = plain(-np.asarray(density).mean(axis=0))
+    measured["noise_std"] = plain(posterior.noise_std.detach().cpu().numpy())
+    if test.noise_std is not None:
+        measured["noise_floor"] = plain(test.noise_std * np.sqrt(2.0 / np.pi))
+    for name in {ACCELERATION, TRUE_ACCELERATION} & set(table):
+        table[name]["known_physics_mae"] = plain(np.abs(rows.known_physics - pairs[name][2]).mean(axis=0))
+    return table, _by_stretch(rows, test, force_errors(rows.mean, test.a, mass))
+
+
+Pair = tuple[np.ndarray, np.ndarray | None, np.ndarray]
+"""Mean and variance of a prediction, and what was there; all (rows, columns)."""
+
+
+def _pairs(rows: PredictedRows, test: Dataset, mass: Matrices) -> dict[str, Pair]:
+    """What is compared: measured accelerations, what their errors are as joint forces, A a with b; and known truth."""
+    truth, mean = test.truth, rows.mean
+    zero, still = np.zeros_like(mean), np.zeros_like(rows.residual)
+    pairs: dict[str, Pair] = {
+        ACCELERATION: (mean, rows.measurement_variance, test.a),
+        FORCE: (force_errors(mean, test.a, mass), None, zero),
+        CONSTRAINT: (rows.residual, None, still),
+    }
+    if "a" in truth:
+        pairs[TRUE_ACCELERATION] = mean, rows.variance, truth["a"]
+        pairs[TRUE_FORCE] = force_errors(mean, truth["a"], rows.mass), None, zero
+    if "Q_U" in truth and rows.unknown_force is not None:
+        pairs[UNKNOWN_FORCE] = rows.unknown_force, rows.unknown_force_variance, truth["Q_U"] + rows.carried_force
+    if "lambda" in truth and rows.multiplier is not None:
+        pairs[CONTACT_FORCE] = rows.multiplier, rows.multiplier_variance, truth["lambda"]
+    return pairs
+
+
+def metrics(mean: np.ndarray, variance: np.ndarray | None, truth: np.ndarray) -> dict[str, list[float | None]]:
+    """Errors by column, and the coverage of entries whose interval has a width."""
+    error, size = np.abs(mean - truth), float(np.sqrt(np.square(truth).mean()))
+    found = {
+        "mae": plain(error.mean(axis=0)),
+        "rmse": plain(np.sqrt(np.square(error).mean(axis=0))),
+        "largest": plain(error.max(axis=0)),
+    }
+    if size > 0.0:
+        found["relative_rmse"] = [float(np.sqrt(np.square(error).mean())) / size]
+    if variance is not None:
+        wide = np.where(variance > (ROUNDING * size) ** 2, variance, np.nan)
+        for level in LEVELS:
+            inside = np.where(np.isnan(wide), np.nan, error <= ndtri(0.5 + 0.5 * level) * np.sqrt(wide))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # of columns without any
+                found[f"coverage_{100 * level:.0f}"] = plain(np.nanmean(inside, axis=0))
+    return found
 
 
 def over_columns(quantity: str, score: str, values: Sequence[float | None]) -> float | None:
-    """One number for all joints: the mean, of `rmse` of forces and motions the root of the mean of squares.
-
-    Columns of which nothing is known (a joint that never moves has no `nrmse`) do not count; None where none is known.
-    """
+    """One number for all joints that have one: the mean, of `rmse` of forces and motions that of squares."""
     known = [value for value in values if value is not None]
     if not known:
         return None
@@ -80,14 +216,19 @@ def over_columns(quantity: str, score: str, values: Sequence[float | None]) -> f
     return float(np.sqrt(np.square(known).mean()) if squares else np.mean(known))
 
 
+def median_and_range(values: Iterable[float | None]) -> dict[str, Any] | None:
+    """Median and range over seeds, with the values; None where there are none (or not for every seed)."""
+    given = list(values)
+    if not given or any(value is None for value in given):
+        return None
+    numbers = [float(value) for value in given if value is not None]
+    return {"median": statistics.median(numbers), "min": min(numbers), "max": max(numbers), "values": numbers}
+
+
 def mass_matrices(dataset: Dataset, model: Model) -> Float[np.ndarray, "_ nv nv"]:
     """M of every row [kg m^2, kg m or kg], rotors and armature included."""
-    blocks = []
-    with torch.no_grad():
-        for start in range(0, len(dataset), ROWS_PER_BLOCK):
-            q = torch.tensor(dataset.q[start : start + ROWS_PER_BLOCK])
-            blocks.append(model.mass_matrix_at(model.loaded_robot.kinematics(q)).cpu().numpy())
-    return np.concatenate(blocks)
+    robot = model.loaded_robot
+    return in_blocks(dataset, lambda q, *_: (model.mass_matrix_at(robot.kinematics(q)),), robot.device)[0]
 
 
 def force_errors(predicted: Rows, target: Rows, mass: Matrices) -> Rows:
@@ -101,98 +242,33 @@ def _spread(a: Rows) -> Float[np.ndarray, " nv"]:
     return np.where(spread > CONSTANT * spread.max(initial=0.0), spread, np.nan)
 
 
-def _against_measurements(
-    posterior: Posterior, predicted: PredictedRows, test: Dataset, forces: Rows, mass: Matrices
-) -> Table:
-    a, mean, variance = test.a, predicted.mean, predicted.measurement_variance
-    rmse = np.sqrt(np.square(mean - a).mean(axis=0))
-    at_rest = force_errors(np.zeros_like(a), a, mass)
-    acceleration = {
-        "mae": np.abs(mean - a).mean(axis=0),
-        "rmse": rmse,
-        "nrmse": rmse / _spread(a),
-        "nlpd": -np.asarray(norm.logpdf(a, mean, np.sqrt(variance))).mean(axis=0),
-        **{f"coverage_{100 * at:.0f}": interval_coverage(mean, variance, a, at) for at in LEVELS},
-        "known_physics_mae": np.abs(predicted.known_physics - a).mean(axis=0),
-        "noise_std": posterior.noise_std.detach().cpu().numpy(),
-    }
-    if test.noise_std is not None:
-        acceleration["noise_floor"] = test.noise_std * np.sqrt(2.0 / np.pi)
-    return {
-        ACCELERATION: {name: plain(values) for name, values in acceleration.items()},
-        ALL_JOINTS: {"nlpd": [float(predicted.negative_log_density.mean())]},
-        FORCE: {
-            "mae": plain(np.abs(forces).mean(axis=0)),
-            "rmse": plain(np.sqrt(np.square(forces).mean(axis=0))),
-            "rmse_at_rest": plain(np.sqrt(np.square(at_rest).mean(axis=0))),
-        },
-        CONSTRAINT: {"mae": plain(predicted.residual.mean(axis=0)), "largest": plain(predicted.residual.max(axis=0))},
-    }
-
-
-def _against_truth(predicted: PredictedRows, test: Dataset) -> Table:
-    table, truth = {}, test.truth
-    if "a" in truth:
-        a, mean = truth["a"], predicted.mean
-        free = {"mae": np.abs(mean - a).mean(axis=0), "rmse": np.sqrt(np.square(mean - a).mean(axis=0))}
-        free["coverage_95"] = interval_coverage(mean, predicted.variance, a)
-        free["known_physics_mae"] = np.abs(predicted.known_physics - a).mean(axis=0)
-        table[TRUE_ACCELERATION] = {name: plain(values) for name, values in free.items()}
-        table[TRUE_FORCE] = {"mae": plain(np.abs(force_errors(mean, a, predicted.mass)).mean(axis=0))}
-    if "Q_U" in truth and predicted.unknown_force is not None:
-        assert predicted.carried_known_force is not None, "it comes with the force"
-        carried = truth["Q_U"] + predicted.carried_known_force
-        table |= _errors(UNKNOWN_FORCE, predicted.unknown_force, predicted.unknown_force_variance, carried)
-    if "lambda" in truth:
-        table |= _errors(CONTACT_FORCE, predicted.multiplier, predicted.multiplier_variance, truth["lambda"])
-    return table
-
-
-def _errors(quantity: str, mean: np.ndarray | None, variance: np.ndarray | None, truth: np.ndarray) -> Table:
-    """Scores of one force; none of what the model lacks, or of another number of contacts."""
-    if mean is None or variance is None or mean.shape != truth.shape or not truth.shape[1]:
-        return {}
-    size = float(np.sqrt(np.square(truth).mean()))
-    wide = variance > (ROUNDING * size) ** 2
-    covered = []
-    for column, rows in enumerate(wide.T):
-        own = mean[rows, column, None], variance[rows, column, None], truth[rows, column, None]
-        covered.append(float(interval_coverage(*own)[0]) if rows.any() else None)
-    scores: dict[str, list[float | None]] = {
-        "mae": plain(np.abs(mean - truth).mean(axis=0)),
-        "rmse": plain(np.sqrt(np.square(mean - truth).mean(axis=0))),
-        "coverage_95": covered,
-    }
-    if size > 0.0:
-        scores["relative_rmse"] = [float(np.sqrt(np.square(mean - truth).mean())) / size]
-    return {quantity: scores}
-
-
-def _components(posterior: Posterior, test: Dataset) -> Table:
-    """Scores of every component of the unknown force whose truth is known.
-
-    Not without an analytical mean, where the processes hold the known forces, too.
-    """
+def _components(posterior: Posterior, test: Dataset) -> dict[str, Pair]:
+    """Every component of the unknown force whose truth is known."""
     if posterior.is_black_box or posterior.carries_known_forces:
         return {}
     named = true_names([name for name, *_ in posterior.trained.unknown.named(posterior.model.robot)], test)
     if not named:
         return {}
 
-    def forces(rows: slice) -> dict[tuple[str, str], Gaussian]:
-        found = posterior.components(test.q[rows], test.v[rows], test.u[rows])
-        joint = {(name, "Q_U"): found[name].joint_force for name in named}
-        return joint | {(name, "force"): force for name in named if (force := found[name].point_force) is not None}
+    first = posterior.components(test.q[:1], test.v[:1], test.u[:1])
+    of = {"Q_U": "joint_force", "force": "point_force"}
+    wanted = [
+        (name, kind)
+        for name in named
+        for kind in of
+        if f"{kind}.{named[name]}" in test.truth and getattr(first[name], of[kind]) is not None
+    ]
 
-    blocks, table = in_blocks(posterior, test, forces), {}
-    for name, kind in blocks[0]:
-        truth = test.truth.get(f"{kind}.{named[name]}")
-        if truth is not None:
-            each = [block[name, kind] for block in blocks]
-            mean = np.concatenate([force.mean.cpu().numpy() for force in each])
-            variance = np.concatenate([force.variance.cpu().numpy() for force in each])
-            table |= _errors(f"{name} at {'the joints' if kind == 'Q_U' else 'its point'}", mean, variance, truth)
-    return table
+    def forces(q: Tensor, v: Tensor, u: Tensor, _: Tensor) -> tuple[Tensor, ...]:
+        found = posterior.components(q, v, u)
+        each = [getattr(found[name], of[kind]) for name, kind in wanted]
+        return tuple(x for force in each for x in (force.mean, force.variance))
+
+    arrays, where = in_blocks(test, forces, posterior.model.robot.device), {"Q_U": "the joints", "force": "its point"}
+    return {
+        f"{name} at {where[kind]}": (mean, variance, test.truth[f"{kind}.{named[name]}"])
+        for (name, kind), mean, variance in zip(wanted, arrays[::2], arrays[1::2], strict=True)
+    }
 
 
 def true_names(components: Sequence[str], dataset: Dataset) -> dict[str, str]:
@@ -215,3 +291,133 @@ def _by_stretch(predicted: PredictedRows, test: Dataset, forces: Rows) -> dict[s
         name: plain(np.array([values[block].mean() if values.size else np.nan for block in blocks]))
         for name, values in found.items()
     }
+
+
+WORSE = 1.01  # error of the model over that of its known forces alone, from which it is pointed out
+WORSE_JOINT, LEAST_WORSE = 1.2, 0.1
+"""The same of one joint, and by how much its error must be larger, in standard deviations of the noise."""
+
+FEWEST_INSIDE = 0.9  # least coverage of 95 % intervals, over all joints, about which nothing is said
+MISSED, CHANCE = 0.15, 4.0
+"""How much less than 95 % the intervals of one joint may hold: this share, or so many deviations of a count by chance
+if that is more."""
+
+MARGIN, POSTURE = 0.25, 0.1
+"""How far beyond the training range of a joint a value may lie: a fraction of that range, and of the widest range of
+all joints (a joint that is held in its posture moves little, and a little more of it is nothing new).
+"""
+
+MOST_OUTSIDE = 0.01  # share of the rows that may lie further outside
+
+
+def unfinished_search(posterior: Posterior) -> Iterator[Doubt]:
+    """A sentence where the search for the parameters did not converge."""
+    if "optimizer" in posterior.settings and not posterior.result.converged:
+        yield look(
+            about="search",
+            what=f"the search for the parameters of this model did not converge ({posterior.result.status}); its "
+            "mean and its intervals may be far from those at the optimum",
+        )
+
+
+def rows_outside(posterior: Posterior, dataset: Dataset) -> Iterator[Doubt]:
+    """A sentence where many rows lie outside of the range of q and v that the model was trained in."""
+    found, outside = [], np.zeros(len(dataset), dtype=bool)
+    for quantity in ("q", "v"):
+        trained, given = getattr(posterior.training, quantity).cpu().numpy(), getattr(dataset, quantity)
+        low, high = trained.min(axis=0), trained.max(axis=0)
+        room = MARGIN * (high - low) + POSTURE * float((high - low).max())
+        beyond = np.maximum(low - given, given - high) - room
+        outside |= (beyond > 0.0).any(axis=1)
+        for k, (name, share) in enumerate(zip(posterior.joint_names, (beyond > 0.0).mean(axis=0), strict=False)):
+            here, there = (f"{x.min():.3g} to {x.max():.3g}" for x in (given[:, k], trained[:, k]))
+            found.append((share, f"{quantity} of {name} is {here} here and was {there} in training"))
+    if outside.mean() > MOST_OUTSIDE:
+        yield look(
+            about="rows outside",
+            what=f"{outside.mean():.0%} of the rows lie outside of the range that the model was trained in (worst: "
+            f"{max(found)[1]}); errors may be larger there, and intervals rest on the prior",
+        )
+
+
+def poor_scores(posterior: Posterior, dataset: Dataset, table: Table) -> Iterator[Doubt]:
+    """Worse than the known forces alone, and intervals that miss: on average, or at joints, which are named."""
+    names, noise = np.array(posterior.joint_names), posterior.noise_std.detach().cpu().numpy()
+    # against the truth where it is known, for noise hides the difference
+    quantity, what = (TRUE_ACCELERATION, "noise-free MAE") if TRUE_ACCELERATION in table else (ACCELERATION, "MAE")
+    mine, alone = (np.array(table[quantity][score], dtype=float) for score in ("mae", "known_physics_mae"))
+    worse = mine > np.maximum(WORSE_JOINT * alone, alone + LEAST_WORSE * noise)
+    ranked = sorted(np.flatnonzero(worse), key=lambda joint: alone[joint] / mine[joint])
+    places = [f"{names[joint]} {mine[joint]:.3g} against {alone[joint]:.3g}" for joint in ranked]
+    if places or mine.mean() > WORSE * alone.mean():
+        where = f" at {len(places)} of {len(names)} joints, {listed(places)}" if places else ""
+        yield look(
+            about="error",
+            what=f"the model is worse here than its known forces alone{where} ({what} {mine.mean():.3g} against "
+            f"{alone.mean():.3g} on average): do not use it for motions like these",
+        )
+    least = 0.95 - max(MISSED, CHANCE * (0.95 * 0.05 / len(dataset)) ** 0.5)
+    for quantity, what in ((ACCELERATION, "measurements"), (TRUE_ACCELERATION, "true accelerations")):
+        inside = np.array(table.get(quantity, {}).get("coverage_95", [1.0]), dtype=float)
+        if not (inside.mean() < FEWEST_INSIDE or inside.min() < least):
+            continue
+        places = [f"{names[joint]} {inside[joint]:.0%}" for joint in np.argsort(inside) if inside[joint] < least]
+        hidden = inside.mean() >= FEWEST_INSIDE
+        of = f"{', but fewer at some joints' if hidden else ''} ({listed(places)})" if places else ""
+        there = " at these" if hidden else ""
+        yield look(
+            about="coverage",
+            what=f"the 95 % intervals hold {inside.mean():.0%} of the {what}{of}: the model is overconfident{there}; "
+            "a force is missing, the noise is larger than stated, or these motions are new to it",
+        )
+
+
+STATES = 20  # training states that are looked at; each alone decides
+INVISIBLE = 1e-7
+"""Singular values of H B below this, relative to the largest one, are zero: accelerations show nothing there."""
+
+
+def normal_force_rests_on_prior(posterior: Posterior) -> bool:
+    """Whether processes of the model can press on a contact together without moving the robot.
+
+    True where, at some training state, processes of the same inputs have a combination f with H B f = 0 that changes
+    lambda: any function of those inputs may then be added to the normal force, and accelerations show nothing of it.
+    So it is for a free force at every joint, not for friction curves that each have an input of their own.
+    """
+    if not posterior.trained.contacts:
+        return False
+    training = posterior.training
+    q, v, u = (x[:STATES] for x in (training.q, training.v, training.u))
+    with torch.no_grad():
+        dynamics = posterior.trained.dynamics(q, v, u)
+        forces = posterior.trained.unknown
+        B, features = forces.direction(dynamics), forces.features(dynamics)
+        moving, pressing = dynamics.H @ B, dynamics.multiplier_map().matrix @ B
+        for z in features:
+            alike = [k for k, other in enumerate(features) if torch.equal(z, other)]
+            if (z == z[:1]).all():  # constant, also without any feature
+                alike = alike[:1]
+            here, there = moving[..., alike], pressing[..., alike]
+            unseen = torch.eye(len(alike)).to(B) - torch.linalg.pinv(here, rtol=INVISIBLE) @ here
+            if ((there @ unseen).abs().amax((-2, -1)) > INVISIBLE * there.abs().amax((-2, -1))).any():
+                return True
+    return False
+
+
+def overlaps(posterior: Posterior, dataset: Dataset) -> Iterator[Doubt]:
+    """Rows that training and test share, and contacts that differ."""
+    repeated = repeated_rows(tuple(getattr(posterior.training, name).cpu().numpy() for name in "qvu"), dataset)
+    if repeated.size:
+        yield look(
+            about="equal rows",
+            what=f"{repeated.size} of {len(dataset)} test rows have the very (q, v, u) of training rows (the first: "
+            f"row {repeated[0]}); where they are the same rows, these scores flatter the model: test on another one.",
+        )
+    own, model = dataset.model, posterior.model
+    differ = own is not None and (own.contacts, own.baumgarte) != (model.contacts, model.baumgarte)
+    if differ and not posterior.is_black_box:  # which has no contacts, and can be carried nowhere
+        yield look(
+            about="contacts",
+            what="the contacts of the model are not those of the data, on which the constraint error is measured; "
+            "predict under them with `posterior.with_model(dataset.model)`",
+        )

@@ -9,7 +9,7 @@ import re
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,26 +19,35 @@ from threadpoolctl import threadpool_limits
 from forcegp.data import Dataset, contact_doubts, farthest_rows
 from forcegp.data.dataset import require_rows
 from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, require_type
+from forcegp.fit import fit
 from forcegp.integration import integrator_named
 from forcegp.jobs import Job, JobStore
 from forcegp.model import Model
 from forcegp.noise import Noise
 from forcegp.posterior import observing
 from forcegp.posterior.posterior import Posterior
-from forcegp.scores.accuracy import CONTACT_FORCE, Matrices, mass_matrices, row_scores
-from forcegp.scores.candidates import (
+from forcegp.scores.accuracy import (
+    CONTACT_FORCE,
+    Matrices,
+    mass_matrices,
+    normal_force_rests_on_prior,
+    overlaps,
+    poor_scores,
+    row_scores,
+    rows_outside,
+    unfinished_search,
+)
+from forcegp.scores.held_out import STARTS, HeldOutMotions, Split, held_out_motions, motion_scores
+from forcegp.scores.models import (
     Candidate,
-    Training,
     checked_identification,
+    few_inputs,
     identified_model,
+    learn,
     usual_identification,
 )
-from forcegp.scores.doubts import doubts, normal_force_rests_on_prior, overlap_warnings
-from forcegp.scores.motions import STARTS, HeldOutMotions, held_out_motions, motion_scores
-from forcegp.scores.splits import Split
 
-SHARE = 2 / 3
-"""Of the training rows among which the points of one seed are chosen."""
+SHARE = 2 / 3  # of the training rows among which the points of one seed are chosen
 IDENTIFICATION, MODEL = "identification", "model"
 OBSERVED = "wind, and the force that stays unexplained, were observed from the rows before each."
 NORMAL_FORCES = "forces along the contact normal rest on the prior alone, since accelerations do not show them"
@@ -94,8 +103,7 @@ class Experiment:
         if len({split.name for split in self.splits}) < len(self.splits) or not self.splits:
             raise InvalidInput("give one split or more, each of its own name.")
         for split in self.splits:  # refused now, not after an hour
-            train, _ = split.apply(self.rows)
-            training_subset(train, self.points, 0)
+            training_subset(split.apply(self.rows)[0], self.points, 0)
             self.motions(split)
 
     @cached_property
@@ -107,10 +115,20 @@ class Experiment:
         """The motions to predict in what this split holds out."""
         return held_out_motions(self.recording, split.test_rows(self.recording), self.horizons, self.starts)
 
-    def training(self, rows: Dataset, recording: Dataset, identified: Model | str | None, seed: int) -> Training:
-        """What models of one seed are fitted to, out of these training rows."""
-        subset = training_subset(rows, self.points, seed)
-        return Training(subset, self.model, rows, recording, identified, seed, self.restarts, self.iterations)
+    def fitted(
+        self, work: Candidate, rows: Dataset, recording: Dataset, identified: Model | str | None, seed: int = 0
+    ) -> Posterior:
+        """Functions of few inputs and laws from all these rows, others from `points`; motions from the recording."""
+        if isinstance(work.given, Posterior):
+            return work.given
+        model = work.model(self.model, identified)
+        few, how = few_inputs(model), {"seed": seed, "restarts": self.restarts}
+        if not few:
+            how |= {"iterations": self.iterations, "points": self.points}
+        if not few and (model.unknown_forces or not model.is_open):
+            rows = training_subset(rows, self.points, seed)
+        posterior: Any = learn(model, rows, work.evidence, **how)[0]
+        return fit(posterior.model, recording, work.motions, start=posterior) if work.motions else posterior
 
     @cached_property
     def configuration(self) -> dict[str, Any]:
@@ -131,25 +149,23 @@ class Experiment:
         text = json.dumps(self.configuration, sort_keys=True)
         common = {"configuration": hashlib.sha256(text.encode()).hexdigest()}
         wanted = sorted({self.identifies, *(each.identification for each in models.values() if each.identification)})
-        identifications: list[Job] = []
-        fits: list[Job] = []
-        for number, split in enumerate(self.splits):
-            places = {name: job_name(split, 0, IDENTIFICATION, name) for name in wanted}
-            for name, place in places.items():
-                spec = {**common, "kind": IDENTIFICATION, "name": name, "split": number, "seed": 0}
-                identifications.append(Job(place, f"{__name__}:compute", spec, arguments=(self, name)))
+        identifications, fits = list[Job](), list[Job]()
+
+        def job(split: int, seed: int, kind: str, name: str, work: Candidate | str, **read: str) -> Job:
+            spec = {**common, "kind": kind, "name": name, "split": split, "seed": seed, **read}
+            spec |= {"digest": work.digest} if isinstance(work, Candidate) else {}
+            place = job_name(self.splits[split], seed, kind, name)
+            return Job(place, f"{__name__}:compute", spec, tuple(sorted({*read.values()})), arguments=(self, work))
+
+        for split in range(len(self.splits)):
+            own = {name: job(split, 0, IDENTIFICATION, name, name) for name in wanted}
+            identifications += own.values()
             for seed in range(seeds):
                 for name, each in models.items():
-                    if each.all_rows and seed:
-                        continue
-                    read = {"mass_matrix": places[self.identifies]}
-                    read |= {"identified": places[each.identification]} if each.identification else {}
-                    spec = {**common, "kind": MODEL, "name": name, "split": number, "seed": seed, **read}
-                    # where the function is defined, which somebody else may have added
-                    code = () if isinstance(each.fit, Posterior) else (_plain(each.fit).__module__,)
-                    place, inputs = job_name(split, seed, MODEL, name), tuple(sorted({*read.values()}))
-                    spec["digest"] = each.digest
-                    fits.append(Job(place, f"{__name__}:compute", spec, inputs, arguments=(self, each), code=code))
+                    if not (each.all_rows and seed):
+                        read = {"mass_matrix": own[self.identifies].name}
+                        read |= {"identified": own[each.identification].name} if each.identification else {}
+                        fits.append(job(split, seed, MODEL, name, each, **read))
         return identifications, fits
 
 
@@ -160,10 +176,6 @@ def fingerprint(dataset: Dataset) -> str:
         values = getattr(dataset, name)
         digest.update(name.encode() if values is None else np.ascontiguousarray(values).tobytes())
     return digest.hexdigest()
-
-
-def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
-    return _plain(function.func) if isinstance(function, partial) else function
 
 
 def job_name(split: Split, seed: int, kind: str, name: str) -> str:
@@ -203,9 +215,9 @@ def compute(
 
 def _identify(experiment: Experiment, train: Dataset, name: str) -> dict[str, Any]:
     start = time.process_time()
-    model, unseen = identified_model(name, experiment.model, train)
+    model = identified_model(name, experiment.model, train)
     assert model.noise is not None, "it was found"
-    found = {"noise": model.noise.to_dict(), "model": model.known.to_dict(), "unseen": unseen}
+    found = {"noise": model.noise.to_dict(), "model": model.known.to_dict()}
     return {"cpu_seconds": time.process_time() - start, **found}
 
 
@@ -214,18 +226,17 @@ def _score(
 ) -> dict[str, Any]:
     train, test = split.apply(experiment.rows)
     identified, before = identified_before(store, spec["identified"]) if "identified" in spec else (None, 0.0)
-    training = experiment.training(train, split.apply(experiment.recording)[0], identified, spec["seed"])
     start = time.process_time()
-    posterior = work.fit if isinstance(work.fit, Posterior) else work.fit(training)
+    posterior = experiment.fitted(work, train, split.apply(experiment.recording)[0], identified, spec["seed"])
     seconds = before + time.process_time() - start
     model, _ = identified_before(store, spec["mass_matrix"])
     whose = f"the model identified from all training rows ({experiment.identifies})"
     if isinstance(model, str):
         whose = f"the model as given, because its identification failed ({model.rstrip('.')})"
     mass = mass_matrices(test, experiment.model if isinstance(model, str) else model)
-    fitted_here = not isinstance(work.fit, Posterior)
-    found = scored(posterior, test, experiment.motions(split), experiment.integrator, mass, fitted_here=fitted_here)
-    return {"cpu_seconds": seconds, "mass_matrix": whose, "training_rows": len(training.rows), **found}
+    known = isinstance(work.given, Posterior)
+    found = scored(posterior, test, experiment.motions(split), experiment.integrator, mass, fitted_here=not known)
+    return {"cpu_seconds": seconds, "mass_matrix": whose, "training_rows": experiment.points, **found}
 
 
 def identified_before(store: JobStore, name: str) -> tuple[Model | str, float]:
@@ -246,18 +257,14 @@ def scored(
     fitted_here: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """One model on one test log as plain JSON values: the table, errors by stretch and motion, and warnings.
-
-    Where the model has observers (`forcegp.posterior.observing`), they see the rows before each one. Rows that training
-    and test share are named unless the model was `fitted_here`, to the other side of a split.
-    """
+    """One model on one log as JSON: table, errors, warnings; also of shared rows unless `fitted_here`."""
     alone, recorded = posterior, test
     if test.time_ordered:
         posterior, test = observing(posterior, test, whole=True)
     table, stretches = row_scores(posterior, test, mass, progress)
     moving, facts = motion_scores(alone, motions, integrator)
-    before = [] if fitted_here else [*overlap_warnings(alone, recorded), *contact_doubts(test, posterior.model)]
-    told = [str(doubt) for doubt in (*before, *doubts(posterior, test, table))]
-    told += [] if posterior is alone else [OBSERVED]
+    doubts = [] if fitted_here else [*overlaps(alone, recorded), *contact_doubts(test, posterior.model)]
+    doubts += [*unfinished_search(posterior), *rows_outside(posterior, test), *poor_scores(posterior, test, table)]
+    told = [*map(str, doubts), *([] if posterior is alone else [OBSERVED])]
     told += [NORMAL_FORCES] if CONTACT_FORCE in table and normal_force_rests_on_prior(alone) else []
     return {"table": table | moving, "stretches": stretches, "motions": facts, "warnings": told, "test_rows": len(test)}

@@ -1,6 +1,7 @@
 """The page of scores in Markdown, and the same tables as rows of text for terminals and reports."""
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -8,25 +9,57 @@ from typing import Any
 import numpy as np
 
 from forcegp.data import Preparation, preparation_report
-from forcegp.scores.accuracy import ACCELERATION, ALL_JOINTS, FORCE, TRUE_ACCELERATION
-from forcegp.scores.paired import CRITERIA, MARGIN, PairedDifference
-from forcegp.scores.scores import Scores
-from forcegp.scores.tables import formatted, markdown_table, number, rendered
+from forcegp.scores.accuracy import ACCELERATION, ALL_JOINTS, FORCE
+from forcegp.scores.scores import CRITERIA, MARGIN, Scores
 
-Column = tuple[str, str, str, int]
-"""Title, quantity, score and decimals; of a coverage in percent."""
+
+def formatted(value: Mapping[str, Any] | float | None, digits: int = 4) -> str:
+    """`.0831 (.0825–.0847)` of a median with its range, `.0831` where that is one number, a dash of nothing."""
+    if not isinstance(value, Mapping):
+        return number(value, digits)
+    middle, low, high = (number(value[name], digits) for name in ("median", "min", "max"))
+    return middle if low == high else f"{middle} ({low}–{high})"
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """With that many decimals; where three or more are asked for, very small and very large ones as a power of ten."""
+    if value is None:
+        return "–"
+    if digits < 3 or value == 0 or 10.0**-digits * 5 <= abs(value) < 1e4:
+        return f"{value:.{digits}f}"
+    return f"{value:.1e}"
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """First column left, the others right."""
+    lines = [f"| {' | '.join(header)} |", f"|---|{'---:|' * (len(header) - 1)}"]
+    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
+
+
+def rendered(template: Path, **values: Any) -> str:
+    """The text of a template, with the filters `formatted`, `number` and `table`; one blank line between paragraphs."""
+    from jinja2 import Environment, StrictUndefined
+
+    pages = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    pages.filters |= {"formatted": formatted, "number": number, "table": lambda rows, head: markdown_table(head, rows)}
+    text = pages.from_string(template.read_text(encoding="utf-8"))
+    return re.sub(r"\n{3,}", "\n\n", text.render(values)).strip() + "\n"
+
+
+Column = tuple[str, str, str, int]  # title, quantity, score and decimals; of a coverage in percent
 
 
 def page(scores: Scores, figures: Sequence[tuple[str, str]] = ()) -> str:
     """Markdown: what was done, the model to take, tables, and what failed; `figures` have names and captions."""
-    finished = [name for name in scores.models if scores.finished(name)]
-    by_joint = [
-        (title, markdown_table(["model", *scores.joint_names], joint_rows(scores, title, quantity, score, digits)))
-        for title, quantity, score, digits in columns_of(scores)
-        if finished and len(joint_numbers(scores, finished[0], quantity, score)) == len(scores.joint_names)
-    ]
-    differences = [[name, *map(_difference, each.values())] for name, each in scores.differences.items()]
-    at_rest = scores.columns("rmse_at_rest", FORCE, finished[0]) if by_joint else []
+    finished, by_joint = [name for name in scores.models if scores.finished(name)], []
+    for title, quantity, score, digits in columns_of(scores) if finished else ():
+        of = ACCELERATION if quantity == ALL_JOINTS else quantity  # densities of each joint alone
+        each = {name: scores.columns(score, of, name) for name in finished}
+        if all(len(numbers) == len(scores.joint_names) for numbers in each.values()):
+            rows = [[name, *(_cell(x, score, digits) for x in numbers)] for name, numbers in each.items()]
+            by_joint.append((title, markdown_table(["model", *scores.joint_names], rows)))
+    differences = [[name, *("–" if x is None else x.numbers for x in each.values())]
+                   for name, each in scores.differences.items()]  # fmt: skip
     notes = [*scores.about.get("notes", ()), *(each for x in scores.about.get("splits", ()) for each in x["notes"])]
     return rendered(
         Path(__file__).with_name("report.md.jinja"),
@@ -36,8 +69,7 @@ def page(scores: Scores, figures: Sequence[tuple[str, str]] = ()) -> str:
         rival=scores.rival,
         differences=differences,
         criteria=[f"{words}, {'difference' if name == 'density' else 'ratio'}" for name, words in CRITERIA.items()],
-        overall=markdown_table(*overall(scores, "**")) if finished else "",
-        at_rest=", ".join(f"{name} {number(x, 3)}" for name, x in zip(scores.joint_names, at_rest, strict=False) if x),
+        overall=markdown_table(*overall(scores)) if finished else "",
         by_joint=by_joint,
         figures=figures,
         listed=[[name, each["kind"], each["summary"], str(len(scores.finished(name)))]
@@ -47,43 +79,29 @@ def page(scores: Scores, figures: Sequence[tuple[str, str]] = ()) -> str:
     )  # fmt: skip
 
 
-BY_JOINT: tuple[Column, ...] = (
-    ("MAE", ACCELERATION, "mae", 4),
-    ("noise-free", TRUE_ACCELERATION, "mae", 4),
-    ("RMSE", ACCELERATION, "rmse", 4),
-    ("NLPD", ACCELERATION, "nlpd", 2),
-    ("in 95 %", ACCELERATION, "coverage_95", 1),
-    ("known physics", ACCELERATION, "known_physics_mae", 4),
-)
-OF_QUANTITIES = (
+OF_ONE = (
     ("MAE", "mae", 4),
     ("RMSE", "rmse", 4),
     ("RMSE / size", "relative_rmse", 3),
+    ("NLPD", "nlpd", 2),
     ("in 95 %", "coverage_95", 1),
+    ("known physics", "known_physics_mae", 4),
 )
 
 
-def joint_table(scores: Scores, model: str | None = None) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of one model: errors of the acceleration by joint, then of all together (NLPD: jointly)."""
-    held, columns = scores.quantities(model), [[*scores.joint_names, "all joints"]]
-    for _, quantity, score, digits in BY_JOINT:
-        known = score in held.get(quantity, ())
-        each = scores.columns(score, quantity, model) if known else [None] * len(scores.joint_names)
-        whole = scores.value(score, ALL_JOINTS if score == "nlpd" else quantity, model) if known else None
-        columns.append([_cell(value, score, digits, None, "") for value in (*each, whole)])
-    return ["joint", *(title for title, *_ in BY_JOINT)], [list(row) for row in zip(*columns, strict=True)]
-
-
-def quantity_table(scores: Scores, model: str | None = None) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of one model: what was scored beside accelerations, all columns together, in their units."""
-    rows = []
-    for name, held in scores.quantities(model).items():
-        found = [
-            (scores.value(score, name, model) if score in held else None, score, n) for _, score, n in OF_QUANTITIES
-        ]
-        if name not in (ACCELERATION, ALL_JOINTS) and any(value is not None for value, *_ in found):
-            rows.append([name, *(_cell(value, score, digits, None, "") for value, score, digits in found)])
-    return ["of all joints", *(title for title, *_ in OF_QUANTITIES)], rows
+def model_table(scores: Scores, model: str | None = None) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of one model: accelerations by joint, then every quantity over all of its columns."""
+    held = scores.quantities(model)
+    titles, names = ["", *(title for title, *_ in OF_ONE)], scores.joint_names
+    own = {score: scores.columns(score, ACCELERATION, model) for _, score, _ in OF_ONE if score in held[ACCELERATION]}
+    each = {
+        name: {score: column[place] for score, column in own.items() if len(column) == len(names)}
+        for place, name in enumerate(names)
+    }
+    for quantity, known in held.items():
+        each[quantity] = {score: scores.value(score, quantity, model) for _, score, _ in OF_ONE if score in known}
+    rows = [[name, *(_cell(row.get(score), score, n) for _, score, n in OF_ONE)] for name, row in each.items() if row]
+    return titles, rows
 
 
 def columns_of(scores: Scores) -> list[Column]:
@@ -102,50 +120,25 @@ def columns_of(scores: Scores) -> list[Column]:
     return [each for each in wanted if all(each[2] in other.get(each[1], ()) for other in held)]
 
 
-def overall(scores: Scores, mark: str = "") -> tuple[list[str], list[list[str]]]:
-    """Header and one row per model, all joints together; `mark` stands on both sides of the best medians."""
+def overall(scores: Scores) -> tuple[list[str], list[list[str]]]:
+    """Header and one row per model, all joints together: medians over runs, with their range."""
     columns, rows = columns_of(scores), []
-    finished = [name for name in scores.models if scores.finished(name)]
     for name, runs in scores.runs.items():
         count = len(scores.finished(name))
         row = [name if count == len(runs) else f"{name} ({count} of {len(runs)} runs)"]
         for _, quantity, score, digits in columns if count else ():
-            spreads = {each: scores.spread(score, quantity, each) for each in finished}
-            medians = [each["median"] for each in spreads.values() if each is not None]
-            row.append(_cell(spreads[name], score, digits, _best(score, medians), mark) + _lost(scores, name, quantity))
+            row.append(_cell(scores.spread(score, quantity, name), score, digits) + _lost(scores, name, quantity))
         rows.append(row + ["–"] * (1 + len(columns) - len(row)))
     return ["model", *(title for title, *_ in columns)], rows
 
 
-def joint_rows(scores: Scores, title: str, quantity: str, score: str, digits: int) -> list[list[str]]:
-    """One row per finished model, one column per joint."""
-    finished = [name for name in scores.models if scores.finished(name)]
-    each = {name: joint_numbers(scores, name, quantity, score) for name in finished}
-    best = [_best(score, [x for x in column if x is not None]) for column in zip(*each.values(), strict=True)]
-    return [[name, *(_cell(x, score, digits, b, "**") for x, b in zip(numbers, best, strict=True))]
-            for name, numbers in each.items()]  # fmt: skip
-
-
-def joint_numbers(scores: Scores, model: str, quantity: str, score: str) -> list[float | None]:
-    """By joint; densities of each joint alone."""
-    return scores.columns(score, ACCELERATION if quantity == ALL_JOINTS else quantity, model)
-
-
-def _best(score: str, medians: Sequence[float]) -> float | None:
-    """The least, of coverages the nearest to their level."""
-    level = float(score.partition("coverage_")[2] or 0.0) / 100.0
-    return min(medians, key=lambda value: abs(value - level) if level else value, default=None)
-
-
-def _cell(value: Mapping[str, Any] | float | None, score: str, digits: int, best: float | None, mark: str) -> str:
-    """A median with its range, or one number; in percent where it is a coverage, marked where it is the best."""
-    if value is None:
-        return "–"
-    factor, unit = (100.0, " %") if score.startswith("coverage") else (1.0, "")
-    spread = value if isinstance(value, Mapping) else {"median": value, "min": value, "max": value, "values": [value]}
-    shown = {name: factor * spread[name] for name in ("median", "min", "max")} | {"values": spread["values"]}
-    text, median = formatted(shown, digits), number(shown["median"], digits)
-    return (f"{mark}{median}{mark}{text.removeprefix(median)}" if spread["median"] == best else text) + unit
+def _cell(value: Mapping[str, Any] | float | None, score: str, digits: int) -> str:
+    """A median with its range, or one number; of a coverage in percent."""
+    if value is None or not score.startswith("coverage"):
+        return formatted(value, digits)
+    if isinstance(value, Mapping):
+        return formatted({name: 100.0 * value[name] for name in ("median", "min", "max")}, digits) + " %"
+    return f"{number(100.0 * value, digits)} %"
 
 
 def _lost(scores: Scores, model: str, quantity: str) -> str:
@@ -161,25 +154,12 @@ def winner_table(scores: Scores) -> tuple[list[str], list[list[str]]]:
     """Header and rows: by criterion the model to take, and the difference that decides, with its interval."""
     rows = []
     for criterion, each in scores.winners.items():
-        pair, sign = each.difference, "−" if criterion == "density" else "/"
-        compared = "–" if pair is None else f"{pair.challenger} {sign} {pair.baseline}"
-        outcome = "–" if pair is None else pair.outcome
-        if pair is not None and pair.favours_challenger and outcome != "better":
-            outcome = "better, not sure"
-        rows.append([CRITERIA[criterion], each.model, compared, _difference(pair).replace("**", ""), outcome])
+        pair, told = each.difference, ["–"] * 3
+        if pair is not None:
+            sure = pair.outcome == "better" or not pair.favours_challenger
+            told = [pair.pair, pair.numbers, pair.outcome if sure else "better, not sure"]
+        rows.append([CRITERIA[criterion], each.model, *told])
     return ["by", "take", "compared", "difference (95 % interval)", "shown"], rows
-
-
-def _difference(found: PairedDifference | None) -> str:
-    if found is None:
-        return "–"
-    sign = "+" if found.criterion == "density" else ""
-    value = f"{found.value:{sign}.3g}"
-    value = f"**{value}**" if found.outcome == "better" else value
-    if found.interval is None:
-        return value
-    low, high = found.interval
-    return f"{value} ({low:+.3g} to {high:+.3g})" if sign else f"{value} ({low:.3g}–{high:.3g})"
 
 
 def unit_of(scores: Scores, quantity: str) -> str:
@@ -196,9 +176,5 @@ def preparation_lines(metadata: Mapping[str, Any]) -> list[str]:
         return ["Preparation: none stated; q, v, u and a are scored as the dataset holds them."]
     settings = {each.name: report.get(each.name) for each in fields(Preparation) if each.name != "why"}
     given = ", ".join(f"{name} {value}" for name, value in settings.items() if name == "cutoff" or np.any(value))
-    lines = [f"Preparation: {given}."]
-    for quantity, reason in dict(report.get("why") or {}).items():
-        told = "; ".join(f"{name} {why}" for name, why in reason.items()) if isinstance(reason, Mapping) else reason
-        lines.append(f"Chosen automatically, {quantity}: {told}")
     earlier = {"preparation": report.get("earlier")}
-    return lines + (preparation_lines(earlier) if preparation_report(earlier) else [])
+    return [f"Preparation: {given}.", *(preparation_lines(earlier) if preparation_report(earlier) else [])]

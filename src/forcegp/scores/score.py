@@ -1,9 +1,8 @@
 """`score`: models side by side on the same rows of a log, fitted to the rest of it or before."""
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,20 +19,18 @@ from forcegp.jobs import JobStore, Progress, machine, run_jobs
 from forcegp.model import Model
 from forcegp.parallel import checked_jobs
 from forcegp.posterior.posterior import Posterior
-from forcegp.scores.candidates import (
+from forcegp.scores.experiment import Experiment, fingerprint, kept, scored
+from forcegp.scores.held_out import STARTS, HeldOutMotions, Split, held_out_motions, split_named
+from forcegp.scores.models import (
     Candidate,
     Given,
+    candidate,
     candidates,
     default_models,
-    fitted_before,
     identified_model,
-    kind_and_summary,
 )
-from forcegp.scores.experiment import Experiment, fingerprint, kept, scored
-from forcegp.scores.motions import STARTS, held_out_motions
 from forcegp.scores.page import page, preparation_lines
 from forcegp.scores.scores import Scores
-from forcegp.scores.splits import Split, split_named
 
 KIND = "forcegp score"
 RESULTS, PAGE = "results.json", "report.md"
@@ -63,20 +60,18 @@ def score(
     """Score models on the same rows: errors, densities, coverage, motions, and paired differences.
 
     Posteriors alone and no `split`: they are scored on all rows of `log`. Otherwise every model is fitted for every
-    split and seed to one side and scored on the other, `identified` (from all training rows) always among them. Every
-    finished piece is kept in `folder/jobs` at once; the same call goes on after an interruption, and one with more
-    models or seeds computes only these. A model that fails is a row that names the error.
+    split and seed to one side and scored on the other, `identified` (from all training rows) always among them. The
+    same call goes on after an interruption, and one with more models or seeds computes only these. A model that fails
+    is a row that names the error.
 
     Parameters
     ----------
-    models: a posterior; or by name posteriors, models to fit, functions of a `Training` that fit one, and names of
-        models FORCES[@EVIDENCE] (`scores.candidates`), of which a list will do. None takes some of every kind.
+    models: a posterior; or by name posteriors, models to fit, and names of models (`scores.models`), of which a list
+        will do. None takes some of every kind.
     split: text of `split_named` or its result; None is "auto" where anything is fitted.
-    horizons: of predicted motions in s; none with (). None takes .1, .2, .5 and 1 s, as far as the log lasts, where
-        anything is fitted, else none.
-    folder: where everything is kept, with the page report.md, its figures and results.json; None keeps nothing.
-    model: the robot as given; None takes the log's.
-    recording: the log at its full rate, for motions.
+    horizons: of predicted motions in s; none with (). None takes .1, .2, .5 and 1 s where anything is fitted.
+    folder: where every finished piece is kept, with the page report.md, figures and results.json; None keeps nothing.
+    model, recording: the robot as given, and the log at its full rate, for motions; None takes the log's, and the log.
     points, seeds: rows that models of many inputs learn from, and how many choices of them.
     starts, integrator: of the motions of every held-out stretch.
     identification: what `identified` is, as in "bodies+viscous+coulomb+rotor@torques"; its mass matrix turns errors of
@@ -86,10 +81,8 @@ def score(
     source: where the data come from, for the page: "title", and "data", a list of lines.
     overwrite: compute everything anew, also where the folder holds results.
 
-    Raises
-    ------
-    InvalidInput: an argument is out of range, the log is of another robot, nothing is held out, no stretch lasts for a
-        horizon, the folder holds something else, or another process is at work there.
+    Raises InvalidInput for arguments out of range, a log of another robot, nothing held out, horizons that no stretch
+    lasts for, a folder of something else, or one where another process is at work.
     """
     log = with_strokes(require_type("log", log, Dataset))
     recording = None if recording is None else with_strokes(recording)
@@ -99,18 +92,24 @@ def score(
         raise InvalidInput(f"models is a {type(given).__name__}; give a Posterior, a mapping from names, or names.")
     if isinstance(seeds, bool) or seeds < 1:
         raise InvalidInput(f"the number of seeds is {seeds}; it must be at least 1.")
-    named = given if isinstance(given, Mapping) else {}
-    before = {name: each for name, each in named.items() if isinstance(each, Posterior)}
     about = {"kind": KIND, "machine": machine(), "forcegp": __version__, "source": dict(source or {}), "rows": len(log),
              "preparation": preparation_lines(log.metadata)}  # fmt: skip
     horizons = None if horizons is None else tuple(horizons)
+    before = (
+        {name: each for name, each in given.items() if isinstance(each, Posterior)}
+        if isinstance(given, Mapping)
+        else {}
+    )
     if before and len(before) == len(given) and split is None:
-        horizons = horizons or ()
+        known = {name: candidate(name, each, each.model, "") for name, each in before.items()}
         if folder is not None:
-            digests = {name: fitted_before(each).digest for name, each in before.items()}
+            digests = {name: each.digest for name, each in known.items()}
             how = {"rows_sha256": fingerprint(log), "models": digests, "horizons": horizons, "integrator": integrator}
             JobStore.open(Path(folder), KIND, how, overwrite=overwrite)
-        scores = _fitted_before(before, log, recording or log, horizons, starts, integrator, about, progress)
+        motions = held_out_motions(recording or log, np.ones(len(recording or log), dtype=bool), horizons or (), starts)
+        runs = _runs_of(before, log, motions, integrator, progress)
+        about |= {"splits": [], "seeds": [0], "notes": list(motions.notes)}
+        scores = _scores(log, runs, known, about, before.__getitem__)
         if folder is not None:
             write(scores, Path(folder))
         return scores
@@ -136,10 +135,8 @@ def score(
             "configuration": experiment.configuration,
             "seeds": list(range(seeds)),
             "identifications": [{key: each[key] for key in ("split", "error") if key in each} for each in found],
-            "notes": unseen_rotors(found),
         }
-        kinds = {name: (each.kind, each.summary) for name, each in chosen.items()}
-        scores = replace(_scores(log, runs, kinds, about), fit=partial(_on_all_rows, experiment, chosen))
+        scores = _scores(log, runs, chosen, about, partial(_on_all_rows, experiment, chosen))
         if folder is not None:
             with store.locked():
                 write(scores, store.folder)
@@ -148,24 +145,15 @@ def score(
 
 def _on_all_rows(experiment: Experiment, chosen: Mapping[str, Candidate], name: str) -> Posterior:
     work, rows = chosen[name], experiment.rows
-    if isinstance(work.fit, Posterior):
-        return work.fit
-    identified = (
-        None if work.identification is None else identified_model(work.identification, experiment.model, rows)[0]
+    of = work.identification
+    return experiment.fitted(
+        work, rows, experiment.recording, None if of is None else identified_model(of, experiment.model, rows)
     )
-    return work.fit(experiment.training(rows, experiment.recording, identified, 0))
-
-
-def unseen_rotors(identifications: Sequence[Mapping[str, Any]]) -> list[str]:
-    """That errors of forces mean little at joints whose inertia no row shows."""
-    names = dict.fromkeys(name.partition(".")[2] for each in identifications for name in each.get("unseen", ()))
-    told = f"the rows do not show the inertia of the rotors of {', '.join(names)}; errors of forces mean little there."
-    return [told] if names else []
 
 
 def write(scores: Scores, folder: Path) -> None:
     """The page, its figures and all numbers into a folder."""
-    from forcegp.scores.figures.scores import scores_pictures
+    from forcegp.scores.figures.model import scores_pictures
 
     folder.mkdir(parents=True, exist_ok=True)
     pictures = scores_pictures(scores)
@@ -175,18 +163,15 @@ def write(scores: Scores, folder: Path) -> None:
     write_text(folder / PAGE, page(scores, [(picture.name, picture.caption) for picture in pictures]))
 
 
-def _fitted_before(
+def _runs_of(
     given: Mapping[str, Posterior],
     log: Dataset,
-    recording: Dataset,
-    horizons: tuple[float, ...] | None,
-    starts: int,
+    motions: HeldOutMotions,
     integrator: str,
-    about: dict[str, Any],
     progress: Progress | None,
-) -> Scores:
-    runs, models, mass = {}, {}, None
-    motions = held_out_motions(recording, np.ones(len(recording), dtype=bool), horizons, starts)
+) -> dict[str, list[dict[str, Any]]]:
+    """One run of each posterior, on all rows."""
+    runs = {}
     for place, (name, posterior) in enumerate(given.items()):
         require_rows("log", log, posterior.joint_names, "the model")
         integrator_named(integrator, posterior.model)
@@ -195,12 +180,10 @@ def _fitted_before(
             if progress is not None:
                 progress(done + place * total, len(given) * total, name)
 
-        found = scored(posterior, log, motions, integrator, mass, progress=report)
-        run = {"split": "all rows", "seed": 0, "error": None, "cpu_seconds": None, **found}
-        run |= {"mass_matrix": "the model itself", "training_rows": len(posterior.training)}
-        runs[name], models[name] = [run], kind_and_summary(posterior)
-    about |= {"splits": [], "seeds": [0], "notes": list(motions.notes)}
-    return replace(_scores(log, runs, models, about), fit=given.__getitem__)
+        run = {"split": "all rows", "seed": 0, "error": None, "cpu_seconds": None, "mass_matrix": "the model itself"}
+        run |= {"training_rows": len(posterior.training)}
+        runs[name] = [run | scored(posterior, log, motions, integrator, progress=report)]
+    return runs
 
 
 def _split_facts(experiment: Experiment, split: Split) -> dict[str, Any]:
@@ -213,15 +196,17 @@ def _split_facts(experiment: Experiment, split: Split) -> dict[str, Any]:
 def _scores(
     log: Dataset,
     runs: Mapping[str, Sequence[Mapping[str, Any]]],
-    models: Mapping[str, tuple[str, str]],
+    models: Mapping[str, Candidate],
     about: Mapping[str, Any],
+    fit: Callable[[str], Posterior],
 ) -> Scores:
     used = sorted({run["mass_matrix"] for each in runs.values() for run in each if run["error"] is None})
     units = {name: log.units[name] for name in ("q", "v", "u", "a")}
     return Scores(
-        models={name: {"kind": kind, "summary": summary} for name, (kind, summary) in models.items()},
+        models={name: {"kind": each.kind, "summary": each.summary} for name, each in models.items()},
         runs=runs,
         joint_names=tuple(log.joint_names),
         units={name: unit if isinstance(unit, str) else list(unit) for name, unit in units.items()},
         about={**about, "mass_matrix": used},
+        fit=fit,
     )

@@ -1,20 +1,146 @@
-"""`Scores`: what was found of several models on the same rows, by quantity, score, joint, stretch of time and seed."""
+"""`Scores`: what was found of several models on the same rows, and which of them is better.
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+Squared errors over stretches and seeds are compared by the logarithm of their ratio (densities by a difference). What
+other stretches and seeds would change are jackknife variances (Efron & Stein 1981), added as Welch & Satterthwaite do.
+"""
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import t as student
 from typing_extensions import override
 
 from forcegp.errors import FitError, InvalidInput, require_known
 from forcegp.posterior.posterior import Posterior
-from forcegp.scores.accuracy import ACCELERATION, ALL_JOINTS, over_columns
-from forcegp.scores.paired import CRITERIA, PairedDifference, paired_difference
-from forcegp.scores.tables import alike, median_and_range
+from forcegp.scores.accuracy import ACCELERATION, median_and_range, over_columns
 from forcegp.summary import Summary, listed
+
+CERTAINTY = 0.95
+MARGIN = 0.02  # of a ratio: a difference below it matters to nobody, however sure it is
+CLEAR, MOSTLY = 0.67, 0.8  # ratio and share of stretches that decide where a log is too short to show anything
+MOST_LOG = 700.0  # of a ratio that is still a finite number
+
+CRITERIA: Mapping[str, str] = {
+    "motion": "error of predicted motions",
+    "force": "force-space error",
+    "acceleration": "normalised error of the acceleration",
+    "density": "negative log predictive density",
+}
+"""What is compared: `motion` over all horizons. Ratios, but densities differences."""
+
+Errors = Float[np.ndarray, "seeds horizons stretches"]
+
+
+@dataclass(frozen=True)
+class PairedDifference:
+    """Challenger against baseline by one criterion.
+
+    `value` is the ratio of root mean square errors (0.8: a fifth less), or the mean difference in nats; the interval is
+    of the same kind, None for one stretch and one seed. The challenger was better in `wins` of `runs` and, over all
+    seeds, in `ahead` of `stretches` (motions, for that score). A ratio within `MARGIN` of 1 is no
+    difference.
+    """
+
+    criterion: str
+    challenger: str
+    baseline: str
+    runs: int
+    wins: int
+    value: float
+    interval: tuple[float, float] | None
+    ahead: int = 0
+    stretches: int = 0
+
+    @property
+    def outcome(self) -> str:
+        """`better`, `worse` or `no difference`."""
+        equal = 0.0 if self.criterion == "density" else 1.0  # where both are equal
+        if self.interval is None or abs(self.value - equal) < MARGIN:
+            return "no difference"
+        low, high = self.interval
+        return "better" if high < equal else "worse" if low > equal else "no difference"
+
+    @property
+    def favours_challenger(self) -> bool:
+        """Whether to take the challenger: shown to be better, or a third better in most stretches."""
+        large = self.criterion != "density" and self.value <= CLEAR and self.ahead >= MOSTLY * self.stretches
+        return self.outcome == "better" or (self.outcome == "no difference" and large)
+
+    @property
+    def pair(self) -> str:
+        """What is compared: `a / b`, of densities `a − b`."""
+        return f"{self.challenger} {'−' if self.criterion == 'density' else '/'} {self.baseline}"
+
+    @property
+    def numbers(self) -> str:
+        """The value with its interval."""
+        form = "+.3g" if self.criterion == "density" else ".3g"
+        ends = "" if self.interval is None else " ({} to {})".format(*(f"{end:{form}}" for end in self.interval))
+        return f"{self.value:{form}}{ends}"
+
+    @property
+    def sentence(self) -> str:
+        """The outcome with its numbers; what it goes by is for the reader to name."""
+        answer = {"better": "**Better**", "worse": "**Worse**", "no difference": "**No difference that the data show**"}
+        unit = " nats" if self.criterion == "density" else ""
+        how = "95 % interval" if self.interval else "one stretch and one seed, so no interval"
+        what = "motions" if self.criterion == "motion" else "held-out stretches of time"
+        better = f"better in {self.wins} of {self.runs} runs and in {self.ahead} of {self.stretches} {what}"
+        return f"{answer[self.outcome]}: {self.pair} = {self.numbers}{unit}, {how}; {better}."
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values."""
+        return {**asdict(self), "verdict": self.outcome, "sentence": self.sentence}
+
+
+def paired_difference(
+    criterion: str, challenger: str, baseline: str, one: Errors, other: Errors
+) -> PairedDifference | None:
+    """Compare squared errors (nats for `density`) on the stretches of both. None without any, or with a 0."""
+    usable = (np.isfinite(one) & np.isfinite(other)).all(axis=(0, 1))
+    one, other = one[..., usable], other[..., usable]
+    nats = criterion == "density"
+
+    def difference(seeds: np.ndarray, stretches: np.ndarray) -> float:
+        a, b = (each[seeds][..., stretches].mean(axis=(0, 2)) for each in (one, other))
+        return float((a - b if nats else 0.5 * (np.log(a) - np.log(b))).mean())
+
+    if not one.size or (not nats and bool((np.minimum(one, other).mean(axis=(0, 2)) <= 0.0).any())):
+        return None
+    every = [np.arange(one.shape[axis]) for axis in (0, 2)]
+    variances, freedoms = [], []
+    for axis, members in enumerate(every):
+        count = len(members)
+        if count > 1:
+            left_out = np.array(
+                [difference(*(np.delete(e, k) if n == axis else e for n, e in enumerate(every))) for k in members]
+            )
+            variances.append((count - 1) * float(left_out.var()))
+            freedoms.append(count - 1)
+    value, interval = difference(*every), None
+
+    def shown(log: float) -> float:
+        return log if nats else math.exp(min(log, MOST_LOG))
+
+    if freedoms:
+        spread = sum(variances)
+        # Welch and Satterthwaite; the larger one's freedom where nothing varies
+        weights = sum(variance**2 / freedom for variance, freedom in zip(variances, freedoms, strict=True))
+        half = float(student.ppf(0.5 + 0.5 * CERTAINTY, spread**2 / weights if weights else max(freedoms)))
+        half *= math.sqrt(spread)
+        interval = (shown(value - half), shown(value + half))
+    wins = int((one.mean(axis=(1, 2)) < other.mean(axis=(1, 2))).sum())
+    ahead = int((one.mean(axis=(0, 1)) < other.mean(axis=(0, 1))).sum())
+    return PairedDifference(
+        criterion, challenger, baseline, len(one), wins, shown(value), interval, ahead, one.shape[2]
+    )
+
 
 Kind = Literal["given", "identified", "residual", "black box", "force prior"]
 """Parametric physics as given or identified, a Gaussian process on what it leaves of the acceleration, a model without
@@ -23,6 +149,14 @@ physics, and Gaussian processes on unknown forces.
 PARAMETRIC, LEARNED = ("given", "identified"), ("force prior", "residual", "black box")
 ORDER = "motion", "force", "acceleration", "density"
 """Criteria that decide, the first one that there is: where a robot goes is what simulators and controllers need."""
+
+
+def alike(texts: Iterable[tuple[str, Any]]) -> list[list[tuple[str, Any]]]:
+    """Texts and what they are about, in groups whose texts differ in numbers alone."""
+    groups: dict[str, list[tuple[str, Any]]] = {}
+    for text, about in texts:
+        groups.setdefault(re.sub(r"\d[\d.e+-]*", "#", text), []).append((text, about))
+    return list(groups.values())
 
 
 class Winner(NamedTuple):
@@ -63,11 +197,7 @@ class Scores(Summary):
     # ------------------------------------------------------------------ numbers
 
     def value(self, score: str, quantity: str = ACCELERATION, model: str | None = None) -> float | None:
-        """One number over all joints, the median over runs: `value("mae")`, `value("rmse", "position after 1 s")`.
-
-        None where it is not a number. `model` may be left out where there is one. Raises InvalidInput for what the
-        table does not hold.
-        """
+        """One number for all joints, the median over runs: `value("rmse", "position after 1 s")`."""
         found = self.spread(score, quantity, model)
         return None if found is None else found["median"]
 
@@ -163,10 +293,7 @@ class Scores(Summary):
 
     @cached_property
     def winners(self) -> dict[str, Winner]:
-        """By criterion the model to take: the best parametric one, unless another is shown to be better.
-
-        The one rule of verdicts. A criterion that no model has is missing.
-        """
+        """By criterion the model to take: the best parametric one, unless another is shown to be better."""
         out = {}
         for criterion in CRITERIA:
             simple, other = (self.best_of(kinds, criterion) for kinds in (PARAMETRIC, LEARNED))
@@ -190,10 +317,7 @@ class Scores(Summary):
         return next((self.winners[name].model for name in ORDER if name in self.winners), None)
 
     def fitted_on_all_rows(self, model: str | None = None) -> Posterior:
-        """The recommended model (or another one by name) from all rows, of which nothing is held out any more.
-
-        Raises FitError where no model was scored, or its fit fails.
-        """
+        """The recommended model (or another one by name) from all rows. Raises FitError if there is none."""
         name = self.recommended if model is None else self._named(model)
         if name is None:
             raise FitError(f"no model was fitted: {'; '.join(self.failures)}.")
@@ -214,12 +338,6 @@ class Scores(Summary):
         return {} if self.rival is None else {
             name: {criterion: self.difference(criterion, name, self.rival) for criterion in CRITERIA} for name in others
         }  # fmt: skip
-
-    @property
-    def verdicts(self) -> list[str]:
-        """A sentence for every other model and criterion: is it better than the rival?"""
-        found = [(by, each) for pairs in self.differences.values() for by, each in pairs.items() if each is not None]
-        return [f"By the {CRITERIA[by]}: {each.sentence}" for by, each in found]
 
     # ------------------------------------------------------------------ to show
 
@@ -248,24 +366,12 @@ class Scores(Summary):
     @override
     def facts(self) -> dict[str, object]:
         """The scores that say most; all are in `to_dict()`."""
-        name = next(iter(self.models))
-        facts: dict[str, object] = {}
-        if len(self.models) > 1:
-            facts = {"models": listed(self.models), "recommended": self.recommended or "none"}
-            name = self.recommended or name
-        if self.finished(name):
-            held = self.quantities(name)
-            for title, score, quantity in (
-                ("mae", "mae", ACCELERATION),
-                ("noise floor", "noise_floor", ACCELERATION),
-                ("known physics mae", "known_physics_mae", ACCELERATION),
-                ("mae noise-free", "mae", f"true {ACCELERATION}"),
-                ("coverage 95", "coverage_95", ACCELERATION),
-                ("nats per row", "nlpd", ALL_JOINTS),
-            ):
-                if score in held.get(quantity, ()):
-                    facts[title] = f"{self.value(score, quantity, name):.3g}"
-        return facts | {"warnings": listed(self.warnings, most=1)}
+        name = next(iter(self.models)) if len(self.models) == 1 else self.recommended or ""
+        held = self.quantities(name)[ACCELERATION] if name and self.finished(name) else ()
+        known = [score for score in ("mae", "noise_floor", "known_physics_mae", "coverage_95") if score in held]
+        facts = {f"{score} of acceleration": f"{self.value(score, model=name):.3g}" for score in known}
+        best = {"recommended": name or "none"} if len(self.models) > 1 else {}
+        return {"models": listed(self.models), **best, **facts, "warnings": listed(self.warnings, most=1)}
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the models as plain JSON values."""

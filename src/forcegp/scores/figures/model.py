@@ -1,52 +1,191 @@
-"""Plots of one model on a recording: accelerations, normal forces and short motions, and which of them there are."""
+"""Plots of one model on a recording (curves, accelerations, normal forces, motions), of contacts, and of scores."""
 
-from collections.abc import Callable
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from forcegp.data import Dataset, recorded_motions
+from forcegp.data import Dataset, evenly, recorded_motions
 from forcegp.errors import ForceGPError, InvalidInput
+from forcegp.forces import (
+    Actuation,
+    CoupledRotors,
+    JointFriction,
+    LoadFriction,
+    Offset,
+    RigidBodies,
+    Rotor,
+    Unknown,
+)
 from forcegp.mechanics import Contact, Held, LoopClosure
+from forcegp.model import Model
 from forcegp.posterior.posterior import Posterior
+from forcegp.scores.accuracy import ACCELERATION, predict_rows, true_names
 from forcegp.scores.figures import style
-from forcegp.scores.figures.friction_curves import curve_panels, friction_curves_figure
-from forcegp.scores.motions import apart_from, interval_about
-from forcegp.scores.predicted_rows import PredictedRows, predict_rows
+from forcegp.scores.held_out import apart_from, interval_about
+from forcegp.scores.page import unit_of
+from forcegp.scores.scores import Scores
 
 LARGEST_GRID = 12
-SAMPLES = 24
-"""Functions drawn for an interval where the model has no calibrated ones."""
+BEYOND = 0.18  # part of the visited range that is drawn on either side of it
+POINTS = 241
+NOT_OF_VELOCITY = (Actuation, RigidBodies, Rotor, CoupledRotors, Offset, LoadFriction)
+"""Known forces that are no curve over the velocity of one joint."""
+LAWS = "friction laws"  # the component of a joint that has laws alone
+TRUE_POINTS = 200
+
+
+@dataclass(frozen=True, eq=False)
+class CurvePanel:
+    """One process of one feature: its name, and its number in its term; None for the laws of a joint alone.
+
+    `joint` is the joint whose friction it is, by number: the laws of the system are added to it.
+    """
+
+    latent: str
+    component: str
+    term: Unknown | None
+    index: int
+    joint: int | None
+
+
+def curve_panels(posterior: Posterior) -> list[CurvePanel]:
+    """All processes of one feature; where there are none, the friction laws of the joints."""
+    robot, panels = posterior.model.robot, []
+    for component, term, which in posterior.trained.unknown.named(robot):
+        for index, own in enumerate(term.latent_names(robot)):
+            place = which.start + index
+            if posterior.likelihood.standardization.shift[place].shape[-1] == 1:
+                joint = robot.joint_names.index(own) if isinstance(term, JointFriction) else None
+                panels.append(CurvePanel(posterior.latent_names[place], component, term, index, joint))
+    with_law = [j for j in range(robot.nv) if not panels and law_forces(posterior.model, j, np.ones(1)).any()]
+    return panels + [CurvePanel(robot.joint_names[joint], LAWS, None, joint, joint) for joint in with_law]
+
+
+def law_forces(model: Model, joint: int, velocities: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """What the friction laws of the system resist with, in Nm or N, where this joint moves alone; 0 without laws."""
+    robot = model.robot
+    v = torch.zeros(len(velocities), robot.nv, dtype=torch.float64, device=robot.device)
+    v[:, joint] = torch.tensor(velocities, dtype=v.dtype, device=v.device)
+    u = v.new_zeros(len(v), len(model.inputs))
+    state = model.state(robot.neutral().expand(len(v), -1), v, u)
+    laws = [law for law in model.laws if not isinstance(law, NOT_OF_VELOCITY)]
+    return -sum((law.force(state).expand_as(v) for law in laws), torch.zeros_like(v))[:, joint].detach().cpu().numpy()
+
+
+def friction_curves_figure(posterior: Posterior, dataset: Dataset | None = None) -> Figure:
+    """The first `LARGEST_GRID` curves with their 95 % bands over what was visited in training, and a little beyond.
+
+    Of joints with the laws of the system, which a line shows alone. Where `dataset` holds the true friction of joints,
+    dots show it. Raises InvalidInput if there is no curve.
+    """
+    panels = curve_panels(posterior)
+    if not panels:
+        raise InvalidInput(
+            f"a model of {posterior.description} has no process that is a curve; fit one with friction priors, for "
+            "example JointFriction() or ContactFriction()."
+        )
+    chosen = panels[:LARGEST_GRID]
+    columns = min(4 if len(chosen) > 6 else 3, len(chosen))
+    rows = math.ceil(len(chosen) / columns)
+    figure = style.new_figure(max(3.1 * columns, 5.2), 1.1 + 2.3 * rows)
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    robot = posterior.model.robot
+    short = dict(zip(robot.joint_names, style.short_joint_names(robot.joint_names), strict=True))
+    several = len({panel.component for panel in chosen}) > 1
+    for number, axes in enumerate(grid):
+        axes.set_visible(number < len(chosen))
+    for axes, panel in zip(grid, chosen, strict=False):
+        feature, unit = _draw_curve(axes, posterior, panel, dataset)
+        own = panel.latent if panel.term is None else panel.term.latent_names(robot)[panel.index]
+        title = f"{panel.component}: {short.get(own, own)}" if several else short.get(own, own)
+        what = {"Nm": "torque [Nm]", "": "force / normal force"}.get(unit, f"force [{unit}]")
+        style.quiet(axes, title=title, x=feature, y=what)
+    below = {"columns": 5 if columns > 2 else 3, "size": style.NORMAL, "markerscale": 2}
+    style.legend_below(figure, *grid[: len(chosen)], **below)
+    what = "Friction" if all("friction" in panel.component for panel in chosen) else "Forces"
+    how = "by the laws of a model" if chosen[0].term is None else "learned"
+    shown = f" ({len(chosen)} of {len(panels)} curves)" if len(chosen) < len(panels) else ""
+    style.heading(figure, f"{what} {how} from {len(posterior.training)} points{shown}")
+    return figure
+
+
+def _draw_curve(axes: Axes, posterior: Posterior, panel: CurvePanel, dataset: Dataset | None) -> tuple[str, str]:
+    """Mean and band, solid where the training data were; training velocities as ticks; the truth as dots."""
+    with torch.no_grad():
+        v = posterior.training.v[:, panel.index, None]
+        visited = v if panel.term is None else panel.term.features(posterior.likelihood.dynamics)[panel.index]
+    visited = visited[:, 0].cpu().numpy()
+    low, high = float(visited.min()), float(visited.max())
+    margin = BEYOND * (high - low)
+    start = max(0.0, low - margin) if low >= 0.0 else low - margin  # a speed is never negative
+    at = np.linspace(start, high + margin, POINTS)
+    inside = (at >= low) & (at <= high)
+    laws = np.zeros(POINTS) if panel.joint is None else law_forces(posterior.model, panel.joint, at)
+    slides = panel.joint is not None and posterior.model.robot.joints[panel.joint].type == "prismatic"
+    mean, spread, label, unit = laws, np.zeros(POINTS), "laws", "N" if slides else "Nm"
+    feature = "velocity [m/s]" if slides else "velocity [rad/s]"
+    if panel.term is not None:
+        curve = posterior.curve(panel.latent, at[:, None])
+        mean, spread = laws + curve.mean.cpu().numpy(), style.QUANTILE * curve.std.cpu().numpy()
+        label, unit = "laws and learned part" if laws.any() else "learned", curve.unit
+        feature = re.sub(" of [^[]*(?= \\[)", "", curve.feature_names[0])  # the title names the joint
+        style.draw_band(axes, at, mean, spread, alpha=0.28, where=inside.tolist(), label="95 % band")
+        style.draw_band(axes, at, mean, spread, alpha=0.12)
+        if laws.any():
+            style.draw_line(axes, at, laws, style.KNOWN_PHYSICS, 1.0, "laws alone", linestyle=style.DASHED)
+    axes.axhline(0.0, color="#B8BCC2", linewidth=0.8, zorder=1)
+    style.draw_line(axes, at[inside], mean[inside], style.PREDICTION, 1.5, label)
+    style.draw_line(
+        axes, at, mean, style.PREDICTION, 1.2, "beyond the training data", linestyle=(0, (3, 2)), zorder=1.9
+    )
+    ticks = {"markersize": 5, "color": style.TRUTH, "alpha": 0.5, "transform": axes.get_xaxis_transform()}
+    axes.plot(visited, np.full(len(visited), 0.025), "|", label="training velocities", **ticks)
+    levels = [(mean - spread)[inside], (mean + spread)[inside]]
+    if dataset is not None and (truth := _truth(posterior, dataset, panel)) is not None:
+        true_at, force = (values[(truth[0] >= at[0]) & (truth[0] <= at[-1])] for values in truth)
+        axes.plot(true_at, force, "o", label="true", color="#A8A8A8", markersize=4.0, markeredgewidth=0, zorder=1.8)
+        levels.append(force)
+    values = np.concatenate(levels)
+    room = 0.12 * max(float(np.ptp(values)), 1e-12)
+    axes.set_ylim(float(values.min()) - 1.6 * room, float(values.max()) + room)
+    axes.set_xlim(at[0], at[-1])
+    axes.locator_params(axis="x", nbins=6)
+    return feature, unit
+
+
+def _truth(posterior: Posterior, dataset: Dataset, panel: CurvePanel) -> tuple[np.ndarray, np.ndarray] | None:
+    """Velocity and true friction of a joint, with its laws, at rows of the Dataset; None where unknown."""
+    components = [name for name, *_ in posterior.trained.unknown.named(posterior.model.robot)]
+    key = f"Q_U.{true_names(components, dataset).get(panel.component)}"
+    if posterior.carries_known_forces or panel.joint is None or key not in dataset.truth:
+        return None
+    rows, model = dataset.rows(evenly(dataset, TRUE_POINTS)), dataset.model or posterior.model
+    at = rows.v[:, panel.joint]
+    return at, law_forces(model, panel.joint, at) - rows.truth[key][:, panel.joint]
+
+
+LARGEST_GRID = 12
+SAMPLES = 24  # functions drawn for an interval where the model has no calibrated ones
 
 
 def model_pictures(
     posterior: Posterior, dataset: Dataset, progress: Callable[[int, int, str], None] | None = None
 ) -> tuple[list[style.Picture], list[str]]:
     """Every plot that the model and the recording allow, and why others are missing (uneven time steps, say)."""
-    wanted: list[tuple[str, str, Callable[[Posterior, Dataset], Figure]]] = [
-        (
-            "motions_ahead",
-            "Every half second a prediction begins at the recorded state and follows the recorded u. The line is its "
-            "error, the band its 95 % interval.",
-            motion_bands_figure,
-        ),
-        ("prediction", "Accelerations over time, and their errors on the right.", prediction_figure),
-    ]
-    if curve_panels(posterior):
-        caption = (
-            "Forces over velocity, with 95 % bands: the friction laws of the model and what was learned beside them. "
-            "Ticks are the velocities of the training data."
-        )
-        wanted.insert(0, ("forces", caption, friction_curves_figure))
-    if posterior.model.contacts:
-        wanted.insert(-1, ("normal_force", "The forces of contacts, which no sensor measured.", normal_force_figure))
-    pictures, missing = [], []
-    for done, (name, caption, draw) in enumerate(wanted):
+    there = {"forces": curve_panels(posterior), "normal_force": posterior.model.contacts}
+    wanted, pictures, missing = [name for name in PICTURES if there.get(name, True)], [], []
+    for done, name in enumerate(wanted):
         if progress is not None:
             progress(done, len(wanted), name)
+        draw, caption = PICTURES[name]
         try:
             pictures.append(style.Picture(name, caption, draw(posterior, dataset)))
         except ForceGPError as error:
@@ -60,57 +199,42 @@ def prediction_figure(posterior: Posterior, dataset: Dataset, *, start: float = 
     The dark band is 2 sigma of the acceleration, the light one adds the measurement noise.
     """
     rows = style.window(dataset, start, seconds)
-    predicted = predict_rows(posterior, rows)
+    predicted, true = predict_rows(posterior, rows), rows.truth.get("a")
+    inner, outer = 2.0 * np.sqrt(predicted.variance), 2.0 * np.sqrt(predicted.measurement_variance)
     figure = style.new_figure(11.0, 1.0 + 1.35 * rows.nv)
-    axes = figure.subplots(rows.nv, 2, sharex=True, squeeze=False, width_ratios=(1.25, 1.0))
+    grid = figure.subplots(rows.nv, 2, sharex=True, squeeze=False, width_ratios=(1.25, 1.0))
     names, units = style.short_joint_names(rows.joint_names), style.joint_units(rows, "a")
-    for joint in range(rows.nv):
-        draw_acceleration(axes[joint, 0], rows, predicted, joint)
-        draw_error(axes[joint, 1], rows, predicted, joint)
-        style.quiet(axes[joint, 0], y=f"{names[joint]}\n{units[joint]}")
-        style.quiet(axes[joint, 1], y=units[joint])
-    for column, title in enumerate(("Acceleration", "Error: prediction minus measurement (dots) or truth (line)")):
-        axes[0, column].set_title(title, fontsize=style.NORMAL, loc="left")
-        axes[-1, column].set_xlabel("time [s]", fontsize=style.NORMAL)
-    figure.align_ylabels(axes[:, 0])
-    figure.align_ylabels(axes[:, 1])
-    title = f"Prediction after {len(posterior.training)} training points"
-    style.legend_above(figure, title, axes[0, 0], axes[0, 1], markerscale=4)
+    dots = {"color": style.MEASUREMENT, "markersize": 1.8, "alpha": 0.7}
+    for joint, (left, right) in enumerate(grid):
+        mean, measured = predicted.mean[:, joint], rows.a[:, joint]
+        left.plot(rows.time, measured, ".", label="measured", **dots)
+        style.draw_band(left, rows.time, mean, inner[:, joint], alpha=0.35, label="2σ")
+        style.draw_band(right, rows.time, 0.0 * mean, outer[:, joint], alpha=0.13, label="2σ of a measurement")
+        style.draw_band(right, rows.time, 0.0 * mean, inner[:, joint], alpha=0.35)
+        right.plot(rows.time, mean - measured, ".", **dots)
+        if true is not None:
+            style.draw_line(left, rows.time, true[:, joint], style.TRUTH, 1.0, "true")
+            style.draw_line(right, rows.time, mean - true[:, joint], style.TRUTH, 1.0)
+        style.draw_line(left, rows.time, mean, style.PREDICTION, 1.3, "predicted", linestyle=style.DASHED)
+        right.axhline(0.0, color=style.PREDICTION, linewidth=0.8, linestyle=style.DASHED)
+        limit, largest = 2.0 * float(np.median(outer[:, joint])), float(np.abs(mean - measured).max())
+        if largest < 1.5 * limit:  # equal scales where the model is right
+            right.set_ylim(-max(limit, 1.05 * largest), max(limit, 1.05 * largest))
+        last = "time [s]" if joint == rows.nv - 1 else ""
+        for axes, label in ((left, f"{names[joint]}\n{units[joint]}"), (right, units[joint])):
+            axes.margins(x=0)
+            style.quiet(axes, y=label, x=last)
+    titles = "Acceleration", "Error: prediction minus measurement (dots) or truth (line)"
+    for axes, title in zip(grid[0], titles, strict=True):
+        axes.set_title(title, fontsize=style.NORMAL, loc="left")
+    style.legend_above(figure, f"Prediction after {len(posterior.training)} training points", *grid[0], markerscale=4)
     return figure
 
 
-def draw_acceleration(axes: Axes, rows: Dataset, predicted: PredictedRows, joint: int) -> None:
-    """Measurement, band, truth and mean of one joint over time."""
-    time, mean, spread = rows.time, predicted.mean[:, joint], 2.0 * predicted.std[:, joint]
-    axes.plot(time, rows.a[:, joint], ".", color=style.MEASUREMENT, markersize=1.8, alpha=0.7, label="measured")
-    style.draw_band(axes, time, mean, spread, alpha=0.35, label="2σ")
-    if "a" in rows.truth:
-        axes.plot(time, rows.truth["a"][:, joint], color=style.TRUTH, linewidth=1.0, label="true")
-    axes.plot(time, mean, color=style.PREDICTION, linewidth=1.3, linestyle=style.DASHED, label="predicted")
-    axes.margins(x=0)
-
-
-def draw_error(axes: Axes, rows: Dataset, predicted: PredictedRows, joint: int) -> None:
-    """Errors of one joint over time, about the bands of 2 sigma without and with measurement noise."""
-    time, mean = rows.time, predicted.mean[:, joint]
-    inner, outer = 2.0 * predicted.std[:, joint], 2.0 * predicted.measurement_std[:, joint]
-    style.draw_band(axes, time, np.zeros_like(mean), outer, alpha=0.13, label="2σ of a measurement")
-    style.draw_band(axes, time, np.zeros_like(mean), inner, alpha=0.35)
-    axes.plot(time, mean - rows.a[:, joint], ".", color=style.MEASUREMENT, markersize=1.8, alpha=0.7)
-    if "a" in rows.truth:
-        axes.plot(time, mean - rows.truth["a"][:, joint], color=style.TRUTH, linewidth=1.0)
-    axes.axhline(0.0, color=style.PREDICTION, linewidth=0.8, linestyle=style.DASHED)
-    axes.margins(x=0)
-    limit, largest = 2.0 * float(np.median(outer)), float(np.abs(mean - rows.a[:, joint]).max())
-    if largest < 1.5 * limit:  # equal scales where the model is right
-        axes.set_ylim(-max(limit, 1.05 * largest), max(limit, 1.05 * largest))
-
-
 def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float = 0.0, seconds: float = 4.0) -> Figure:
-    """One row per contact: force over `seconds` of the first episode, with the truth where the Dataset holds "lambda".
+    """Forces of contacts in N over `seconds` of the first episode, and the truth where the Dataset holds "lambda".
 
-    The force is |s_p| lambda in N, positive where the surface pushes along its gradient; where a point is held, the
-    part along each axis of the world. Raises InvalidInput without contacts, and for models without forces.
+    Positive where the surface pushes; of a held point along each axis. Raises InvalidInput where there are none.
     """
     if not posterior.model.contacts:
         raise InvalidInput(
@@ -158,12 +282,10 @@ def _contact_labels(contact: Contact) -> tuple[str, str]:
 def motion_bands_figure(
     posterior: Posterior, dataset: Dataset, *, start: float = 0.0, seconds: float = 6.0, horizon: float = 0.5
 ) -> Figure:
-    """Errors of q over time: every `horizon` s a prediction begins at the recorded state and follows the recorded u.
+    """Errors of q: every `horizon` s a prediction begins at the recorded state and follows the recorded u.
 
-    Bands are 95 % intervals: calibrated ones of the model, else those of functions drawn from it; a model without
-    either has none. Positions would coincide at this scale, so their errors are drawn. At most 12 joints.
-
-    Raises InvalidInput for a recording whose rows are not evenly spaced, or shorter than `horizon`.
+    Bands are 95 % intervals, calibrated or of functions drawn from the model. At most 12 joints. Raises InvalidInput
+    for uneven rows, or fewer than `horizon` lasts.
     """
     rows = style.window(dataset, start, seconds)
     elapsed = rows.time - rows.time[0]
@@ -201,3 +323,101 @@ def motion_bands_figure(
     shown = f" ({joints} of {rows.nv} joints)" if joints < rows.nv else ""
     style.legend_above(figure, f"Errors of positions predicted {horizon:g} s ahead{shown}", panels[0][0])
     return figure
+
+
+def contacts_figure(
+    time: Float[np.ndarray, " rows"],
+    distance: Float[np.ndarray, " rows"],
+    threshold: float,
+    torque: Float[np.ndarray, "rows nv"],
+    contacts: Sequence[tuple[float, float]],
+    joints: Sequence[str],
+    title: str,
+) -> Figure:
+    """Squared Mahalanobis distances with their threshold, and torques in Nm (N); `contacts` (start, end) in s."""
+    figure = style.new_figure(9.0, 5.4)
+    above, below = figure.subplots(2, 1, sharex=True)
+    for axes in (above, below):
+        axes.margins(x=0)
+        for start, end in contacts:
+            axes.axvspan(start, end, color=style.KNOWN_PHYSICS, alpha=0.18, linewidth=0, label="contact")
+    style.draw_line(above, time, np.maximum(distance, 1e-3), style.PREDICTION, 0.8, "distance from free motion")
+    style.draw_line(above, time, np.full_like(time, threshold), style.TRUTH, 1.0, "threshold", linestyle=style.DASHED)
+    above.set_yscale("log")
+    above.set_ylim(bottom=max(0.1, float(np.quantile(distance, 0.01))))
+    style.quiet(above, y="squared distance [σ²]")
+    names = style.short_joint_names(joints)
+    for joint, name in enumerate(names):
+        style.draw_line(below, time, torque[:, joint], style.SERIES[joint % len(style.SERIES)], 0.9, name)
+    style.quiet(below, x="time [s]", y="unexplained torque [Nm (N)]")
+    style.legend_above(figure, title, above)
+    style.legend_below(figure, below)
+    return figure
+
+
+PICTURES: dict[str, tuple[Callable[[Posterior, Dataset], Figure], str]] = {
+    "forces": (
+        friction_curves_figure,
+        "Forces over velocity, with 95 % bands: the friction laws of the model and what was learned beside them. "
+        "Ticks are the velocities of the training data.",
+    ),
+    "motions_ahead": (
+        motion_bands_figure,
+        "Every half second a prediction begins at the recorded state and follows the recorded u. The line is its "
+        "error, the band its 95 % interval.",
+    ),
+    "normal_force": (normal_force_figure, "The forces of contacts, which no sensor measured."),
+    "prediction": (prediction_figure, "Accelerations over time, and their errors on the right."),
+}
+"""By name, how each is drawn, and what is to be seen."""
+
+
+COLORS = {
+    "given": (style.KNOWN_PHYSICS,),
+    "identified": (style.IDENTIFIED, "#00563F"),
+    "black box": (style.BLACK_BOX, "#7B3F67"),
+    "residual": (style.SERIES[4],),
+    "force prior": (style.PREDICTION, style.SERIES[5], "#17375E"),
+}
+"""By the kind of a model, as in all other figures; what is refined on motions is its model with dashes."""
+
+
+def scores_pictures(scores: Scores) -> list[style.Picture]:
+    """The errors of motions, where there are some."""
+    models = [name for name in scores.models if ACCELERATION in scores.quantities(name)]
+    caption = "How the error of predicted positions grows, on time that no model has seen."
+    return [style.Picture("motions", caption, motions_figure(scores, models))] if scores.horizons and models else []
+
+
+def motions_figure(scores: Scores, models: list[str]) -> Figure:
+    """RMS error of q over motions and joints against the length of the prediction: median and range over runs."""
+    figure = style.new_figure(8.2, 3.8)
+    axes = figure.subplots()
+    for name, looks in _looks(scores, models).items():
+        spreads = {h: scores.spread("rmse", f"position after {h:g} s", name) for h in scores.horizons}
+        known = {h: spread for h, spread in spreads.items() if spread is not None}
+        low, middle, high = ([spread[key] for spread in known.values()] for key in ("min", "median", "max"))
+        axes.plot(list(known), middle, label=name, **looks)
+        axes.fill_between(list(known), low, high, color=looks["color"], alpha=0.12, linewidth=0)
+    title, label = "Motions predicted from recorded states under recorded forces", unit_of(scores, "q")
+    style.quiet(axes, title=title, x="length of the prediction [s]", y=f"RMS error of q [{label}]")
+    axes.set_yscale("log")
+    style.plain_ticks(axes.yaxis)
+    figure.legend(loc="outside right upper", fontsize=style.SMALL, frameon=False)
+    return figure
+
+
+def _looks(scores: Scores, models: list[str]) -> dict[str, dict[str, Any]]:
+    """How every model is drawn: colours of its kind; earlier ones wider, so that curves which coincide are seen."""
+    bases = {name: re.sub(r"[@+]motions(:[^+]*)?$", "", name) for name in models}  # without refinement on motions
+    kinds = {base: scores.models[name]["kind"] for name, base in bases.items()}
+    named = sorted(kinds, key=lambda base: "gp:joint-friction" not in base)  # which has one colour everywhere
+    looks = {}
+    for below, (name, base) in enumerate(bases.items(), start=1 - len(models)):
+        alike = [other for other in named if kinds[other] == kinds[base]]
+        turn, place = divmod(alike.index(base), len(COLORS[kinds[base]]))
+        color, refined = COLORS[kinds[base]][place], name != base
+        looks[name] = {"color": color, "linestyle": "--" if refined else ("-", "-.", ":")[turn % 3]}
+        looks[name] |= {"linewidth": 1.2 - 0.35 * below, "marker": "o", "markersize": 3.0 - 0.5 * below}
+        looks[name] |= {"markerfacecolor": "white" if refined else color}
+    return looks

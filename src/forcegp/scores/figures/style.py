@@ -106,10 +106,7 @@ def legend_below(figure: FigureBase, *axes: Axes, columns: int | None = None, si
 
 
 def plain_ticks(axis: Axis) -> None:
-    """Numbers such as 0.02 and 50 on a logarithmic axis with its final limits: at powers of ten alone if it is long.
-
-    On a short one there are at most four, since `LogLocator` crowds them there.
-    """
+    """Numbers such as 0.02 and 50 on a logarithmic axis with its final limits: at powers of ten alone if it is long."""
     low, high = axis.get_view_interval()
     of_decades = LogLocator(subs=(1.0, 2.0, 5.0) if high < 80.0 * low else (1.0,))
     axis.set_major_locator(MaxNLocator(3) if high < 5.0 * low else of_decades)
@@ -148,10 +145,7 @@ def save_figure(figure: Figure, path: str | Path) -> None:
 
 
 def window(dataset: Dataset, start: float, seconds: float) -> Dataset:
-    """The rows of the first episode from `start` seconds after its beginning on, for `seconds`, in the order of time.
-
-    Raises InvalidInput if there are none.
-    """
+    """Rows of the first episode from `start` s on for `seconds`, in order of time. Raises InvalidInput."""
     rows = np.flatnonzero(dataset.episode == dataset.episodes[0])
     rows = rows[np.argsort(dataset.time[rows], kind="stable")]
     elapsed = dataset.time[rows] - dataset.time[rows[0]]

@@ -1,0 +1,277 @@
+"""`forcegp export`, `monitor` and `excite`: what is done with a fitted model."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+import forcegp
+import forcegp.data
+import forcegp.posterior
+import forcegp.scores
+from forcegp.atomic_files import write_json
+from forcegp.cli.command import DATASET, MODEL, NUMBERS, Command, begins, listed, numbers_of, unless_given
+from forcegp.cli.robot_options import CONTACTS, RobotOptions, parse_contacts, require_same_joints
+from forcegp.cli.terminal import Terminal, columns
+from forcegp.errors import InvalidInput
+from forcegp.scores.page import number
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export(Command):
+    """Write a fitted model as a program that needs no Python.
+
+    c: C99 with the weights inside and <math.h> only, a header, an example, a self-test, a CMakeLists.txt, and forms
+    for CasADi's external and acados' generic functions. It is compiled and compared with the model before it is there.
+    casadi: CasADi functions with all derivatives, for casadi.Function.load (pip install 'forcegp[casadi]').
+
+    For example:
+      forcegp export run --to c --out deployed --covariance
+      forcegp export run --to casadi --out planner --steps 0.02
+      forcegp export run --to c --out mpc --jacobian --steps 0.02 --integrator implicit-midpoint
+    """
+
+    model: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
+    """The folder that `forcegp fit --out` wrote."""
+    to: Literal["c", "casadi"]
+    """What to write."""
+    out: Annotated[Path, arg(metavar="FOLDER")]
+    """The folder to write."""
+    covariance: bool = False
+    """With the covariance of the acceleration, which makes the program some 2 MB larger."""
+    jacobian: bool = False
+    """With derivatives in q, v and u. Compilers take some ten seconds for them."""
+    steps: Annotated[float | None, unless_given("DT", "without", float)] = None
+    """With x+ = f(x, u), a step of DT seconds."""
+    integrator: Annotated[str | None, unless_given("NAME", "symplectic-euler", str)] = None
+    """How the step of --steps is computed: symplectic-euler, rk4 or implicit-midpoint (stiff friction)."""
+    unchecked: bool = False
+    """Do not compile the program and compare it with the model."""
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Write and show."""
+        if self.integrator is not None and self.steps is None:
+            raise InvalidInput("--integrator was given without --steps, which sets the length of a step.")
+        self.require_free(self.out)
+        posterior = forcegp.load_posterior(self.model)
+        names = ("to", "covariance", "jacobian", "steps", "integrator")
+        content = {"run": str(self.model), **{name: getattr(self, name) for name in names}}
+        with self.folder(self.out, content) as folder:
+            found = TARGETS[self.to](self, terminal, posterior, folder)
+        return {"out": str(self.out), **content, **found}
+
+
+def _c(options: Export, terminal: Terminal, posterior: Any, folder: Path) -> dict[str, Any]:
+    same = {name: getattr(options, name) for name in ("covariance", "jacobian", "steps", "unchecked")}
+    integrator = options.integrator or "symplectic-euler"
+    made = forcegp.export_c(posterior, folder, **same, integrator=integrator, source=str(options.model))
+    terminal.show(
+        columns(str(options.out), ["file", "bytes"], [[file, f"{size:,}"] for file, size in made.files.items()])
+    )
+    for function, apart in made.differences.items():
+        terminal.show(f"{function}: at most {apart:.1e} of the largest value from forcegp's own")
+    return {"name": made.name, "files": made.files, "differences": made.differences, "inflation": made.inflation}
+
+
+def _casadi(options: Export, terminal: Terminal, posterior: Any, folder: Path) -> dict[str, Any]:
+    for name in ("covariance", "jacobian", "unchecked"):
+        if getattr(options, name):
+            raise InvalidInput(f"--{name} is for --to c; CasADi functions have all derivatives, and no covariance.")
+    given = {"steps": options.steps, "integrator": options.integrator or "symplectic-euler"}
+    differences = forcegp.posterior.export_casadi(posterior, folder, **given)
+    rows = [[file, f"{apart:.1e}"] for file, apart in differences.items()]
+    terminal.show(columns(str(options.out), ["file", "largest difference / largest value"], rows))
+    return {"differences": differences}
+
+
+TARGETS: dict[str, Callable[[Export, Terminal, Any, Path], dict[str, Any]]] = {"c": _c, "casadi": _casadi}
+"""What writes each target to a folder; a new one is a function here and a name in `Export.to`."""
+
+
+PLACE = tuple(f"{name}_{axis}" for name in ("point", "force", "force_std") for axis in "xyz")
+COLUMNS = ("start", "end", "peak", "probability", "link", "also", "newton", *PLACE)
+APART = 0.25  # alarms that are less apart in s belong to one contact
+
+
+@dataclass(frozen=True, kw_only=True)
+class Monitor(Command):
+    """Find contacts in a log without a force sensor: time, link and force of each.
+
+    A residual torque counts as a contact if it exceeds what free motion of the same robot shows.
+    LOG is a dataset; forcegp import makes one of any log.
+
+    For example:
+      forcegp monitor run log.h5 --free 120 --out contacts
+      forcegp monitor run shift.h5 --free morning.h5 --false-alarms 0.01 --out contacts
+    """
+
+    model: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
+    """The folder that `forcegp fit --out` wrote, of a robot without contacts."""
+    log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
+    """The log to search, at the rate of its sensors."""
+    out: Annotated[Path, arg(metavar="FOLDER")]
+    """The folder to write: contacts.csv, contacts.json and contacts.png."""
+    free: Annotated[str, arg(metavar="S|FREE.h5")]
+    """Motion of 40 s or more without contacts, not used for training: the first S seconds of LOG, which are not
+    searched, or another log."""
+    false_alarms: Annotated[float, arg(metavar="N")] = 0.1
+    """Accepted false alarms per hour."""
+    bandwidth: Annotated[float, arg(metavar="HZ")] = 5.0
+    """Cut-off of the low-pass filter on the torques. A higher one is faster, a lower one finds smaller forces."""
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Calibrate, look, draw and show."""
+        try:
+            seconds, other = float(self.free), None
+        except ValueError:
+            seconds, other = 1.0, Path(self.free)
+        if not (seconds > 0.0 and (other is None or other.is_file())):
+            raise InvalidInput(f"--free is {self.free}; give seconds above 0, or a dataset that is there (.h5).")
+        self.require_free(self.out)
+        posterior = forcegp.load_posterior(self.model)
+        log = _dataset(self.log, posterior)
+        dt = forcegp.data.filters.uniform_step(log.time[log.episode == log.episodes[0]], str(self.log))
+        motions = list(_motions(log, self.log, dt))
+        if other is not None:
+            known = [each[1:] for each in _motions(_dataset(other, posterior), other, dt)]
+        else:
+            first, rows = motions[0], round(min(seconds / dt, float(len(motions[0][0]))))
+            known, motions[0] = [tuple(x[:rows] for x in first[1:])], tuple(x[rows:] for x in first)
+        monitor = forcegp.ContactMonitor(posterior.predictor(), dt=dt, bandwidth=self.bandwidth)
+        with terminal.progress("looking"):
+            monitor.calibrate(known, false_alarms_per_hour=self.false_alarms)
+            parts = [(time, q, monitor.run(q, v, u)) for time, q, v, u in motions if len(time) > 1]
+        if not parts:
+            raise InvalidInput(f"nothing is left of {self.log} after --free {self.free}.")
+        contacts = [found for time, q, state in parts for found in _contacts(monitor, time, q, state)]
+        content = {
+            "run": str(self.model),
+            "log": str(self.log),
+            **{name: getattr(self, name) for name in ("free", "false_alarms", "bandwidth")},
+            **{"dt": dt, "threshold": monitor.threshold, "seconds": sum(len(time) for time, *_ in parts) * dt},
+        }
+        title = f"{self.log.name}: {len(contacts)} contacts in {content['seconds']:.0f} s"
+        with self.folder(self.out, content) as folder:
+            write_json(folder / "contacts.json", {**content, "contacts": contacts})
+            with (folder / "contacts.csv").open("w", encoding="utf-8", newline="") as file:
+                table = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+                table.writeheader()
+                table.writerows(contacts)
+            time, _, state = max(parts, key=lambda part: len(part[0]))
+            shown = [(each["start"], each["end"]) for each in contacts if time[0] <= each["start"] <= time[-1]]
+            arrays = time, state.distance.numpy(), monitor.threshold, state.torque.numpy()
+            figure = forcegp.scores.contacts_figure(*arrays, shown, log.joint_names, title)
+            forcegp.scores.save_figure(figure, folder / "contacts.png")
+        terminal.note(f"figure: {self.out / 'contacts.png'}")
+        limit = monitor.threshold
+        header = ["on", "from [s]", "to [s]", "force [N]", "distance /\nthreshold"]
+        rows = [
+            [each["link"], *(f"{each[name]:.2f}" for name in ("start", "end", "newton")), f"{each['peak'] / limit:.1f}"]
+            for each in contacts
+        ]
+        terminal.show(columns(title, header, rows) if rows else title)
+        return {**content, "contacts": contacts}
+
+
+def _dataset(path: Path, posterior: Any) -> forcegp.Dataset:
+    """The dataset, of the joints of the model. Raises InvalidInput for others."""
+    dataset = forcegp.Dataset.load(path)
+    require_same_joints(posterior, dataset, path)
+    return dataset
+
+
+def _motions(dataset: forcegp.Dataset, path: Path, dt: float) -> Iterator[tuple[Any, Any, Any, Any]]:
+    """time, q, v and u of every episode. Raises InvalidInput for other time steps."""
+    for episode in dataset.episodes:
+        at = dataset.episode == episode
+        step = forcegp.data.filters.uniform_step(dataset.time[at], f"episode {episode} of {path}")
+        if abs(step - dt) > 0.01 * dt:
+            raise InvalidInput(
+                f"{path} has steps of {step:.4g} s and the log of {dt:.4g} s; import both at one --rate."
+            )
+        yield dataset.time[at], dataset.q[at], dataset.v[at], dataset.u[at]
+
+
+def _contacts(monitor: forcegp.ContactMonitor, time: Any, q: Any, state: Any) -> Iterator[dict[str, Any]]:
+    """Alarms that follow each other closely, as one contact with the place and the force of its peak."""
+    import numpy as np  # here, so that --help does not wait for it
+
+    alarms, distance = np.flatnonzero(state.alarm.numpy()), state.distance.numpy()
+    for rows in np.split(alarms, np.flatnonzero(np.diff(alarms) * monitor.dt > APART) + 1) if alarms.size else ():
+        peak = int(rows[distance[rows].argmax()])
+        place = monitor.place(q[peak], state.torque[peak])
+        ends = float(time[rows[0]]), float(time[rows[-1]]), float(distance[peak]), float(state.probability[peak])
+        three = [x for name in ("point", "force", "force_std") for x in getattr(place, name)]
+        found = (*ends, place.link, " ".join(place.also), float(np.linalg.norm(place.force)), *three)
+        yield dict(zip(COLUMNS, found, strict=True))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Excite(Command):
+    """Choose the motion within limits, from rest to rest, that reduces the uncertainty of learned forces most.
+
+    With --robot instead of a model, one that identifies base parameters and friction.
+
+    For example:
+      forcegp excite run --limits velocity=1.5,acceleration=6 --out next.csv
+      forcegp excite --robot arm.urdf --limits velocity=1,1,2 --seconds 20 --out next.csv
+    """
+
+    model: Annotated[Positional[Path | None], MODEL, arg(metavar="[RUN]")] = None
+    """The folder that `forcegp fit --out` wrote."""
+    out: Annotated[Path, arg(metavar="FILE.csv")]
+    """t, q, v, a and u to write, 100 rows per second, as `forcegp import` reads them."""
+    seconds: Annotated[float, arg(metavar="S")] = 10.0
+    """How long the motion lasts."""
+    limits: Annotated[tuple[str, ...], listed(goes_on=NUMBERS), unless_given("WHAT=X,...", "the robot file's")] = ()
+    """Largest position (from the start), velocity, acceleration or torque, for all joints or for each. Of the limits of
+    the robot file nine tenths are used."""
+    posture: Annotated[tuple[float, ...], listed(float), unless_given("Q,...", "middle of log or ranges")] = ()
+    """Positions of the joints at both ends."""
+    avoid: Annotated[tuple[str, ...], listed(goes_on=NUMBERS), unless_given(CONTACTS, "its contacts")] = ()
+    """Surfaces that points of the robot must not touch, as in `forcegp fit --contact`; or none."""
+    clearance: Annotated[float, arg(metavar="M")] = 0.05
+    """How far the points of --avoid stay away, in m."""
+    tries: Annotated[int, arg(metavar="N")] = 300
+    """How many motions to look at."""
+    seed: Annotated[int, arg(metavar="K")] = 0
+    """Draws the motions that are looked at."""
+    robot: RobotOptions = RobotOptions()
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Choose, write, draw and show."""
+        self.require_free_file(self.out, begins(b"t,q_"), "a motion of forcegp")
+        model, limits = self.robot.chosen(), {}
+        if (model is None) == (self.model is None):
+            raise InvalidInput("give either the folder of a fitted model or --robot ARM.urdf.")
+        for word in self.limits:
+            name, _, values = word.partition("=")
+            numbers = numbers_of(values, f"--limits {word}: give numbers, for example --limits velocity=1.5.")
+            limits[name] = numbers[0] if len(numbers) == 1 else numbers
+        given = {name: getattr(self, name) for name in ("seconds", "clearance", "seed")}
+        with terminal.progress(f"choosing a motion of {self.seconds:g} s") as report:
+            chosen = forcegp.excitation(
+                model or forcegp.load_posterior(str(self.model)),
+                **given,
+                motions=self.tries,
+                limits=limits,
+                start=list(self.posture) or None,
+                surfaces=parse_contacts(self.avoid) if self.avoid else None,
+                progress=report,
+            )
+        chosen.save_csv(self.out)
+        usage = {name: values.tolist() for name, values in chosen.usage.items()}
+        table = {f"{name}\nover limit": values for name, values in usage.items()}
+        spread = None if chosen.spread is None else chosen.spread.tolist()
+        if spread is not None:
+            table |= {"spread of a,\nbefore": spread[0], "\nafter": spread[1]}
+        rows = [
+            [name, *map(number, each)] for name, *each in zip(chosen.robot.joint_names, *table.values(), strict=True)
+        ]
+        terminal.show(columns(str(self.out), ["joint", *table], rows))
+        return {"out": str(self.out), "usage": usage, "spread": spread, "condition": chosen.condition}

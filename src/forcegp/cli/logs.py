@@ -1,0 +1,401 @@
+"""`forcegp import` and `check`, and the options of a log: its columns, and the filter that makes rows of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+import forcegp
+import forcegp.checks
+import forcegp.data
+import forcegp.recordings
+from forcegp.atomic_files import atomic_file
+from forcegp.cli.command import DATASET, LOG, MAPPING, NUMBERS, Command, listed, numbers_of, options_of, unless_given
+from forcegp.cli.robot_options import FEET, RobotOptions, parse_feet
+from forcegp.cli.terminal import Terminal, columns, doubts_table, facts, shown
+from forcegp.errors import DatasetError, InvalidInput
+
+Columns = Annotated[str | None, unless_given("COLUMNS", "by the names", str)]
+Text = Annotated[str | None, unless_given("TEXT", "none", str)]
+Seconds = Annotated[float | None, unless_given("S", "all", float)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CutoffOptions:
+    """How a log is filtered."""
+
+    cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "none"
+    """Low-pass filter q and u without delay, and recompute v and a. auto: chosen by the spectrum and held-out
+    torques."""
+    differentiate: Literal["q", "v"] = "q"
+    """q: v and a from filtered positions. v: a from filtered velocities."""
+
+    def preparation(self) -> forcegp.data.Preparation:
+        """The preparation that the options describe. Raises InvalidInput, naming the option, for what is no number."""
+        if self.cutoff in ("none", "auto"):
+            cutoff = None if self.cutoff == "none" else "auto"
+        else:
+            complaint = f"--cutoff is {self.cutoff!r}; give a frequency in Hz, auto or none."
+            [cutoff] = numbers_of(self.cutoff, complaint, one=True)
+        return forcegp.data.Preparation(cutoff=cutoff, differentiate=self.differentiate)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterOptions(CutoffOptions):
+    """How rows to learn from are made of a raw log."""
+
+    delay: Annotated[str, arg(metavar="S|auto")] = "0"
+    """Delay of u in the log, in s. auto: estimated for all joints together where u are the torques of all joints and
+    nothing is touched, else 0."""
+    lag: Annotated[str, arg(metavar="S|auto")] = "0"
+    """Time constant in s with which actuators of first order follow u, thrusters where a base has them. auto: estimated
+    for thrusters."""
+    every: Annotated[int | None, unless_given("N", "1, or what the filter leaves", int)] = None
+    """Keep every N-th row, after the filter."""
+    trim: Annotated[float, arg(metavar="S")] = 0.0
+    """Drop S seconds at both ends of each episode, after the filter."""
+
+    def preparation(self) -> forcegp.data.Preparation:
+        """As above."""
+        late: dict[str, Any] = {"delay": self.delay, "lag": self.lag}
+        for name in [name for name, given in late.items() if given != "auto"]:
+            [late[name]] = numbers_of(late[name], f"--{name} is {late[name]!r}; give seconds, or auto.", one=True)
+        return replace(super().preparation(), every=1 if self.every is None else self.every, trim=self.trim, **late)
+
+
+def prepared_rows(
+    preparation: forcegp.data.Preparation, raw: forcegp.Dataset, *, thin: bool
+) -> tuple[forcegp.Dataset, forcegp.Dataset]:
+    """Rows to learn from, with `thin` as many as the filter leaves, and the same at the full rate."""
+    if preparation.changes_nothing:
+        return raw, raw
+    preparation = preparation.resolved(raw)
+    every = preparation.thinning(raw) if thin else preparation.every
+    rows = replace(preparation, every=every).apply(raw)
+    return rows, rows if every == 1 else replace(preparation, every=1).apply(raw)
+
+
+def with_delay_that_shows(
+    terminal: Terminal, preparation: forcegp.data.Preparation, dataset: forcegp.Dataset
+) -> forcegp.data.Preparation:
+    """The same with a delay of 0 instead of "auto" where a log shows none, which is reported on stderr."""
+    contacts = dataset.model is not None and dataset.model.contacts
+    if preparation.delay != "auto" or (forcegp.data.torques_of_joints(dataset) and not contacts):
+        return preparation
+    terminal.note(
+        "u is taken to be on time: delays are estimated where it holds the torques of all joints and nothing is "
+        "touched; give --delay in s where it is late"
+    )
+    return replace(preparation, delay=0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColumnOptions:
+    """Which columns of a log are what."""
+
+    feet: Annotated[tuple[str, ...], listed(goes_on=NUMBERS), unless_given(FEET, "none")] = ()
+    """Frames, or points of them, that stand on the ground at times: 1 or 0 in columns of u after those of the
+    actuators, in this order. Without these columns motion and forces decide; rows that leave it open are dropped.
+    FRAME:flat is a foot that does not turn while it stands."""
+    mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "log.yaml or forcegp.yaml beside it", Path)] = (
+        None
+    )
+    """What the columns mean; flags replace its entries."""
+    time: Columns = None
+    """Time stamps; of a bag with several topics, those of the messages that become rows."""
+    step: Annotated[float | None, unless_given("S", "by the time stamps", float)] = None
+    """Seconds between two rows, for a log without time stamps."""
+    q: Columns = None
+    """Positions, one per joint; of a moving base x, y, z and its orientation."""
+    v: Annotated[str | None, unless_given("COLUMNS", "by the names, else central differences of q", str)] = None
+    """Velocities, one per joint; of a moving base linear, then angular. derive: differentiate this one."""
+    u: Columns = None
+    """Forces or torques of the actuators, or what motors of the robot take; a constant such as 0 is for all."""
+    a: Annotated[str | None, unless_given("COLUMNS", "by the names, else central differences of v", str)] = None
+    """Accelerations, one per joint."""
+    joints: Annotated[str | None, unless_given("NAMES", "those of --robot", str)] = None
+    """Names of the joints in the order of the columns."""
+    orientation: Annotated[Literal["xyzw", "wxyz", "angles"] | None, unless_given("xyzw|wxyz|angles", "xyzw")] = None
+    """Orientation of a base that moves: a quaternion with w last or first, or angles roll, pitch, yaw (in a plane yaw
+    alone)."""
+    axes: Text = None
+    """Axes of a moving base's v and a, of the linear and the angular part: body, world, or imu, which is what an
+    accelerometer at its origin measures. For instance v=world,body,a=imu; body unless stated."""
+    ned: bool = False
+    """World axes are north, east, down and base axes forward, right, down (PX4); y and z change sign."""
+    unit: Text = None
+    """Units that are not SI, for instance q=deg,time=ms,u=mNm; several for one signal are one per joint: q=deg,mm.
+    With a moving base, each is for the columns of its kind."""
+    sign: Text = None
+    """1 or -1 per joint, for all signals (--sign=1,-1) or for one (u=-1)."""
+    episode: Text = None
+    """A column that numbers the episodes."""
+    episodes: Text = None
+    """A pattern for arrays or groups of one file, each of which is an episode: piece*, data/demo_*."""
+    headerless: Text = None
+    """Text without names of columns: how many numbers make a row, for all files or for each: 1,7,7."""
+    delimiter: Annotated[str | None, unless_given("comma|tab|semicolon|blanks|LETTER", "detected", str)] = None
+    """What separates the columns of a text."""
+    side_by_side: bool = False
+    """The files are one recording, with a signal in each; columns are called FILE:column."""
+    gap: Annotated[float | None, unless_given("S", "10 median steps", float)] = None
+    """A longer pause starts a new episode."""
+    rate: Annotated[str, arg(metavar="HZ|auto|log")] = "auto"
+    """Rows per second. auto: rows at uneven times are given even ones at the median rate, by a cubic spline. log: every
+    stamp is kept."""
+    start: Seconds = None
+    """Leave out what comes earlier, in seconds from the first row of each episode."""
+    end: Seconds = None
+    """Leave out what comes later."""
+    unwrap: bool = False
+    """Continue angles of joints that jump by a turn."""
+    beyond_limits: bool = False
+    """Accept positions beyond the limits of the URDF."""
+
+    def options(self) -> forcegp.recordings.ImportOptions:
+        """How rows come of columns. Raises InvalidInput."""
+        same = ("gap", "start", "end", "unwrap", "beyond_limits")
+        given: dict[str, Any] = {name: getattr(self, name) for name in same} | {"rate": self.rate}
+        if self.rate not in ("auto", "log"):
+            complaint = f"--rate is {self.rate!r}; give rows per second, auto or log."
+            [given["rate"]] = numbers_of(self.rate, complaint, one=True)
+        return forcegp.recordings.ImportOptions(stance="auto", **given)
+
+    def model(self, robot: RobotOptions) -> forcegp.Model | None:
+        """The robot, with the known forces and contacts of --identified, or with feet."""
+        touching = parse_feet(self.feet)
+        model = robot.chosen()
+        if not touching:
+            return model
+        if robot.identified is not None:
+            raise InvalidInput("--identified brings its contacts along; leave --feet out.")
+        if model is None:
+            raise InvalidInput("--feet needs --robot ROBOT.urdf.")
+        return model.with_contacts((*touching, *model.loops))
+
+    def mapped(self, logs: Sequence[Path], terminal: Terminal) -> forcegp.recordings.ColumnMapping:
+        """The mapping of the file, changed by the flags. Raises InvalidInput."""
+        path = self.mapping
+        if path is None:
+            found = {forcegp.recordings.beside(log) for log in logs} - {None}
+            if len(found) > 1:
+                several = ", ".join(sorted(map(str, found)))
+                raise InvalidInput(f"the logs have different mappings beside them ({several}); give --mapping.")
+            path = next(iter(found), None)
+            if path is not None:
+                terminal.note(f"the columns are mapped by {path}")
+        stored = forcegp.recordings.ColumnMapping() if path is None else forcegp.recordings.read_mapping(path)
+        return stored.changed_by(self._flags())
+
+    def _flags(self) -> forcegp.recordings.ColumnMapping:
+        given: dict[str, Any] = {
+            item.name: getattr(self, item.name) for item in fields(forcegp.recordings.ColumnMapping)
+        }
+        if self.delimiter is not None:
+            given["delimiter"] = forcegp.recordings.DELIMITERS.get(self.delimiter, self.delimiter)
+        if self.headerless is not None:
+            words = self.headerless.split(",")
+            if not all(word.strip().isdigit() for word in words):
+                raise InvalidInput(f"--headerless is {self.headerless!r}; give whole numbers such as 7 or 1,7,7.")
+            given["headerless"] = [int(word) for word in words]
+        readers = dict.fromkeys(("unit", "axes", "sign"), forcegp.recordings.by_quantity)
+        if self.sign is not None and "=" not in self.sign:
+            given["sign"] = self.sign.split(",")
+            del readers["sign"]
+        given |= {name: read(name, given[name]) for name, read in readers.items() if given[name] is not None}
+        return forcegp.recordings.mapping_of(given)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Import(Command):
+    """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, npz, MATLAB, HDF5, ROS bags.
+
+    State which columns are the time, the positions, velocities and forces of the joints (or of a base that moves), and
+    their units: by flags, or in a YAML file. One beside the log, log.yaml or forcegp.yaml, is found by itself. COLUMNS
+    are names, patterns such as pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi".
+
+    With a --cutoff, --delay, --lag, --stance, --every or --trim, rows are filtered, aligned and thinned out, and what
+    that costs is reported; LOG may then be a dataset, too. The low-pass filter runs forwards and backwards, so that
+    nothing is delayed; v and a are computed anew.
+
+    For example:
+      forcegp import run.csv --time t --q 'pos{1..2}' --u 'tau{1..2}' --robot arm.urdf --out log.h5
+      forcegp import run.mcap --q /joint_states:position --u /joint_states:effort --joints a,b --out log.h5
+      forcegp import walk.mcap --q '/odom:pose,/joints:position.{joints}' --robot dog.urdf --base floating --out log.h5
+      forcegp import walk.csv --mapping dog.yaml --robot dog.urdf --base floating --feet FL_foot,FR_foot --out log.h5
+      forcegp import log.h5 --cutoff auto --delay auto --every 10 --out data.h5
+    """
+
+    logs: Positional[Annotated[tuple[Path, ...], LOG, arg(metavar="LOG...", help_behavior_hint="")]]
+    """Files, or folders of ROS 2 bags; each is at least one episode."""
+    out: Annotated[Path, arg(metavar="FILE.h5")]
+    """The dataset to write (HDF5)."""
+    stance: Literal["log", "auto"] = "log"
+    """auto: set the switches of contacts to what motion and forces show, and leave out rows that leave one open."""
+    robot: RobotOptions = RobotOptions()
+    columns: ColumnOptions = ColumnOptions()
+    filter: FilterOptions = FilterOptions()
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Read, check, prepare, write and show."""
+        if not self.logs:
+            raise InvalidInput("give at least one log.")
+        self.require_free_file(self.out)
+        preparation, mapping = replace(self.filter.preparation(), stance=self.stance), None
+        if forcegp.data.is_dataset(self.logs[0]):
+            raw, done = self._dataset(preparation), {}
+        else:
+            mapping = self.columns.mapped(self.logs, terminal)
+            given = {"model": self.columns.model(self.robot), "options": self.columns.options()}
+            with terminal.progress("importing") as report:
+                raw = forcegp.import_recordings(self.logs, mapping, **given, report=report)
+            done = dict(raw.metadata["import"])
+            if done["open_switches"]:
+                preparation = replace(preparation, stance="auto")
+        dataset, prepared = raw, None
+        if not preparation.changes_nothing:
+            with terminal.progress("preparing"):
+                prepared = preparation.apply(raw)
+            dataset = prepared
+            done |= {"rows": len(dataset), "preparation": prepared.metadata["preparation"]}
+        with atomic_file(self.out, overwrite=self.overwrite) as temporary:
+            dataset.save(temporary)
+        shown = [] if mapping is None else [_imported(terminal, self.out, done)]
+        terminal.show(*shown, *([] if prepared is None else [_price(self.out, raw, prepared)]))
+        return {"out": str(self.out), **done}
+
+    def _dataset(self, preparation: forcegp.data.Preparation) -> forcegp.Dataset:
+        """The dataset that is to be prepared. Raises InvalidInput for options that are about logs."""
+        path, *others = self.logs
+        about_logs = self.words(*options_of(ColumnOptions))
+        if others or about_logs:
+            what = about_logs[0].partition("=")[0] if about_logs else "more than one file"
+            raise InvalidInput(f"{path} is a dataset of forcegp already, of which one is prepared; leave {what} out.")
+        if preparation.changes_nothing:
+            raise InvalidInput(
+                f"{path} is a dataset of forcegp already, so there is nothing to do: give --cutoff, --delay, --lag, "
+                "--stance, --every or --trim."
+            )
+        dataset = forcegp.Dataset.load(path)
+        return replace(dataset, model=self.robot.model_if_any(dataset, path))
+
+
+REPAIRED = {
+    "repeated_stamps_dropped": "rows dropped for a repeated time stamp",
+    "rows_in_stretches_too_short": "rows left out in stretches of fewer than 5",
+}
+
+
+def _imported(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> str:
+    """What was guessed, repaired and left out, as notes, and what came out."""
+    for found in done["guessed"]:
+        terminal.note(f"found by name: {found}")
+    for each in done["recordings"]:
+        notes = [*each["notes"], *(f"{text}: {each[name]}" for name, text in REPAIRED.items() if each[name])]
+        if gaps := each["gaps"]:
+            notes.append(f"gaps that split it: {len(gaps)}, of up to {max(gaps):.4g} s")
+        if notes:
+            terminal.note(f"{each['name']}: {'; '.join(notes)}")
+    if (step := done["resampled_to_step"]) is not None:
+        worst = max(each["largest_deviation_of_a_step"] for each in done["recordings"])
+        terminal.note(f"resampled to {1 / step:.6g} Hz: steps deviate by up to {worst:.0%} from their median")
+    how = ", ".join(f"{name} {text}" for name, text in done["signals"].items())
+    if done.get("preparation", {}).get("cutoff") is not None:
+        how = "filtered and differentiated anew"
+    seconds = sum(each["seconds"] for each in done["recordings"])
+    return f"{out}: rows: {done['rows']}, episodes: {len(done['episodes'])} ({seconds:.4g} s); {how}"
+
+
+def _price(out: Path, dataset: forcegp.Dataset, prepared: forcegp.Dataset) -> Any:
+    """What was done, and the noise of every joint before and after; what the filter removed is in the report."""
+    report = prepared.metadata["preparation"]
+    cutoff, why, values = report["cutoff"], report["why"], {"rows": " -> ".join(map(str, report["rows"]))}
+    if "sample_rate" in report:
+        values["sample rate"] = " -> ".join(f"{rate:.4g} Hz" for rate in report["sample_rate"])
+    filtered = "none" if cutoff is None else f"{cutoff:.3g} Hz, order 4, forwards and backwards"
+    values["filter"] = "; ".join([filtered, *([why["cutoff"]] if "cutoff" in why else [])])
+    for name in ("delay", "lag"):
+        if report[name] or name in why:
+            values[f"{name} of u"] = "; ".join([f"{1e3 * report[name]:.1f} ms", *([why[name]] if name in why else [])])
+    if "stance" in report:
+        values["stance"] = stance_text(report)
+    if cutoff is not None:
+        noise, unit = report["acceleration_noise"], dataset.units["a"]
+        each = zip(dataset.joint_names, noise["before"], noise["after"], strict=True)
+        found = ", ".join(f"{name} {shown(before)} -> {shown(after)}" for name, before, after in each)
+        values["noise of a"] = f"{found}, in {unit if isinstance(unit, str) else 'the units of each joint'}"
+    return facts(f"{out}: prepared", values)
+
+
+def stance_text(report: Mapping[str, Any]) -> str:
+    """How long each foot stands, and how many rows leave it open, of a report of `Preparation`."""
+    shares = ", ".join(f"{name} {share:.0%}" for name, share in report["stance"]["standing"].items())
+    return f"{shares}; {report['stance']['open_rows']} rows left out, which leave one open"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check(Command):
+    """Look for what would spoil a model: wrong units, signs, joints and delays, dead channels, poor motion, noise.
+
+    Each doubt is ok, look (judge yourself) or wrong (results would be wrong), and what to do. Nothing is changed.
+
+    For example:
+      forcegp check log.h5 --robot arm.urdf
+      forcegp check log.h5 --robot arm.urdf --strict --json
+    """
+
+    log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
+    """The dataset to check (HDF5)."""
+    strict: bool = False
+    """Exit with code 2 if anything is wrong."""
+    robot: RobotOptions = RobotOptions()
+    filter: CutoffOptions = CutoffOptions(cutoff="auto")
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Check, and show. Raises DatasetError with `strict` where something is wrong."""
+        preparation = self.filter.preparation()
+        dataset = forcegp.Dataset.load(self.log)
+        model = self.robot.model_if_any(dataset, self.log)
+        with terminal.progress("checking"):
+            report = forcegp.check(dataset, model, preparation=preparation)
+        content = {"data": str(self.log), **report.to_dict()}
+        terminal.show(*_shown(terminal, self.log, report))
+        wrong = report.doubts.at("wrong")
+        if self.strict and wrong:
+            raise DatasetError(
+                f"{self.log}: {len(wrong)} things are wrong ({wrong.subjects}); without --strict this is no error."
+            )
+        return content
+
+
+def _shown(terminal: Terminal, data: Path, report: forcegp.checks.CheckReport) -> list[Any]:
+    """One paragraph per doubt, worst first, and the numbers of every joint."""
+    from rich.text import Text
+
+    content = report.to_dict()
+    counts = content["counts"]
+    heading = Text(f"{data}: {counts['wrong']} wrong, {counts['look']} to look at, {counts['ok']} ok", style="bold")
+    measured = any(value is not None for each in content["joints"] for name, value in each.items() if name != "joint")
+    numbers = [_numbers(report, content)] if measured else []
+    return [heading, doubts_table(report.doubts, terminal.worded), *numbers]
+
+
+def _numbers(report: forcegp.checks.CheckReport, content: Mapping[str, Any]) -> Any:
+    cutoff = content["cutoff"]
+    filtered = "not\nfiltered" if cutoff is None else f"filtered\nat {cutoff:.3g} Hz"
+    header = ["joint", "torque un-\nexplained", "rms", "factor", "noise of a\nas logged", filtered, "times M"]
+    rows = [
+        [
+            each["joint"],
+            shown(each["unexplained"], "{:.2g} %", 100.0),
+            *(shown(each[name]) for name in ("residual", "factor", "noise_before", "noise_after", "noise_torque")),
+        ]
+        for each in content["joints"]
+    ]
+    units = report.inputs.log.units
+    unit = f"{units['u']} and {units['a']}" if isinstance(units["u"], str) else "the units of each joint"
+    return columns(f"Every joint; in {unit}".replace("^2", "²"), header, rows)

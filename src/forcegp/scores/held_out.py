@@ -1,0 +1,318 @@
+"""What is held out: whole episodes, or blocks of time with a guard around them; and the motions that begin there.
+
+Neighbouring rows are nearly equal, and filters mix them, so a split of single rows would test memory (Racine 2000,
+"Consistent cross-validatory model-selection for dependent data: hv-block cross-validation").
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from forcegp.data import Dataset, require_disjoint
+from forcegp.data.views import EVEN_STEPS, RecordedMotions, recorded_motions
+from forcegp.errors import InvalidInput, require_type, usable_arguments
+from forcegp.posterior import Posterior, observing
+from forcegp.posterior.rollout import Rollout
+from forcegp.robots.manifold import ConfigurationSpace
+from forcegp.scores.accuracy import Table
+from forcegp.summary import plain
+
+FORMS, DEFAULT_BLOCKS = "episodes:N,N..., leave-one-out or blocks:N:K,K...", "blocks:5:3,5"
+
+
+@dataclass(frozen=True)
+class Split:
+    """Which stretches of time are held out, and how far training rows must stay away from them.
+
+    Because it is given in times, it divides a recording and its decimated version at the same moments.
+
+    Fields
+    ------
+    name: short, unlike those of other splits of the same data; a file name may hold it.
+    words: what was done, as part of a sentence.
+    held_out: the stretches to predict: episode, begin <= t, and t < end [s], infinite at the ends of a recording.
+    guard: seconds between any training row and a held-out stretch of the same episode.
+    """
+
+    name: str
+    words: str
+    held_out: tuple[tuple[int, float, float], ...]
+    guard: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.guard) and self.guard >= 0.0):
+            raise InvalidInput(f"guard is {self.guard} s; it must be finite and at least 0.")
+
+    def test_rows(self, dataset: Dataset) -> Bool[np.ndarray, " rows"]:
+        """Which rows are held out."""
+        return self._near(dataset, 0.0)
+
+    def training_rows(self, dataset: Dataset) -> Bool[np.ndarray, " rows"]:
+        """Which rows may be learned from: not held out, and not within the guard."""
+        return ~self._near(dataset, self.guard)
+
+    def _near(self, dataset: Dataset, margin: float) -> Bool[np.ndarray, " rows"]:
+        t, inside = dataset.time, np.zeros(len(dataset), dtype=bool)
+        for episode, begin, end in self.held_out:
+            inside |= (dataset.episode == episode) & (t >= begin - margin) & (t < end + margin)
+        return inside
+
+    def apply(self, dataset: Dataset) -> tuple[Dataset, Dataset]:
+        """`(training, test)`. Raises InvalidInput where a side is empty, and DatasetError where both share rows."""
+        train, test = self.training_rows(dataset), self.test_rows(dataset)
+        for side, rows in (("hold out", test), ("learn from", train)):
+            if not rows.any():
+                raise InvalidInput(
+                    f"split {self.name!r} leaves no row to {side}; the dataset has episodes {list(dataset.episodes)} "
+                    f"and the guard is {self.guard} s."
+                )
+        sides = dataset.rows(train), dataset.rows(test)
+        whole = all(math.isinf(begin) and math.isinf(end) for _, begin, end in self.held_out)
+        # Blocks of one episode have equal metadata by nature; of those only repeated rows are refused.
+        require_disjoint(sides[0] if whole else replace(sides[0], metadata={}), sides[1])
+        return sides
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values; None where a stretch goes to the end of the recording."""
+        held_out = [
+            {"episode": episode, "begin": None if math.isinf(begin) else begin, "end": None if math.isinf(end) else end}
+            for episode, begin, end in self.held_out
+        ]
+        return {"name": self.name, "words": self.words, "held_out": held_out, "guard": self.guard}
+
+
+@usable_arguments("split_named")
+def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split, ...]:
+    """The splits of a text, as `forcegp score --split` takes it: several for leave-one-out, else one.
+
+    auto: a quarter of the episodes, drawn at random, or with one episode blocks 3 and 5 of five.
+    episodes:N,N...: whole episodes.
+    leave-one-out: every episode once.
+    blocks:N:K,K...: every episode is cut into N blocks of equal duration; those of these numbers, from 1, are held out,
+        and training rows within `guard` seconds of them are left out.
+    Raises InvalidInput for anything else, and where nothing would be held out or nothing left to learn from.
+    """
+    require_type("dataset", dataset, Dataset)
+    known, alone = [int(each) for each in dataset.episodes], len(dataset.episodes) == 1
+    kind, *parts = (DEFAULT_BLOCKS if text == "auto" and alone else text).split(":")
+    try:
+        match kind, [[int(word) for word in part.split(",")] for part in parts]:
+            case "auto", []:
+                drawn = np.random.default_rng(0).choice(known, size=max(round(0.25 * len(known)), 1), replace=False)
+                return (_episodes_apart(known, sorted(drawn.tolist())),)
+            case "leave-one-out", []:
+                return tuple(_episodes_apart(known, [number]) for number in known)
+            case "episodes", [chosen]:
+                return (_episodes_apart(known, chosen),)
+            case "blocks", [[count], chosen]:
+                return (_blocks_apart(dataset, count, sorted(chosen), guard),)
+            case _:
+                pass
+    except InvalidInput:
+        raise
+    except ValueError:
+        pass  # a text where a number belongs
+    raise InvalidInput(f"the split is {text!r}; give auto, {FORMS}, for example {DEFAULT_BLOCKS}.")
+
+
+def _require_some(what: str, chosen: Sequence[int], known: Sequence[int]) -> None:
+    if not set(chosen) < set(known) or len(set(chosen)) < len(chosen):
+        raise InvalidInput(
+            f"held-out {what} are {list(chosen)}; name some of {list(known)}, each once, and leave one to learn from, "
+            f"or hold out blocks of time ({DEFAULT_BLOCKS})."
+        )
+
+
+def _episodes_apart(known: Sequence[int], episodes: Sequence[int]) -> Split:
+    """Whole episodes."""
+    _require_some("episodes", episodes, known)
+    rest = [number for number in known if number not in episodes]
+    words = f"trained on whole episodes ({_listed(rest)}), tested on others ({_listed(episodes)})"
+    held_out = tuple((number, -math.inf, math.inf) for number in episodes)
+    return Split(f"episodes-{'-'.join(map(str, episodes))}", words, held_out)
+
+
+def _blocks_apart(dataset: Dataset, blocks: int, numbers: Sequence[int], guard: float) -> Split:
+    stretches = []
+    _require_some("blocks", numbers, range(1, blocks + 1))
+    for episode in dataset.episodes:
+        time = dataset.time[dataset.episode == episode]
+        edges = np.linspace(time.min(), time.max(), blocks + 1)
+        if not edges[0] < edges[-1]:
+            raise InvalidInput(f"episode {episode} has one row; it cannot be cut into blocks of time.")
+        edges[0], edges[-1] = -math.inf, math.inf  # what lies outside of the rows seen here belongs to the ends
+        stretches += [(episode, float(edges[n - 1]), float(edges[n])) for n in numbers]
+    each = "the recording" if len(dataset.episodes) == 1 else "every episode"
+    words = (
+        f"{each} cut into {blocks} consecutive blocks of equal duration, block{'s' if len(numbers) > 1 else ''} "
+        f"{_listed(numbers)} held out, and training rows within {guard:g} s of them left out"
+    )
+    return Split(f"blocks-{blocks}-{'-'.join(map(str, numbers))}", words, tuple(stretches), guard)
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    *first, last = map(str, numbers)
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+INTERVAL = (0.025, 0.975)
+
+HORIZONS = (0.1, 0.2, 0.5, 1.0)
+STARTS = 10
+GAP = 1.5  # a pause of more than this many median steps is a gap, over which no motion goes
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutMotions:
+    """The motions to predict, and the horizons [s] that they last for; `notes` report what is missing.
+
+    `stretches` are the rows that each motion is part of, for observers.
+    """
+
+    motions: RecordedMotions | None
+    horizons: tuple[float, ...]
+    notes: tuple[str, ...] = field(default=())
+    stretches: tuple[tuple[Dataset, tuple[int, ...]], ...] = ()
+
+    def of(self, posterior: Posterior) -> tuple[Posterior, RecordedMotions]:
+        """The posterior, and the motions with what its observers have seen before each of them."""
+        assert self.motions is not None, "there are motions"
+        pairs = [observing(posterior, rows, whole=True) for rows, _ in self.stretches]
+        if all(seen is rows for (_, seen), (rows, _) in zip(pairs, self.stretches, strict=True)):
+            return posterior, self.motions
+        seconds = self.horizons[-1]
+        u = [recorded_motions(seen, at, seconds).u for (_, seen), (_, at) in zip(pairs, self.stretches, strict=True)]
+        return pairs[0][0], replace(self.motions, u=np.concatenate(u))
+
+
+def held_out_motions(
+    recording: Dataset,
+    held_out: Bool[np.ndarray, " rows"],
+    horizons: Sequence[float] | None = None,
+    starts: int = STARTS,
+) -> HeldOutMotions:
+    """`starts` motions in every held-out stretch without gaps that lasts as long as the longest horizon.
+
+    None takes those of `HORIZONS` that some stretch lasts for, with a note. Raises InvalidInput for others.
+    """
+    wanted = tuple(HORIZONS if horizons is None else horizons)
+    if not all(isinstance(h, int | float) and 0.0 < h < np.inf for h in wanted):
+        raise InvalidInput(f"horizons are {list(wanted)}; give positive numbers of seconds.")
+    wanted = tuple(sorted(set(wanted)))
+    if starts < 1:
+        raise InvalidInput(f"the number of starts is {starts}; it must be at least 1.")
+    if not wanted:
+        return HeldOutMotions(None, (), ())
+    if not recording.time_ordered:
+        return HeldOutMotions(None, (), ("no motion was predicted: the rows are not in the order of time.",))
+    stretches, step = _stretches(recording, held_out), _step(recording)
+    longest = max((float(np.ptp(recording.time[rows])) for rows in stretches), default=0.0)
+    possible, notes = tuple(h for h in wanted if step <= h <= longest * (1.0 + EVEN_STEPS)), list[str]()
+    if len(possible) < len(wanted):
+        left_out = ", ".join(f"{h:g} s" for h in wanted if h not in possible)
+        notes.append(f"not predicted: {left_out}; held-out stretches last {longest:.3g} s at most, steps {step:.3g} s.")
+        if horizons is not None:
+            raise InvalidInput(f"horizons {notes[0]} Give shorter ones.")
+    found, parts = [], []
+    for rows in stretches if possible else ():
+        if np.ptp(recording.time[rows]) >= possible[-1] * (1.0 - EVEN_STEPS):
+            try:
+                found.append(recorded_motions(recording.rows(rows), starts, possible[-1]))
+                parts.append((recording.rows(rows), found[-1].rows))
+            except InvalidInput as error:
+                notes.append(f"motions of one stretch were left out: {error}")
+    notes = list(dict.fromkeys(notes))
+    if not found:
+        return HeldOutMotions(None, (), tuple(notes))
+    joined = {name: np.concatenate([getattr(each, name) for each in found]) for name in ("q", "v", "u")}
+    motions = RecordedMotions(tuple(row for each in found for row in each.rows), found[0].dt, **joined)
+    return HeldOutMotions(motions, possible, tuple(notes), tuple(parts))
+
+
+def motion_scores(
+    posterior: Posterior, held_out: HeldOutMotions, integrator: str = "rk4"
+) -> tuple[Table, dict[str, Any] | None]:
+    """`position after 0.5 s` and the like at every horizon, and what belongs to all of them; None without motions.
+
+    `rmse` over the motions of q in rad or m, of a base in its own axes, and of v; `coverage_95` of q where there are
+    intervals. `diverged` motions do not count. `squared` (horizons, motions) is the mean over joints for q.
+    """
+    if held_out.motions is None:
+        return {}, None
+    posterior, motions = held_out.of(posterior)
+    rollout = posterior.rollout(
+        motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, integrator=integrator, baumgarte=None
+    )
+    recorded = torch.as_tensor(motions.q.copy(), device=rollout.q.device)
+    off = apart_from(recorded, rollout.q, rollout.space)
+    found = {"position": off, "velocity": torch.as_tensor(motions.v.copy(), device=rollout.q.device) - rollout.v}
+    inside = inside_interval(rollout, recorded)
+    table: Table = {}
+    facts: dict[str, Any] = {"horizons": list(held_out.horizons), "motions": len(motions.q), "integrator": integrator}
+    facts |= {"dt": motions.dt, "diverged": [], "squared": []}
+    for horizon in held_out.horizons:
+        row = round(horizon / motions.dt)
+        lasting = torch.isfinite(off[:, row]).all(-1)
+        for name, errors in found.items():
+            here = errors[lasting, row].square().mean(0).sqrt()
+            table[f"{name} after {horizon:g} s"] = {"rmse": plain(here.cpu().numpy())}
+        if inside is not None:
+            table[f"position after {horizon:g} s"]["coverage_95"] = plain(inside[lasting, row].mean(0).cpu().numpy())
+        facts["diverged"].append(int((~lasting).sum()))
+        facts["squared"].append(plain(off[:, row].square().mean(-1).cpu().numpy()))
+    return table, facts
+
+
+def apart_from(q0: Tensor, q1: Tensor, space: ConfigurationSpace) -> Float[Tensor, "*batch nv"]:
+    """The way from q0 to q1: their difference, on the manifold where a base moves; NaN where one of them is."""
+    if space.is_vector_space:
+        return q1 - q0
+    lost = torch.isnan(q0).any(-1) | torch.isnan(q1).any(-1)
+    neutral = space.neutral().to(q1)
+    way = space.difference(*(torch.where(lost[..., None], neutral, q) for q in (q0, q1)))
+    return torch.where(lost[..., None], torch.nan, way)
+
+
+def interval_about(rollout: Rollout, q0: Tensor) -> tuple[Float[Tensor, "*batch nv"], Float[Tensor, "*batch nv"]]:
+    """Ends of the 95 % interval of q as ways from q0."""
+    space = rollout.space
+    if space.is_vector_space:
+        low, high = rollout.interval()
+        return low - q0, high - q0
+    if rollout.intervals is None:
+        levels = torch.tensor(INTERVAL, dtype=q0.dtype, device=q0.device)
+        assert rollout.samples is not None, "without them there is no interval"
+        low, high = torch.quantile(apart_from(q0, rollout.samples.q, space), levels, dim=0)
+        return low, high
+    # what steps from the motion change of the way to it: entries of a step are as if independent
+    way, (_, wide) = apart_from(q0, rollout.q, space), rollout.interval()
+    half = (space.chart_matrix(way).square() * wide.square()[..., None, :]).sum(-1).sqrt()
+    return way - half, way + half
+
+
+def inside_interval(rollout: Rollout, recorded: Tensor) -> Float[Tensor, "motions rows nv"] | None:
+    """Whether the recorded q lies in the 95 % interval, NaN after a divergence; None where there is no interval."""
+    if rollout.samples is None and rollout.intervals is None:
+        return None
+    low, high = interval_about(rollout, rollout.q)
+    off = apart_from(rollout.q, recorded, rollout.space)
+    return torch.where(torch.isnan(high - low), torch.nan, ((low <= off) & (off <= high)).to(off))
+
+
+def _step(recording: Dataset) -> float:
+    pauses = np.diff(recording.time)[np.diff(recording.episode) == 0]
+    return float(np.median(pauses)) if pauses.size else float("inf")
+
+
+def _stretches(recording: Dataset, held_out: Bool[np.ndarray, " rows"]) -> list[np.ndarray]:
+    """Numbers of held-out rows that follow each other in one episode without a gap."""
+    rows = np.flatnonzero(held_out)
+    apart = (np.diff(rows) > 1) | (np.diff(recording.episode[rows]) != 0)
+    apart |= np.diff(recording.time[rows]) > GAP * _step(recording)
+    return [part for part in np.split(rows, np.flatnonzero(apart) + 1) if len(part) > 1]
