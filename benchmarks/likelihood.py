@@ -30,9 +30,8 @@ from threadpoolctl import threadpool_limits
 
 from forcegp.forces import ToolForces
 from forcegp.forces.kernels import kernel_of, squared_exponential
-from forcegp.inference.cholesky import factorize
 from forcegp.inference.dense_kernels import taken_apart
-from forcegp.inference.likelihood import INNER, deflated_covariance, negative_log_likelihood
+from forcegp.inference.likelihood import INNER, deflated_covariance, factorize, negative_log_likelihood
 
 JOINTS, INPUTS, TANGENTS = 7, 21, 2
 

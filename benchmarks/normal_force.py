@@ -23,9 +23,8 @@ from forcegp import Dataset, HybridForce, KukaSurfaceConfig, fit, simulate_kuka_
 from forcegp.data import farthest_rows
 from forcegp.forces import parse_forces
 from forcegp.posterior.predictor import Predictor
-from forcegp.simulation.bullet import ArmState, BulletArm
 from forcegp.simulation.kuka_surface import IdealContact, kuka_urdf, tool_friction_of
-from forcegp.simulation.trajectory import table_of
+from forcegp.simulation.trajectory import ArmState, BulletArm, table_of
 
 SEEDS = (1, 2, 3, 4, 5)
 ROWS, SECONDS, WANTED = 100, 8.0, 15.0
@@ -94,7 +93,7 @@ def played(control: HybridForce, task: Dataset, seed: int = 0, noise: float = 0.
         low, high = ([getattr(joint, end) for joint in task.model.robot.joints] for end in ("lower", "upper"))
         reference = np.clip(task.q, low, high)  # the scenario begins on the limit of a joint
         for q_d, v_d, a_d in zip(reference, task.v, task.truth["a"], strict=True):
-            state = ArmState.of(arm)
+            state = ArmState.of(arm, *arm.state())
             q, v = (x + noise * std * rng.standard_normal(7) for x, std in ((state.q, NOISE_Q), (state.v, NOISE_V)))
             u = control(q, v, q_d, v_d, a_d, WANTED).numpy()
             forces.append(surface.step(arm, state, u).multiplier - WANTED)

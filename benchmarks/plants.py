@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from forcegp.robots import Robot
 from forcegp.simulation import KukaSurfaceConfig
+from forcegp.simulation.kuka_surface import joint_friction_of
 
 OF_PLANTS = ("exponential", "asymmetric", "load", "lugre", "drift")  # joint friction that no model has
 ASYMMETRY = 0.7  # Coulomb friction backwards over that forwards
@@ -47,7 +48,7 @@ class JointFrictionLaw:
         names = ("joint_coulomb", "joint_static", "joint_viscous")
         self.coulomb, self.static, self.viscous = (np.array(getattr(config, name)) for name in names)
         self.bristles = np.zeros_like(self.coulomb)
-        self.laws = None if config.joint_friction in OF_PLANTS else config.joint_laws(robot)
+        self.laws = None if config.joint_friction in OF_PLANTS else joint_friction_of(config, robot)
 
     @property
     def of_velocity(self) -> bool:

@@ -129,8 +129,8 @@ SIZES = {"q": "nq", "v": "nv", "a": "nv", "u": "nu"}
 ARMS = {
     "control/informative_motions",
     "forces/columns",
-    "simulation/bullet",
-    "simulation/joint_friction",
+    "simulation/free_arms",
+    "simulation/trajectory",
     "simulation/kuka_motion",
 }
 """Modules of robots that are bolted to the world and driven in every joint, where these sizes are one."""

@@ -13,8 +13,7 @@ from forcegp import Dataset, Robot, load_posterior
 from forcegp.evidence.bodies import body_pseudo_inertias, carrying, with_bodies
 from forcegp.forces import Coulomb
 from forcegp.model import Model
-from forcegp.simulation.quadrotor import simulate_quadrotor
-from forcegp.simulation.quadruped import simulate_quadruped
+from forcegp.simulation.moving_bases import simulate_quadrotor, simulate_quadruped
 from forcegp.simulation.scenarios import QuadrotorConfig, QuadrupedConfig
 
 COLUMNS = ("--time", "t", "--q", "x,y,z,qx,qy,qz,qw", "--v", "v{1..6}", "--u", "rotor_{1..4}")

@@ -5,8 +5,8 @@ import json
 import pytest
 from tests.robots.mjcf_models import FOUR_BAR
 from tests.robots.robot_models import CHAIN
+from tests.robots.test_base import MANY
 from tests.robots.test_mimic import CHAIN_MIMICS, with_mimics
-from tests.robots.test_remedies import MANY
 
 from forcegp import Dataset, Model, Robot
 from forcegp.cli.main import parse_arguments

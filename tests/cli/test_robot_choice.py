@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.posterior.arm import URDF, arm_data, arm_model
-from tests.robots.test_nearest_inertia import BROKEN
+from tests.robots.test_robot_file import BROKEN
 
 from forcegp.cli.main import parse_arguments
 from forcegp.cli.robot_options import SYSTEM_FILE

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from forcegp.codegen.branch_free_linalg import StraightLineAlgebra, cholesky, pseudo_inverse, solve_lower
 from forcegp.codegen.c_writer import Program, write_function, write_program
-from forcegp.codegen.graph import BINARY, ONE, UNARY, ZERO, Copier, Graph, evaluated, gradients, jacobian
+from forcegp.codegen.graph import BINARY, ONE, UNARY, ZERO, Copier, Graph, evaluated, jacobian
 from forcegp.codegen.library import (
     NOT_FINITE,
     NOT_POSITIVE,
@@ -18,7 +17,7 @@ from forcegp.codegen.library import (
     compile_library,
     vector_unit,
 )
-from forcegp.codegen.tracing import trace
+from forcegp.codegen.tracing import StraightLineAlgebra, cholesky, pseudo_inverse, solve_lower, trace
 from forcegp.errors import InvalidInput
 
 
@@ -80,24 +79,20 @@ def test_every_operation_and_its_derivative(compiled):
     assert [tuple(part.shape) for part in found] == [tuple(part.shape) for part in everything(x, y)]
     outputs = flat(found)
     slopes = [node for row in jacobian(graph, outputs, graph.inputs) for node in row]
-    weights = [graph.constant(0.1 + 0.01 * k) for k in range(len(outputs))]
-    backwards = gradients(graph, outputs, weights, graph.inputs)
-    function = compiled(Program(graph, {"x": 6}, {"y": outputs, "J": slopes, "g": backwards}))
+    function = compiled(Program(graph, {"x": 6}, {"y": outputs, "J": slopes}))
     rows = 0.3 * normal(19, 6, seed=2)  # the last vector is not full
 
     def plain(row: torch.Tensor) -> torch.Tensor:
         return torch.cat([part.flatten() for part in everything(row[None, :3], row[None, 3:])])
 
     expected = torch.stack([plain(row) for row in rows])
-    values, J, g = rows_of(function, rows)
+    values, J = rows_of(function, rows)
     assert float((values - expected).abs().max()) < 1e-13
     assert float((function.single(rows[4])[1][0] - expected[4]).abs().max()) < 1e-13
     with_numpy = torch.tensor(np.stack(np.broadcast_arrays(*evaluated(graph, outputs, list(rows.mT.numpy()))), -1))
     assert float((with_numpy - expected).abs().max()) < 1e-13
     theirs = torch.stack([torch.autograd.functional.jacobian(plain, row) for row in rows])
     assert float((J.view(theirs.shape) - theirs).abs().max()) < 1e-12
-    weight = torch.tensor([graph.value(node) for node in weights], dtype=torch.float64)
-    assert float((g - weight @ theirs).abs().max()) < 1e-12
 
 
 def test_functions_far_from_where_they_are_easy(compiled):
@@ -208,15 +203,6 @@ def test_the_pseudo_inverse_of_redundant_rows_that_nearly_depend_on_each_other(t
     A = body @ torch.randn(5, 6, 12, generator=draw).double()
     found, expected = pseudo_inverse(A, 1e-9), torch.linalg.pinv(A, rtol=1e-9)
     assert float((found - expected).abs().max()) < 1e-11 * float(expected.abs().max())  # condition of A: some 1e3
-
-
-def test_derivatives_of_the_pseudo_inverse_hold_where_rows_are_orthogonal_and_equally_long():
-    """There the rotations have none: those of what they leave must be right."""
-    A = torch.eye(3, 7, dtype=torch.float64)
-    direction = normal(3, 7)
-    expected = torch.autograd.functional.jvp(torch.linalg.pinv, A, direction)[1]
-    found = torch.autograd.functional.jvp(lambda B: pseudo_inverse(B, 1e-9), A, direction)[1]
-    assert float((found - expected).abs().max()) < 1e-13
 
 
 def test_factor_and_solution_are_those_of_torch():

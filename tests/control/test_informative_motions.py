@@ -167,7 +167,7 @@ def test_what_cannot_be_is_refused(posterior, changes, message):
 
 
 def test_without_a_start_it_is_inside_of_the_limits(posterior):
-    how = {"motions": 1, "seconds": 4.0, "margin": 0.2}
+    how = {"motions": 1, "seconds": 4.0}
     np.testing.assert_allclose(excitation(FREE, **how).start, 0.0, atol=1e-12)  # the limits are -3 and 3
     middle = posterior.training.q.mean(0).numpy()
-    np.testing.assert_allclose(excitation(posterior, **how).start, middle.clip(-0.57, 0.57))
+    np.testing.assert_allclose(excitation(posterior, **how).start, middle.clip(-2.565, 2.565))

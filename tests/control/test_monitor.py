@@ -143,11 +143,7 @@ def test_learned_friction_sees_what_the_urdf_does_not(posterior):
     free, limits = motion(120.0, 1), {}
     push = np.zeros((400, 2))
     push[200:] = 0.25, 0.1
-    models = {
-        "learned": posterior.predictor(covariance="none"),
-        "urdf": URDF_ALONE,
-        "both": posterior.predictor(),
-    }
+    models = {"learned": posterior.predictor(covariance="none"), "urdf": URDF_ALONE, "both": posterior.predictor()}
     for name, model in models.items():
         found = ContactMonitor(model, dt=DT).calibrate([free])
         limits[name] = found.run(*motion(4.0, 7, push)).alarm[250:].double().mean()

@@ -115,14 +115,6 @@ def test_a_force_that_is_not_finite_is_an_error(predictor):
     assert mujoco.get_mjcb_passive() is None
 
 
-def test_one_callback_at_a_time(predictor):
-    model = model_of()
-    forces = MujocoForces(predictor, model)
-    with forces, pytest.raises(InvalidInput, match="has a passive callback already"):
-        forces.__enter__()
-    assert mujoco.get_mjcb_passive() is None
-
-
 @pytest.mark.parametrize(
     ("urdf", "change", "message"),
     [

@@ -55,41 +55,11 @@ def test_gravity_compensation_is_that_of_a_robot_at_rest():
         np.testing.assert_allclose(PDGravity(robot, **GAINS)(q, v, q_d, v_d, a_d), expected, rtol=1e-9)
 
 
-def reference(time):
-    size, rate = np.array([0.8, 0.6]), np.array([3.0, 4.0])
-    return size * np.sin(rate * time), size * rate * np.cos(rate * time), -size * rate**2 * np.sin(rate * time)
-
-
-def largest_error(control, dt, fine=8, push=(0.0, 0.0), seconds=2.0, friction=VISCOUS):
-    """Of a motion whose torques are held for dt, integrated in steps dt / fine."""
-    (q, v, _), errors = reference(0.0), []
-    for k in range(round(seconds / dt)):
-        q_d, v_d, a_d = reference(k * dt)
-        errors.append(np.abs(q_d - q).max())
-        u = np.asarray(control(q, v, q_d, v_d, a_d)) + push
-        for _ in range(fine):
-            at = [torch.tensor(x) for x in (q + 0.5 * dt / fine * v, v, u - np.array(friction) * v)]
-            v = v + dt / fine * ROBOT.forward_dynamics(*at).numpy()
-            q = q + dt / fine * v
-    return np.array(errors)
-
-
-def test_with_the_true_model_the_error_vanishes_with_the_step():
-    coarse, fine = (largest_error(ComputedTorque(TRUE, **GAINS), dt, seconds=1.0).max() for dt in (0.02, 0.01))
-    assert fine < 0.6 * coarse
-    assert fine < 0.2 * largest_error(ComputedTorque(URDF_ALONE, **GAINS), 0.01, seconds=1.0).max()
-
-
-def test_torques_keep_their_limits_and_the_integral_waits():
-    control = ComputedTorque(URDF_ALONE, **GAINS, integral=10.0, dt=0.01, torque_limits=[500.0, 1.0])
+def test_torques_keep_their_limits():
+    control = ComputedTorque(URDF_ALONE, **GAINS, torque_limits=[500.0, 1.0])
     u = control(*STILL, [2.0, 2.0], [0.0, 0.0], [0.0, 0.0])
     assert float(u[1].abs()) == 1.0
     assert control.saturated.tolist() == [False, True]
-    before = control.summed
-    control(*STILL, [2.0, 2.0], [0.0, 0.0], [0.0, 0.0])
-    assert (control.summed - before).tolist() == pytest.approx([0.017, 0.0])
-    control.restart()
-    assert not control.summed.any()
     assert float(ComputedTorque(URDF_ALONE, **GAINS).torque_limits.max()) == 60.0  # of the URDF
 
 
@@ -181,7 +151,6 @@ def test_models_with_and_without_contacts(touching):
         ({"stiffness": -1.0}, "stiffness is -1.0; give numbers of at least 0"),
         ({"stiffness": [1.0, 2.0, 3.0]}, r"stiffness has shape \(3,\)"),
         ({"damping": np.nan}, "damping"),
-        ({"integral": 1.0}, "dt is None"),
         ({"torque_limits": 0.0}, "torque_limits are zero"),
         ({"on_failure": "zero"}, "hold, raise"),
     ],
@@ -213,14 +182,13 @@ def test_it_raises_or_holds_but_never_gives_nan():
     assert control.held == 1
 
 
-def test_a_broken_sensor_is_held_and_leaves_the_integral_alone():
-    control = ComputedTorque(URDF_ALONE, **GAINS, integral=10.0, dt=0.01, torque_limits=0.5, on_failure="hold")
+def test_a_broken_sensor_is_held():
+    control = ComputedTorque(URDF_ALONE, **GAINS, torque_limits=0.5, on_failure="hold")
     q_d = [0.1, -0.1]
-    safe, summed = control(*STILL, q_d, [0.0, 0.0], [0.0, 0.0]), control.summed
+    safe = control(*STILL, q_d, [0.0, 0.0], [0.0, 0.0])
     assert control.saturated.any()
     assert torch.equal(control([np.nan, 0.0], [0.0, 0.0], q_d, [0.0, 0.0], [0.0, 0.0]), safe)
     assert control.held == 1
-    assert torch.equal(control.summed, summed)
     assert not control.saturated.any()
     with pytest.raises(InvalidInput, match="give 2 finite numbers"):
         control([0.0], [0.0, 0.0], q_d, [0.0, 0.0], [0.0, 0.0])

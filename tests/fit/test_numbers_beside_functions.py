@@ -17,7 +17,7 @@ from forcegp.fit.joint import Slopes, Whitening, with_free_numbers
 from forcegp.fit.physical import typical_sizes
 from forcegp.forces import JointForces, JointFriction, Payload, RigidBodies, Viscous
 from forcegp.noise import Noise
-from forcegp.simulation.quadruped import simulate_quadruped
+from forcegp.simulation.moving_bases import simulate_quadruped
 from forcegp.simulation.scenarios import QuadrupedConfig
 
 HAND = ("mass", "center_of_mass.x", "center_of_mass.y", "center_of_mass.z")

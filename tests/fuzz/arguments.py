@@ -192,8 +192,6 @@ def _cost(q: torch.Tensor, v: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
 TRACKING = {
     "stiffness": 10.0,
     "damping": None,
-    "integral": 0.0,
-    "dt": 0.01,
     "torque_limits": 50.0,
     "on_failure": "hold",
 }
@@ -415,13 +413,13 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "MPPI": _call(
         forcegp.MPPI,
         lambda kind, **k: kind(INPUTS.predictor, _cost, **k)(*STATE[:2]),
-        "noise correlation temperature functions seed on_failure",
+        "noise functions seed on_failure",
         lambda: {"dt": 0.01, "steps": 2, "torque_limits": 5.0, "samples": 3, "integrator": "rk4"},
     ),
     "excitation": _call(
         forcegp.excitation,
         None,
-        "margin start surfaces clearance task seed",
+        "start surfaces clearance task seed",
         lambda: {
             **{"model": INPUTS.posterior.with_contacts(()), "seconds": 1.0, "limits": {"velocity": 1.0}, "rows": 5},
             "motions": 2,

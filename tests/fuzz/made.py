@@ -30,7 +30,7 @@ from forcegp.noise import Noise
 from forcegp.posterior import save_posterior
 from forcegp.robots import Robot
 from forcegp.simulation import QuadrotorConfig
-from forcegp.simulation.quadrotor import simulate_quadrotor
+from forcegp.simulation.moving_bases import simulate_quadrotor
 
 MODELS = ("structured", "carried", "independent")
 QUICK = OptimizerOptions(iterations=2)

@@ -1,11 +1,16 @@
 """Small random problems with the structure of constrained rigid bodies: W = H B with H A^T = 0."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from gpytorch.kernels import RBFKernel, ScaleKernel
 
+from forcegp.codegen.c_writer import Program, head, write_entry, write_function
+from forcegp.codegen.graph import Graph, jacobian
+from forcegp.codegen.library import RowFunction, aligned, compile_library
 from forcegp.inference import LatentKernels, Terms
+from forcegp.inference.one_input import LatentCall, OneInputCall
 
 
 def normal(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -66,3 +71,17 @@ def problem(
         features=[normal(count, dimension, seed=seed + 5 + c) for c in range(W.shape[-1])],
         kernels=squared_exponential_kernels(W.shape[-1], dimension, seed),
     )
+
+
+def rows_of_call(part: LatentCall, lanes: int, folder: Path) -> RowFunction:
+    """A latent as a compiled program from features to values, slopes and prior variances."""
+    graph = Graph(part.summed.features if isinstance(part, OneInputCall) else part.features)
+    values = part.call(graph, part.given(graph, graph.inputs) if isinstance(part, OneInputCall) else graph.inputs, True)
+    slopes = [node for row in jacobian(graph, values, graph.inputs) for node in row]
+    outputs = {"f": values, "J": slopes, "k": part.variance(graph, graph.inputs)}
+    program = Program(graph, {"z": len(graph.inputs)}, outputs)
+    function = write_function("program", graph, program.nodes, lanes, [f"{part.name}_slopes"])
+    source = "\n".join([head(lanes), part.c_source(lanes, True), function, write_entry(program, "program")])
+    options = ("-std=gnu11", "-O1", "-fno-math-errno", "-fPIC", "-shared")
+    library = compile_library(source, options, folder / f"{part.name}-{lanes}.so", "evaluate")
+    return RowFunction(library, 1, [len(x) for x in outputs.values()], [aligned(part.table())])

@@ -1,10 +1,9 @@
 """Deflation is a change of variables: nothing may depend on the basis, and nothing may get lost."""
 
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.inference.problems import constrained_inverse_mass, normal, problem
+from tests.inference.problems import normal, problem
 
 from forcegp.inference.likelihood import DeflatedSystem, Deflation, deflate, solve_deflated, whiten
 
@@ -49,39 +48,8 @@ def test_any_other_basis_gives_the_same(seed):
         torch.testing.assert_close(here.beta, there.beta, rtol=1e-9, atol=1e-9)
 
 
-def test_points_of_lower_rank_keep_an_orthonormal_basis():
-    W = constrained_inverse_mass(4, 3, 0)
-    W[1] = constrained_inverse_mass(1, 3, 2)[0]
-    W[2] = 0.0
-    y = normal(4, 3)
-    deflation = deflate(W, y)
-    assert deflation.rank == 3
-    torch.testing.assert_close(deflation.U.mT @ deflation.U, torch.eye(3, dtype=torch.float64).expand(4, -1, -1))
-    torch.testing.assert_close(deflation.U @ deflation.C, W)
-    assert not deflation.C[2].any()
-
-
 def test_nothing_to_deflate():
     deflation = deflate(torch.zeros(4, 3, 2, dtype=torch.float64), normal(4, 3))
     assert deflation.rank == 0
     assert torch.equal(deflation.remainder, normal(4, 3))
     assert deflate(torch.zeros(0, 3, 2, dtype=torch.float64), normal(0, 3)).U.shape[0] == 0
-
-
-@pytest.mark.parametrize("shared", [False, True], ids=["one per point", "shared"])
-@pytest.mark.parametrize("covariances", [False, True], ids=["variances", "covariances"])
-def test_whitening(covariances, shared):
-    given_problem = problem(count=6, outputs=3)
-    noise = given_problem.noise[:1] if shared else given_problem.noise
-    R = torch.diag_embed(noise)
-    if covariances:
-        factor = 0.2 * normal(len(noise), 3, 3, seed=4)
-        noise = R = R + factor @ factor.mT
-    W_white, y_white, half_log_determinant = whiten(given_problem.W, given_problem.residual, noise)
-    R = R.expand(6, 3, 3)
-    expected = given_problem.W.mT @ torch.linalg.solve(R, given_problem.W)
-    torch.testing.assert_close(W_white.mT @ W_white, expected)
-    torch.testing.assert_close(
-        W_white.mT @ y_white[..., None], given_problem.W.mT @ torch.linalg.solve(R, given_problem.residual[..., None])
-    )
-    torch.testing.assert_close(half_log_determinant, 0.5 * torch.logdet(R).sum())

@@ -80,20 +80,6 @@ def test_gradients_are_those_of_gpytorch(kernel):
         torch.testing.assert_close(gradient, reference, rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("dimension", [None, 1, 3])
-def test_squared_exponential_gradcheck(dimension):
-    kernel = scaled_rbf(dimension)
-    z = normal(4, dimension or 2).requires_grad_()
-    names, parameters = zip(*kernel.named_parameters(), strict=True)
-
-    def matrix(z, *parameters):
-        latent = LatentKernels([kernel])
-        given = {f"kernels.0.{name}": value for name, value in zip(names, parameters, strict=True)}
-        return latent.matrices(given, [z])[0]
-
-    assert torch.autograd.gradcheck(matrix, (z, *parameters))
-
-
 def test_the_variance_of_a_point_is_the_output_scale_to_the_last_bit():
     """Rounding of |z_i - z_i|^2 would make it smaller."""
     kernel = scaled_rbf(3)
@@ -119,12 +105,6 @@ def test_features_far_from_zero_lose_nothing(shift):
             rtol=0.0,
             atol=1e-15 * shift,
         )
-
-
-def test_second_derivatives_are_refused_and_never_silently_wrong():
-    z = normal(4, 3).requires_grad_()
-    with pytest.raises(NotImplementedError, match="first derivatives only"):
-        torch.autograd.grad(kernel_matrix(scaled_rbf(3), z).sum(), z, create_graph=True)
 
 
 # ---------------------------------------------------------------- several latents

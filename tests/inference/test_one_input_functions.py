@@ -1,27 +1,20 @@
 """Latents of one input in pieces, against sums of kernel functions."""
 
-import ctypes
 import math
-import subprocess
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import torch
-from tests.inference.problems import normal
+from tests.inference.problems import normal, rows_of_call
 
-from forcegp.codegen.library import compiler
-from forcegp.errors import CompilerError
+from forcegp.codegen.library import NOT_FINITE
 from forcegp.forces.kernels import kernel_of
 from forcegp.inference import ExactPosterior, LatentKernels, Terms
-from forcegp.inference.one_input import (
-    OneInputFunctions,
-    drawn_form,
-    one_input_form,
-    value_and_slope,
-)
+from forcegp.inference.one_input import OneInputCall, drawn_form, one_input_form, value_and_slope
 from forcegp.inference.pathwise import draw_functions
 from forcegp.inference.posterior import LatentPosterior
+from forcegp.inference.prepared_kernels import kernel_sums
 
 EXACT = [
     "friction",
@@ -32,27 +25,6 @@ EXACT = [
     "constant",
     "friction + matern-3/2 + matern-1/2 + constant",
 ]
-
-# the macros of the C writer, for one state and for eight
-ONE = """#include <math.h>
-#include <stddef.h>
-typedef double real;
-#define LANES 1
-#define AT(x, k) (x)
-#define r_exp exp
-#define r_tanh tanh
-#define r_asinh asinh
-#define r_sqrt sqrt
-"""
-EIGHT = """#include <math.h>
-#include <stddef.h>
-typedef double real __attribute__((vector_size(64)));
-#define LANES 8
-#define AT(x, k) ((x)[k])
-#define EACH(f) static real r_##f(real x) { real y; for (int k = 0; k < 8; ++k) y[k] = f(x[k]); return y; }
-EACH(exp) EACH(tanh) EACH(asinh) EACH(sqrt)
-"""
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 
 
 @LatentPosterior.register
@@ -177,67 +149,21 @@ def test_drawn_functions_of_rough_kernels_are_exact(expression):
     assert (form.values(s) - one_input_form(latent, 0, nothing).values(s)).abs().max() > 0.1
 
 
-def test_the_mean_of_a_posterior():
-    latent = posterior("friction")
-    z = normal(9, 1, seed=20)
-    close(one_input_form(latent, 0).values(z[:, 0]), latent.mean([z]), 1e-12)
-
-
 def test_one_source_serves_all_functions_of_a_structure():
     forms = [one_input_form(latents("friction", normal(count, seed=count)), 0) for count in (3, 9)]
     assert forms[0].c_source("f") == forms[1].c_source("f")
     assert all(np.isfinite(form.table()).all() for form in forms)
 
 
-def compiled(form: OneInputFunctions, head: str, options: tuple[str, ...], folder) -> ctypes.CDLL:
-    """The form as a loop over states; skips the test where there is no compiler."""
-    loop = """
-extern void many(long n, const double *table, const double *s, double *f, double *slope, int functions);
-extern void many(long n, const double *table, const double *s, double *f, double *slope, int functions) {
-  for (long i = 0; i < n; i += LANES) {
-    real x, value[64], change[64];
-    for (int k = 0; k < LANES; ++k) AT(x, k) = s[i + k];
-    latent(table, x, value, slope ? change : NULL);
-    for (int k = 0; k < LANES; ++k) for (int r = 0; r < functions; ++r) {
-      f[(i + k) * functions + r] = AT(value[r], k);
-      if (slope) slope[(i + k) * functions + r] = AT(change[r], k);
-    }
-  }
-}
-"""
-    try:
-        command = compiler()
-    except CompilerError as error:
-        pytest.skip(str(error))
-    source, library = folder / "latent.c", folder / "latent.so"
-    source.write_text(head + form.c_source("latent") + loop)
-    subprocess.run([*command, *options, "-O2", "-fPIC", "-shared", str(source), "-o", str(library), "-lm"], check=True)
-    return ctypes.CDLL(str(library))
-
-
-def run(library: ctypes.CDLL, form: OneInputFunctions, s: np.ndarray, slopes: bool = True):
-    def pointer(array):
-        return array.ctypes.data_as(ctypes.c_void_p) if array is not None else None
-
-    table, functions = form.table(), len(form.constants)
-    f, slope = np.zeros((len(s), functions)), np.zeros((len(s), functions)) if slopes else None
-    library.many(ctypes.c_long(len(s)), pointer(table), pointer(s), pointer(f), pointer(slope), functions)
-    return f, slope
-
-
-@pytest.mark.parametrize(("head", "options"), [(ONE, STRICT), (EIGHT, ("-std=gnu99",))], ids=["one", "eight"])
+@pytest.mark.parametrize("lanes", [1, 8])
 @pytest.mark.parametrize("expression", [EXACT[-1], "friction", "linear", "constant"])
-def test_the_c_code_computes_the_same(expression, head, options, tmp_path):
+def test_the_c_code_computes_the_same(expression, lanes, tmp_path):
     given = latents(expression, normal(30, seed=3))
-    form = one_input_form(given, 0, normal(30, 3, seed=4))
-    library = compiled(form, head, options, tmp_path)
-    s = torch.cat([torch.linspace(-1.2, 1.2, 170) * float(form.knots.abs().max()), form.knots[:16], torch.zeros(6)])
-    s = torch.cat([s.double()[: len(s) // 8 * 8], torch.tensor([math.nan] * 8, dtype=torch.float64)])
-    f, slope = run(library, form, s.numpy())
-    known = ~np.isnan(f)
-    assert (known == ~form.values(s).isnan().numpy()).all()
-    for found, expected in zip((f, slope), value_and_slope(form.values, s), strict=True):
-        np.testing.assert_allclose(
-            found[known], expected.numpy()[known], rtol=0, atol=1e-13 * float(expected[known].abs().max())
-        )
-    np.testing.assert_array_equal(run(library, form, s.numpy(), slopes=False)[0], f)
+    form = one_input_form(given, 0)
+    function = rows_of_call(OneInputCall(kernel_sums(given)[0], form), lanes, tmp_path)
+    s = torch.cat([torch.linspace(-1.2, 1.2, 170) * float(form.knots.abs().max()), form.knots[:16], torch.zeros(5)])
+    outputs = [torch.empty(len(s), size, dtype=torch.float64) for size in function.outputs]
+    assert function.rows(len(s), [s.double()[:, None]], outputs) == 0
+    for found, expected in zip(outputs, value_and_slope(form.values, s.double()), strict=False):
+        close(found, expected, 1e-13)
+    assert function.single(torch.tensor([math.nan]).double())[0] & NOT_FINITE

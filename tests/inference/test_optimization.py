@@ -94,12 +94,6 @@ def test_iterations_are_limited():
 # ---------------------------------------------------------------- parameters without effect
 
 
-def test_a_parameter_that_the_objective_ignores_stays():
-    result = minimize_objective(rosenbrock, {**start(), "unused": tensor(4.0, 5.0)})
-    assert result.converged
-    assert torch.equal(result.parameters["unused"], tensor(4.0, 5.0))
-
-
 def test_no_parameters_at_all():
     """A model with everything fixed: the value is still wanted."""
     result = minimize_objective(lambda parameters: tensor(3.0)[0], {})
@@ -168,10 +162,7 @@ def test_a_wall_in_front_of_the_optimum_ends_the_search_at_the_wall():
 
 @pytest.mark.parametrize(
     ("objective", "cause"),
-    [
-        (barrier_that_raises, "the covariance matrix is not positive definite"),
-        (barrier_that_gives_nan, "not finite"),
-    ],
+    [(barrier_that_raises, "the covariance matrix is not positive definite"), (barrier_that_gives_nan, "not finite")],
 )
 def test_a_start_that_cannot_be_evaluated_is_an_error_with_its_cause(objective, cause):
     with pytest.raises(FitError, match=f"cannot be evaluated at the start values: .*{cause}"):
@@ -182,14 +173,7 @@ def test_a_start_that_cannot_be_evaluated_is_an_error_with_its_cause(objective, 
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [
-        {"iterations": -1},
-        {"tolerance": -1.0},
-        {"tolerance": math.nan},
-        {"patience": -1},
-    ],
-    ids=str,
+    "wrong", [{"iterations": -1}, {"tolerance": -1.0}, {"tolerance": math.nan}, {"patience": -1}], ids=str
 )
 def test_options_are_checked(wrong):
     with pytest.raises(InvalidInput):
@@ -245,9 +229,3 @@ def test_a_search_without_hope_of_reaching_an_earlier_one_ends_and_says_so():
     pace = [alone.history[i - 5] - alone.history[i] for i in range(5, k + 1)]
     hopeless = [alone.history[i] + 100.0 > 2.0 * pace[i - 5] for i in range(5, k + 1)]
     assert hopeless == [False] * (k - 5) + [True]
-
-
-def test_the_best_of_several_starts_counts_those_that_were_dropped():
-    options = OptimizerOptions(patience=10)
-    results = [minimize_objective(rosenbrock, start(), options, rival=rival) for rival in (math.inf, -100.0)]
-    assert best_of(results).status.endswith("(best of 2 starts, 1 of them dropped)")

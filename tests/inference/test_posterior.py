@@ -1,5 +1,8 @@
 """The posterior of the latents against dense Gaussian conditioning."""
 
+import math
+from dataclasses import replace
+
 import pytest
 import torch
 from gpytorch.kernels import LinearKernel, MaternKernel, RBFKernel, ScaleKernel
@@ -8,7 +11,9 @@ from hypothesis import strategies as st
 from tests.inference.dense import dense_posterior
 from tests.inference.problems import Problem, normal, problem
 
-from forcegp.inference import ExactPosterior, LatentKernels, posterior
+from forcegp.errors import InvalidInput, NotEnoughMemory
+from forcegp.inference import ExactPosterior, LatentKernels, engines, memory, posterior
+from forcegp.inference.engines import Exact, Inducing, ProblemSize, choose_engine, engine_from_dict
 
 SHAPES = {
     "no constraint": {"constraints": 0},
@@ -87,16 +92,6 @@ def test_no_data_leaves_the_prior():
     torch.testing.assert_close(covariance, torch.diag(variances).expand_as(covariance))
 
 
-def test_data_that_say_nothing_leave_the_prior():
-    given_problem = problem(count=5)
-    given_problem.W = torch.zeros_like(given_problem.W)
-    features = new_features(given_problem)
-    with torch.no_grad():
-        mean, covariance = condition(given_problem).mean(features), condition(given_problem).covariance(features)
-    assert not mean.any()
-    torch.testing.assert_close(covariance, dense(given_problem, features)[1])
-
-
 def test_data_without_noise_are_reproduced():
     given_problem = problem(constraints=0)
     given_problem.noise = torch.full((1, 5), 1e-10, dtype=torch.float64)
@@ -136,3 +131,79 @@ def test_covariance_is_positive_semi_definite_and_below_the_prior(count, outputs
     scale = float(prior.max())
     assert torch.linalg.eigvalsh(covariance).min() > -1e-8 * scale
     assert torch.linalg.eigvalsh(prior - covariance).min() > -1e-8 * scale
+
+
+CPU = torch.device("cpu")
+SIZE = ProblemSize(rows=1000, outputs=2, rank=2, latents=3, features=9)
+GIB = 2**30
+
+
+@pytest.fixture
+def free(monkeypatch):
+    """A function that sets how many bytes are free."""
+
+    def to(size):
+        for module in (engines, memory):
+            monkeypatch.setattr(module, "free_memory", lambda device: size)
+
+    to(1000 * GIB)
+    return to
+
+
+@pytest.mark.parametrize(
+    ("engine", "matrices"),
+    [
+        (Exact(), [(2000, 2000), (3000, 1000)]),
+        (Inducing(100), [*[(300, 300)] * 3, (20_000, 100), (12 * 1000, 3 * 2)]),
+        # its batch: ten matrices of the points and the rows of all latents
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_memory_is_that_of_the_matrices(engine, matrices):
+    assert engine.required_bytes(SIZE) == sum(8 * rows * columns for rows, columns in matrices)
+
+
+def test_learning_needs_two_more_matrices_for_each_latent():
+    assert Exact().bytes_to_learn(SIZE) - Exact().required_bytes(SIZE) == 3 * 8 * 3 * 1000**2
+
+
+def test_the_engine_follows_rows_features_and_memory(free):
+    assert choose_engine(replace(SIZE, rows=1500), CPU).engine == Exact()
+    assert choose_engine(replace(SIZE, rows=8000), CPU).engine == Exact()  # rN = 16,000
+    assert choose_engine(replace(SIZE, rows=8001), CPU).engine == Inducing(points=1000, refine=0)
+    assert choose_engine(replace(SIZE, rows=60_000), CPU).engine == Inducing(points=1000, refine=0)
+    assert choose_engine(replace(SIZE, rows=1501, features=3), CPU).engine == Inducing()
+    assert choose_engine(replace(SIZE, rows=1501, features=4), CPU).engine == Exact()
+    assert choose_engine(replace(SIZE, rows=1501, features=3), CPU, inducing=False).engine == Exact()
+    assert choose_engine(replace(SIZE, rows=10**6, latents=0), CPU).engine == Exact()
+    few = replace(SIZE, features=2)
+    free(Exact().required_bytes(few))  # 90 % of it may be planned with
+    assert choose_engine(few, CPU).engine == Inducing()
+    free(math.ceil(Exact().required_bytes(SIZE) / 0.9))
+    assert choose_engine(SIZE, CPU).engine == Exact()
+    free(1000)
+    with pytest.raises(NotEnoughMemory, match="N=1000 rows"):
+        choose_engine(SIZE, CPU)
+
+
+@pytest.mark.parametrize(
+    ("kind", "fine", "wrong"),
+    [
+        (Inducing, {"points": 1}, {"points": 0}),
+        (Inducing, {"tolerance": 0.0}, {"tolerance": -1e-9}),
+        (Inducing, {"refine": 0}, {"refine": -1}),
+    ],
+    ids=str,
+)
+def test_settings_up_to_their_bounds(kind, fine, wrong):
+    engine = kind(**fine)
+    assert engine_from_dict(engine.to_dict()) == engine
+    ((name, value),) = wrong.items()
+    with pytest.raises(InvalidInput, match=f"{name} is {value!r}"):
+        kind(**wrong)
+
+
+@pytest.mark.parametrize("stored", [None, ["exact"], {"name": "gone"}, {"name": "exact", "points": 3}, {"points": 3}])
+def test_what_is_no_stored_engine_is_refused(stored):
+    with pytest.raises(InvalidInput, match="exact, inducing"):
+        engine_from_dict(stored)

@@ -3,13 +3,10 @@
 import pytest
 import torch
 from gpytorch.kernels import MaternKernel, RBFKernel, ScaleKernel
-from tests.inference.problems import normal, problem
+from tests.inference.problems import normal, problem, rows_of_call
 
-from forcegp.codegen.c_writer import Program, head, write_entry, write_function
-from forcegp.codegen.graph import Graph, jacobian
-from forcegp.codegen.library import RowFunction, aligned, compile_library
-from forcegp.inference import ExactPosterior, LatentKernels, Terms
-from forcegp.inference.prepared_kernels import kernel_groups, kernel_sums
+from forcegp.inference import ExactPosterior, LatentKernels, Terms, prepared_kernels
+from forcegp.inference.prepared_kernels import Sample, compress, kernel_groups, kernel_sums
 
 SHARED = [1, 3, 4]
 """Latents with the same centres; one of them has one length scale for all features."""
@@ -44,25 +41,10 @@ def test_latents_are_grouped_by_their_centers(latent):
 def test_the_sums_as_c_have_values_slopes_and_roots(latent, lanes, tmp_path):
     """Every group in a program of its own, whose inputs are the features."""
     for group, part in zip(kernel_groups(latent), kernel_sums(latent), strict=True):
-        graph = Graph(part.features)
-        values = part.call(graph, graph.inputs, True)
-        slopes = [node for row in jacobian(graph, values, graph.inputs) for node in row]
-        program = Program(
-            graph, {"z": part.features}, {"f": values, "J": slopes, "k": part.variance(graph, graph.inputs)}
-        )
-        text = [
-            head(lanes),
-            part.c_source(lanes, True),
-            write_function("program", graph, program.nodes, lanes, [f"{part.name}_slopes"]),
-        ]
-        options = ("-std=gnu11", "-O1", "-fno-math-errno", "-fPIC", "-shared")
-        source = "\n".join([*text, write_entry(program, "program")])
-        library = compile_library(source, options, tmp_path / f"{part.name}-{lanes}.so", "evaluate")
-        sizes = [len(x) for x in program.outputs.values()]
-        function = RowFunction(library, 1, sizes, [aligned(part.table())])
+        function = rows_of_call(part, lanes, tmp_path)
         z = points(latent, 11)
         given = z[group[0]]
-        outputs = [torch.empty(11, size, dtype=torch.float64) for size in sizes]
+        outputs = [torch.empty(11, size, dtype=torch.float64) for size in function.outputs]
         assert function.rows(11, [given], outputs) == 0
         leaf = [x.clone().requires_grad_() for x in z]
         expected = latent.mean(leaf)[:, list(group)]
@@ -74,3 +56,59 @@ def test_the_sums_as_c_have_values_slopes_and_roots(latent, lanes, tmp_path):
             close(outputs[1].view(11, len(group), -1)[:, place], mine)
             close(function.single(given[3])[1][1].view(len(group), -1)[place], mine[3])
         close(outputs[2], torch.stack([latent.kernels.dense[c].diagonal(given) for c in group], -1))
+
+
+@pytest.fixture(scope="module")
+def compressible() -> ExactPosterior:
+    given = problem(count=10)
+    given.kernels.requires_grad_(False)
+    return ExactPosterior.condition(given.kernels, given.terms)
+
+
+def sample(count: int, seed: int) -> Sample:
+    return Sample([normal(count, 3, seed=seed + c) for c in range(5)], normal(count, 2, 5, seed=seed + 9))
+
+
+def deviations(matrix: torch.Tensor, at: Sample) -> torch.Tensor:
+    return torch.einsum("nkc,ncd,nkd->nk", at.W, matrix, at.W).sqrt()
+
+
+def test_all_combinations_give_the_exact_covariance(compressible):
+    at = sample(30, seed=50)  # 60 directions, more than there are data
+    compressed = compress(compressible, at, sample(4, seed=90), tolerance=0.0, largest=1000)
+    assert compressed.rank == 10 * 4  # H has rank 4
+    new = sample(6, seed=200).features
+    torch.testing.assert_close(compressed.at(compressible, new), compressible.covariance(new), rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("tolerance", [0.3, 0.1, 0.03])
+def test_it_is_the_smallest_rank_of_the_tolerance_and_never_below_the_exact_covariance(compressible, tolerance):
+    chosen_at, checked_at = sample(20, seed=50), sample(7, seed=90)
+    compressed = compress(compressible, chosen_at, checked_at, tolerance=tolerance, largest=1000)
+    assert 1 < compressed.rank < 40
+    at_check = compressed.at(compressible, checked_at.features)
+    exact = compressible.covariance(checked_at.features)
+    assert float(torch.linalg.eigvalsh(at_check - exact).min()) > -1e-9
+    inflation = deviations(at_check, checked_at) / deviations(exact, checked_at) - 1.0
+    torch.testing.assert_close(compressed.inflation, inflation.flatten(), rtol=0.0, atol=1e-7)
+    assert float(inflation.max()) <= tolerance
+    smaller = compress(compressible, chosen_at, checked_at, tolerance=tolerance, largest=compressed.rank - 1)
+    assert smaller.rank == compressed.rank - 1
+    assert float(smaller.inflation.max()) > tolerance
+
+
+def test_blocks_of_states_change_nothing(compressible, monkeypatch):
+    whole = compress(compressible, sample(9, seed=50), sample(7, seed=90), tolerance=0.0, largest=12)
+    monkeypatch.setattr(prepared_kernels, "BLOCK_BYTES", 8 * 10 * 5 * 5 * 4)  # four states
+    blocks = compress(compressible, sample(9, seed=50), sample(7, seed=90), tolerance=0.0, largest=12)
+    torch.testing.assert_close(blocks.inflation, whole.inflation, rtol=1e-7, atol=1e-9)
+    monkeypatch.setattr(prepared_kernels, "BLOCK_BYTES", 1)  # less than a state needs
+    assert compress(compressible, sample(3, seed=50), sample(2, seed=90), tolerance=0.0, largest=3).rank == 3
+
+
+def test_directions_without_variance_do_not_count(compressible):
+    at = sample(9, seed=50)
+    blind = Sample(at.features, torch.cat([at.W, torch.zeros_like(at.W)], dim=1))
+    compressed = compress(compressible, at, blind, tolerance=0.05, largest=12)
+    assert torch.isfinite(compressed.inflation).all()
+    assert len(compressed.inflation) == 18

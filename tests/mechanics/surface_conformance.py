@@ -10,11 +10,10 @@ import pytest
 import torch
 
 from forcegp.errors import ContactError
-from forcegp.mechanics import ImplicitSurface, Surface
+from forcegp.mechanics import Surface
 from forcegp.mechanics.surfaces import SURFACES, object_from_dict, surface_to_dict
 
 BATCHES = [(), (1,), (0,), (4,), (2, 3), (3, 0, 2)]
-STEP = 1e-5
 
 
 def assert_rounded(given: torch.Tensor, expected: torch.Tensor) -> None:
@@ -50,15 +49,6 @@ class SurfaceConformance:
             if one_by_one:
                 assert_rounded(result.reshape(-1, *trailing), torch.stack(one_by_one))
 
-    def test_gradient_and_hessian_against_finite_differences(self):
-        p = self.points(20)
-        steps = STEP * torch.eye(3, dtype=torch.float64)[:, None, :]
-        ahead, behind = p + steps, p - steps
-        gradient = (self.surface.value(ahead) - self.surface.value(behind)).mT / (2.0 * STEP)
-        torch.testing.assert_close(self.surface.gradient(p), gradient, rtol=1e-8, atol=1e-8)
-        hessian = (self.surface.gradient(ahead) - self.surface.gradient(behind)).permute(1, 2, 0) / (2.0 * STEP)
-        torch.testing.assert_close(self.surface.hessian(p), hessian, rtol=1e-8, atol=1e-8)
-
     def test_gradient_and_hessian_against_autograd(self):
         for point in self.points(10):
             gradient = torch.autograd.functional.jacobian(self.surface.value, point)
@@ -70,13 +60,6 @@ class SurfaceConformance:
         for name in ("value", "gradient", "hessian"):
             p = self.points(2).requires_grad_()
             assert torch.autograd.gradcheck(getattr(self.surface, name), (p,)), name
-
-    def test_an_implicit_surface_of_the_same_function_is_the_same(self):
-        implicit, p = ImplicitSurface(self.surface.value), self.points(5)
-        for name in ("value", "gradient", "hessian"):
-            torch.testing.assert_close(
-                getattr(implicit, name)(p), getattr(self.surface, name)(p), rtol=1e-12, atol=1e-12
-            )
 
     def test_a_signed_distance_has_unit_normals(self):
         p = self.points(20)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from tests.mechanics.systems import POINT, assert_close, assert_derivatives, robot, states, surfaces
+from tests.mechanics.systems import POINT, assert_close, robot, states, surfaces
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import FRAMES, MODELS
 
@@ -81,16 +81,6 @@ def test_baumgarte_turns_the_distance_into_a_damped_oscillator(surface, omega, z
         -2.0 * zeta * omega * (without[0] * v).sum(-1) - omega**2 * distance,
         1e-12,
     )
-
-
-@pytest.mark.parametrize("surface", SURFACES)
-def test_derivatives(surface):
-    def function(q, v):
-        A, b, gradient = constraint("tree", surface, Baumgarte(3.0, 0.5), q, v, torch.zeros_like(q))
-        return torch.cat([A, b[None], gradient])
-
-    q, v, _ = states(robot("tree").nv)
-    assert_derivatives(function, q, v)
 
 
 # ---------------------------------------------------------------- values

@@ -80,60 +80,6 @@ class TestAgainstDenseEquations:
         forces = dynamics.Q_K + Q_U + (A.mT @ dynamics.multiplier(Q_U)[..., None])[..., 0]
         assert_close((M @ a[..., None])[..., 0], forces, TOLERANCE)
 
-    def test_affine_maps(self, solved):
-        dynamics, Q_U = solved
-        for affine, value in (
-            (dynamics.acceleration_map(), dynamics.acceleration(Q_U)),
-            (dynamics.multiplier_map(), dynamics.multiplier(Q_U)),
-        ):
-            assert_close(affine(Q_U), value, 1e-14)
-            assert_close(affine.offset + (affine.matrix @ Q_U[..., None])[..., 0], value, 1e-14)
-
-    def test_contact_forces_do_the_work_of_the_multiplier(self, solved, model):
-        """sum_k J_k^T F_k = A^T lambda, with every F_k along the normal of its surface."""
-        dynamics, Q_U = solved
-        built = model_with(model, "none")
-        forces = dynamics.contact_force_map()(Q_U).unflatten(-1, (-1, 3)) if dynamics.b.shape[-1] else None
-        multiplier = dynamics.multiplier(Q_U)
-        total = torch.zeros_like(Q_U)
-        for index in range(dynamics.b.shape[-1]):
-            force = forces[:, index]
-            assert_close(force, dynamics.normals[:, index] * multiplier[:, index, None], 1e-14)
-            point = self.point_of(dynamics, index, model)
-            J = built.robot.frame_jacobian(dynamics.state.q, FRAMES[model], point)[:, :3]
-            total = total + (J.mT @ force[..., None])[..., 0]
-        assert_close(total, (dynamics.A.mT @ multiplier[..., None])[..., 0], TOLERANCE)
-        if not dynamics.b.shape[-1]:
-            assert dynamics.contact_force_map()(Q_U).shape == (20, 0)
-
-    @staticmethod
-    def point_of(dynamics, index, model):
-        kinds = {1: "one", 2: "same twice", 3: "three", 4: "four corners"}
-        return model_with(model, kinds[dynamics.b.shape[-1]]).contacts[index].point
-
-    def test_least_constraint(self, solved):
-        """Among all accelerations with A a = b, a is nearest to the free one in the metric of M (Gauss 1829)."""
-        dynamics, Q_U = solved
-        M, a = dynamics.M, dynamics.acceleration(Q_U)
-        free = torch.linalg.solve(M, dynamics.Q_K + Q_U)
-        allowed = dynamics.H @ M @ normal(20, M.shape[-1], seed=11)[..., None]  # A H = 0
-
-        def constraint(acceleration):
-            difference = (acceleration - free)[..., None]
-            return (difference.mT @ M @ difference)[..., 0, 0]
-
-        for step in (-0.1, 0.1):
-            assert bool((constraint(a + step * allowed[..., 0]) > constraint(a)).all())
-
-
-def test_redundant_contacts_share_the_force_equally():
-    once, twice = model_with("iiwa", "one"), model_with("iiwa", "one")
-    twice = twice.with_contacts(once.contacts * 2)
-    q_v_u, Q_U = states(7, 5), normal(5, 7)
-    single, shared = once.dynamics(*q_v_u), twice.dynamics(*q_v_u)
-    assert_close(shared.acceleration(Q_U), single.acceleration(Q_U), TOLERANCE)
-    assert_close(shared.multiplier(Q_U), single.multiplier(Q_U).expand(5, 2) / 2.0, TOLERANCE)
-
 
 # ---------------------------------------------------------------- batches
 
@@ -166,13 +112,6 @@ def test_derivatives(model, kind):
 
 
 # ---------------------------------------------------------------- what it refuses
-
-
-def test_states_that_are_not_finite():
-    q, v, u = states(7, 3)
-    q[1, 2] = torch.nan
-    with pytest.raises(NumericalError, match="mass matrix is not positive definite"):
-        model_with("iiwa", "one").dynamics(q, v, u)
 
 
 def test_a_constraint_that_is_not_finite():

@@ -1,6 +1,5 @@
 """Each known force against its formula, with its sign, through files, and from the numbers of the URDF."""
 
-import json
 import math
 
 import numpy as np
@@ -27,7 +26,7 @@ from forcegp.forces import (
     Viscous,
 )
 from forcegp.forces.force import JointLaw
-from forcegp.forces.registry import FORCES, force_class, force_from_dict, force_to_dict
+from forcegp.forces.registry import FORCES, force_class
 from forcegp.mechanics import State
 from forcegp.model import Model
 
@@ -42,10 +41,7 @@ FORMULAS = {
     "actuation": (lambda: Actuation(), lambda q, v, u: u),
     "bias": (lambda: RigidBodies(), lambda q, v, u: -pinocchio_bias(q, v)),
     "viscous": (lambda: Viscous(NUMBERS), lambda q, v, u: -TENSOR * v),
-    "Coulomb": (
-        lambda: Coulomb(NUMBERS, 0.02),
-        lambda q, v, u: -TENSOR * (v / 0.02).tanh(),
-    ),
+    "Coulomb": (lambda: Coulomb(NUMBERS, 0.02), lambda q, v, u: -TENSOR * (v / 0.02).tanh()),
     "Stribeck": (
         lambda: Stribeck(NUMBERS, 3.0, [0.1, 0.2, 0.3, 0.4], 0.02),
         lambda q, v, u: -(TENSOR + 3.0 * (-((v / TENTHS) ** 2)).exp()) * (v / 0.02).tanh(),
@@ -152,15 +148,6 @@ def test_wrong_numbers_are_named(kind, arguments, error, message):
 
 
 # ---------------------------------------------------------------- files
-
-
-@pytest.mark.parametrize("make_and_formula", FORMULAS.values(), ids=FORMULAS)
-def test_they_survive_a_file_exactly(make_and_formula):
-    force = make_and_formula[0]().bound_to(chain())
-    again = force_from_dict(json.loads(json.dumps(force_to_dict(force)))).bound_to(chain())
-    assert type(again) is type(force)
-    for name, value in force.values.items():
-        assert torch.equal(again.values[name], value)
 
 
 def test_every_law_of_joints_is_tested_here():

@@ -2,12 +2,12 @@ import math
 
 import pytest
 import torch
-from hypothesis import strategies as st
 from tests.mechanics.surface_conformance import SurfaceConformance
+from tests.mechanics.systems import normal
 
 from forcegp.errors import ContactError, FileFormatError, InvalidInput
-from forcegp.mechanics import ImplicitSurface, Plane, Sphere, Surface
-from forcegp.mechanics.surfaces import SURFACES, object_from_dict
+from forcegp.mechanics import ImplicitSurface, Plane, Sphere, Surface, surface_axes
+from forcegp.mechanics.surfaces import SURFACES, TURNED_OVER, object_from_dict
 
 
 class TestPlane(SurfaceConformance):
@@ -54,30 +54,14 @@ class TestSubclassWithValueOnly(SurfaceConformance):
 
 def test_signs_and_distances():
     p = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 0.5]], dtype=torch.float64)
-    for surface, expected in (
-        (Plane((0, 0, 2), 2), [2.0, -0.5]),
-        (Sphere((0, 0, 0), 1), [2.0, -0.5]),
-    ):
+    for surface, expected in ((Plane((0, 0, 2), 2), [2.0, -0.5]), (Sphere((0, 0, 0), 1), [2.0, -0.5])):
         torch.testing.assert_close(surface.value(p), torch.tensor(expected, dtype=torch.float64))
         torch.testing.assert_close(surface.gradient(p), torch.tensor([[0.0, 0.0, 1.0]] * 2, dtype=torch.float64))
-
-
-def test_curvatures():
-    """The Hessian of a signed distance holds the principal curvatures of the parallel surface: 0, 1 / r, 1 / r^2 ..."""
-    p = torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
-    for surface, curvatures in (
-        (Plane((0, 0, 1), 0), [0.0, 0.0, 0.0]),
-        (Sphere((0, 0, 0), 1), [0.5, 0.5, 0.0]),
-    ):
-        torch.testing.assert_close(surface.hessian(p), torch.diag(torch.tensor(curvatures, dtype=torch.float64)))
 
 
 def test_directions_need_not_be_unit_vectors():
     assert Plane((0, 0, 4), 2) == Plane((0, 0, 1), 0.5)
     assert Plane((0, 0, -1), 0.5) != Plane((0, 0, 1), -0.5)  # the other side is positive
-
-
-finite = st.floats(-1e3, 1e3)
 
 
 # ---------------------------------------------------------------- what they refuse
@@ -132,3 +116,39 @@ def test_a_function_must_return_a_scalar_tensor(function, batch, what):
 def test_damaged_surfaces_are_refused(stored):
     with pytest.raises(FileFormatError, match="surface"):
         object_from_dict("surface", SURFACES, stored)
+
+
+STEP = 1e-6
+NEAR_DOWN = [(0.0, 0.0, -2.0), (1e-9, 0.0, -1.0), (0.0, -1e-5, -1.0), (0.1, 0.2, -1.0)]
+
+
+def normals(*shape: int) -> torch.Tensor:
+    given = normal(*shape, 3)
+    return given / given.norm(dim=-1, keepdim=True)
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (0,), (300,), (2, 3)], ids=str)
+def test_columns_are_a_right_handed_rotation_whose_third_is_the_normal(batch):
+    gradients = 0.3 * normal(*batch, 3)
+    axes = surface_axes(gradients)
+    assert axes.shape == (*batch, 3, 3)
+    torch.testing.assert_close(axes.mT @ axes, torch.eye(3).double().expand_as(axes), rtol=0.0, atol=1e-14)
+    torch.testing.assert_close(torch.linalg.det(axes), torch.ones(batch).double(), rtol=0.0, atol=1e-14)
+    unit = gradients / gradients.norm(dim=-1, keepdim=True)
+    torch.testing.assert_close(axes[..., 2], unit, rtol=0.0, atol=1e-14)
+
+
+def test_on_a_table_the_tangents_are_x_and_y():
+    assert torch.equal(surface_axes(torch.tensor([0.0, 0.0, 2.0]).double()), torch.eye(3).double())
+
+
+def test_it_is_smooth_by_finite_differences():
+    steps = STEP * torch.eye(3).double()[:, None]
+    points = torch.cat([1.5 * normals(200), torch.tensor([(0.0, 0.0, 1.0), *NEAR_DOWN], dtype=torch.float64)])
+    unit_z = points[:, 2] / points.norm(dim=-1)
+    points = points[(unit_z - TURNED_OVER).abs() > 1e-3]  # where the axes start from -z instead of z
+    numeric = (surface_axes(points + steps) - surface_axes(points - steps)).permute(1, 2, 3, 0) / (2.0 * STEP)
+    exact = torch.func.vmap(torch.func.jacrev(surface_axes))(points)
+    torch.testing.assert_close(exact, numeric, rtol=0.0, atol=1e-8)
+    length = exact.square().sum((-3, -2, -1)).sqrt() * points.norm(dim=-1)
+    assert float(length.max()) < 10.0  # nowhere does a small change of the normal turn the tangents by much

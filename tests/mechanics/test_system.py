@@ -1,5 +1,4 @@
 import contextlib
-import copy
 import math
 
 import pytest
@@ -109,15 +108,6 @@ def test_a_point_that_cannot_move_along_the_normal():
         held.check_states(*states(1, 2))
 
 
-def test_contradictory_contacts_are_named():
-    """The same point on two parallel planes: whichever Baumgarte pulls it to, the other is violated."""
-    tool = FRAMES["iiwa"]
-    contacts = tuple(Contact(tool, (0.0, 0.0, 0.1), Plane((0.0, 0.0, 1.0), height)) for height in (0.055, 0.065))
-    held = Model(robot("iiwa"), contacts, baumgarte=Baumgarte(10.0))
-    with pytest.raises(ContactError, match=r"row \d: .* = 5\.00e-01 for contact [01]"):
-        held.check_states(*states(7, 3))
-
-
 def test_contacts_contradict_each_other_from_a_millionth_on():
     """At rest b = -omega^2 s, and the acceleration lies between the two: half of omega^2 times the gap is missing."""
     tool, point = FRAMES["iiwa"], torch.tensor([0.0, 0.0, 0.1, 1.0], dtype=torch.float64)
@@ -164,29 +154,3 @@ def test_a_surface_that_holds_code_cannot_be_stored_but_given_again():
         built.to_json()
     stored = built.with_contacts(()).to_dict()
     assert_same_dynamics(Model.from_dict(stored, contacts=waves), built)
-
-
-def places(value, path=()):
-    """Every place in a tree of dictionaries and lists."""
-    yield path
-    if isinstance(value, dict | list):
-        for key in value if isinstance(value, dict) else range(len(value)):
-            yield from places(value[key], (*path, key))
-
-
-STORED = complete().to_dict()
-PLACES = [place for place in places(STORED) if place]
-RUBBISH = [None, 5, -1.5, "rubbish", "", [], ["a"], [[]], {}, {"a": 1}, math.nan, math.inf, True, "DELETE"]
-
-
-def damaged(place, rubbish) -> dict:
-    stored = copy.deepcopy(STORED)
-    *above, last = place
-    parent = stored
-    for key in above:
-        parent = parent[key]
-    if rubbish == "DELETE":
-        del parent[last]
-    else:
-        parent[last] = rubbish
-    return stored

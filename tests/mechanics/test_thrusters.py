@@ -87,12 +87,6 @@ def test_motions_foresee_a_wrench_that_fades_to_what_lasts(robot):
     torch.autograd.gradcheck(lambda u: model.foreseen(u, 0.1), u[:1].clone().requires_grad_())
 
 
-def test_gradients(robot):
-    model = Model(robot, (), (Actuation(), Thrusters("pod", PLACES, 2.0, 0.1, AXES, 2), RigidBodies()))
-    q, v, u = states(robot, 1)
-    torch.autograd.gradcheck(lambda u: model.dynamics(q, v, u).Q_K, u[0].clone().requires_grad_())
-
-
 @pytest.mark.parametrize(
     ("make", "words"),
     [

@@ -5,6 +5,8 @@ import pytest
 import torch
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import CHAIN, FRAMES, MODELS, TREE
+from torch.autograd import gradcheck, gradgradcheck
+from torch.func import jacfwd, jacrev
 
 from forcegp.robots import Robot
 
@@ -33,33 +35,22 @@ def case(request):
     return robot, Oracle(text, robot), FRAMES[model], *states
 
 
-def test_mass_matrix(case):
-    robot, oracle, _, q, *_ = case
-    theirs = [oracle.mass_matrix(x) for x in q]
-    assert relative_error(robot.mass_matrix(torch.tensor(q)), theirs) < 1e-12
+FUNCTIONS = {
+    "mass_matrix": "q",
+    "bias_forces": "qv",
+    "gravity_forces": "q",
+    "inverse_dynamics": "qva",
+    "forward_dynamics": "qvt",
+}
 
 
-def test_bias_forces(case):
-    robot, oracle, _, q, v, *_ = case
-    theirs = [oracle.bias_forces(*x) for x in zip(q, v, strict=True)]
-    assert relative_error(robot.bias_forces(torch.tensor(q), torch.tensor(v)), theirs) < 1e-12
-
-
-def test_gravity_forces(case):
-    robot, oracle, _, q, *_ = case
-    assert relative_error(robot.gravity_forces(torch.tensor(q)), [oracle.gravity_forces(x) for x in q]) < 1e-12
-
-
-def test_inverse_dynamics(case):
-    robot, oracle, _, q, v, a, _ = case
-    theirs = [oracle.inverse_dynamics(*x) for x in zip(q, v, a, strict=True)]
-    assert relative_error(robot.inverse_dynamics(*map(torch.tensor, (q, v, a))), theirs) < 1e-12
-
-
-def test_forward_dynamics(case):
-    robot, oracle, _, q, v, _, tau = case
-    theirs = [oracle.forward_dynamics(*x) for x in zip(q, v, tau, strict=True)]
-    assert relative_error(robot.forward_dynamics(*map(torch.tensor, (q, v, tau))), theirs) < 1e-9
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_dynamics(case, function):
+    robot, oracle, _, *states = case
+    given = [dict(zip("qvat", states, strict=True))[name] for name in FUNCTIONS[function]]
+    theirs = [getattr(oracle, function)(*x) for x in zip(*given, strict=True)]
+    ours = getattr(robot, function)(*map(torch.tensor, given))
+    assert relative_error(ours, theirs) < (1e-9 if function == "forward_dynamics" else 1e-12)
 
 
 @pytest.mark.parametrize("point", [None, POINT, torch.tensor(POINT, dtype=torch.float64)])
@@ -89,3 +80,47 @@ def test_every_frame(text):
         np.testing.assert_allclose(robot.frame_pose(args[0], frame), pose, atol=1e-13)
         np.testing.assert_allclose(robot.frame_jacobian(args[0], frame), jacobian, atol=1e-13)
         np.testing.assert_allclose(robot.frame_bias_acceleration(*args, frame), acceleration, atol=1e-12)
+
+
+def largest_error(ours: torch.Tensor, theirs: np.ndarray) -> float:
+    return float(abs(ours.numpy() - theirs).max() / abs(theirs).max())
+
+
+@pytest.fixture(params=[*MODELS])
+def at_one_state(request):
+    text = MODELS[request.param]()
+    armature = 0.1 * np.arange(1, 1 + Robot.from_urdf_text(text).nv)
+    robot = Robot.from_urdf_text(text, armature=armature)
+    states = np.random.default_rng(11).normal(size=(3, robot.nv))
+    return robot, Oracle(text, robot), *states
+
+
+@pytest.mark.parametrize("jacobian", [jacrev, jacfwd])
+def test_forward_dynamics_with_respect_to_state_and_force(at_one_state, jacobian):
+    robot, oracle, *states = at_one_state
+    ours = jacobian(robot.forward_dynamics, argnums=(0, 1, 2))(*map(torch.tensor, states))
+    for mine, theirs in zip(ours, oracle.forward_dynamics_derivatives(*states), strict=True):
+        assert largest_error(mine, theirs) < 1e-8
+
+
+@pytest.fixture(scope="module")
+def chain():
+    robot = Robot.from_urdf_text(CHAIN)
+    states = torch.tensor(np.random.default_rng(5).normal(size=(3, 2, robot.nv)))
+    return robot, *states
+
+
+def test_first_and_second_derivatives_by_finite_differences(chain):
+    robot, q, v, tau = chain
+    inputs = [x.clone().requires_grad_() for x in (q, v, tau)]
+    assert gradcheck(robot.forward_dynamics, inputs, rtol=1e-5, check_forward_ad=True)
+    assert gradgradcheck(robot.forward_dynamics, inputs, rtol=1e-4, atol=1e-4, fast_mode=True)
+
+
+def test_frame_functions_are_differentiable(chain):
+    robot, q, v, _ = chain
+    point = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64).requires_grad_()
+    q, v = q.clone().requires_grad_(), v.clone().requires_grad_()
+    assert gradcheck(lambda q: robot.frame_pose(q, "tool"), [q])
+    assert gradcheck(lambda q, p: robot.frame_jacobian(q, "tool", p), [q, point])
+    assert gradcheck(lambda q, v, p: robot.frame_bias_acceleration(q, v, "tool", p), [q, v, point])

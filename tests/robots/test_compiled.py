@@ -2,48 +2,24 @@
 
 import os
 import pickle
-import stat
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from tests.robots.robot_models import TREE
+from tests.robots.test_moving_bases import LIMBS
 
 from forcegp.codegen.c_writer import write_program
+from forcegp.codegen.graph import Graph, evaluated, node_of
 from forcegp.codegen.library import RowFunction, compile_library
 from forcegp.errors import CompilerError, InvalidInput
 from forcegp.robots import Robot
-from forcegp.robots.compiled import UnrolledRobot, trace_dynamics
+from forcegp.robots.compiled import UnrolledKinematics, UnrolledRobot, factorize, trace_dynamics
 
-# a branch, a slide, skew axes, a fixed link and armature, in as few joints as have them
-TEXT = """<robot name="small">
-  <link name="base"/>
-  <joint name="swing" type="revolute">
-    <origin xyz="0.1 0 0.4" rpy="0.3 0.2 -0.5"/><parent link="base"/><child link="arm"/><axis xyz="1 2 -1"/>
-    <limit lower="-2" upper="2" effort="50" velocity="3"/>
-  </joint>
-  <joint name="slide" type="prismatic">
-    <origin xyz="0.2 0.1 0" rpy="0 0.7 0"/><parent link="arm"/><child link="cart"/><axis xyz="0 1 1"/>
-    <limit lower="-1" upper="1" effort="50" velocity="3"/>
-  </joint>
-  <joint name="turn" type="continuous">
-    <origin xyz="-0.2 0.1 0.3"/><parent link="arm"/><child link="hand"/>
-  </joint>
-  <joint name="mount" type="fixed">
-    <origin xyz="0 0.1 0.05" rpy="0.4 0 0"/><parent link="hand"/><child link="tool"/>
-  </joint>
-  <link name="arm"><inertial><origin xyz="0.1 0 0.2" rpy="0.1 0.2 0"/><mass value="3"/>
-    <inertia ixx="0.04" ixy="0.002" ixz="0" iyy="0.05" iyz="-0.003" izz="0.03"/></inertial></link>
-  <link name="cart"><inertial><origin xyz="0 0.1 0"/><mass value="1.2"/>
-    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.012" iyz="0" izz="0.009"/></inertial></link>
-  <link name="hand"><inertial><origin xyz="0.03 0.02 0.1"/><mass value="0.8"/>
-    <inertia ixx="0.004" ixy="0" ixz="0.0005" iyy="0.005" iyz="0" izz="0.003"/></inertial></link>
-  <link name="tool"><inertial><origin xyz="0 0 0.05"/><mass value="0.3"/>
-    <inertia ixx="0.001" ixy="0" ixz="0" iyy="0.0012" iyz="0" izz="0.0008"/></inertial></link>
-</robot>
-"""
-ARMATURE = {"swing": 0.2, "slide": 0.4}
+ARMATURE = {"a_hip": 0.2, "b_slide": 0.4}
 METHODS = {
     "mass_matrix": 1,
     "bias_forces": 2,
@@ -56,7 +32,7 @@ METHODS = {
 
 @pytest.fixture(scope="module")
 def robot():
-    return Robot.from_urdf_text(TEXT, armature=ARMATURE)
+    return Robot.from_urdf_text(LIMBS, armature=ARMATURE, base="fixed")  # a branch, a slide, skew axes
 
 
 @pytest.fixture(scope="module")
@@ -155,56 +131,35 @@ def test_what_cannot_be_loaded_never_enters_the_folder(robot, tmp_path, monkeypa
     robot.compile(tmp_path / "dynamics").gravity_forces(random(3))
 
 
-@pytest.mark.parametrize("mode", [0o777, 0o770, 0o722])
-def test_folders_in_folders_that_others_can_write_to(robot, tmp_path, mode):
-    shared = tmp_path / "shared"
-    own = shared / "mine" / "dynamics"
-    own.mkdir(parents=True, mode=0o700)
-    shared.chmod(mode)
-    link = tmp_path / "link"
-    link.symlink_to(own)
-    for folder in (own, link, shared / "new"):
-        with pytest.raises(CompilerError, match=r"shared .*chmod go-w .*shared\)"):
-            robot.compile(folder).gravity_forces(random(3))
-    assert not (shared / "new").exists()
-    assert list(own.iterdir()) == []
-    shared.chmod(mode | stat.S_ISVTX)  # as /tmp: nobody can exchange what is there
-    robot.compile(own).gravity_forces(random(3))
-    assert len(list(own.iterdir())) == 1
-    with pytest.raises(CompilerError, match="shared can be written to by others"):  # not the folder of the files itself
-        robot.compile(shared).gravity_forces(random(3))
+COUNT = 6
 
 
-def test_folders_of_others(robot, tmp_path):
-    theirs = tmp_path / "theirs"
-    theirs.mkdir()
-    try:
-        os.chown(theirs, os.getuid() + 12345, -1)
-    except PermissionError:
-        pytest.skip("only root may give a folder away")
-    with pytest.raises(CompilerError, match=r"theirs .*another user"):
-        robot.compile(theirs / "mine").gravity_forces(random(3))
+class Scalars:
+    """Rows of numbers (COUNT, n) as expressions, and arrays of expressions as numbers (COUNT, ...)."""
+
+    def __init__(self, *rows):
+        self.graph, self.values = Graph(), [column for given in rows for column in np.asarray(given).T]
+        self.given = [self.graph.more_inputs(np.shape(given)[1]) for given in rows]
+
+    def numbers(self, array):
+        nodes = [node_of(self.graph, scalar) for scalar in array.flat]
+        found = [np.broadcast_to(x, COUNT) for x in evaluated(self.graph, nodes, self.values)]
+        return np.stack(found, axis=-1).reshape(COUNT, *array.shape)
 
 
-def test_missing_folders_are_made_for_the_user_alone(robot, tmp_path):
-    before = os.umask(0)
-    try:
-        robot.compile(tmp_path / "a" / "b" / "c").gravity_forces(random(3))
-    finally:
-        os.umask(before)
-    made = [tmp_path / "a", tmp_path / "a" / "b", tmp_path / "a" / "b" / "c"]
-    assert [stat.S_IMODE(folder.stat().st_mode) for folder in made] == [0o700] * 3
+def close(ours, theirs, tolerance=1e-10):
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=tolerance * np.abs(np.asarray(theirs)).max())
 
 
-def test_files_that_are_not_whole_or_not_ones_own(robot, tmp_path):
-    robot.compile(tmp_path).gravity_forces(random(3))
-    (path,) = tmp_path.iterdir()
-    assert stat.S_IMODE(path.stat().st_mode) == 0o700
-    path.chmod(0o722)
-    with pytest.raises(CompilerError, match="can be written to by others"):
-        robot.compile(tmp_path).gravity_forces(random(3))
-    other = tmp_path / "other"
-    other.mkdir(mode=0o700)
-    (other / path.name).write_bytes(b"half a library")
-    with pytest.raises(CompilerError, match=r"cannot be loaded .*delete"):
-        robot.compile(other).gravity_forces(random(3))
+def test_structure_stays_structure():
+    """Joints on different branches are coupled by the float 0.0, and nothing fills in when M is factorised."""
+    robot = Robot.from_urdf_text(TREE)
+    q = torch.randn(COUNT, robot.nv, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    scalars = Scalars(q)
+    M = UnrolledKinematics(UnrolledRobot(robot), *scalars.given).mass_matrix()
+    L, D = factorize(M)
+    related = robot.tree.related[..., 0].bool().numpy()
+    assert np.array_equal(M != 0.0, related)
+    assert np.array_equal(L != 0.0, np.tril(related))
+    L, D = scalars.numbers(L), scalars.numbers(D)
+    close(np.swapaxes(L, 1, 2) @ (D[:, :, None] * L), robot.mass_matrix(q))

@@ -10,6 +10,7 @@ import pytest
 import torch
 from tests.robots.mjcf_models import ALL, ARM, CHAIN, FOUR_BAR, GRIPPER, QUADRUPED
 from tests.robots.mujoco_oracle import MujocoOracle, compiled, states
+from tests.robots.test_moving_bases import LIMBS
 
 from forcegp import Robot
 from forcegp.errors import (
@@ -131,14 +132,6 @@ def test_a_joint_that_an_equality_holds_is_locked():
     assert robot.joint_names == ("k",)
 
 
-def test_a_joint_that_follows_the_first_one_is_not_locked():
-    text = HINGE.format("", BALL + '<body name="b"><joint name="k"/><geom size=".1"/></body>', "")
-    coupled = '<equality><joint joint1="k" joint2="j" polycoef="0 2 0 0 0"/></equality></mujoco>'
-    robot = Robot.from_mjcf_text(text.replace("</mujoco>", coupled))
-    assert not robot.locked
-    assert robot.joint_names == ("j",)
-
-
 def test_rotor_inertias_of_actuators_count():
     text = HINGE.format('armature=".3"', BALL, '<actuator><motor joint="j" gear="3" armature=".2"/></actuator>')
     assert Robot.from_mjcf_text(text).armature.item() == pytest.approx(0.3 + 9 * 0.2)
@@ -156,11 +149,7 @@ BAD = {
         "points",
     ),
     "field": ('<mujoco><asset><hfield name="h" nrow="60000" ncol="60000"/></asset></mujoco>', MalformedMjcf, "points"),
-    "depth": (
-        f"<mujoco><worldbody>{'<body>' * 9000}{'</body>' * 9000}</worldbody></mujoco>",
-        MalformedMjcf,
-        "levels",
-    ),
+    "depth": (f"<mujoco><worldbody>{'<body>' * 9000}{'</body>' * 9000}</worldbody></mujoco>", MalformedMjcf, "levels"),
     "schema": ('<mujoco><worldbody><joint what="1"/></worldbody></mujoco>', MalformedMjcf, "MuJoCo refuses it"),
     "no mass": (HINGE.format("", "", ""), MalformedMjcf, "mass and inertia"),
     "a ball joint": (HINGE.format('type="ball"', BALL, ""), UnsupportedJoint, "three hinges"),
@@ -196,3 +185,59 @@ def test_files_include_others_and_are_found_by_their_root_element(tmp_path):
     assert Robot.from_file(tmp_path / "arm.xml").nv == 4
     with pytest.raises(MalformedUrdf, match="from_mjcf reads"):
         Robot.from_urdf(tmp_path / "arm.mjcf")
+
+
+def written(robot):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RobotFileWarning)
+        return robot.to_mjcf()
+
+
+def followers(robot):
+    drives = zip(robot.layout.bodies, robot.layout.drives, strict=True)
+    return {
+        body.name: (robot.joint_names[drive.joint], drive.multiplier, drive.offset)
+        for body, drive in drives
+        if body.name not in robot.joint_names
+    }
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_mujoco_and_forcegp_read_the_same_robot(name, tmp_path):
+    robot = read(ALL[name])
+    text = written(robot)
+    same_dynamics(robot, MujocoOracle(mujoco.MjModel.from_xml_string(text), followers(robot)))
+    again = Robot.from_mjcf_text(text)
+    assert (again.joint_names, again.base, again.name) == (robot.joint_names, robot.base, robot.name)
+    q, v, a = states(robot)
+    torch.testing.assert_close(again.inverse_dynamics(q, v, a), robot.inverse_dynamics(q, v, a), rtol=1e-11, atol=1e-11)
+    for joint, other in zip(robot.joints, again.joints, strict=True):
+        numbers = [(x.lower, x.upper, x.effort_limit, x.damping, x.friction) for x in (joint, other)]
+        assert numbers[0] == pytest.approx(numbers[1], rel=1e-12)
+    assert set(again.link_names) >= {x for x in robot.link_names if robot.link(x).mass}
+    torch.testing.assert_close(again.armature, robot.armature)
+
+
+@pytest.mark.parametrize("options", [{"base": "floating"}, {"base": "fixed"}])
+def test_bases_and_locked_joints(options):
+    robot = Robot.from_urdf_text(LIMBS, locked={"a_knee": 0.3}, armature={"b_slide": 0.2}, **options)
+    again = Robot.from_mjcf_text(written(robot))
+    assert again.joint_names == robot.joint_names
+    q, v, a = states(robot)
+    torch.testing.assert_close(again.inverse_dynamics(q, v, a), robot.inverse_dynamics(q, v, a), rtol=1e-11, atol=1e-11)
+
+
+def test_rods_and_points_and_last_links_without_mass(tmp_path):
+    text = """<robot name="rod"><link name="base"/><joint name="j" type="revolute"><parent link="base"/>
+    <child link="rod"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="2" velocity="3"/></joint>
+    <link name="rod"><inertial><origin xyz="0 0 .5"/><mass value="2"/>
+    <inertia ixx="{0}" iyy="{0}" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+    for moment in (0.0, 0.3):
+        robot = Robot.from_urdf_text(text.format(moment))
+        robot.to_mjcf(tmp_path / "rod.xml")
+        again = Robot.from_file(tmp_path / "rod.xml")
+        assert again.mass_matrix(torch.zeros(1).double()).item() == pytest.approx(0.5 + moment, rel=1e-12)
+    bare = text.format(0.3).replace('value="2"', 'value="0"').replace('"0.3"', '"0"')
+    with pytest.raises(RobotModelError, match="give it a mass"):
+        Robot.from_urdf_text(bare, armature={"j": 1.0}).to_mjcf(tmp_path / "none.xml")
+    assert not (tmp_path / "none.xml").exists()

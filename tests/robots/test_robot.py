@@ -5,10 +5,16 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from tests.robots.robot_models import CHAIN, TREE, loaded
+from tests.robots.robot_models import CHAIN, MODELS, TREE, loaded
 
 from forcegp.errors import InvalidInput, NonPhysicalInertia, NumericalError, UnknownFrame, UnknownJoint, UnknownLink
 from forcegp.robots import Robot
+from forcegp.robots.inertia import (
+    pseudo_inertia_of_standard,
+    rotation_from_rpy,
+    rpy_from_rotation,
+    standard_of_pseudo_inertia,
+)
 
 
 @pytest.fixture(scope="module")
@@ -161,3 +167,37 @@ def test_singular_mass_matrix_is_an_error():
     nowhere = nowhere * torch.nan
     with pytest.raises(NumericalError, match=r"mass matrix is not positive definite.*armature"):
         Robot.from_urdf_text(body).forward_dynamics(nowhere, one, one)
+
+
+def test_pseudo_inertia_of_standard_parameters():
+    """[[Sigma, h], [h^T, m]] with Sigma = tr(I)/2 - I and h = m c (Wensing, Kim & Slotine 2018, eq. 5)."""
+    m, hx, hy, hz, xx, xy, yy, xz, yz, zz = parameters = torch.randn(
+        10, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    inertia = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).reshape(3, 3)
+    expected = torch.zeros(4, 4, dtype=torch.float64)
+    expected[:3, :3] = 0.5 * inertia.trace() * torch.eye(3, dtype=torch.float64) - inertia
+    expected[:3, 3] = expected[3, :3] = torch.stack([hx, hy, hz])
+    expected[3, 3] = m
+    torch.testing.assert_close(pseudo_inertia_of_standard(parameters), expected, rtol=0.0, atol=1e-15)
+    torch.testing.assert_close(standard_of_pseudo_inertia(expected), parameters, rtol=0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_the_regressor_times_any_parameters_is_the_joint_force(model):
+    robot = Robot.from_urdf_text(MODELS[model]())
+    rng = np.random.default_rng(1)
+    q, v, a = torch.tensor(rng.normal(size=(3, 4, robot.nv)))
+    parameters = torch.tensor(rng.normal(size=(robot.nv, 10)))
+    kinematics = robot.kinematics(q, v)
+    mass, bias = kinematics.dynamics_of_bodies(parameters)
+    expected = (mass @ a[..., None])[..., 0] + bias
+    found = torch.einsum("...ikp,kp->...i", kinematics.torque_regressor(a), parameters)
+    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("pitch", [0.3, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-9, 2.5])
+def test_angles_of_a_rotation_give_it_back(pitch):
+    for roll, yaw in ((0.0, 0.0), (1.0, -2.0), (-3.0, 0.4)):
+        rotation = rotation_from_rpy((roll, pitch, yaw))
+        np.testing.assert_allclose(rotation_from_rpy(rpy_from_rotation(rotation)), rotation, atol=1e-15)

@@ -77,13 +77,6 @@ WRONG = {
         errors.RobotModelError,  # and nothing moves
         ["joint 'hinge' mimics 'other'", "which the file lacks", "no movable joint"],
     ),
-    "mimic of nothing": (changed("<axis", "<mimic/><axis"), errors.MalformedUrdf, ["joint 'hinge'", "'joint'"]),
-    "NaN multiplier": (
-        changed("<axis", '<mimic joint="other" multiplier="nan"/><axis'),
-        errors.InvalidNumber,
-        ["joint 'hinge'", "<mimic> multiplier is NaN"],
-    ),
-    "no parent": (changed('<parent link="base"/>', ""), errors.MalformedUrdf, ["joint 'hinge'", "<parent>"]),
     "unknown child": (
         changed('<child link="arm"/>', '<child link="amr"/>'),
         errors.MalformedUrdf,
@@ -100,16 +93,10 @@ WRONG = {
     ),
     "no mass element": (changed('<mass value="2"/>', ""), errors.MissingInertia, ["link 'arm'", "has no mass"]),
     "no inertia element": (re.sub("<inertia .*/>", "", SMALL), errors.NonPhysicalInertia, ["'arm'", "no <inertia>"]),
-    "no ixx": (changed(IXX, ""), errors.MalformedUrdf, ["link 'arm'", "'ixx'"]),
     "moving link without inertia": (
         without_inertial(SMALL),
         errors.MissingInertia,
         ["link 'arm'", "joint 'hinge'", "add an <inertial>"],
-    ),
-    "moving links that are all massless": (
-        without_inertial(with_joint("mount", "arm", "tool", '<link name="tool"/>')),
-        errors.MissingInertia,
-        ["link 'arm' and the links fixed to it ('tool')"],
     ),
     "massless but inert": (
         changed('"2"', '"0"'),
@@ -118,12 +105,6 @@ WRONG = {
     ),
     "negative mass": (changed('"2"', '"-2"'), errors.NonPhysicalInertia, ["link 'arm'", "-2 kg is negative"]),
     "absurd mass": (changed('"2"', '"1e308"'), errors.NonPhysicalInertia, ["link 'arm'", "above 1e+09 kg"]),
-    "NaN mass": (changed('"2"', '"nan"'), errors.NonPhysicalInertia, ["link 'arm'", "not finite"]),
-    "indefinite inertia": (
-        changed('ixy="0"', 'ixy="0.2"'),
-        errors.NonPhysicalInertia,
-        ["link 'arm'", "not positive definite", "-0.1"],
-    ),
     "triangle inequality": (
         changed(IXX, 'ixx="0.21"'),
         errors.NonPhysicalInertia,
@@ -134,19 +115,10 @@ WRONG = {
         errors.NonPhysicalInertia,
         ["link 'arm'", "joint 'hinge'", "no rotational inertia", "`armature`"],
     ),
-    **{
-        f"{attribute} {value}": (
-            changed("<limit ", f'<dynamics {attribute}="{value}"/><limit '),
-            errors.InvalidNumber,
-            ["joint 'hinge'", f"<dynamics> {attribute} is {value}", "finite number"],
-        )
-        for attribute in ("damping", "friction")
-        for value in ("inf",)
-    },
-    "mass of the smallest number": (
-        changed('value="2"', 'value="5e-324"'),
+    "infinite damping": (
+        changed("<limit ", '<dynamics damping="inf"/><limit '),
         errors.InvalidNumber,
-        ["link 'arm'", "5e-324 kg", "too small"],
+        ["joint 'hinge'", "<dynamics> damping is inf", "finite number"],
     ),
     "two parents": (
         with_joint("second", "base", "arm"),
@@ -158,7 +130,6 @@ WRONG = {
         errors.KinematicLoop,
         ["'a' <- 'b' <- 'a'", "remove one of its joints"],
     ),
-    "nothing but a loop": (with_joint("back", "arm", "base"), errors.KinematicLoop, ["'base' <- 'arm' <- 'base'"]),
     "two parts": (
         changed('<link name="base"/>', '<link name="base"/><link name="stray"/>'),
         errors.KinematicLoop,

@@ -1,5 +1,6 @@
 import sys
 import xml.etree.ElementTree as ElementTree
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -7,9 +8,9 @@ import torch
 
 from forcegp.errors import MissingExtra, SimulationError
 from forcegp.robots import Robot
-from forcegp.simulation.bullet import BulletArm
 from forcegp.simulation.kuka_surface import TOOL_LINK, kuka_urdf
 from forcegp.simulation.scenarios import KukaSurfaceConfig
+from forcegp.simulation.trajectory import BulletArm
 
 pytest.importorskip("pybullet")
 
@@ -72,32 +73,6 @@ def test_a_step_is_rigid_body_dynamics_and_nothing_else(arm, robot, spread):
         np.testing.assert_allclose(q_next, q + STEP * v_next, atol=1e-14)
 
 
-def test_energy_of_the_free_arm_is_kept_up_to_the_integrator(robot):
-    bodies = [
-        (float(link.find("inertial/mass").get("value")), numbers(link.find("inertial/origin")), link.get("name"))
-        for link in ElementTree.fromstring(urdf()).findall("link")
-        if link.find("inertial") is not None
-    ]
-
-    def energy(q: np.ndarray, v: np.ndarray) -> float:
-        tensor = torch.tensor(q)
-        kinetic = 0.5 * v @ robot.mass_matrix(tensor).numpy() @ v
-        poses = [(mass, center, robot.frame_pose(tensor, name).numpy()) for mass, center, name in bodies]
-        return float(kinetic + sum(mass * 9.8 * (T[:3, :3] @ center + T[:3, 3])[2] for mass, center, T in poses))
-
-    def drift(step: float) -> float:
-        with BulletArm(urdf(), gravity=9.8, time_step=step, tool_point=POINT) as arm:
-            arm.reset(np.array([0.3, 0.8, -0.2, -1.2, 0.1, 0.4, 0.0]), np.zeros(7))
-            start = energy(*arm.state())
-            for _ in range(round(0.3 / step)):
-                arm.step(np.zeros(7))
-            return abs(energy(*arm.state()) - start)
-
-    coarse, fine = drift(1e-3), drift(1e-4)
-    assert fine < 0.2 * coarse  # first order, so no hidden damping remains as the step shrinks
-    assert fine < 0.05
-
-
 def test_inertia_off_the_axes_of_its_link_is_refused():
     turned = urdf().replace('<origin rpy="0 0 0" xyz="0 -0.03 0.12" />', '<origin rpy="0.3 0 0" xyz="0 -0.03 0.12" />')
     assert turned != urdf()
@@ -123,3 +98,36 @@ def test_without_pybullet_the_command_to_install_it_is_given(monkeypatch):
     monkeypatch.setitem(sys.modules, "pybullet_data", None)
     with pytest.raises(MissingExtra, match=r"pip install 'forcegp\[sim\]'"):
         urdf()
+
+
+pybullet_data = pytest.importorskip("pybullet_data")
+ODD = {"tool_center_of_mass": (0.01, 0.0, 0.02), "joint_damping": 0.25, "base_height": 0.4}
+
+
+def test_it_refers_to_no_file_and_keeps_the_licence():
+    text = urdf()
+    for word in ("filename", "mesh", "<visual", "<collision", "<material"):
+        assert word not in text.partition("<robot")[2]
+    assert "THIS SOFTWARE IS PROVIDED BY THE COPYRIGHT HOLDERS" in text
+    assert "Changed by forcegp" in text
+
+
+def test_tool_damping_and_base_are_the_ones_given():
+    text = kuka_urdf(type("Odd", (KukaSurfaceConfig,), ODD)(tool_mass=3.5))
+    tool = ElementTree.fromstring(text).find("link[@name='lbr_iiwa_link_7']/inertial")
+    assert tool.find("mass").get("value") == "3.5"
+    assert numbers(tool.find("origin")) == [0.01, 0.0, 0.02]
+    moments = {name: float(value) for name, value in tool.find("inertia").items()}
+    assert moments == {"ixx": 0.005, "iyy": 0.0036, "izz": 0.0047, "ixy": 0, "ixz": 0, "iyz": 0}
+    robot = Robot.from_urdf_text(text)
+    assert [joint.damping for joint in robot.joints] == [0.25] * 7
+    base = robot.frame_pose(torch.zeros(7, dtype=torch.float64), "lbr_iiwa_link_0")
+    assert base[:3, 3].tolist() == [0.0, 0.0, 0.4]
+
+
+def test_joints_and_the_other_links_are_the_originals():
+    original = Robot.from_urdf(Path(pybullet_data.getDataPath()) / "kuka_iiwa/model.urdf")
+    changed = Robot.from_urdf_text(urdf(joint_damping=0.5))
+    assert changed.joints == original.joints
+    kept = [f"lbr_iiwa_link_{number}" for number in range(1, 7)]
+    assert all(changed.link(name) == original.link(name) for name in kept)

@@ -7,7 +7,7 @@ import torch
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, SimulationError
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
-from forcegp.simulation.kuka_surface import DryFriction
+from forcegp.simulation.kuka_surface import PointFriction, joint_friction_of
 
 pytest.importorskip("pybullet")
 
@@ -75,7 +75,7 @@ def test_dry_friction_is_its_law_at_the_true_normal_force(scenes, name):
     jacobian, velocity, normal, _ = tool_motion(data)
     force, load = data.truth["force.tool-friction"], np.abs(data.truth["lambda"][:, 0])
     static = made.static_coefficient if made.friction == "stribeck" else made.coulomb_coefficient
-    law = DryFriction(made.coulomb_coefficient, static, made.breakaway_velocity, made.friction_smoothing)
+    law = PointFriction(0.0, made.coulomb_coefficient, static, made.breakaway_velocity, made.friction_smoothing)
     tangential = velocity - (velocity * normal).sum(1)[:, None] * normal
     speed = np.linalg.norm(tangential, axis=1)
     np.testing.assert_allclose(np.linalg.norm(force, axis=1), law.coefficient(speed) * load, atol=1e-9)
@@ -89,7 +89,7 @@ def test_dry_friction_is_its_law_at_the_true_normal_force(scenes, name):
 def test_joint_friction_is_its_law(scenes):
     data = scenes["none"]
     np.testing.assert_array_equal(
-        data.truth["Q_U.joint-friction"], config("none").joint_law(data.model.robot)(data.v, data.u, None, 0.0)
+        data.truth["Q_U.joint-friction"], joint_friction_of(config("none"), data.model.robot)(data.v, data.u)
     )
 
 
@@ -103,10 +103,7 @@ def test_free_motion_stays_above_the_table(scenes):
 
 @pytest.mark.parametrize(
     ("changes", "message"),
-    [
-        ({"friction": "wet"}, "no friction .wet. in the tool"),
-        ({"surface": "cone"}, "no surface 'cone'"),
-    ],
+    [({"friction": "wet"}, "no friction .wet. in the tool"), ({"surface": "cone"}, "no surface 'cone'")],
 )
 def test_parts_that_do_not_fit_are_refused(changes, message):
     with pytest.raises(InvalidInput, match=message):

@@ -144,24 +144,6 @@ def test_predicted_motions_keep_the_wind_of_their_start(posterior, test):
     assert after < 0.3 * np.linalg.norm(blind.q[-1, :3].numpy() - seen.q[300 + len(first.q) - 1, :3])
 
 
-def test_motions_fade_to_what_lasts_where_no_wind_is_observed(posterior, test):
-    """In twelve columns; beside an observed wind, and with a time that is given, there are six, which are held."""
-    still = replace(posterior, settings={name: value for name, value in posterior.settings.items() if name != "air"})
-    seeing, seen = observing(still, acting(test))
-    usual, held = observing(still, acting(test), seconds=0.02)
-    assert [len(each.model.inputs) for each in (seen, held)] == [16, 10]
-    assert len(observing(posterior, acting(test))[1].model.inputs) == 13
-    u = torch.tensor(seen.u[300:330])
-    moved = seeing.rollout(seen.q[300], seen.v[300], u, 1 / 240).q
-    other = u.clone()
-    other[0, 10:] = other[0, 4:10]  # all of it lasts
-    stays = seeing.rollout(seen.q[300], seen.v[300], other, 1 / 240).q
-    assert float((stays - moved).abs().max()) > 1e-6
-    start = other[:, :10].clone()
-    expected = usual.rollout(seen.q[300], seen.v[300], start, 1 / 240).q
-    torch.testing.assert_close(stays, expected)
-
-
 def test_what_lasts_is_foreseen_from_the_past():
     """Of a wrench that comes back to its mean within .1 s that mean; of one that wanders all of it."""
     rng, time = np.random.default_rng(0), np.arange(3000) / 100
@@ -204,24 +186,6 @@ def test_a_model_with_wind_learns_rows_of_another_flight(posterior, test, tmp_pa
         posterior.update(rows.rows(np.arange(10)))
     with pytest.raises(InvalidInput, match="longer pieces"):
         observing(posterior, rows.rows(np.arange(10)))
-
-
-def test_a_fit_reports_that_no_wind_was_found(posterior):
-    from forcegp.cli.fit import fit_summary
-
-    still = replace(posterior, settings={name: value for name, value in posterior.settings.items() if name != "air"})
-    unasked = replace(still, target=still.model.known.with_forces(AerodynamicForce(observe=0.0)))
-    found = [fit_summary(each, 1.0)["wind_not_found"] for each in (posterior, still, unasked)]
-    assert found == [False, True, False]
-    assert fit_summary(posterior, 1.0)["wind"] == posterior.settings["air"]["wind"]
-
-
-def test_a_predictor_holds_the_wind_of_the_training(posterior, test):
-    rows = acting(test).rows(np.arange(3))
-    predictor = posterior.predictor(compile=False)
-    for q, v, u in zip(rows.q, rows.v, rows.u, strict=True):
-        expected = posterior.predict(q, v, u, covariance=False).mean
-        np.testing.assert_allclose(predictor.mean(q, v, u), expected, rtol=1e-9, atol=1e-9)
 
 
 def test_a_predictor_takes_what_observers_report(posterior, test, tmp_path):

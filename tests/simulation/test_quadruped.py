@@ -5,10 +5,9 @@ import pinocchio as pin
 import pytest
 import torch
 
-from forcegp import Accelerations, Coulomb, Normal, Stribeck, Torques, Viscous, fit
+from forcegp import Accelerations, Stribeck, Viscous, fit
 from forcegp.errors import InvalidInput
-from forcegp.forces import Actuation, Body, RigidBodies
-from forcegp.model import Model
+from forcegp.forces import Body, RigidBodies
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 
@@ -75,13 +74,3 @@ def test_payload_friction_and_foot_forces_are_found():
 def test_other_numbers_are_refused(wrong):
     with pytest.raises(InvalidInput, match=next(iter(wrong))):
         QuadrupedConfig(**wrong)
-
-
-def test_coefficients_of_friction_are_those_of_joints_and_not_of_the_base():
-    train = simulate_quadruped(QuadrupedConfig(seconds=3.0, seed=1, joint_friction="coulomb", payload=0.0))
-    laws = (Actuation(), RigidBodies(), Viscous(Normal(0.05)), Coulomb(Normal(0.5), 0.02))
-    found = fit(Model(train.model.robot, train.model.contacts, laws), train, Torques(), rows=200).parameters
-    assert len(found) == 24
-    assert not [name for name in found if "base" in name]
-    levels = [estimate.value for name, estimate in found.items() if name.startswith("coulomb.level")]
-    np.testing.assert_allclose(levels, 0.8, rtol=0.05)

@@ -1,10 +1,18 @@
 import numpy as np
+import pinocchio as pin
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+import torch
 
 from forcegp.simulation import KukaSurfaceConfig
-from forcegp.simulation.trajectory import SegmentPath, random_path
+from forcegp.simulation.trajectory import (
+    ArmState,
+    SegmentPath,
+    joint_acceleration,
+    over_table,
+    random_path,
+    table_height,
+    table_of,
+)
 
 START = np.array([0.0, 0.5, 0.1])
 
@@ -34,19 +42,6 @@ def test_it_rests_before_after_and_on_a_segment_without_length():
     assert not acceleration.any()
 
 
-@given(st.integers(0, 1000))
-def test_velocity_is_the_derivative_of_position_and_acceleration_of_velocity(seed):
-    path = random_path(KukaSurfaceConfig(), START, 4.0, np.random.default_rng(seed))
-    time = np.linspace(0, 4, 4001)[1:-1]
-    step = 1e-7
-    before, after = path.sample(time - step), path.sample(time + step)
-    _, velocity, acceleration = path.sample(time)
-    np.testing.assert_allclose((after[0] - before[0]) / (2 * step), velocity, atol=1e-5)
-    smooth = (before[2] == after[2]).all(axis=1)  # away from the jumps of acceleration
-    assert smooth.mean() > 0.99
-    np.testing.assert_allclose((after[1] - before[1])[smooth] / (2 * step), acceleration[smooth], atol=1e-5)
-
-
 def test_way_points_are_reached_at_rest_below_the_surface_within_their_ranges():
     config = KukaSurfaceConfig()
     path = random_path(config, START, 60.0, np.random.default_rng(0))
@@ -69,3 +64,69 @@ def test_accelerations_are_the_published_rule():
         path.points, path.points[1:], path.durations, path.accelerations, strict=False
     ):
         assert acceleration == pytest.approx(max(0.5, 4 * np.linalg.norm(end - start) / duration**2))
+
+
+KINDS = ("plane", "tilted", "sphere")
+MIDDLE = np.array([0.0, 0.5, 0.055])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_heights_lie_on_the_surface_through_its_middle(kind):
+    config = KukaSurfaceConfig(surface=kind)
+    xy = np.random.default_rng(1).uniform((-0.5, 0.4), (0.5, 0.6), (30, 2))
+    height, _, _ = table_height(config, xy)
+    points = torch.from_numpy(np.column_stack([xy, MIDDLE[2] + height]))
+    np.testing.assert_allclose(table_of(config).value(points), 0.0, atol=1e-13)
+    assert table_height(config, MIDDLE[None, :2])[0] == pytest.approx(0.0, abs=1e-15)
+
+
+def test_the_tilted_plane_falls_towards_positive_x_by_its_angle():
+    height, _, _ = table_height(KukaSurfaceConfig(surface="tilted"), np.array([[1.0, 0.5]]))
+    assert height[0] == pytest.approx(-np.tan(np.deg2rad(10)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_velocity_and_acceleration_of_the_bent_path_are_derivatives(kind):
+    config = KukaSurfaceConfig(surface=kind)
+    start = np.array([0.1, 0.5, 0.3])
+    flat = random_path(config, start, 4.0, np.random.default_rng(3))
+
+    def path(time: np.ndarray):
+        return over_table(config, flat.sample(time))
+
+    np.testing.assert_allclose(path(np.zeros(1))[0][0, :2], start[:2], atol=1e-14)
+    time, step = np.linspace(0, 4, 1001)[1:-1], 1e-6
+    before, after = path(time - step), path(time + step)
+    _, velocity, acceleration = path(time)
+    np.testing.assert_allclose((after[0] - before[0]) / (2 * step), velocity, atol=1e-4)
+    smooth = np.abs(after[2] - before[2]).max(axis=1) < 1e-3  # away from the jumps of acceleration
+    assert smooth.mean() > 0.98
+    np.testing.assert_allclose((after[1] - before[1])[smooth] / (2 * step), acceleration[smooth], atol=1e-4)
+
+
+def turned(quaternion: np.ndarray) -> np.ndarray:
+    return pin.Quaternion(quaternion).toRotationMatrix()
+
+
+def test_the_law_is_the_published_one_with_the_pseudo_inverse():
+    rng = np.random.default_rng(0)
+    orientation = np.array([0.0, -1.0, 0.0, 0.0])
+    posture, selected = np.deg2rad((85, 50, -10, -100, -170, -25, -100)), np.array([0, 1, 1, 0, 1, 0, 0.0])
+    for _ in range(20):
+        q, v, J, bias = rng.normal(size=7), rng.normal(size=7), rng.normal(size=(6, 7)), rng.normal(size=6)
+        position, aim = rng.normal(size=3), tuple(rng.normal(size=(3, 3)))
+        present = (values := rng.normal(size=4)) / np.linalg.norm(values)
+        state = ArmState(q, v, np.eye(7), np.zeros(7), position, present, J, bias)
+        found = joint_acceleration(KukaSurfaceConfig(), state, aim)
+
+        velocity = J @ v
+        task = np.concatenate(
+            [
+                aim[2] + 2 * 100 * (aim[1] - velocity[:3]) + 1e4 * (aim[0] - position),
+                -2 * 100 * velocity[3:] + 1e4 * pin.log3(turned(orientation) @ turned(present).T),
+            ]
+        )
+        inverse = np.linalg.pinv(J)
+        null = (np.eye(7) - inverse @ J) @ (selected * (1e4 * (posture - q) - 100 * v))
+        np.testing.assert_allclose(found, inverse @ (task - bias) + null, rtol=1e-9, atol=1e-6)
+        np.testing.assert_allclose(J @ found + bias, task, rtol=1e-9, atol=1e-6)

@@ -1,7 +1,6 @@
-"""Straight-line arithmetic on scalars: what every program that is made at run time is written from.
+"""Straight-line arithmetic on scalars, each operation once: what all programs that are made at run time consist of.
 
-A `Graph` holds each operation once, and none that constants decide. Derivatives are nodes of the same graph (Griewank &
-Walther, "Evaluating Derivatives", 2008, ch. 3 and 4).
+Derivatives are nodes of the same graph (Griewank & Walther, "Evaluating Derivatives", 2008).
 """
 
 import math
@@ -286,29 +285,6 @@ def evaluated(graph: Graph, outputs: Sequence[int], inputs: Sequence[np.ndarray]
 
 FLAT = ("less", "at_most", "equal", "look up", "input", "constant", "call")
 """Without derivatives; a call is used through its outputs."""
-
-
-def gradients(
-    graph: Graph, outputs: Sequence[int], cotangents: Sequence[int], wanted: Sequence[int], held: Sequence[int] = ()
-) -> list[int]:
-    """``sum_k cotangents_k d outputs_k / d wanted``; ``held`` and the cotangents count as constants."""
-    adjoint: dict[int, int] = {}
-    for output, cotangent in zip(outputs, cotangents, strict=True):
-        adjoint[output] = graph.apply("add", adjoint.get(output, ZERO), cotangent)
-    targets, stops = set(wanted), {node for node in held if graph.value(node) is None}
-    depends: set[int] = set()
-    for node in range(max(outputs, default=-1) + 1):
-        if node not in stops and (node in targets or not depends.isdisjoint(graph.operands(node))):
-            depends.add(node)
-    for node in range(max(outputs, default=-1), -1, -1):
-        above = adjoint.get(node, ZERO)
-        if node not in depends or above == ZERO or node in targets:
-            continue
-        for operand, slope in partials(graph, node):
-            if operand in depends:
-                share = graph.apply("multiply", above, slope())
-                adjoint[operand] = graph.apply("add", adjoint.get(operand, ZERO), share)
-    return [adjoint.get(node, ZERO) for node in wanted]
 
 
 def jacobian(

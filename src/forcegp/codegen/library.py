@@ -114,11 +114,7 @@ def default_folder() -> Path:
 
 
 def load_library(
-    name: str,
-    key: str,
-    write: Callable[[int], str],
-    options: Sequence[str] = (),
-    folder: Path | None = None,
+    name: str, key: str, write: Callable[[int], str], options: Sequence[str] = (), folder: Path | None = None
 ) -> ctypes.CDLL:
     """The library with the function `evaluate` of the C text that `write` gives for so many lanes, found or compiled.
 

@@ -1,6 +1,7 @@
 """From a function written in torch to a graph: the tensor operations of one call, taken apart into scalars.
 
-Loops and branches of Python leave no trace. Operations that only move numbers run on tensors of node numbers.
+Loops and branches of Python leave no trace. Operations that only move numbers run on tensors of node numbers. Small
+dense linear algebra stands here without branches on values; derivatives are right as well.
 """
 
 import math
@@ -10,11 +11,11 @@ from typing import Any
 
 import torch
 from torch import Tensor, _decomp
+from torch.overrides import TorchFunctionMode
 from torch.utils import _pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 from typing_extensions import override
 
-from forcegp.codegen.branch_free_linalg import StraightLineAlgebra
 from forcegp.codegen.graph import ONE, UNARY, ZERO, Expression, Graph
 from forcegp.errors import InvalidInput
 
@@ -60,6 +61,103 @@ def trace(
     with torch.no_grad(), _InsideTorch(recorded), recorded:
         results = list(function(*examples))
     return graph, [_numbers(graph, recorded.numbers_of(x)).nodes for x in results]
+
+
+class StraightLineAlgebra(TorchFunctionMode):
+    """Within it, the functions of torch.linalg that Gauss' principle uses are those of this module."""
+
+    @override
+    def __torch_function__(self, func: Any, types: Any, args: tuple = (), kwargs: dict[str, Any] | None = None) -> Any:
+        kwargs = kwargs or {}
+        if func is torch.linalg.cholesky:
+            return cholesky(*args)
+        if func is torch.linalg.solve_triangular and not kwargs.get("upper", False) and kwargs.get("left", True):
+            return solve_lower(*args)
+        if func is torch.linalg.pinv:
+            rows, columns = args[0].shape[-2:]
+            tolerance = kwargs.get("rtol", max(rows, columns) * torch.finfo(args[0].dtype).eps)  # torch's own default
+            if rows > columns:
+                return pseudo_inverse(args[0].mT, tolerance).mT
+            return pseudo_inverse(args[0], tolerance)
+        return func(*args, **kwargs)
+
+
+def cholesky(matrix: Tensor) -> Tensor:
+    """The lower Cholesky factor (..., n, n); NaN where the matrix is not positive definite."""
+    columns, rest = [], matrix
+    for k in range(matrix.shape[-1]):
+        column = rest[..., :, k] / rest[..., k, k, None].sqrt()
+        column = torch.cat([torch.zeros_like(column[..., :k]), column[..., k:]], dim=-1)
+        rest = rest - column[..., :, None] * column[..., None, :]
+        columns.append(column)
+    return torch.stack(columns, dim=-1)
+
+
+def solve_lower(lower: Tensor, right: Tensor) -> Tensor:
+    """lower^-1 right (..., n, k)."""
+    rows: list[Tensor] = []
+    for i in range(lower.shape[-1]):
+        value = right[..., i, :]
+        for k, row in enumerate(rows):
+            value = value - lower[..., i, k, None] * row
+        rows.append(value / lower[..., i, i, None])
+    return torch.stack(rows, dim=-2)
+
+
+def pseudo_inverse(matrix: Tensor, tolerance: float) -> Tensor:
+    """The pseudo-inverse (..., n, m) of a matrix (..., m, n) with m <= n, what is within the tolerance dropped.
+
+    From an orthonormal basis Q of the rows: A = L Q with L = A Q^T, L^T = R U, A^+ = Q^T R^-T U.
+    """
+    Q = _basis(matrix, tolerance)
+    R, U = _lower_and_orthonormal((matrix @ Q.mT).mT)
+    R = R + torch.diag_embed(torch.where(R.diagonal(dim1=-2, dim2=-1) > 0.0, 0.0, 1.0))
+    return (U.mT @ solve_lower(R, Q)).mT
+
+
+def _basis(matrix: Tensor, tolerance: float) -> Tensor:
+    """Orthonormal rows (..., m, n) that span those of the matrix, the longest remainder first."""
+    rest, basis, largest = matrix, matrix[..., :0, :], None
+    for k in range(matrix.shape[-2]):
+        squares = (rest * rest).sum(-1)
+        row, square = rest[..., 0, :], squares[..., 0]
+        for i in range(1, matrix.shape[-2]):
+            longer = squares[..., i] > square
+            row, square = (
+                torch.where(longer[..., None], rest[..., i, :], row),
+                torch.where(longer, squares[..., i], square),
+            )
+        largest = square if largest is None else largest
+        if k:  # again, since rounding of the remainder is not orthogonal
+            row = row - ((basis @ row[..., None])[..., 0][..., None, :] @ basis)[..., 0, :]
+        unit = _unit(row, tolerance**2 * largest)[0]
+        basis = torch.cat([basis, unit[..., None, :]], dim=-2)
+        rest = rest - (rest @ unit[..., None]) * unit[..., None, :]
+    return basis
+
+
+def _lower_and_orthonormal(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """L (..., m, m) and Q (..., m, n), L Q the matrix of independent or zero rows, made orthogonal twice."""
+    count, lower, basis = matrix.shape[-2], [], matrix[..., :0, :]
+    for k, row in enumerate(matrix.unbind(-2)):
+        along = torch.zeros_like(matrix[..., :k, 0])
+        for _ in range(2 if k else 0):
+            share = (basis @ row[..., None])[..., 0]
+            row, along = row - (share[..., None, :] @ basis)[..., 0, :], along + share
+        unit, length = _unit(row, torch.zeros_like(row[..., 0]))
+        basis = torch.cat([basis, unit[..., None, :]], dim=-2)
+        rest = torch.zeros_like(matrix[..., : count - k - 1, 0])
+        lower.append(torch.cat([along, length[..., None], rest], dim=-1))
+    return torch.stack(lower, dim=-2), basis
+
+
+def _unit(row: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
+    """The row over its length, and that; zeros where its square is not above the least."""
+    square = (row * row).sum(-1)
+    kept = square > least
+    length = torch.where(kept, torch.where(kept, square, torch.ones_like(square)).sqrt(), torch.zeros_like(square))
+    unit = row / torch.where(kept, length, torch.ones_like(length))[..., None]
+    return torch.where(kept[..., None], unit, 0.0 * row), length
 
 
 class _InsideTorch(StraightLineAlgebra):

@@ -27,7 +27,7 @@ class RobotVectorEnv(VectorEnv):
     episode that ended, or whose motion diverges (`terminated`, `info["diverged"]`), begins anew with the next step.
 
     * model: a predictor, a posterior, or the folder of one. draw: 0 moves under the mean, k draws k functions from the
-      posterior with `function_seed`, of which every episode takes one: domain randomisation.
+      posterior, of which every episode takes one: domain randomisation.
     * reward(q, v, u, q_next, v_next) -> (n,), terminated(q, v) -> (n,), start(generator, n) -> q, v take and return
       arrays of n rows; without them 0, never, and at rest at q = 0. `steps` truncates an episode. torque_limits have to
       be finite.
@@ -48,7 +48,6 @@ class RobotVectorEnv(VectorEnv):
         terminated: Callable[..., np.ndarray] | None = None,
         start: Callable[..., tuple[np.ndarray, np.ndarray]] | None = None,
         integrator: str = "implicit-midpoint",
-        function_seed: int = 0,
         threads: int | None = 1,
     ) -> None:
         model = load_posterior(model) if isinstance(model, str | Path) else model
@@ -61,7 +60,7 @@ class RobotVectorEnv(VectorEnv):
         self.steps = None if steps is None else whole_number("steps", steps, 1)
         check_time_step(dt)
         self.dt, self.reward, self.terminated, self.start = dt, reward, terminated, start
-        self._how = {"integrator": integrator, "seed": function_seed, "threads": threads}
+        self._how = {"integrator": integrator, "threads": threads}
         robot = self.predictor.posterior.model.robot
         robot.require_vectors("environments")
         limits = [joint.effort_limit for joint in robot.joints] if torque_limits is None else torque_limits

@@ -1,9 +1,7 @@
 """Motions that teach most, from rest to rest within limits: how sure a model will be after one is known before it.
 
-The covariance of a Gaussian process depends on where its data are alone (Rasmussen & Williams 2006, eq. 2.26). Without
-learned forces the information on base parameters takes its place (D-optimality; Swevers et al. 1997). Motions are cubic
-B-splines (de Boor 1978) in the hull of their control points, the first and last three at the start; between samples an
-eighth of the second difference is added, exactly for v and a.
+The covariance of a Gaussian process depends on where its data are alone. Without learned forces the information on base
+takes its place (D-optimality; Swevers et al. 1997). Motions are cubic B-splines, in the hull of their points.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -39,6 +37,7 @@ from forcegp.summary import Summary, rounded
 
 QUANTITIES = ("position", "velocity", "acceleration", "torque")
 SPANS, SAMPLES = 2.5, 20  # pieces of a spline per second, samples in each
+MARGIN = 0.9  # of the limits of a robot file
 SHRINK, ROUNDS, EXACT = 0.85, 40, 1e-12  # of a motion beyond its limits; rounding
 LONGEST, INSIDE = 120.0, 0.95  # s, for the memory of all samples; of the positions, for a start that is not given
 STATES, MOST_ROWS = 150, 150  # where the spread is computed; those learned so far that take part in the search
@@ -233,13 +232,13 @@ def _between(samples: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " k"]:
     return np.abs(np.diff(samples, 2, axis=0)).max(0) / 8.0
 
 
-def motion_limits(robot: Robot, start: np.ndarray, given: Mapping[str, Any], margin: float) -> dict[str, np.ndarray]:
-    """The `limits`: those given, and `margin` times the URDF's. InvalidInput names a joint that cannot keep them."""
+def motion_limits(robot: Robot, start: np.ndarray, given: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The `limits`: those given, and `MARGIN` times the URDF's. InvalidInput names a joint that cannot keep them."""
     for name in given:
         require_known("limit", name, "excitation", QUANTITIES)
-    joints = [(x.lower, x.upper, margin * x.velocity_limit, np.inf, margin * x.effort_limit) for x in robot.joints]
+    joints = [(x.lower, x.upper, MARGIN * x.velocity_limit, np.inf, MARGIN * x.effort_limit) for x in robot.joints]
     lower, upper, *most = np.array(joints).T
-    inset = 0.5 * (1.0 - margin) * np.nan_to_num(upper - lower, posinf=0.0)
+    inset = 0.5 * (1.0 - MARGIN) * np.nan_to_num(upper - lower, posinf=0.0)
     stated, limits = [np.stack([lower + inset - start, upper - inset - start])], {}
     for name, ends in zip(QUANTITIES, stated + [np.outer((-1.0, 1.0), x) for x in most], strict=True):
         asked = per_joint(f"limits[{name!r}]", given.get(name, np.inf), robot.nv).numpy()
@@ -250,7 +249,7 @@ def motion_limits(robot: Robot, start: np.ndarray, given: Mapping[str, Any], mar
             raise InvalidInput(
                 f"joint {robot.joint_names[j]}: no motion from {start[j]:.4g} can be chosen within {name} limits of "
                 f"{low[j]:.4g} and {high[j]:.4g}{' from there' * (name == 'position')}; give limits={{{name!r}: ...}}, "
-                "another start or margin."
+                "or another start."
             )
     endless = np.isinf(limits["position"])
     limits["position"] = np.where(endless, limits["velocity"], limits["position"])
@@ -263,7 +262,6 @@ def excitation(
     *,
     seconds: float = 10.0,
     limits: Mapping[str, Any] | None = None,
-    margin: float = 0.9,
     start: Any = None,
     surfaces: Sequence[Contact] | None = None,
     clearance: float = 0.05,
@@ -279,7 +277,7 @@ def excitation(
       be sure once it has learned from `rows` rows of the motion; or a robot or another model, for the
       identification of base parameters and friction.
     * limits: of "position" (from the start), "velocity", "acceleration" and "torque", numbers or one per joint, in rad,
-      s and Nm (m, N); those of the URDF count, too, `margin` times.
+      s and Nm (m, N); nine tenths of those of the URDF count, too.
     * start: posture (nv,); None takes the mean of the training rows, or the middle of the joints' limits.
     * surfaces: contacts whose points keep `clearance` m away; None takes the model's. No other collision is looked at.
     * motions: how many to look at; the first third at random, the others as changes to the best so far.
@@ -291,7 +289,7 @@ def excitation(
     known = Model(model) if isinstance(model, Robot) else model.model if isinstance(model, Posterior) else model
     known.robot.require_vectors("planned motions")
     robot, rng = known.robot, np.random.default_rng(whole_number("seed", seed, 0))
-    for name, value, most in (("seconds", seconds, LONGEST), ("margin", margin, 1.0), ("clearance", clearance, 1e9)):
+    for name, value, most in (("seconds", seconds, LONGEST), ("clearance", clearance, 1e9)):
         if not isinstance(value, int | float) or not 0.0 < value <= most:
             raise InvalidInput(f"{name} is {value!r}; give a positive number of at most {most:g}.")
     if start is None:
@@ -299,9 +297,9 @@ def excitation(
         lowest = np.array([x.lower if np.isfinite(x.lower) else 0.0 for x in robot.joints])
         middle = lowest + np.nan_to_num(half, posinf=0.0)
         start = model.training.q.mean(0).numpy() if isinstance(model, Posterior) else middle
-        start = start.clip(middle - INSIDE * margin * half, middle + INSIDE * margin * half)
+        start = start.clip(middle - INSIDE * MARGIN * half, middle + INSIDE * MARGIN * half)
     start = finite_vector("start", start, robot.nv)
-    bounds = motion_limits(robot, start, require_type("limits", {} if limits is None else limits, Mapping), margin)
+    bounds = motion_limits(robot, start, require_type("limits", {} if limits is None else limits, Mapping))
     rows, motions = whole_number("rows", rows, 1), whole_number("motions", motions, 1, 100_000)
     learned = model if isinstance(model, Posterior) and model.latent_names else None
     teaches = BaseParameters(known, bounds["torque"][1]) if learned is None else LearnedForces(learned, rows)

@@ -96,10 +96,9 @@ NO_TORQUES = (
 
 
 class TrackingController(Controller):
-    """Feedback on a reference q_d, v_d, a_d (nv,), as an acceleration: a_d + Kd (v_d - v) + Kp (q_d - q) + Ki sum.
+    """Feedback on a reference q_d, v_d, a_d (nv,), as an acceleration: a_d + Kd (v_d - v) + Kp (q_d - q).
 
-    * stiffness Kp in 1/s^2 and damping Kd in 1/s, numbers or one per joint; None damps critically. integral Ki in 1/s^3
-      needs the time `dt` between calls; a joint at its limit does not add to it.
+    * stiffness Kp in 1/s^2 and damping Kd in 1/s, numbers or one per joint; None damps critically.
     * torque_limits: largest absolute torques in Nm (N); None takes the efforts of the URDF.
     * on_failure: "raise", or "hold" for the last torque where none can be computed or an input is not finite.
 
@@ -113,34 +112,18 @@ class TrackingController(Controller):
         *,
         stiffness: Any,
         damping: Any = None,
-        integral: Any = 0.0,
-        dt: float | None = None,
         torque_limits: Any = None,
         on_failure: OnFailure = "raise",
     ) -> None:
         super().__init__(robot, torque_limits, on_failure)
         self.stiffness = per_joint("stiffness", stiffness, robot.nv)
         self.damping = 2.0 * self.stiffness.sqrt() if damping is None else per_joint("damping", damping, robot.nv)
-        self.integral = per_joint("integral", integral, robot.nv)
-        if dt is not None or bool(self.integral.any()):
-            check_time_step(dt)
-        self.dt = dt or 0.0
         ends = [(joint.lower, joint.upper) for joint in robot.joints]
         self._range = torch.tensor(ends, dtype=torch.float64).unbind(1)
 
-    @override
-    def restart(self) -> None:
-        """Forget earlier calls and the integral of the error."""
-        super().restart()
-        self.summed = torch.zeros(self.robot.nv, dtype=torch.float64)
-
     def __call__(self, q: Any, v: Any, q_d: Any, v_d: Any, a_d: Any) -> Float[Tensor, " nv"]:
         """The torques (nv,) in Nm (N) at the state q, v under this reference, in rad, rad/s, rad/s^2 (m, ...)."""
-        summed, held = self.summed, self.held
-        u = self.limited(lambda: self._asked(*self.vectors(q=q, v=v, q_d=q_d, v_d=v_d, a_d=a_d)))
-        if self.held > held:
-            self.summed = summed
-        return u
+        return self.limited(lambda: self._asked(*self.vectors(q=q, v=v, q_d=q_d, v_d=v_d, a_d=a_d)))
 
     def _asked(self, q: Tensor, v: Tensor, q_d: Tensor, v_d: Tensor, a_d: Tensor) -> Tensor:
         """Before limits, under a reference that the joints can reach."""
@@ -152,12 +135,11 @@ class TrackingController(Controller):
                 f"the reference asks {self.robot.joint_names[j]} to be at {float(q_d[j]):.4g}, and it moves "
                 f"between {float(low[j]):.4g} and {float(high[j]):.4g}; change q_d, or the limits in the URDF."
             )
-        self.summed = self.summed + self.dt * torch.where(self.saturated, 0.0, q_d - q)
         return self._torques(q, v, v_d, a_d, q_d - q, v_d - v)
 
     def feedback(self, e: Tensor, e_v: Tensor) -> Tensor:
         """The acceleration against errors of position and velocity."""
-        return self.stiffness * e + self.damping * e_v + self.integral * self.summed
+        return self.stiffness * e + self.damping * e_v
 
     @abstractmethod
     def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
@@ -165,7 +147,7 @@ class TrackingController(Controller):
 
 
 class PDGravity(TrackingController):
-    """u = M(q) (Kd (v_d - v) + Kp (q_d - q) + Ki sum) + g(q): masses alone; `robot` may be `robot.compile()`."""
+    """u = M(q) (Kd (v_d - v) + Kp (q_d - q)) + g(q): masses alone; `robot` may be `robot.compile()`."""
 
     def __init__(self, robot: Robot | CompiledRobot, **settings: Any) -> None:
         self._dynamics = robot
@@ -177,7 +159,7 @@ class PDGravity(TrackingController):
 
 
 class ComputedTorque(TrackingController):
-    """u = M (a_d + Kd (v_d - v) + Kp (q_d - q) + Ki sum) + h - Q_U: all forces compensated, also those learned.
+    """u = M (a_d + Kd (v_d - v) + Kp (q_d - q)) + h - Q_U: all forces compensated, also those learned.
 
     * model: `posterior.predictor()`, or a `Model` without anything learned, which takes longer. Gains as
       `TrackingController` has them.
@@ -285,8 +267,8 @@ class HybridForce(TrackingController):
 Cost = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Costs (...) of whole motions q, v (..., T+1, nv) in rad, rad/s (m, m/s) under torques u (..., T, nv) in Nm (N)."""
 
-SHARE_OF_MEDIAN = 0.02
-"""The temperature over the distance from the least to the median cost, where none is given."""
+SHARE_OF_MEDIAN, CORRELATION = 0.02, 0.95
+"""The temperature over the distance from the least to the median cost; the correlation of two successive torques."""
 SMALLEST_SCALE = 0.05
 """Of the noise: sequences far from the plan find another way, those near to it refine the one that it has."""
 
@@ -303,8 +285,7 @@ class MPPI(Controller):
     * cost: costs (...) of whole motions q, v (..., T+1, nv) under u (..., T, nv), the last state included.
     * torque_limits: largest absolute torques in Nm (N), a number or one per joint; None takes the efforts of the URDF.
     * noise: largest standard deviation around the plan, None for half the limits; it falls to a twentieth from sequence
-      to sequence. correlation: of two successive torques, in [0, 1). temperature: None takes 2 % of the distance from
-      the least to the median cost. on_failure: "raise", or "hold" for the last torque.
+      to sequence. on_failure: "raise", or "hold" for the last torque.
 
     Raises InvalidInput for arguments that do not fit, NumericalError where no sequence has a finite cost.
     """
@@ -319,8 +300,6 @@ class MPPI(Controller):
         torque_limits: Any = None,
         samples: int = 128,
         noise: Any = None,
-        correlation: float = 0.95,
-        temperature: float | None = None,
         functions: int = 0,
         integrator: str = "implicit-midpoint",
         seed: int = 0,
@@ -339,13 +318,8 @@ class MPPI(Controller):
         self.noise = per_joint("noise", 0.5 * self.torque_limits if noise is None else noise, nv)
         if not bool(self.noise.isfinite().all()):
             raise InvalidInput("noise is infinite where torque_limits are; give noise in Nm or N, or finite limits.")
-        self.temperature = temperature
-        if temperature is not None and not (isinstance(temperature, int | float) and 0.0 < temperature < math.inf):
-            raise InvalidInput(f"temperature is {temperature!r}; give a positive number in units of the cost, or None.")
-        if not (isinstance(correlation, int | float) and 0.0 <= correlation < 1.0):
-            raise InvalidInput(f"correlation is {correlation!r}; give a number of at least 0 and below 1.")
         apart = torch.arange(self.steps, dtype=torch.float64)
-        self._colour = torch.linalg.cholesky(correlation ** (apart[:, None] - apart).abs())
+        self._colour = torch.linalg.cholesky(CORRELATION ** (apart[:, None] - apart).abs())
         self._scales = torch.logspace(math.log10(SMALLEST_SCALE), 0.0, self.samples, dtype=torch.float64)
         self._how: dict[str, Any] = {"integrator": integrator, "functions": functions, "seed": seed, "threads": threads}
 
@@ -392,7 +366,5 @@ class MPPI(Controller):
                 "smaller dt, less noise or fewer steps, or on_failure='hold'."
             )
         self._best = torques[costs.argmin()]
-        temperature = self.temperature
-        if temperature is None:
-            temperature = max(SHARE_OF_MEDIAN * float(costs[costs.isfinite()].median() - best), 1e-12)
+        temperature = max(SHARE_OF_MEDIAN * float(costs[costs.isfinite()].median() - best), 1e-12)
         return torch.einsum("s,stj->tj", torch.softmax((best - costs) / temperature, dim=0), torques)

@@ -19,8 +19,7 @@ from forcegp.evidence.likelihood import MarginalLikelihood
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
 from forcegp.inference import LatentKernels, Terms
-from forcegp.inference.cholesky import CholeskyFactor, factorize
-from forcegp.inference.likelihood import deflated_covariance, whiten
+from forcegp.inference.likelihood import CholeskyFactor, deflated_covariance, factorize, whiten
 from forcegp.posterior import Posterior
 from forcegp.posterior.fitted import Estimates
 

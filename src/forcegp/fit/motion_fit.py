@@ -21,8 +21,8 @@ from forcegp.data.views import RecordedMotions, all_motions
 from forcegp.errors import InvalidInput, NonPhysicalInertia, NumericalError
 from forcegp.evidence.least_squares import correlation_time
 from forcegp.fit.motion_unknowns import SCALES, Unknowns
-from forcegp.inference.cholesky import factorize
 from forcegp.inference.engines import InducingWeights
+from forcegp.inference.likelihood import factorize
 from forcegp.integration.midpoint_sensitivities import WindowMotions, window_motions
 from forcegp.model import Model
 from forcegp.posterior import Posterior

@@ -1,18 +1,15 @@
 """Kernels of all latents: matrices of GPyTorch kernels, exact and lean, and their parameters by name.
 
-GPyTorch's own sums need jitter, and switch silently to conjugate gradients above N D = 800. A kernel class of anybody
-may have `squared_exponential_embedding(z)` (n, e), for k = exp(-1/2 |e - e'|^2); `matern_embedding(z)` and `nu`; or
-`weight_features(z)` (n, p), for k = phi . phi', all differentiable. Every other kernel is called as it is.
+A kernel class of anybody may have `squared_exponential_embedding(z)` (n, e), for k = exp(-1/2 |e - e'|^2),
+`matern_embedding(z)` and `nu`, or `weight_features(z)` (n, p), for k = phi . phi'. Every other kernel is called.
 """
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
 from functools import partial, reduce
 from operator import add, mul
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from gpytorch.kernels import (
@@ -29,15 +26,11 @@ from gpytorch.kernels import (
 from jaxtyping import Float
 from torch import Tensor
 from torch.func import functional_call
-from typing_extensions import override
 
 from forcegp.errors import InvalidInput
 
 PointMap = Callable[[Tensor], Tensor]
 """Features (n, d) -> something (n, _) of every point."""
-
-NO_DISTANCE = 1e-8
-"""Scaled distance below which the derivative of a kernel with a kink at zero counts as zero."""
 
 
 def embedding(kernel: Kernel) -> tuple[PointMap, float] | None:
@@ -82,8 +75,11 @@ def squared_exponential_parameters(kernel: Kernel) -> tuple[Tensor, Tensor] | No
 def squared_distance(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:
     """|x_i - y_j|^2 by one matrix product, centred first: cancellation stays below 1e-14 for standardised inputs."""
     centre = y.mean(dim=0, keepdim=True) if y.shape[0] else 0.0
-    x, y = x - centre, y - centre
-    return (x.square().sum(-1)[:, None] + y.square().sum(-1)[None, :]).addmm(x, y.mT, alpha=-2.0).clamp_min(0.0)
+    left, right = x - centre, y - centre
+    d2 = (left.square().sum(-1)[:, None] + right.square().sum(-1)[None, :]).addmm(left, right.mT, alpha=-2.0)
+    if x is y:  # 0 to the last bit, as the variance of a point is the output scale
+        d2 = d2.masked_fill(torch.eye(len(x), dtype=torch.bool, device=x.device), 0.0)
+    return d2.clamp_min(0.0)
 
 
 def lengthscale_of(kernel: Kernel) -> Float[Tensor, " d"]:
@@ -115,202 +111,50 @@ def _matern(r: Tensor, smoothness: float) -> Tensor:
     return polynomial * torch.exp(-a)
 
 
-def _matern_slope(r: Tensor, smoothness: float) -> Tensor:
-    """-2 dk/d(r^2); for smoothness 1/2 it grows as 1/r and counts as 0 where the points coincide."""
-    a = math.sqrt(2.0 * smoothness) * r
-    decay = torch.exp(-a)
-    if smoothness == 0.5:
-        return torch.where(r > NO_DISTANCE, decay / r, torch.zeros_like(r))
-    return 3.0 * decay if smoothness == 1.5 else 5.0 / 3.0 * (1.0 + a) * decay
+class DenseKernel(NamedTuple):
+    """A kernel that is taken apart: k(z_i, other_j) and k(z_i, z_i), with the parameters of its modules at the call.
 
-
-class StationaryMatrix(torch.autograd.Function):
-    """s k(r) with r_ij = |(z_i - z_j) / l|: the squared exponential (smoothness inf) or a Matern.
-
-    Has first derivatives only; saves nothing of size N x N but its result and, for a Matern, the derivative of it.
+    Made once for a kernel, for the checks of what a kernel is cost more than small matrices do.
     """
 
-    @staticmethod
-    def forward(ctx, z: Tensor, lengthscale: Tensor, outputscale: Tensor, smoothness: float) -> Tensor:  # type: ignore[override]  # the base takes *args
-        """The matrix (n, n)."""
-        scaled = z / lengthscale
-        if smoothness == math.inf:
-            K = squared_distance(scaled, scaled).mul_(-0.5)
-            K.diagonal().zero_()
-            slope = K.exp_().mul_(outputscale)
-        else:
-            r = distance(scaled, scaled)
-            K = _matern(r, smoothness).mul_(outputscale)
-            slope = _matern_slope(r, smoothness).mul_(outputscale)
-        ctx.save_for_backward(z, lengthscale, outputscale, K, slope)
-        return K
+    cross: Callable[[Tensor, Tensor], Tensor]
+    diagonal: Callable[[Tensor], Tensor]
 
-    @staticmethod
-    def backward(ctx, upstream: Tensor):  # type: ignore[override]  # the base takes *args
-        """Gradients in z, length scales and output scale."""
-        # With create_graph=True: `once_differentiable` would let it pass where upstream is a constant.
-        if torch.is_grad_enabled():
-            raise NotImplementedError(
-                "this kernel matrix has first derivatives only; for a Hessian take finite differences of its gradient"
-            )
-        z, lengthscale, outputscale, K, slope = ctx.saved_tensors
-        weighted = upstream * slope
-        scaled = (z - z.mean(0)) / lengthscale  # centred, or features far from zero cancel below
-        product = weighted @ scaled
-        rows, columns = weighted.sum(1), weighted.sum(0)
-        z_gradient = lengthscale_gradient = outputscale_gradient = None
-        if ctx.needs_input_grad[2]:
-            outputscale_gradient = (weighted.sum() if slope is K else (upstream * K).sum()) / outputscale
-        if ctx.needs_input_grad[1]:
-            # sum_ij G_ij slope_ij (x_id - x_jd)^2 / l_d^3, expanded so that only N x d arrays appear
-            per_input = ((rows + columns)[:, None] * scaled.square()).sum(0) - 2.0 * (scaled * product).sum(0)
-            lengthscale_gradient = per_input / lengthscale
-            if lengthscale.numel() == 1:
-                lengthscale_gradient = lengthscale_gradient.sum().reshape(lengthscale.shape)
-        if ctx.needs_input_grad[0]:
-            transposed = weighted.mT @ scaled
-            z_gradient = (product + transposed - (rows + columns)[:, None] * scaled) / lengthscale
-        return z_gradient, lengthscale_gradient, outputscale_gradient, None
-
-
-class DenseKernel(ABC):
-    """A kernel that is taken apart: its matrices, with the parameters that its modules hold at the call.
-
-    Made once for a kernel by `taken_apart`, for the checks of what a kernel is cost more than small matrices do.
-    """
-
-    @abstractmethod
     def matrix(self, z: Float[Tensor, "n d"]) -> Float[Tensor, "n n"]:
-        """k(z_i, z_j), of which there are first derivatives only."""
-
-    @abstractmethod
-    def cross(self, z: Float[Tensor, "n d"], other: Float[Tensor, "N d"]) -> Float[Tensor, "n N"]:
-        """k(z_i, other_j)."""
-
-    @abstractmethod
-    def diagonal(self, z: Float[Tensor, "n d"]) -> Float[Tensor, " n"]:
-        """k(z_i, z_i)."""
+        """k(z_i, z_j)."""
+        return self.cross(z, z)
 
 
 def taken_apart(kernel: Kernel) -> DenseKernel:
     """The kernel as sums, products and leaves whose formulas are evaluated here; any other kernel is called."""
-    kind = type(kernel)
-    if kernel.batch_shape or kernel.active_dims is not None:
-        return _Called(kernel)
-    if kind in (AdditiveKernel, ProductKernel):  # subclasses may have other formulas
-        parts = [taken_apart(cast(Kernel, part)) for part in cast(AdditiveKernel, kernel).kernels]
-        return _Composed(parts, add if kind is AdditiveKernel else mul)
-    if isinstance(kernel, ScaleKernel) and kind is ScaleKernel:
-        base = kernel.base_kernel  # whose active_dims are those of the scaled kernel
-        plain = type(base) in (RBFKernel, MaternKernel) and not base.batch_shape
-        return _OfDistance(base, kernel) if plain else _Composed([taken_apart(base)], scale=kernel)
-    if embedding(kernel) is not None:
-        return _OfDistance(kernel)
-    return _Called(kernel) if weight_features(kernel) is None else _Weighted(kernel)
+    kind, found, phi = type(kernel), None, None
+    if not kernel.batch_shape and kernel.active_dims is None:
+        if kind in (AdditiveKernel, ProductKernel):  # subclasses may have other formulas
+            parts = [taken_apart(cast(Kernel, part)) for part in cast(AdditiveKernel, kernel).kernels]
+            combine: Callable[[Tensor, Tensor], Tensor] = add if kind is AdditiveKernel else mul
+            return DenseKernel(
+                lambda z, other: reduce(combine, [part.cross(z, other) for part in parts]),
+                lambda z: reduce(combine, [part.diagonal(z) for part in parts]),
+            )
+        if isinstance(kernel, ScaleKernel) and kind is ScaleKernel:
+            base = taken_apart(kernel.base_kernel)
 
+            def scaled_by(value: Tensor) -> Tensor:
+                return cast(Tensor, kernel.outputscale) * value
 
-@dataclass(frozen=True, eq=False)
-class _Called(DenseKernel):
-    """A kernel of which nothing is known: GPyTorch evaluates it."""
+            return DenseKernel(lambda z, other: scaled_by(base.cross(z, other)), lambda z: scaled_by(base.diagonal(z)))
+        found, phi = embedding(kernel), weight_features(kernel)
+    if found is not None:
+        embed, smoothness = found
 
-    kernel: Kernel
+        def cross(z: Tensor, other: Tensor) -> Tensor:
+            right = embed(other)
+            return of_distance(right if z is other else embed(z), right, smoothness)
 
-    @override
-    def matrix(self, z: Tensor) -> Tensor:
-        return self.cross(z, z)
-
-    @override
-    def cross(self, z: Tensor, other: Tensor) -> Tensor:
-        return self.kernel(z, other).to_dense()
-
-    @override
-    def diagonal(self, z: Tensor) -> Tensor:
-        return cast(Tensor, self.kernel(z, z, diag=True))
-
-
-@dataclass(frozen=True, eq=False)
-class _Composed(DenseKernel):
-    """A sum or a product of others, times the variance of `scale`."""
-
-    parts: Sequence[DenseKernel]
-    combine: Callable[[Tensor, Tensor], Tensor] = add
-    scale: ScaleKernel | None = None
-
-    @override
-    def matrix(self, z: Tensor) -> Tensor:
-        return self._composed([part.matrix(z) for part in self.parts])
-
-    @override
-    def cross(self, z: Tensor, other: Tensor) -> Tensor:
-        return self._composed([part.cross(z, other) for part in self.parts])
-
-    @override
-    def diagonal(self, z: Tensor) -> Tensor:
-        return self._composed([part.diagonal(z) for part in self.parts])
-
-    def _composed(self, values: Sequence[Tensor]) -> Tensor:
-        value = reduce(self.combine, values)
-        return value if self.scale is None else self.scale.outputscale * value
-
-
-@dataclass(frozen=True, eq=False)
-class _OfDistance(DenseKernel):
-    """A squared exponential or a Matern, also of the distance in an embedding; with an output scale if it has one."""
-
-    kernel: Kernel
-    scale: ScaleKernel | None = None
-
-    @override
-    def matrix(self, z: Tensor) -> Tensor:
-        embed, lengthscale, smoothness = self._form(z)
-        return cast(Tensor, StationaryMatrix.apply(embed(z), lengthscale, self._variance(z), smoothness))
-
-    @override
-    def cross(self, z: Tensor, other: Tensor) -> Tensor:
-        embed, lengthscale, smoothness = self._form(z)
-        return self._variance(z) * of_distance(embed(z) / lengthscale, embed(other) / lengthscale, smoothness)
-
-    @override
-    def diagonal(self, z: Tensor) -> Tensor:
-        return self._variance(z).expand(len(z))
-
-    def _form(self, z: Tensor) -> tuple[PointMap, Tensor, float]:
-        """Embedding, length scales there, and smoothness."""
-        found = embedding(self.kernel)
-        assert found is not None, "taken_apart found it"
-        if type(self.kernel) in (RBFKernel, MaternKernel):  # whose length scales have gradients written by hand
-            return lambda points: points, lengthscale_of(self.kernel), found[1]
-        return found[0], torch.ones(1, dtype=z.dtype, device=z.device), found[1]
-
-    def _variance(self, z: Tensor) -> Tensor:
-        if self.scale is None:
-            return torch.ones((), dtype=z.dtype, device=z.device)
-        return cast(Tensor, self.scale.outputscale)
-
-
-@dataclass(frozen=True, eq=False)
-class _Weighted(DenseKernel):
-    """phi(z) . phi(z')."""
-
-    kernel: Kernel
-
-    @override
-    def matrix(self, z: Tensor) -> Tensor:
-        phi = self._features(z)
-        return phi @ phi.mT
-
-    @override
-    def cross(self, z: Tensor, other: Tensor) -> Tensor:
-        return self._features(z) @ self._features(other).mT
-
-    @override
-    def diagonal(self, z: Tensor) -> Tensor:
-        return self._features(z).square().sum(-1)
-
-    def _features(self, z: Tensor) -> Tensor:
-        features = weight_features(self.kernel)
-        assert features is not None, "taken_apart found them"
-        return features(z)
+        return DenseKernel(cross, lambda z: z.new_ones(len(z)))
+    if phi is not None:
+        return DenseKernel(lambda z, other: phi(z) @ phi(other).mT, lambda z: phi(z).square().sum(-1))
+    return DenseKernel(lambda z, other: kernel(z, other).to_dense(), lambda z: cast(Tensor, kernel(z, z, diag=True)))
 
 
 class _Call(torch.nn.Module):
@@ -333,11 +177,20 @@ class LatentKernels(torch.nn.Module):
     def __init__(self, kernels: Iterable[Kernel]) -> None:
         super().__init__()
         self.kernels = torch.nn.ModuleList(kernels)
-        self.dense: list[DenseKernel] = [taken_apart(kernel) for kernel in self]
-        """The same kernels, taken apart: their matrices."""
+        self._dense: list[DenseKernel] | None = None
         for name, value in self.named_parameters():
             if value.dtype != torch.float64:
                 raise InvalidInput(f"{name} is {value.dtype}; inference needs float64, call .double() on the kernel.")
+
+    @property
+    def dense(self) -> list[DenseKernel]:
+        """The same kernels, taken apart."""
+        if self._dense is None:
+            self._dense = [taken_apart(kernel) for kernel in self]
+        return self._dense
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_dense": None}  # a copy takes its own kernels apart
 
     def __iter__(self) -> Iterator[Kernel]:
         return iter(cast("list[Kernel]", list(self.kernels)))

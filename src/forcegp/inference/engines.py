@@ -13,10 +13,9 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, require_known, usable_arguments
-from forcegp.inference.cholesky import CholeskyFactor
 from forcegp.inference.dense_kernels import LatentKernels
 from forcegp.inference.inducing import InducingPosterior, WeightSpace
-from forcegp.inference.likelihood import Terms
+from forcegp.inference.likelihood import CholeskyFactor, Terms
 from forcegp.inference.memory import USABLE, free_memory, gib, require_memory
 from forcegp.inference.posterior import ExactPosterior, LatentPosterior
 
@@ -99,8 +98,8 @@ class Exact(Engine):
         return 8 * ((size.rows * size.rank) ** 2 + size.latents * size.rows**2)
 
     def bytes_to_learn(self, size: ProblemSize) -> int:
-        """Memory that the likelihood with its gradients takes: kernel matrices, their slopes and gradients as well."""
-        return self.required_bytes(size) + 16 * size.latents * size.rows**2
+        """Memory that the likelihood with its gradients takes: those of the kernel matrices as well."""
+        return self.required_bytes(size) + 24 * size.latents * size.rows**2
 
     @override
     def condition(self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None) -> LatentPosterior:

@@ -1,9 +1,7 @@
 """Variational inducing points: all data through a few points per latent, with a bound on what that costs.
 
-Gaussian processes as finitely many weights, k_c ~ phi_c . phi_c', phi_c(z) = L_c^-1 k_c(p_c, z), of posterior precision
-B = I + Phi^T D^-1 Phi. D = I is the posterior of Titsias (2009); with what the weights leave out in D it is the fully
-independent training conditional (Snelson & Ghahramani 2006). N times `left_out` bounds, in nats, what it costs (Burt,
-Rasmussen & van der Wilk 2020, theorem 4).
+Weights w with k_c ~ phi_c . phi_c', phi_c(z) = L_c^-1 k_c(p_c, z), of precision B = I + Phi^T D^-1 Phi: Titsias
+(2009). N times `left_out` bounds, in nats, what it costs (Burt, Rasmussen & van der Wilk 2020, theorem 4).
 """
 
 import math
@@ -19,9 +17,8 @@ from torch.utils.checkpoint import checkpoint
 from typing_extensions import override
 
 from forcegp.errors import NumericalError
-from forcegp.inference.cholesky import CholeskyFactor, factorize
 from forcegp.inference.dense_kernels import DenseKernel, LatentKernels
-from forcegp.inference.likelihood import Terms, whiten
+from forcegp.inference.likelihood import CholeskyFactor, Terms, factorize, whiten
 from forcegp.inference.posterior import BLOCK_BYTES, LatentPosterior
 
 ROUNDING = 1e-13

@@ -5,24 +5,130 @@ covariance T = (c_ic . c_jc k_c(x_i, x_j))_ij + I. With alpha = T^-1 t, beta_c =
 
     NLL = 1/2 t^T alpha + 1/2 log|T| + 1/2 |remainder|^2 + sum_i log|L_i| + D N / 2 log 2 pi
     dNLL/dk_c      = 1/2 (V_c^T V_c - beta_c beta_c^T)
-    dNLL/dC_iac    = sum_jb T^-1_(ia)(jb) C_jbc k_c[i,j] - alpha_ia (K_c beta_c)_i
+    dNLL/dC_iac    = sum_jb T^-1_(ia)(jb) C_jbc k_c[i,j] - alpha_ia (K_c beta_c)_i, for changes of the noise alone
     dNLL/dW~_i     = U_i dNLL/dC_i - remainder_i (K_c beta_c)_i^T           dNLL/dy~_i = U_i alpha_i + remainder_i
 
 T lives in one buffer of (rN)^2 doubles that becomes its own factor L and L^-1, lower triangle only.
 """
 
 import math
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.linalg import lapack
 from torch import Tensor
 
-from forcegp.errors import NumericalError
-from forcegp.inference.cholesky import CholeskyFactor, factorize
+from forcegp.errors import NumericalError, NumericalWarning
 from forcegp.inference.memory import return_freed_memory
+
+JITTER_LADDER = (0.0, 1e-12, 1e-10, 1e-8)
+"""Multiples of the mean diagonal that are added in turn; beyond the last one the factorisation fails."""
+
+
+@dataclass(frozen=True, eq=False)
+class CholeskyFactor:
+    """Lower Cholesky factor L of T = L L^T; the strict upper triangle of `lower` (n, n) holds leftovers.
+
+    `jitter` is what had to be added to the diagonal, 0 almost always.
+    """
+
+    lower: Float[Tensor, "n n"]
+    jitter: float = 0.0
+
+    def log_determinant(self) -> Float[Tensor, ""]:
+        """log |T|."""
+        return 2.0 * self.lower.diagonal().log().sum()
+
+    def solve(self, right: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        """T^-1 right."""
+        if not _is_for_lapack(self.lower):
+            return torch.cholesky_solve(right, self.lower)
+        solution, _ = lapack.dpotrs(self.lower.numpy().T, right.numpy(), lower=0)
+        return torch.from_numpy(solution)
+
+    def solve_lower(self, right: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        """L^-1 right."""
+        return torch.linalg.solve_triangular(self.lower, right, upper=False)
+
+    def solve_upper(self, right: Float[Tensor, "n k"]) -> Float[Tensor, "n k"]:
+        """L^-T right."""
+        return torch.linalg.solve_triangular(self.lower.mT, right, upper=True)
+
+    def into_inverse_factor(self) -> Float[Tensor, "n n"]:
+        """L^-1 in the lower triangle, written over the factor's own memory: the factor is used up."""
+        if not _is_for_lapack(self.lower):
+            return torch.linalg.inv(self.lower.tril_())
+        return self._in_place(lapack.dtrtri, "dtrtri")
+
+    def into_inverse(self) -> Float[Tensor, "n n"]:
+        """T^-1 in the lower triangle, written over the factor's own memory: the factor is used up."""
+        if not _is_for_lapack(self.lower):
+            return torch.cholesky_inverse(self.lower.tril_(), out=self.lower)
+        return self._in_place(lapack.dpotri, "dpotri")
+
+    def _in_place(self, function: Callable[..., tuple[np.ndarray, int]], name: str) -> Float[Tensor, "n n"]:
+        # The row-major lower triangle is the column-major upper one: LAPACK takes the transposed view without a copy.
+        inverse, info = function(self.lower.numpy().T, lower=0, overwrite_c=1)
+        if info != 0:
+            raise NumericalError(
+                f"inverting the covariance from its Cholesky factor failed (LAPACK {name} info={info})"
+            )
+        return torch.from_numpy(inverse.T)
+
+
+def factorize(build: Callable[[], Float[Tensor, "n n"]]) -> CholeskyFactor:
+    """Cholesky factor of the matrix that `build` returns, whose lower triangle is read and overwritten.
+
+    A matrix that is not positive definite in floating point is built again with more of its mean diagonal added
+    (`JITTER_LADDER`), and a NumericalWarning. Raises NumericalError where entries are not finite, or that does not
+    help.
+    """
+    jitter = 0.0
+    for relative in JITTER_LADDER:
+        matrix = build()
+        if not bool(torch.isfinite(matrix.diagonal()).all()):
+            raise NumericalError(
+                "the covariance matrix has entries that are not finite; check the data for huge or constant columns "
+                "and the start values of the hyper-parameters"
+            )
+        jitter = relative * float(matrix.diagonal().mean()) if relative and matrix.shape[0] else relative
+        if jitter:
+            matrix.diagonal().add_(jitter)
+        lower, ok = _cholesky_in_place(matrix)
+        if ok:
+            if jitter:
+                warnings.warn(
+                    f"added {jitter:.2e} ({relative:.0e} of the mean diagonal) to make a {matrix.shape[0]} x "
+                    f"{matrix.shape[0]} covariance "
+                    "positive definite; larger noise or fewer duplicate points avoid this",
+                    NumericalWarning,
+                    stacklevel=2,
+                )
+            return CholeskyFactor(lower, jitter)
+    raise NumericalError(
+        f"the covariance matrix is not positive definite even with {jitter:.2e} added to its diagonal; raise the noise "
+        "level, remove duplicate points, or check that the inputs are finite and of similar scale"
+    )
+
+
+def _is_for_lapack(matrix: Tensor) -> bool:
+    """Where scipy can work: on the CPU, and not on an empty matrix, which its LAPACK refuses."""
+    return matrix.device.type == "cpu" and matrix.numel() > 0
+
+
+def _cholesky_in_place(matrix: Float[Tensor, "n n"]) -> tuple[Float[Tensor, "n n"], bool]:
+    if not _is_for_lapack(matrix):
+        lower, info = torch.linalg.cholesky_ex(matrix)
+        return lower, bool((info == 0) & torch.isfinite(lower.diagonal()).all())  # one wait for a GPU, not two
+    factor, info = lapack.dpotrf(matrix.numpy().T, lower=0, clean=0, overwrite_a=1)
+    lower = torch.from_numpy(factor.T)
+    return lower, info == 0 and bool(torch.isfinite(lower.diagonal()).all())
+
 
 RANK_TOLERANCE = 1e-12
 """Singular values of W~_i below this fraction of the largest count as zero: rounding in H A^T = 0."""
@@ -136,13 +242,13 @@ def negative_log_likelihood(
     noise: Float[Tensor, "#N D"] | Float[Tensor, "#N D D"],
     kernel_matrices: Sequence[Float[Tensor, "N N"]],
 ) -> Float[Tensor, ""]:
-    """Exact -log p(y) of y = m + sum_c W_c f_c + noise, residual = y - m; differentiable in every argument.
+    """Exact -log p(y) of y = m + sum_c W_c f_c + noise, residual = y - m; differentiable in all but W.
 
     `noise` holds variances (N or 1, D) or covariances (N or 1, D, D); one N x N kernel matrix per latent (Rasmussen &
     Williams 2006, eq. 2.30). Raises NumericalError when a covariance cannot be factorised.
     """
     count, outputs, _ = W.shape
-    if outputs > 1 and noise.ndim == 2 and not W.requires_grad and _acts_apart(W):
+    if outputs > 1 and noise.ndim == 2 and _acts_apart(W):
         one = range(outputs)
         return torch.stack(
             [
@@ -150,8 +256,8 @@ def negative_log_likelihood(
                 for d, K in zip(one, kernel_matrices, strict=True)
             ]
         ).sum()
-    W_white, y_white, log_noise = whiten(W, residual, noise)
-    quadratic_and_logdet = _DeflatedNLL.apply(W.requires_grad, W_white, y_white, *kernel_matrices)
+    W_white, y_white, log_noise = whiten(W.detach(), residual, noise)
+    quadratic_and_logdet = _DeflatedNLL.apply(W_white, y_white, *kernel_matrices)
     return quadratic_and_logdet + log_noise + 0.5 * count * outputs * math.log(2.0 * math.pi)
 
 
@@ -208,21 +314,21 @@ class _DeflatedNLL(torch.autograd.Function):
     """1/2 y~^T S~^-1 y~ + 1/2 log|S~|; the gradients are computed in the forward pass while T^-1 is in memory."""
 
     @staticmethod
-    def forward(ctx, W_varies: bool, W_white: Tensor, y_white: Tensor, *kernel_matrices: Tensor) -> Tensor:  # type: ignore[override]  # the base takes *args
+    def forward(ctx, W_white: Tensor, y_white: Tensor, *kernel_matrices: Tensor) -> Tensor:  # type: ignore[override]  # the base takes *args
         deflation = deflate(W_white, y_white)
         system = solve_deflated(deflation, kernel_matrices)
         alpha, beta = system.alpha, system.beta
         value = 0.5 * (
             (deflation.t * alpha).sum() + system.factor.log_determinant() + deflation.remainder.square().sum()
         )
-        W_needed, y_needed, *K_needed = ctx.needs_input_grad[1:]
+        W_needed, y_needed, *K_needed = ctx.needs_input_grad
         gradients: list[Tensor | None] = [None] * (2 + len(kernel_matrices))
         if y_needed:
             gradients[1] = (deflation.U @ alpha[..., None])[..., 0] + deflation.remainder
         if not kernel_matrices:
             gradients[0] = torch.zeros_like(W_white)
         elif W_needed or any(K_needed):
-            C_gradient, gradients[2:] = _contractions(system, kernel_matrices, W_needed and W_varies, K_needed)
+            C_gradient, gradients[2:] = _contractions(system, K_needed)
             if W_needed:
                 latent_mean = torch.stack([K @ beta[:, c] for c, K in enumerate(kernel_matrices)], dim=-1)
                 C_gradient = C_gradient - alpha[..., None] * latent_mean[:, None, :]
@@ -232,7 +338,7 @@ class _DeflatedNLL(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, upstream: Tensor):  # type: ignore[override]  # the base takes *args
-        return None, *scaled_gradients("the deflated likelihood", upstream, ctx.gradients)
+        return scaled_gradients("the deflated likelihood", upstream, ctx.gradients)
 
 
 def scaled_gradients(what: str, upstream: Tensor, gradients: Sequence[Tensor | None]) -> tuple[Tensor | None, ...]:
@@ -244,18 +350,16 @@ def scaled_gradients(what: str, upstream: Tensor, gradients: Sequence[Tensor | N
     return tuple(None if g is None else upstream * g for g in gradients)
 
 
-def _contractions(
-    system: DeflatedSystem, kernel_matrices: Sequence[Tensor], W_varies: bool, K_needed: Sequence[bool]
-) -> tuple[Tensor, list[Tensor | None]]:
+def _contractions(system: DeflatedSystem, K_needed: Sequence[bool]) -> tuple[Tensor, list[Tensor | None]]:
     """sum_jb T^-1 C k and dNLL/dK from one sweep over L^-1; the factor's memory is used up.
 
-    Where only the noise moves W~_i, ``sum_j [T^-1]_ij C_j k_ij C_i^T = 1 - [T^-1]_ii`` is cheaper.
+    As the noise alone moves W~_i, it is ``sum_j [T^-1]_ij C_j k_ij C_i^T = 1 - [T^-1]_ii`` that counts.
     """
     C, beta = system.deflation.C, system.beta
     count, rank, _ = C.shape
     inverse = system.factor.into_inverse_factor()
     K_gradients = [torch.outer(beta[:, c], -0.5 * beta[:, c]) if need else None for c, need in enumerate(K_needed)]
-    C_gradient, diagonal = torch.zeros_like(C), C.new_zeros(count, rank, rank)
+    diagonal = C.new_zeros(count, rank, rank)
     height = max(1, INNER // max(1, rank))
     for start in range(0, count, height):
         stop = min(count, start + height)
@@ -266,13 +370,7 @@ def _contractions(
         for c, K_gradient in enumerate(K_gradients):
             if K_gradient is not None:
                 K_gradient[:stop, :stop].addmm_(V[:, c], V[:, c].mT, alpha=0.5)
-        if W_varies:
-            seen = torch.stack([K[:stop, :stop] @ V[:, c] for c, K in enumerate(kernel_matrices)], dim=-1)
-            C_gradient[:stop] += torch.bmm(X, seen)
-        else:
-            diagonal[:stop] += torch.bmm(X, X.mT)
-    if W_varies:
-        return C_gradient, K_gradients
+        diagonal[:stop] += torch.bmm(X, X.mT)
     squares = C.square().sum(-1, keepdim=True)  # the rows of C_i are orthogonal
     dual = torch.where(squares > RANK_TOLERANCE**2 * squares.sum(1, keepdim=True), C / squares, torch.zeros_like(C))
     return dual - (1.0 + system.factor.jitter) * diagonal @ dual, K_gradients

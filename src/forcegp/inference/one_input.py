@@ -1,7 +1,6 @@
 """Latents with one input as functions in pieces, whose cost does not depend on the number of training points.
 
-Between neighbouring centres a sum of Materns is e^-u and e^-v times polynomials, for it is Markov. So the friction
-kernel and Materns have an exact form, which two passes over the sorted centres prepare; others have none.
+A sum of Materns is Markov: between neighbouring centres it is e^-u and e^-v times polynomials. Other kernels have none.
 """
 
 import hashlib
@@ -20,7 +19,7 @@ from forcegp.codegen.c_writer import c_text, filled
 from forcegp.codegen.graph import Graph
 from forcegp.errors import InvalidInput
 from forcegp.inference.dense_kernels import PointMap
-from forcegp.inference.pathwise import ComposedSamples, DrawnTerm, FunctionSamples, draw_functions, kernel_terms
+from forcegp.inference.pathwise import DrawnTerm, FunctionSamples, draw_functions, kernel_terms
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PADDING, CompressedCovariance, KernelSum, kernel_sums
 
@@ -154,12 +153,10 @@ def one_input_form(
     return markov_functions(latent.kernels[index], centers[:, 0], weights)
 
 
-def drawn_form(
-    drawn: FunctionSamples | ComposedSamples, latent: LatentPosterior, index: int
-) -> OneInputFunctions | None:
+def drawn_form(drawn: FunctionSamples, latent: LatentPosterior, index: int) -> OneInputFunctions | None:
     """S drawn functions of one latent; None as in `one_input_form`, and for functions that have cosines."""
     centers = latent.features[index].detach()
-    if centers.shape[-1] != 1 or not isinstance(drawn, ComposedSamples):
+    if centers.shape[-1] != 1:
         return None
     terms = drawn.terms[index]
     if any(term.frequencies for term in terms):
@@ -208,12 +205,12 @@ def markov_functions(
             continue
         factor, *others = term.factors
         amplitude, curve = _curve(factor.embedding, centers)
-        if others or not curve or factor.power >= 0.0 or factor.shape not in MATERN:
+        if others or not curve or factor.smoothness not in MATERN:
             return None
         if drawn:
             own = slice(first, first := first + len(grids[number]))
             weights[own] += root * _news(drawn[number]).mT
-        polynomial, rate = MATERN[factor.shape], math.sqrt(2.0 * factor.shape) * abs(amplitude)
+        polynomial, rate = MATERN[factor.smoothness], math.sqrt(2.0 * factor.smoothness) * abs(amplitude)
         side = list(constants).index(key), curves.setdefault(curve, len(curves)), len(polynomial)
         y = CURVES[curve[0]][0](curve[1] * knots)
         at_knots = torch.zeros_like(weights[: len(knots)]).index_add_(0, place, weights).cpu().numpy()

@@ -122,11 +122,7 @@ class _Search:
         self.cause = cause
 
     def __call__(self, point: np.ndarray) -> tuple[float, np.ndarray]:
-        """Objective and gradient for a line search; where they do not exist, a parabola about the best point stands in.
-
-        It rises by as much as the objective was to fall: the line search shortens its step, and never accepts the
-        point.
-        """
+        """Objective and gradient; where there are none, a parabola about the best point, as steep as that falls."""
         evaluated = self.evaluate(point)
         if evaluated is not None:
             return evaluated

@@ -1,15 +1,14 @@
-"""Functions drawn from the posterior (Matheron's rule; Wilson et al. 2020, eq. 10), and its mean, for many calls.
+"""Functions drawn from the posterior (Matheron's rule; Wilson et al. 2020, eq. 10).
 
-A drawn function is a sum of random cosines (Rahimi & Recht 2007), with frequencies of its own, and an update by the
-data. Squared exponentials of all latents are one batched operation (`FunctionSamples`); other kernels are multiplied
-out into terms, features times a function of a distance, and drawn term by term (`ComposedSamples`).
+Kernels are multiplied out into terms, features times a function of a distance, and drawn term by term: sums of random
+cosines (Rahimi & Recht 2007), with frequencies of their own, and an update by the data.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -18,35 +17,28 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import InvalidInput
-from forcegp.inference.dense_kernels import (
-    PointMap,
-    embedding,
-    squared_exponential_parameters,
-    weight_features,
-)
+from forcegp.inference.dense_kernels import PointMap, embedding, weight_features
 from forcegp.inference.posterior import LatentPosterior
 
 
-@dataclass(frozen=True, eq=False)
-class SpectralFactor:
-    """A function of the distance in e(z), by its spectrum: omega = g^power n with n ~ N(0, I), g ~ Gamma(shape, shape).
+class SpectralFactor(NamedTuple):
+    """A function of the distance in e(z): the squared exponential (smoothness inf) or a Matern.
 
-    The squared exponential has power 0, a Matern of smoothness nu shape nu and power -1/2 (a Student t distribution).
+    Its spectrum is n, or n / sqrt(g) (a Student t distribution), n ~ N(0, I) and g ~ Gamma(smoothness, smoothness).
     """
 
     embedding: PointMap
-    power: float = 0.0
-    shape: float = math.inf
+    smoothness: float
 
     def frequencies(self, size: tuple[int, int, int], generator: torch.Generator) -> Float[Tensor, "S e P"]:
         """Independent draws; e entries belong to one frequency."""
         samples, _, count = size
         omega = torch.randn(size, generator=generator, dtype=torch.float64, device=generator.device)
-        if not self.power:
+        if self.smoothness == math.inf:
             return omega
         seed = torch.randint(2**62, (), generator=generator, device=generator.device)
-        gamma = np.random.default_rng(int(seed)).standard_gamma(self.shape, (samples, 1, count)) / self.shape
-        return omega * torch.as_tensor(gamma**self.power, device=generator.device)
+        gamma = np.random.default_rng(int(seed)).standard_gamma(self.smoothness, (samples, 1, count)) / self.smoothness
+        return omega / torch.as_tensor(np.sqrt(gamma), device=generator.device)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +76,9 @@ def kernel_terms(kernel: Kernel) -> list[KernelTerm]:
             for part in kernel.kernels:
                 terms = [left.times(right) for left, right in product(terms, kernel_terms(cast(Kernel, part)))]
             return terms
-        factor = _spectral_factor(kernel)
-        if factor is not None:
-            return [KernelTerm(one.scale, factors=(factor,))]
+        found = embedding(kernel)
+        if found is not None:
+            return [KernelTerm(one.scale, factors=(SpectralFactor(*found),))]
         features = weight_features(kernel)
         if features is not None:
             return [KernelTerm(one.scale, features=(features,))]
@@ -97,14 +89,6 @@ def kernel_terms(kernel: Kernel) -> list[KernelTerm]:
         "`squared_exponential_embedding`, `matern_embedding` or `weight_features`, all without active_dims; use such "
         "kernels, or ask for no samples."
     )
-
-
-def _spectral_factor(kernel: Kernel) -> SpectralFactor | None:
-    found = embedding(kernel)
-    if found is None:
-        return None
-    embed, smoothness = found
-    return SpectralFactor(embed) if smoothness == math.inf else SpectralFactor(embed, -0.5, smoothness)
 
 
 GRID = 4096
@@ -134,7 +118,7 @@ class DrawnTerm:
         options = {"generator": generator, "dtype": torch.float64, "device": generator.device}
         if not embedded:
             return cls(term, (), (torch.randn(samples, columns, **options),))
-        if [(factor.shape, factor.power) for factor in term.factors] == [(0.5, -0.5)] and embedded[0].shape[-1] == 1:
+        if [factor.smoothness for factor in term.factors] == [0.5] and embedded[0].shape[-1] == 1:
             from scipy.signal import lfilter  # half a second, which only drawing should cost
 
             low, high = float(embedded[0].min()) - 3.0, float(embedded[0].max()) + 3.0
@@ -185,125 +169,14 @@ BLOCK_BYTES = 16 * 2**20
 
 
 @dataclass(frozen=True, eq=False)
-class StackedKernels:
-    """The squared exponentials of all latents as one batched operation, with the centres of the posterior.
-
-    Features are over their length scales; fewer features and centres are padded with zeros (`stacked`).
-    """
-
-    lengthscales: tuple[Float[Tensor, " _"], ...]
-    variances: Float[Tensor, " C"]
-    centers: Float[Tensor, "C 1 d"]
-    training: Float[Tensor, "C N d"]
-
-    @classmethod
-    def of(cls, latent: LatentPosterior) -> "StackedKernels | None":
-        """None if some kernel is not a scaled squared exponential, or if there are no latents."""
-        parameters = [squared_exponential_parameters(kernel) for kernel in latent.kernels]
-        if not parameters or any(found is None for found in parameters):
-            return None
-        lengthscales, variances = zip(*(found for found in parameters if found is not None), strict=True)
-        lengthscales = tuple(
-            scale.detach().expand(z.shape[-1]) for scale, z in zip(lengthscales, latent.features, strict=True)
-        )
-        training = _scaled(latent.features, lengthscales)
-        centers = training.mean(1, keepdim=True)
-        return cls(lengthscales, torch.stack([s.detach() for s in variances]), centers, training - centers)
-
-    def scaled(self, features: Sequence[Float[Tensor, "*n _"]]) -> Float[Tensor, "C n d"]:
-        """Features over length scales about the centre of the training points, flattened to one batch dimension."""
-        return _scaled([z.reshape(-1, z.shape[-1]) for z in features], self.lengthscales) - self.centers
-
-    def cross(self, scaled: Float[Tensor, "C n d"]) -> Float[Tensor, "C n N"]:
-        """k_c(z, z_j) for points from `scaled`."""
-        squares = scaled.square().sum(-1)[..., :, None] + self.training.square().sum(-1)[..., None, :]
-        distance = torch.baddbmm(squares, scaled, self.training.mT, alpha=-2.0).clamp_min_(0.0)
-        return distance.mul_(-0.5).exp_() * self.variances[:, None, None]  # not in place: exp needs its result
-
-
-def mean_function(latent: LatentPosterior) -> Callable[[Sequence[Tensor]], Tensor]:
-    """`latent.mean`, prepared for many calls with few points; kernels that cannot be stacked are evaluated by it."""
-    with torch.no_grad():
-        kernels, weights = StackedKernels.of(latent), stacked(latent.weights)
-    if kernels is None:
-        return latent.mean
-    return lambda features: (kernels.cross(kernels.scaled(features)) @ weights[..., None])[..., 0].mT
-
-
-@dataclass(frozen=True, eq=False)
 class FunctionSamples:
-    """S functions drawn from the posterior of the latents; the same points always give the same values.
-
-    `frequencies` of the scaled features, `amplitudes` of cosines and sines, `beta` the weights of the centres.
-    """
-
-    kernels: StackedKernels
-    frequencies: Float[Tensor, "S C d P"]
-    amplitudes: Float[Tensor, "2 S C P"]
-    beta: Float[Tensor, "S C N"]
-
-    @classmethod
-    def draw(
-        cls, latent: LatentPosterior, samples: int, seed: int, frequencies: int = FREQUENCIES, widening: float = 1.0
-    ) -> "FunctionSamples":
-        """Draw functions, `widening` times as far from the mean; the same seed gives the same ones.
-
-        Raises InvalidInput if a kernel is not a scaled squared exponential; `draw_functions` takes others, too.
-        """
-        with torch.no_grad():
-            kernels = StackedKernels.of(latent)
-            if kernels is None:
-                raise InvalidInput("only scaled squared exponentials can be stacked; call draw_functions instead")
-            generator = torch.Generator(device=kernels.training.device).manual_seed(seed)
-            like = {"generator": generator, "dtype": torch.float64, "device": kernels.training.device}
-            latents, _, dimension = kernels.training.shape
-            omega = torch.randn(samples, latents, dimension, frequencies, **like)
-            scale = (kernels.variances / frequencies).sqrt()[:, None]
-            amplitudes = scale * torch.randn(2, samples, latents, frequencies, **like)
-            prior = torch.stack(  # one function at a time, for all its cosines at all points are many numbers
-                [_cosines(kernels.training, omega[s], amplitudes[:, s]) for s in range(samples)], dim=1
-            )
-            at_centers = [values[:, : len(z)] for values, z in zip(prior, latent.features, strict=True)]
-            weights = _widened(latent, latent.function_weights(at_centers, generator), widening)
-        return cls(kernels, omega, widening * amplitudes, stacked(weights).transpose(0, 1))
-
-    def __call__(self, features: Sequence[Float[Tensor, "S n _"]]) -> Float[Tensor, "S n C"]:
-        """Every function at points of its own: f_s,c(z_s,i)."""
-        samples = self.beta.shape[0]
-        scaled = self.kernels.scaled(features)
-        cross = self.kernels.cross(scaled).unflatten(1, (samples, -1))  # C S n N
-        update = (cross @ self.beta.transpose(0, 1)[..., None])[..., 0]
-        points = scaled.unflatten(1, (samples, -1)).transpose(0, 1)
-        prior = _cosines(points, self.frequencies, self.amplitudes)
-        return prior.movedim(1, -1) + update.permute(1, 2, 0)
-
-
-@dataclass(frozen=True, eq=False)
-class ComposedSamples:
-    """S functions drawn from the posterior of the latents, whose kernels are sums and products."""
+    """S functions drawn from the posterior of the latents; the same points always give the same values."""
 
     # whole functions: independent noise in every step would average out along a motion
     latent: LatentPosterior
     terms: tuple[tuple[DrawnTerm, ...], ...]
     beta: tuple[Float[Tensor, "S _"], ...]
     widening: float
-
-    @classmethod
-    def draw(
-        cls, latent: LatentPosterior, samples: int, seed: int, frequencies: int = FREQUENCIES, widening: float = 1.0
-    ) -> "ComposedSamples":
-        """As `FunctionSamples.draw`, `frequencies` per function and term. Raises InvalidInput as `kernel_terms`."""
-        with torch.no_grad():
-            generator = torch.Generator(device=latent.features[0].device).manual_seed(seed)
-            terms = tuple(
-                tuple(DrawnTerm.draw(term, z, samples, frequencies, generator) for term in kernel_terms(kernel))
-                for kernel, z in zip(latent.kernels, latent.features, strict=True)
-            )
-            prior = [
-                _at_same_points(drawn, z, samples, frequencies) for drawn, z in zip(terms, latent.features, strict=True)
-            ]
-            weights = _widened(latent, latent.function_weights(prior, generator), widening)
-            return cls(latent, terms, tuple(weights), widening)
 
     def __call__(self, features: Sequence[Float[Tensor, "S n _"]]) -> Float[Tensor, "S n C"]:
         """Every function at points of its own: f_s,c(z_s,i)."""
@@ -317,20 +190,27 @@ class ComposedSamples:
 
 
 def draw_functions(
-    latent: LatentPosterior, samples: int, seed: int, widening: float = 1.0
-) -> FunctionSamples | ComposedSamples:
+    latent: LatentPosterior, samples: int, seed: int, widening: float = 1.0, frequencies: int = FREQUENCIES
+) -> FunctionSamples:
     """Functions drawn from the posterior of the latents, `widening` times as far from its mean; the same for a seed.
 
-    Raises InvalidInput for a kernel of which neither features nor a spectrum are known.
+    `frequencies` per function and term. Raises InvalidInput for a kernel of which neither features nor a spectrum are
+    known.
     """
     with torch.no_grad():
-        stacked = StackedKernels.of(latent) is not None
-    return (FunctionSamples if stacked else ComposedSamples).draw(latent, samples, seed, widening=widening)
-
-
-def _widened(latent: LatentPosterior, weights: Sequence[Tensor], widening: float) -> list[Tensor]:
-    """w f + (1 - w) mean at the centres, of functions f whose prior part is multiplied by w as well."""
-    return [widening * drawn + (1.0 - widening) * mean for drawn, mean in zip(weights, latent.weights, strict=True)]
+        device = latent.features[0].device if latent.features else torch.device("cpu")
+        generator = torch.Generator(device=device).manual_seed(seed)
+        terms = tuple(
+            tuple(DrawnTerm.draw(term, z, samples, frequencies, generator) for term in kernel_terms(kernel))
+            for kernel, z in zip(latent.kernels, latent.features, strict=True)
+        )
+        prior = [
+            _at_same_points(drawn, z, samples, frequencies) for drawn, z in zip(terms, latent.features, strict=True)
+        ]
+        drawn = zip(latent.function_weights(prior, generator), latent.weights, strict=True)
+        # w f + (1 - w) mean at the centres, of functions f whose prior part is multiplied by w as well
+        weights = tuple(widening * own + (1.0 - widening) * mean for own, mean in drawn)
+        return FunctionSamples(latent, terms, weights, widening)
 
 
 def _sum(drawn: Sequence[DrawnTerm], z: Float[Tensor, "n d"], samples: slice) -> Float[Tensor, "S m"]:
@@ -345,32 +225,3 @@ def _at_same_points(
     few = max(1, BLOCK_BYTES // (8 * max(1, len(z)) * frequencies))
     parts = [slice(start, min(samples, start + few)) for start in range(0, samples, few)]
     return torch.cat([_sum(drawn, z.repeat(part.stop - part.start, 1), part) for part in parts])
-
-
-def _cosines(
-    points: Float[Tensor, "*batch n d"],
-    frequencies: Float[Tensor, "*batch d P"],
-    amplitudes: Float[Tensor, "2 *batch P"],
-) -> Float[Tensor, "*batch n"]:
-    """sum_p amplitude_0p cos(omega_p z) + amplitude_1p sin(omega_p z)."""
-    phase = points @ frequencies
-    return (phase.cos() @ amplitudes[0][..., None] + phase.sin() @ amplitudes[1][..., None])[..., 0]
-
-
-def _scaled(features: Sequence[Tensor], lengthscales: Sequence[Tensor]) -> Float[Tensor, "C n d"]:
-    widest = max(z.shape[-1] for z in features)
-    most = max(len(z) for z in features)
-    return torch.stack(
-        [
-            torch.nn.functional.pad(z / scale, (0, widest - z.shape[-1], 0, most - len(z)))
-            for z, scale in zip(features, lengthscales, strict=True)
-        ]
-    )
-
-
-def stacked(weights: Sequence[Float[Tensor, "*S _"]]) -> Float[Tensor, "C *S N"]:
-    """Weights of all latents as one tensor, with zeros for the centres that a latent has not."""
-    if not weights:
-        return torch.zeros(0, 0, dtype=torch.float64)
-    most = max(w.shape[-1] for w in weights)
-    return torch.stack([torch.nn.functional.pad(w, (0, most - w.shape[-1])) for w in weights])

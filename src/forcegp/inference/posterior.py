@@ -1,8 +1,4 @@
-"""Posterior of the latent functions at new points, and the exact one with rows appended or left out.
-
-The mean is E f_c = sum_j k_c(z, z_j) w_cj. Rows are appended by block Cholesky factorisation (Golub & Van Loan 2013,
-4.2.9).
-"""
+"""Posterior of the latent functions at new points, and the exact one with rows appended or left out."""
 
 import math
 from abc import ABC, abstractmethod
@@ -17,9 +13,16 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
-from forcegp.inference.cholesky import CholeskyFactor, factorize
 from forcegp.inference.dense_kernels import LatentKernels
-from forcegp.inference.likelihood import DeflatedSystem, Deflation, Terms, deflated_covariance, solve_deflated
+from forcegp.inference.likelihood import (
+    CholeskyFactor,
+    DeflatedSystem,
+    Deflation,
+    Terms,
+    deflated_covariance,
+    factorize,
+    solve_deflated,
+)
 
 BLOCK_BYTES = 64 * 2**20
 """Working memory of one block of test points."""
@@ -150,12 +153,8 @@ def exact(latent: LatentPosterior, what: str) -> ExactPosterior:
     )
 
 
-COPIED_ROWS = 256
-"""Rows of a factor that are copied at once, without what lies beyond their diagonal."""
-
-
 def with_rows(latent: ExactPosterior, terms: Terms) -> ExactPosterior:
-    """The posterior of the old rows and those of `terms`, at the same kernels; the old posterior stays valid.
+    """The posterior of the old rows and those of `terms` (Golub & Van Loan 2013, 4.2.9); the old one stays valid.
 
     Raises NumericalError where the new ones are not finite or the covariance cannot be factorised.
     """
@@ -191,9 +190,7 @@ def appended(factor: CholeskyFactor, cross: Float[Tensor, "m n"], own: Float[Ten
     """
     size, more = factor.lower.shape[0], own.shape[0]
     lower = factor.lower.new_empty(size + more, size + more)
-    for start in range(0, size, COPIED_ROWS):  # memory that is never touched, above the diagonal, costs nothing
-        stop = min(size, start + COPIED_ROWS)
-        lower[start:stop, :stop] = factor.lower[start:stop, :stop]
+    lower[:size, :size] = factor.lower
     below = factor.solve_lower(cross.mT).mT if size else cross
     lower[size:, :size] = below
     own.sub_(below @ below.mT)

@@ -1,10 +1,8 @@
 """Posterior means of all latents as sums for C, and their covariance compressed, for many calls with few points.
 
-The kernel of one pair (z, z_j) is traced as a graph and taken apart: what depends on the centre alone becomes a table,
-what depends on z alone is computed once per state, only the rest in the loop of the C function.
-
-The covariance k(z, z) - (B^T V)^T (B^T V) with V = L^-1 K(z) is that of a process which has seen only R combinations of
-the data: never below the exact one. B holds leading left singular vectors of V at sample states.
+The kernel of one pair is traced; what depends on the centre alone becomes a table, what depends on z alone is computed
+once per state. The covariance k - (B^T V)^T (B^T V), V = L^-1 K(z), is that of a process which has seen only R
+combinations of the data: never below the exact one. B holds leading left singular vectors of V at sample states.
 """
 
 import math
@@ -18,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.codegen.c_writer import c_text, c_value, filled, sections
-from forcegp.codegen.graph import ONE, Copier, Graph, Slopes, evaluated, gradients
+from forcegp.codegen.graph import Copier, Graph, Slopes, evaluated, jacobian
 from forcegp.codegen.tracing import trace
 from forcegp.inference.dense_kernels import squared_exponential_parameters
 from forcegp.inference.posterior import BLOCK_BYTES, ExactPosterior, LatentPosterior
@@ -124,12 +122,9 @@ class KernelSum:
     @cached_property
     def _partials(self) -> dict[tuple[int, int], int]:
         """(latent, operand) -> the node of d k / d operand."""
-        found = {}
-        for g, kernel in enumerate(self.kernels):
-            for k, node in enumerate(gradients(self.pair, [kernel], [ONE], self.operands)):
-                if self.pair.value(node) != 0.0:
-                    found[g, k] = node
-        return found
+        slopes = enumerate(jacobian(self.pair, self.kernels, self.operands))
+        found = {(g, k): node for g, row in slopes for k, node in enumerate(row)}
+        return {place: node for place, node in found.items() if self.pair.value(node) != 0.0}
 
     @cached_property
     def _slopes(self) -> Slopes:
@@ -335,10 +330,7 @@ def kernel_sums(latent: LatentPosterior) -> tuple[KernelSum, ...]:
 def _squared_exponentials(
     centers: Float[Tensor, "N d"], scales: Sequence[tuple[Tensor, Tensor]]
 ) -> tuple[PairFunction, Callable[[Tensor], Tensor], tuple[float, ...]]:
-    """k_c(z, z_j) - s_c of latents with the same centres, k_c(z, z), and s_c, from length scales and variances.
-
-    From the features themselves, less a constant: with long length scales k is nearly s, and sums cancel.
-    """
+    """k_c(z, z_j) - s_c of latents with the same centres, k_c(z, z), and s_c: k is nearly s, and sums would cancel."""
     shift = centers.mean(0)
     precisions = torch.stack([length.detach().expand(centers.shape[-1]) ** -2 for length, _ in scales])
     variances = torch.stack([variance.detach().reshape(()) for _, variance in scales])

@@ -1,12 +1,8 @@
 """Motions by the implicit midpoint rule, of many windows at once, with derivatives in start and parameters.
 
-Linearised at a guess (q_m, v_m) of the middle of every step, the rule is one affine recursion along each window,
-
-    (1 - h/2 a_v - h^2/4 a_q) v_m = v + h/2 (a - a_q (q_m - q) - a_v v_m + a_p dp)    (right side at the guess),
-
-which is Newton's method on all steps of all windows at once when repeated (lifted: Bock & Plitt 1984; Albersmeyer &
-Diehl, SIAM J. Optim. 2010). Where a base moves, positions follow from the guessed v_m exactly, and the recursion runs
-over steps from them in body axes.
+Linearised at a guess of the middle of every step, the rule is one affine recursion along each window; repeated, this is
+Newton's method on all steps at once (lifted: Bock & Plitt 1984; Albersmeyer & Diehl 2010). Where a base moves, the
+recursion runs over steps from the guessed path, in body axes.
 """
 
 from collections.abc import Callable

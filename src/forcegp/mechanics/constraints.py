@@ -1,7 +1,6 @@
-"""Closed loops as rows of the same A: A = n^T (J_a - J_b) where p_a = p_b along axes n of the world.
+"""Closed loops as rows of the same A: A = n^T (J_a - J_b) where p_a = p_b along n (Featherstone 2008, section 8.2).
 
-A multiplier is the force on the first frame (Featherstone 2008, section 8.2). Rows of the orientation have the error
-2 tan(t/2) k for a turn by t about k, and torques as multipliers.
+A multiplier is the force on the first frame. Rows of the orientation have the error 2 tan(t/2) k for a turn t about k.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,12 +14,7 @@ from typing_extensions import override
 
 from forcegp.errors import ContactError, InvalidInput
 from forcegp.mechanics.gauss_principle import AXES, Contact, Row, placed
-from forcegp.mechanics.surfaces import (
-    SURFACES,
-    Held,
-    object_from_dict,
-    surface_to_dict,
-)
+from forcegp.mechanics.surfaces import SURFACES, Held, object_from_dict, surface_to_dict
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import finite_vector
 from forcegp.robots.mjcf_model import LoopDescription

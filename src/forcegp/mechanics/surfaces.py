@@ -1,7 +1,6 @@
 """Surfaces s(p) = 0 that a point of the robot can be held on, with derivatives; p (..., 3) in m, world axes.
 
-The built-in ones are signed distances, so a multiplier is the normal force in N. One of your own is a subclass with
-`value`; to be stored it needs an entry in `SURFACES` and plain numbers as its fields.
+The built-in ones are signed distances: a multiplier is the normal force in N. One of your own is a class with `value`.
 """
 
 import math

@@ -13,7 +13,7 @@ from torch import Tensor
 from forcegp.codegen.library import RowFunction
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning, require_type
 from forcegp.inference.memory import blas_threads
-from forcegp.inference.pathwise import draw_functions, mean_function
+from forcegp.inference.pathwise import draw_functions
 from forcegp.integration.integrators import (
     Feedback,
     ImplicitMidpoint,
@@ -49,7 +49,7 @@ def accelerations(posterior: Any, model: Model, samples: int = 0, seed: int = 0)
     """The mean acceleration of a `Posterior` at states (n, nv), or of `samples` functions, each at its part."""
     prior, standardize = posterior.trained.unknown, posterior.likelihood.standardization
     samples = samples if len(posterior.kernels.kernels) else 0  # without unknown forces all functions are the same
-    latent, functions = posterior.latent, mean_function(posterior.latent)
+    latent, functions = posterior.latent, posterior.latent.mean
     if samples:
         functions = draw_functions(latent, samples, seed, posterior.widening)
 

@@ -13,14 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import (
-    ForceGPError,
-    InvalidInput,
-    RobotFileWarning,
-    RobotModelError,
-    UnknownJoint,
-    require_known,
-)
+from forcegp.errors import ForceGPError, InvalidInput, RobotFileWarning, RobotModelError, UnknownJoint, require_known
 
 LARGEST = 2**63 - 1
 """Of the integers that every library takes."""

@@ -1,11 +1,7 @@
 """The dynamics of one robot as machine code: its rigid-body algorithms unrolled into scalars, and `CompiledRobot`.
 
-Entries are floats or expressions, so what the structure makes zero vanishes while the code is written. Quantities of a
-body are in its own axes, about its own origin: with w, w' and a of the origin and the pseudo-inertia P,
-
-    A = [[w']x + [w]x [w]x, a]  (3 x 4),  F = A P,  force f = F[:, 3],  moment n = (F21 - F12, F02 - F20, F10 - F01)
-
-(recursive Newton-Euler, composite rigid bodies: Featherstone, "Rigid Body Dynamics Algorithms", 2008, ch. 5 and 6).
+Entries are floats or expressions, so what the structure makes zero vanishes. Quantities of a body are in its own axes,
+about its own origin: A = [[w']x + [w]x [w]x, a], F = A P with the pseudo-inertia P (Featherstone 2008, ch. 5 and 6).
 """
 
 from collections.abc import Iterable, Sequence
@@ -20,16 +16,9 @@ from typing_extensions import override
 
 from forcegp.codegen.c_writer import Program, write_program
 from forcegp.codegen.graph import Expression, Graph, node_of
-from forcegp.codegen.library import (
-    NOT_POSITIVE,
-    RowFunction,
-    are_plain,
-    default_folder,
-    load_library,
-    require_plain,
-)
+from forcegp.codegen.library import NOT_POSITIVE, RowFunction, are_plain, default_folder, load_library, require_plain
 from forcegp.codegen.tracing import trace
-from forcegp.errors import InvalidInput, NumericalError, require_known
+from forcegp.errors import InvalidInput, NumericalError
 from forcegp.robots.arguments import broadcast_batch
 from forcegp.robots.kinematics import NOT_POSITIVE_DEFINITE
 from forcegp.robots.layout import WORLD, Drive
@@ -391,13 +380,6 @@ class CompiledRobot(RigidBodyDynamics):
 
     def __repr__(self) -> str:
         return f"CompiledRobot({self.robot!r}, folder={str(self.folder)!r})"
-
-    def prepare(self, *functions: str) -> "CompiledRobot":
-        """Compile functions now: those named, or all; returns the same object. Raises InvalidInput for other names."""
-        for name in functions or ARGUMENTS:
-            require_known("function", name, "a compiled robot", ARGUMENTS)
-            self.program(name)
-        return self
 
     def program(self, function: str) -> RowFunction:
         """The machine code of a function."""

@@ -1,9 +1,7 @@
 """Which body carries which link, in what order the joints come, and whether all of it is a tree.
 
-Movable joints are numbered depth first, children in file order (Pinocchio's: alphabetical). Each moves a body: its
-child link, turned so that z is the joint axis, and what is fixed to it. Of a joint of several degrees of freedom the
-last body carries the links. A mimic joint moves by ``multiplier q + offset``: with G from coordinates to joints of all
-bodies, M = G^T M_all G, bias = G^T bias_all, J = J_all G, exactly.
+Movable joints are numbered depth first, children in file order. Each moves a body: its child link, turned so that z is
+the joint axis, and what is fixed to it. A mimic joint moves by ``multiplier q + offset``: M = G^T M_all G.
 """
 
 import re
@@ -121,9 +119,7 @@ def _objection(source: str, joint: Joint, at: Joint, found: bool) -> Unsupported
 
 
 def with_followers(
-    joints: Mapping[str, Joint],
-    bodies: Sequence[Joint],
-    drives: Mapping[str, tuple[str, float, float]],
+    joints: Mapping[str, Joint], bodies: Sequence[Joint], drives: Mapping[str, tuple[str, float, float]]
 ) -> tuple[Joint, ...]:
     """The joints with damping and dry friction of those that follow them: factors of multiplier^2 and |multiplier|."""
     whole = dict(joints)

@@ -1,9 +1,7 @@
 """A base that moves freely, and positions that are points of a manifold instead of vectors.
 
 q of a floating joint is the position of the child link (m) and the quaternion x, y, z, w; v its linear and angular
-velocity in its own axes, as in Pinocchio: q' = q V. Formulas: Sola, Deray & Atchuthan, "A micro Lie theory for state
-estimation in robotics" (2018), appendices B and D; Hairer, Lubich & Wanner, "Geometric Numerical Integration" (2006),
-eq. III.4.1 and lemma III.4.2.
+velocity in its own axes, as in Pinocchio (Sola, Deray & Atchuthan 2018; Hairer, Lubich & Wanner 2006, III.4, IV.4).
 """
 
 from collections.abc import Callable, Sequence
@@ -117,8 +115,7 @@ class ConfigurationSpace:
         if not self.groups:
             return v
         return self._joined(
-            lambda rows, _: v[..., rows],
-            lambda group: chart_velocity(step[..., group.rows], v[..., group.rows]),
+            lambda rows, _: v[..., rows], lambda group: chart_velocity(step[..., group.rows], v[..., group.rows])
         )
 
     def chart_matrix(self, step: Tensor) -> Tensor:

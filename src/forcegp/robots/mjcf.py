@@ -1,8 +1,6 @@
 """MJCF, MuJoCo's robot files: read by MuJoCo's own compiler, and written.
 
-Every body becomes a link of its name and frame; several joints of one body are a chain of links without mass. What
-changes accelerations and has no place in a robot is noted by name. MuJoCo moves no body without mass: when written, of
-a chain of joints between such links all go to the link at its end.
+Every body becomes a link; several joints of one body are a chain of links without mass, which MuJoCo does not move.
 """
 
 import math

@@ -41,8 +41,8 @@ from forcegp.robots.urdf_file import (
     read_text,
     replace_dynamics,
     replace_inertial,
+    warn_of_rotors,
     with_chosen_inertias,
-    with_comment,
     with_note,
     write_robot_file,
     write_text,
@@ -165,27 +165,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         locked = locked_positions(problems.given["locked"] or {})
         named = problems.given | {"locked": locked, "inertias": inertias if inertias != "strict" else None}
         problems.given = {name: value for name, value in named.items() if value}
-        numbers = finite_vector("gravity", gravity, 3), armature, beside or {}, locked, inertias
-        robot = cls._read(text, problems, base, *numbers)
-        problems.raise_all()
-        assert robot is not None, "a problem was collected otherwise"
-        if not quiet:
-            problems.warn(stacklevel=5)
-        return robot
-
-    @classmethod
-    def _read(
-        cls,
-        text: str,
-        problems: Problems,
-        base: BaseChoice | None,
-        gravity: np.ndarray,
-        armature: Vector | Mapping[str, float | int] | None,
-        beside: Mapping[str, float],
-        locked: Mapping[str, float],
-        inertias: InertiaChoice,
-    ) -> "Robot | None":
-        """The robot of a text, None where it cannot be made; ``problems`` collects what is wrong."""
+        down, robot = finite_vector("gravity", gravity, 3), None
         description = parse_urdf(text, problems)
         if not description.complete:  # nothing can be said of a tree that lacks joints
             problems.raise_all()
@@ -194,17 +174,19 @@ class Robot(RobotStructure, RigidBodyDynamics):
             text, description = with_chosen_inertias(inertias, text, description, layout, problems)
             names = tuple(joint.name for joint in layout.joints)
             if armature is None:  # a file may have those of joints that are locked here
-                armature = {name: value for name, value in beside.items() if name in names}
-            rotor_inertias = armature_values(armature, names, description.name)
-            tree = compile_tree(description, layout, gravity, rotor_inertias)
+                armature = {name: value for name, value in (beside or {}).items() if name in names}
+            tree = compile_tree(description, layout, down, armature_values(armature, names, description.name))
             frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
             robot = cls(description, layout, tree, text, tuple(locked.items()), frames, layout.base)
             without = bodies_without_inertia(description, layout, tree, problems.broken)
             limp = robot._limp() if without and not problems.broken else range(robot.nv)
             problems.errors += [error for coordinate, error in without if coordinate in limp]
             check_base(description, layout.standing, problems)
-            return robot
-        return None
+        problems.raise_all()
+        assert robot is not None, "a problem was collected otherwise"
+        if not quiet:
+            problems.warn(stacklevel=5)
+        return robot
 
     @classmethod
     def from_stored(cls, stored: Mapping[str, Any]) -> "Robot":
@@ -286,10 +268,10 @@ class Robot(RobotStructure, RigidBodyDynamics):
         """The URDF text, written to ``path`` if given, and rotor inertias beside it, with a RobotFileWarning."""
         armature = dict(zip(self.joint_names, self.armature.tolist(), strict=True))
         source = self.source if path is None else Path(path).name
-        text = with_comment(self.urdf_text, armature, source=source, stacklevel=3)
+        warn_of_rotors(armature, source=source, stacklevel=3)
         if path is not None:
-            write_robot_file(Path(path), text, armature)
-        return text
+            write_robot_file(Path(path), self.urdf_text, armature)
+        return self.urdf_text
 
     @usable_arguments("Robot.to_mjcf")
     def to_mjcf(self, path: str | Path | None = None, loops: Sequence[LoopDescription] = ()) -> str:

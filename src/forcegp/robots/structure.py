@@ -30,19 +30,6 @@ from forcegp.summary import Summary, listed
 
 
 @dataclass(frozen=True, eq=False)
-class Level:
-    """Joints of equal depth, whose poses are computed in one operation."""
-
-    joints: Tensor | slice
-    parents: Tensor | None  # positions in the previous level; None where that is the whole level, in order
-
-    def to(self, device: torch.device) -> "Level":
-        """The same level with its indices on another device."""
-        joints = self.joints if isinstance(self.joints, slice) else self.joints.to(device)
-        return Level(joints, None if self.parents is None else self.parents.to(device))
-
-
-@dataclass(frozen=True, eq=False)
 class Tree:
     """Constants of a tree with n bodies, on one device. Index i is body i and the joint that moves it."""
 
@@ -52,8 +39,7 @@ class Tree:
     sine: Tensor
     cosine: Tensor
     slide: Tensor
-    levels: tuple[Level, ...]
-    order: Tensor | None  # joint i's position when the levels are laid end to end; None where that is i
+    parents: tuple[int, ...]
     revolute: Tensor  # (n, 1, 1): 1 for revolute and continuous joints, 0 for prismatic ones
     all_revolute: bool
     descendants: Tensor  # (n, n): [i, j] = 1 where body j is moved by joint i, and is not empty
@@ -76,7 +62,7 @@ class Tree:
         """The same constants on another device. Raises InvalidInput for one that is not there."""
         device = usable_device(device)
         moved = {key: value.to(device) for key, value in vars(self).items() if isinstance(value, Tensor)}
-        return replace(self, **moved, levels=tuple(level.to(device) for level in self.levels))
+        return replace(self, **moved)
 
     def equals(self, other: "Tree") -> bool:
         """Whether both move alike to 1e-9, whatever their URDFs look like."""
@@ -130,7 +116,6 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
     coupling = np.zeros((n, len(layout.joints)))
     for body, drive in enumerate(layout.drives):
         coupling[body, drive.joint] = drive.multiplier
-    levels, order = _levels(layout.parents)
 
     constants: dict[str, Any] = {
         "rest": rest[..., None],
@@ -153,8 +138,7 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
     return Tree(
         groups=layout.groups,
         positions=torch.as_tensor(positions) if layout.groups else None,
-        levels=levels,
-        order=order,
+        parents=layout.parents,
         all_revolute=bool(revolute.all()),
         is_above=torch.tensor(moves[..., None]) > 0,
         coupled=layout.coupled,
@@ -162,27 +146,6 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
         has_armature=bool(armature.any()),
         **{name: torch.tensor(array, dtype=torch.float64) for name, array in constants.items()},
     )
-
-
-def _levels(parents: tuple[int, ...]) -> tuple[tuple[Level, ...], Tensor | None]:
-    depth: list[int] = []
-    for parent in parents:
-        depth.append(0 if parent == WORLD else depth[parent] + 1)
-    members = [[i for i, d in enumerate(depth) if d == level] for level in range(max(depth) + 1)]
-    levels = []
-    for level, joints in enumerate(members):
-        above = [members[level - 1].index(parents[i]) for i in joints] if level else None
-        whole = above is None or above == list(range(len(members[level - 1])))
-        contiguous = joints == list(range(joints[0], joints[-1] + 1))
-        levels.append(
-            Level(
-                slice(joints[0], joints[-1] + 1) if contiguous else torch.tensor(joints),
-                None if whole else torch.tensor(above),
-            )
-        )
-    laid = [i for joints in members for i in joints]
-    order = None if laid == sorted(laid) else torch.tensor(np.argsort(laid))
-    return tuple(levels), order
 
 
 MASSLESS = InertialDescription(0.0, np.zeros(3), np.zeros((3, 3)))

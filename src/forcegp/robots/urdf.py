@@ -11,12 +11,7 @@ import numpy as np
 from defusedxml import DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden
 from defusedxml import ElementTree as SafeElementTree
 
-from forcegp.errors import (
-    InvalidNumber,
-    MalformedUrdf,
-    UnsafeXml,
-    UnsupportedJoint,
-)
+from forcegp.errors import InvalidNumber, MalformedUrdf, UnsafeXml, UnsupportedJoint
 from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import rotation_from_rpy, transform
 

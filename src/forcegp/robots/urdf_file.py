@@ -223,9 +223,6 @@ IN_THE_FILE = (
 )
 
 
-COMMENT = "rotor inertias (armature), which URDF has no element for, stand in the file *.armature.json"
-
-
 def read_robot_file(path: str | Path) -> str:
     """URDF text of a file, .xacro expanded. Raises UnreadableRobotFile, MissingExtra, MalformedUrdf."""
     text = read_text(path)
@@ -259,18 +256,16 @@ def read_armature(path: str | Path) -> dict[str, float] | None:
         raise InvalidNumber(f"{beside}: holds no rotor inertia per joint; correct it, or remove it.") from None
 
 
-def with_comment(text: str, armature: Mapping[str, float], *, source: str, stacklevel: int) -> str:
-    """The URDF text with a comment where some rotor inertia is not zero, and a RobotFileWarning that says which."""
-    present = {joint: value for joint, value in armature.items() if value}
-    if not present:
-        return text
-    warnings.warn(
-        f"{source}: URDF has no element for rotor inertias ({', '.join(present)}): they go into a file beside it "
-        "(.armature.json), which Robot.from_urdf reads back; give them to other programs by hand.",
-        RobotFileWarning,
-        stacklevel=stacklevel,
-    )
-    return text if COMMENT in text else with_note(text, COMMENT)
+def warn_of_rotors(armature: Mapping[str, float], *, source: str, stacklevel: int) -> None:
+    """A RobotFileWarning that says which rotor inertias are not zero, and so not in the URDF text."""
+    present = [joint for joint, value in armature.items() if value]
+    if present:
+        warnings.warn(
+            f"{source}: URDF has no element for rotor inertias ({', '.join(present)}): they go into a file beside it "
+            "(.armature.json), which Robot.from_urdf reads back; give them to other programs by hand.",
+            RobotFileWarning,
+            stacklevel=stacklevel,
+        )
 
 
 def write_robot_file(path: Path, text: str, armature: Mapping[str, float]) -> None:

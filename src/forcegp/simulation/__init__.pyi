@@ -1,5 +1,4 @@
-from .quadrotor import simulate_quadrotor as simulate_quadrotor
-from .quadruped import simulate_quadruped as simulate_quadruped
+from .moving_bases import simulate_quadrotor as simulate_quadrotor, simulate_quadruped as simulate_quadruped
 from .free_arms import simulate_free_arm as simulate_free_arm
 from .kuka_surface import kuka_file as kuka_file
 from .kuka_surface import simulate_kuka_surface as simulate_kuka_surface

@@ -1,18 +1,72 @@
-"""`ur5-free` and `double-pendulum`: arms that touch nothing, with friction in every joint, by our own dynamics."""
+"""`ur5-free` and `double-pendulum`: arms that touch nothing; and friction of joints by name, of all plants."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from forcegp.data import Dataset
 from forcegp.forces import Actuation, RigidBodies
+from forcegp.forces.force import JointLaw, Law
+from forcegp.forces.joint_laws import LazyState, Viscous
+from forcegp.forces.registry import parse_forces
 from forcegp.model import Model
 from forcegp.robots import Robot
-from forcegp.simulation.joint_friction import LawsOfJoints
 from forcegp.simulation.scenarios import FreeArmConfig
 from forcegp.simulation.trajectory import RATE, recorded
+
+Numbers = Mapping[str, Any]
+"""Coefficients by name, one number or one per joint; "velocity" stands for velocities that have no number here."""
+
+
+def joint_laws(expression: str, robot: Robot, numbers: Numbers) -> tuple[Law, ...]:
+    """The laws of this expression (`parse_forces`), with viscous friction, bound to the robot.
+
+    Coefficients that it does not give have these numbers, or their defaults.
+    """
+    forces = parse_forces(expression)
+    laws = forces if any(isinstance(force, Viscous) for force in forces) else (Viscous(), *forces)
+    out = []
+    for law in laws:
+        assert isinstance(law, JointLaw), "`require_joint_friction` sees to it"
+        found = {}
+        for name, coefficient in law.coefficients.items():
+            given = getattr(law, name)
+            number = numbers.get(name, numbers["velocity"] if coefficient.unit == "velocity" else coefficient.default)
+            found[name] = number if given is None else given
+        out.append(law.with_values(found).bound_to(robot))
+    return tuple(out)
+
+
+@dataclass(frozen=True, eq=False)
+class LawsOfJoints:
+    """What laws make of velocities, step by step."""
+
+    robot: Robot
+    laws: tuple[Law, ...]
+
+    @classmethod
+    def named(cls, expression: str, robot: Robot, numbers: Numbers) -> "LawsOfJoints":
+        """`joint_laws`; none for "none"."""
+        return cls(robot, () if expression == "none" else joint_laws(expression, robot, numbers))
+
+    def __call__(
+        self, v: Float[np.ndarray, "*batch nv"], u: np.ndarray | None = None
+    ) -> Float[np.ndarray, "*batch nv"]:
+        """Joint forces [Nm or N] with the sign that accelerates; u [Nm or N] is that of the actuators."""
+        at = torch.tensor(v)
+        state = LazyState(self.robot, torch.zeros_like(at), at, torch.zeros_like(at) if u is None else torch.tensor(u))
+        return sum((law.force(state).numpy() for law in self.laws), np.zeros_like(v))
+
+    def slope(self, v: Float[np.ndarray, " nv"], step: float = 1e-6) -> Float[np.ndarray, " nv"]:
+        """-dQ/dv of every joint, where it is positive: how much of a velocity a step loses."""
+        low, high = self(np.stack([v - step, v + step]))
+        return np.maximum((low - high) / (2.0 * step), 0.0)
+
 
 FINE = 4  # steps between two rows
 STIFFNESS = 100.0  # of the controller in 1/s^2, critically damped

@@ -140,19 +140,9 @@ class KukaSurfaceConfig(CommonConfig):
             require_known("friction", self.friction, "the tool", ("viscous", *dry_laws()))
         require_joint_friction(self.joint_friction, self.own_laws)
 
-    def joint_laws(self, robot: Any) -> Any:
-        """The laws that `joint_friction` names (`LawsOfJoints`), with the numbers above where it gives none."""
-        from forcegp.simulation.joint_friction import LawsOfJoints
-
-        more = tuple(near - level for near, level in zip(self.joint_static, self.joint_coulomb, strict=True))
-        numbers: dict[str, Any] = {"damping": self.joint_viscous, "level": self.joint_coulomb, "breakaway": more}
-        numbers |= {"velocity_scale": self.joint_smoothing, "velocity": self.joint_breakaway_velocity}
-        return LawsOfJoints.named(self.joint_friction, robot, numbers)
-
-    def joint_law(self, robot: Any) -> Callable[..., Any]:
-        """Torques of friction [Nm] in the next step, of velocities [rad/s], applied torques, inertias and the time."""
-        laws = self.joint_laws(robot)
-        return lambda v, u, mass, time: laws(v, u)
+    def joint_law(self, robot: Any) -> Callable[..., Any] | None:
+        """Of a subclass with `own_laws`: friction [Nm] of the next step, of velocities, torques, inertias and time."""
+        return None
 
     @property
     def pressing_force(self) -> float:
@@ -250,8 +240,8 @@ SCENARIOS: Mapping[str, tuple[type, str]] = MappingProxyType(
         "kuka-surface": (KukaSurfaceConfig, "kuka_surface:simulate_kuka_surface"),
         "ur5-free": FREE_ARM,
         "double-pendulum": FREE_ARM,
-        "quadruped": (QuadrupedConfig, "quadruped:simulate_quadruped"),
-        "quadrotor": (QuadrotorConfig, "quadrotor:simulate_quadrotor"),
+        "quadruped": (QuadrupedConfig, "moving_bases:simulate_quadruped"),
+        "quadrotor": (QuadrotorConfig, "moving_bases:simulate_quadrotor"),
     }
 )
 """Name -> the frozen dataclass of all its numbers, and "module:name" of a function `(config, progress) -> Dataset`."""
