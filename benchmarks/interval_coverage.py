@@ -55,7 +55,9 @@ def main() -> None:
         for points in given.points:
             posterior = fit(train.model.with_forces(parse_forces(given.prior)), train, points=points)
             both = posterior, posterior.with_settings(widening=1.0)
-            inside, plain = (scores_of(each, test[::15])["coverage_95_noise_free"] for each in both)
+            inside, plain = (
+                scores_of(each, test.rows(slice(None, None, 15)))["coverage_95_noise_free"] for each in both
+            )
             rows.append((inside, plain, drawn_below(posterior), posterior.widening))
             told = f"{inside:11.3f}  {plain:9.3f}  {rows[-1][2]:16.2f}  {rows[-1][3]:6.2f}"
             print(f"{seed:4d} {points:4d}  {told}", flush=True)

@@ -39,12 +39,9 @@ class Doubt:
     @property
     def command(self) -> str:
         """The `forcegp import` that states the correction; empty where options cannot."""
-        correction, name = self.correction, "orientation"
-        flags = [f"--{name} {own[0]}" for own in correction.get(name, {}).values()]
-        for name in ("axes", "unit", "sign"):
-            stated = correction.get(name, {})
-            each = (f"{k}={','.join(x if isinstance(x, str) else f'{x:g}' for x in own)}" for k, own in stated.items())
-            flags += [f"--{name} {','.join(each)}"] if stated else []
+        flags = [f"--orientation {own[0]}" for own in self.correction.get("orientation", {}).values()]
+        each = ((name, self.correction.get(name)) for name in ("axes", "unit", "sign"))
+        flags += [f"--{name} {stated_as(values)}" for name, values in each if values]
         return " ".join(["forcegp import", *flags]) if flags else ""
 
     @property
@@ -109,6 +106,11 @@ class Doubts(tuple[Doubt, ...]):
         """One warning each; `stacklevel` as in `warnings.warn`, of the caller."""
         for doubt in self:
             warnings.warn(str(doubt), kind, stacklevel=stacklevel + 1)
+
+
+def stated_as(values: Mapping[str, Iterable[str | float]]) -> str:
+    """`q=deg,m,time=ms`, as options state it."""
+    return ",".join(f"{k}={','.join(x if isinstance(x, str) else f'{x:g}' for x in own)}" for k, own in values.items())
 
 
 def listed(names: tuple[str, ...] | list[str]) -> str:

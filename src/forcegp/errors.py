@@ -163,7 +163,7 @@ class RobotFileWarning(DataWarning):
 
 
 class ContactWarning(DataWarning):
-    """The rows contradict the contacts that are stated: another point, no force, or a contact that is missing."""
+    """The rows contradict the contacts that are stated: no motion along the surface, or no force."""
 
 
 def require_type(name: str, given: object, kind: type[Kind], example: str = "") -> Kind:

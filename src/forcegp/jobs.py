@@ -200,9 +200,8 @@ def _is_own_start(entry: Path) -> bool:
 def run_jobs(store: JobStore, jobs: Sequence[Job], at_once: Jobs = 1, progress: Progress | None = None) -> int:
     """Compute all jobs that the store lacks, so many at once, or in an executor; returns how many.
 
-    Every finished job is kept at once, so a run that is killed at any moment goes on where it was. A job that fails
-    stops only what depends on it. Results of other code or settings are computed anew, with a warning. Raises FitError
-    at the end if any job has failed, naming the first, and BackendError if a worker died.
+    Every finished job is kept at once; one that fails stops only what depends on it. Results of other code or settings
+    are computed anew, with a warning. Raises FitError at the end if any job has failed, BackendError if a worker died.
     """
     wanted = digests(jobs)
     if all(store.has(name, digest) for name, digest in wanted.items()):

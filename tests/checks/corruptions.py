@@ -248,17 +248,11 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "3 % of q zero": (lambda d: dropped(d, "q", 0.03), "zero|drop|velocity"),
     "frozen position": (lambda d: column(d, "q", 1, held), "frozen"),
     "saturation": (lambda d: column(d, "u", 0, lambda x: np.clip(x, *np.quantile(x, [0.1, 0.9]))), "saturation"),
-    "noise_std 100 times too small": (lambda d: replace(d, noise_std=np.full(2, 1e-3)), "noise"),
-    "frozen torque": (lambda d: column(d, "u", 0, held), "frozen"),
     "encoder zero off by .4": (lambda d: replace(d, q=d.q + np.array([0.0, 0.4])), "zero"),
+    "frozen torque": (lambda d: column(d, "u", 0, held), "frozen"),
     "torque channel dead": (lambda d: column(d, "u", 1, lambda x: 0 * x), "dead torque|constant"),
     "time in ms": (lambda d: replace(d, time=1000 * d.time), "velocity|acceleration|sampling"),
 }
-CONTACT_CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
-    "contact 2 cm sideways": (lambda d: moved(d, (0.02, 0.0, 0.0)), "contact"),
-}
-
-
 UNSEEN: Mapping[str, tuple[str, ...]] = {
     "crane": ("length .4 -> .6",),  # these change no torque, or a constant
 }

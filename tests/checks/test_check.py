@@ -1,7 +1,6 @@
 """Every planted defect is found and named, and a clean log stays clean."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,10 +8,8 @@ import pytest
 from tests.checks.logs import arm, clean, column, pendulum
 
 from forcegp.checks import CheckReport, check
-from forcegp.data import Dataset, Preparation
+from forcegp.data import Preparation
 from forcegp.errors import InvalidInput
-from forcegp.model import Model
-from forcegp.robots import Robot
 
 SYSTEMS = {"arm": arm, "pendulum": pendulum}
 
@@ -30,27 +27,11 @@ def test_a_clean_log_raises_no_alarm(model, seed, noise):
     assert {item.about for item in report.doubts} >= {"sampling", "velocity", "torque", "excitation", "noise"}
 
 
-def all_motion(data: Dataset, sign: list[float], names: str = "qva") -> Dataset:
-    return replace(data, **{name: getattr(data, name) * np.array(sign) for name in names})
-
-
-ALL = ("pan", "lift", "bend")
-DEFECTS: dict[str, tuple[Callable[[Dataset], Dataset], str, str, tuple[str, ...]]] = {
-    "velocities late": (lambda d: replace(d, v=np.roll(d.v, 4, axis=0)), "look", "velocity", ALL),
-    "dead position": (lambda d: column(d, "q", 1, lambda x: 0 * x + 0.3), "wrong", "constant channel", ("lift",)),
-    "a joint that stays": (lambda d: all_motion(d, [1e-3, 1, 1]), "look", "excitation", ("pan",)),
-}
-
-
-@pytest.mark.parametrize("name", DEFECTS)
-def test_a_planted_defect_is_found(name):
-    plant, severity, subject, joints = DEFECTS[name]
-    report = check(plant(clean(4)))
-    found = [item for item in report.doubts.of(subject) if item.level != "ok"]
-    assert found, told(report)
-    assert found[0].level in (severity, "wrong")
-    assert set(found[0].joints) == set(joints), told(report)
-    assert found[0].advice
+def test_a_joint_that_stays_does_not_show_its_friction():
+    data = clean(4)
+    small = {name: getattr(data, name) * np.array([1e-3, 1, 1]) for name in "qva"}
+    (found,) = [each for each in check(replace(data, **small)).doubts.of("excitation") if each.joints]
+    assert (found.level, found.joints) == ("look", ("pan",))
 
 
 def test_a_gap_is_not_differentiated_across():
@@ -82,15 +63,6 @@ def test_repeated_rows_are_told():
     repeated = replace(data, q=data.q[kept], v=data.v[kept], u=data.u[kept])
     (found,) = check(repeated).doubts.of("repeated rows")
     assert found.numbers["share"] == pytest.approx(0.75, abs=0.02)
-
-
-def test_gravity_of_a_base_that_hangs_is_named():
-    data = clean(8, pendulum())
-    wall = Robot.from_urdf_text(pendulum().robot.urdf_text, gravity=(0.0, 0.0, 9.81))
-    report = check(replace(data, model=None), Model(wall))
-    (found,) = report.doubts.of("gravity")
-    np.testing.assert_allclose(found.numbers["gravity"], [0, 0, -9.81], atol=0.5)
-    assert "`gravity`=0,0,-9.81" in found.advice or found.numbers["degrees"] > 170
 
 
 def test_an_angle_that_wraps_is_told_and_unwrapped():

@@ -7,7 +7,6 @@ import pytest
 import torch
 from tests.checks.clean_logs import clean_logs, rests
 from tests.checks.corruptions import (
-    CONTACT_CORRUPTIONS,
     CORRUPTIONS,
     ROBOTS,
     UNSEEN,
@@ -15,7 +14,6 @@ from tests.checks.corruptions import (
     clean,
     invented,
     named,
-    on_a_line,
     said_by_check,
     said_by_fit,
     scaled,
@@ -42,25 +40,10 @@ def test_a_corruption_is_named_by_check_and_before_a_fit(name):
     assert named(line, words), line
 
 
-@pytest.mark.parametrize("name", CONTACT_CORRUPTIONS)
-def test_a_corrupted_contact_is_named_by_check_and_before_a_fit(name):
-    corrupt, words = CONTACT_CORRUPTIONS[name]
-    data = corrupt(on_a_line(3))
-    assert named(said_by_check(data), words)
-    assert named(said_by_fit(data), words)
-
-
 def test_an_invented_contact_is_named_by_check_and_before_a_fit():
     data = invented(clean(two_links(), 2))
     assert named(said_by_check(data), "contact")
     assert named(said_by_fit(data), "contact")
-
-
-@pytest.mark.nightly
-def test_clean_logs_raise_no_alarm():
-    for name, data in clean_logs(1):
-        assert not [each for each in check_if_long(data) if each.level == "wrong"], name
-        assert not quick_check(data), name
 
 
 def check_if_long(data):
@@ -123,8 +106,8 @@ def test_nine_of_ten_corruptions_are_named_on_all_robots(seed):
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("seed", range(2, 12))
-def test_clean_logs_raise_no_alarm_on_more_seeds(seed):
+@pytest.mark.parametrize("seed", range(1, 12))
+def test_clean_logs_raise_no_alarm(seed):
     torch.manual_seed(seed)
     for name, data in clean_logs(seed):
         assert not [each for each in check_if_long(data) if each.level == "wrong"], name

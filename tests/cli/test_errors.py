@@ -13,7 +13,6 @@ from tests.posterior.arm import URDF, arm_data
 
 from forcegp import scores
 from forcegp.cli.main import main
-from forcegp.data.dataset_fields import sliding_joints
 from forcegp.model import Model
 from forcegp.posterior import load_posterior
 from forcegp.robots import Robot
@@ -99,7 +98,6 @@ def test_another_robot_keeps_gravity_armature_and_locked_joints_of_the_recording
         **two,
         model=Model(recorded),
         joint_names=recorded.joint_names,
-        sliding=sliding_joints(recorded),
         noise_std=np.full(2, 0.5),
         truth={},
     ).save("locked.h5")

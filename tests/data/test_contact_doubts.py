@@ -1,4 +1,4 @@
-"""Contacts that the rows contradict: beside the point, invented; and none where they are right."""
+"""Contacts that the rows contradict: off their surface, invented; and none where they are right."""
 
 from dataclasses import replace
 
@@ -29,24 +29,14 @@ def sliding() -> Dataset:
     return simulated(7)
 
 
-def test_a_point_two_centimetres_sideways_is_measured(sliding):
-    """The tool keeps its orientation, so that |A a - b| does not change: the place of the force does."""
-    assert kinds(sliding) == []
-    assert kinds(sliding, sliding.model.without_mean()) == [], "a model without physics has nothing to compare"
-    for shift in ((0.02, 0.0, 0.0), (0.0, -0.02, 0.0)):
-        (doubt,) = contact_doubts(moved(sliding, shift))
-        assert doubt.numbers["kind"] == "point"
-        assert doubt.numbers["shift"] == pytest.approx(0.02, abs=0.012)
-        assert sliding.model is not None
-        near = np.array(doubt.numbers["point"]) - np.array(sliding.model.contacts[0].point)
-        assert np.linalg.norm(near) < 0.012
+def test_a_model_without_physics_has_nothing_to_compare(sliding):
+    assert kinds(sliding) == kinds(sliding, sliding.model.without_mean()) == []
 
 
 def test_few_rows_are_enough_and_never_too_many(sliding):
     chosen = np.random.default_rng(0).choice(len(sliding), 20, replace=False)
     few = sliding.rows(chosen)
     assert kinds(few) == []
-    assert kinds(moved(few, (0.02, 0.0, 0.0))) == ["point"]
     assert kinds(few.rows(slice(0, 6))) == []
 
 
@@ -83,10 +73,7 @@ def test_clean_logs_of_many_seeds_are_not_doubted(seed):
 @pytest.mark.nightly
 @pytest.mark.parametrize("seed", range(5))
 def test_wrong_contacts_of_five_seeds_are_doubted(seed):
-    data, line = simulated(seed), on_a_line(seed)
-    for each in (data, line):
-        for shift in ((0.02, 0.0, 0.0), (0.0, 0.02, 0.0)) if each is data else ((0.02, 0.0, 0.0),):
-            assert kinds(moved(each, shift))
+    assert kinds(moved(on_a_line(seed), (0.02, 0.0, 0.0))) == ["off"]
 
 
 def test_noise_of_positions_is_no_motion_of_feet_that_stand():

@@ -7,7 +7,7 @@ import pytest
 from tests.fit.test_payload import ROBOT, TEXT, log
 
 from forcegp import Model, Rotor, Stribeck, Torques, Viscous, fit
-from forcegp.data import Preparation, estimate_delay
+from forcegp.data import Preparation
 from forcegp.data.spectrum import FACTORS, held_out_cutoff
 from forcegp.errors import DatasetError
 from forcegp.evidence import motion_residuals
@@ -69,11 +69,3 @@ def test_a_passive_robot_keeps_the_cutoff_of_its_spectrum():
 def test_short_logs_are_refused():
     with pytest.raises(DatasetError, match="too few to choose a cut-off"):
         held_out_cutoff(raw(1, 1e-4).rows(slice(0, 300)), ROBOT, 6.0)
-
-
-@pytest.mark.parametrize("late", [0.0, 0.006])
-def test_stribeck_friction_is_no_delay(late):
-    """With one smooth sign of the velocity, friction like this looked 20 ms late."""
-    rows = Preparation(cutoff=12.0, trim=0.5).apply(raw(4, 1e-5, late))
-    found = estimate_delay(rows)
-    assert found.significant == pytest.approx(late, abs=1e-3)

@@ -80,17 +80,6 @@ def test_velocities_and_accelerations_of_a_tumbling_body():
     np.testing.assert_array_less(np.array(errors[1]) * 3.5, errors[0])  # of second order
 
 
-def test_noise_of_a_pose_is_taken_away():
-    log, generator = tumbling(), np.random.default_rng(1)
-    noise = torch.tensor(1e-4 * generator.normal(size=log.v.shape))
-    noisy = replace(log, q=log.model.robot.integrate(torch.tensor(log.q), noise).numpy())
-    prepared = Preparation(cutoff=8.0, trim=0.5).apply(noisy)
-    raw = differentiated(noisy, "q").a
-    true = log.a[np.isin(log.time, prepared.time)]
-    assert np.abs(raw - log.a).std() > 2.0
-    assert np.sqrt(np.mean((prepared.a - true) ** 2)) < 0.05
-
-
 @pytest.mark.parametrize("how", [{}, {"differentiate": "v"}])
 def test_neither_signs_nor_the_frame_of_the_world_matter(how):
     generator = np.random.default_rng(2)

@@ -117,15 +117,6 @@ def test_without_forces_the_motion_decides():
     assert decided.mean() > 0.95
 
 
-def test_forces_are_the_weight_where_nothing_moves():
-    log, _ = walk(6, lift=False, joint_friction="none", payload=0.0, noise=0.0)
-    found = estimate_stance(log)
-    robot = log.model.robot
-    weight = 9.81 * sum(robot.link(name).mass for name in robot.link_names)
-    assert (found.flags == 1.0).all()
-    assert found.force.sum(axis=1).mean() == pytest.approx(weight, rel=0.1)  # sizes of forces that also lean
-
-
 def test_prepared_rows_carry_the_flags_and_leave_open_ones_out():
     log, flags = walk(9)
     prepared = Preparation(stance="auto", every=2).apply(log)

@@ -1,13 +1,11 @@
 """Rows in stretches of time."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.data.samples import dataset
 
 from forcegp.data import farthest_rows, time_blocks
-from forcegp.errors import InvalidInput
 
 
 def test_rows_of_one_stretch_and_episode_form_a_block_in_order_of_time():
@@ -27,9 +25,3 @@ def test_every_row_is_in_one_block_that_is_no_longer_than_said(count, seed, seco
         assert len(set(rows.episode[chosen])) == 1
         assert np.ptp(rows.time[chosen]) <= seconds * (1.0 + 1e-12)
         assert (np.diff(rows.time[chosen]) > 0).all()
-
-
-@pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_length_that_is_none_is_refused(seconds):
-    with pytest.raises(InvalidInput, match="must be positive and finite"):
-        time_blocks(np.zeros(2), np.zeros(2, int), seconds)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import functools
 import inspect
 from collections.abc import Callable
@@ -57,57 +56,37 @@ MADE: dict[str, Callable[[], Any]] = {
     "[[1, 2], [3]]": lambda: [[1, 2], [3]],
     "['a', 'b', 'c']": lambda: ["a", "b", "c"],
     "{'a': 1}": lambda: {"a": 1},
-    "{1: None}": lambda: {1: None},
-    "{'pan': 'x'}": lambda: {"pan": "x"},
-    "a set": lambda: {1, 2},
     "an object": object,
-    "a type": lambda: int,
-    "a function": lambda: len,
     "a generator": lambda: (k for k in range(3)),
-    "a range": lambda: range(3),
     "a slice": lambda: slice(0, 2),
-    "a path": lambda: Path("nowhere"),
     "a path with NUL": lambda: "a\x00b",
-    "a date": lambda: datetime.date(2026, 1, 1),
-    "an error": ValueError,
     **{f"tensor {k}": make for k, make in enumerate(TENSORS)},
     "array of dates": lambda: np.full(3, np.datetime64("2026-01-01")),
-    "array of texts": lambda: np.array(["a", "b", "c"]),
     "array of objects": lambda: np.array([{}, [], None], object),
     "array of records": lambda: np.zeros(3, [("a", "f8")]),
-    "masked": lambda: np.ma.masked_array(np.ones(3), [True, False, False]),
     "array of nothing": lambda: np.zeros((0, 3)),
-    "array without columns": lambda: np.zeros((3, 0)),
     "array (3, 3)": lambda: np.ones((3, 3)),
     "array (14, 3)": lambda: np.ones((14, 3)),
     "array (14, 3) of NaN": lambda: np.full((14, 3), np.nan),
-    "array (14, 3) huge": lambda: np.full((14, 3), 1e307),
-    "array (14,)": lambda: np.arange(14.0),
     "array (1, 1, 1, 3)": lambda: np.ones((1, 1, 1, 3)),
-    "scalar of NumPy": lambda: np.float64(0.5),
-    "complex array": lambda: np.ones(3) * 1j,
     "a Dataset": lambda: INPUTS.data,
     "a Dataset of a row": lambda: INPUTS.data.rows([0]),
     "a Dataset of other joints": lambda: INPUTS.other,
     "a posterior": lambda: INPUTS.posterior,
     "a Dataset of a drone": lambda: INPUTS.moving,
     "array (7,)": lambda: np.ones(7),
-    "array (6,)": lambda: np.ones(6),
-    "array (2, 3)": lambda: np.ones((2, 3)),
     "array (6, 2)": lambda: np.ones((6, 2)),
     "a robot": lambda: INPUTS.data.model.robot,
     "a model": lambda: INPUTS.data.model,
     "a free model": lambda: arm_model(0),
     "a contact": lambda: INPUTS.data.model.contacts[0],
-    "a noise": lambda: forcegp.Noise(0.1),
-    "a plane": lambda: forcegp.Plane((0.0, 0.0, 1.0), 0.0),
 }
 """Made anew for every case: some can be used once only, and none may be changed by the one before."""
 
 
 def _dataset() -> dict[str, Any]:
     data = INPUTS.data
-    names = ("q", "v", "u", "a", "time", "joint_names", "sliding", "episode", "model", "noise_std", "truth", "metadata")
+    names = ("q", "v", "u", "a", "time", "joint_names", "episode", "model", "noise_std", "truth", "metadata")
     return {name: getattr(data, name) for name in names}
 
 
@@ -251,7 +230,6 @@ POINT = (0.0, 0.0, 0.1)
 CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "Dataset": _call(forcegp.Dataset, given=_dataset),
     "Dataset.rows": (lambda index: INPUTS.data.rows(index), lambda: {"index": [0, 1]}),
-    "Dataset[]": (lambda index: INPUTS.data[index], lambda: {"index": "q"}),
     "Dataset.load": _call(forcegp.Dataset.load, given=lambda: {"path": INPUTS.folder / "train.h5"}),
     "predict": _call(Posterior.predict, _of_posterior("predict"), "covariance", _states),
     "components": _call(Posterior.components, _of_posterior("components"), "covariance", _states),
@@ -269,8 +247,6 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "predictor().refreshed": (lambda **k: INPUTS.predictor.refreshed(**k), lambda: {"posterior": INPUTS.posterior}),
     "curve": _call(Posterior.curve, _of_posterior("curve"), "features", lambda: {"latent": "pan", "points": 5}),
-    "with_contacts": _call(Posterior.with_contacts, _of_posterior("with_contacts"), given=lambda: {"contacts": ()}),
-    "with_robot": _call(Posterior.with_robot, _of_posterior("with_robot"), given=lambda: {"robot": _robot()}),
     "with_model": _call(Posterior.with_model, _of_posterior("with_model"), given=lambda: {"model": INPUTS.data.model}),
     "predictor": _call(
         Posterior.predictor,
@@ -278,11 +254,9 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         "covariance tolerance largest_rank",
     ),
     "predictor()": (lambda **k: INPUTS.predictor(**k), _states),
-    "predictor().mean": (lambda **k: INPUTS.predictor.mean(**k), _states),
     "Noise": _call(
         forcegp.Noise, lambda _, **k: _fitted(forcegp.Noise(**k)), "acceleration learn", lambda: {"force": 0.1}
     ),
-    "noise": (_fitted, lambda: {"noise": 0.1}),
     "fit": _call(
         fit,
         _fit_of(lambda: INPUTS.data.model.with_forces(JointForces())),
@@ -318,20 +292,9 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "Model.from_file": _call(
         forcegp.Model.from_file, _shown, given=lambda: {"path": INPUTS.folder / "drone.xml", "base": None}
     ),
-    "floating": (lambda **k: Robot.from_urdf_text(URDF, **k).neutral(), lambda: {"base": None, "locked": None}),
     "integrate": _call(Robot.integrate, _of_drone("integrate"), given=lambda: {"q": POSE, "step": STILL + 0.1}),
-    "difference": _call(Robot.difference, _of_drone("difference"), given=lambda: {"q0": POSE, "q1": POSE}),
     "normalized": _call(Robot.normalized, _of_drone("normalized"), given=lambda: {"q": POSE}),
-    "inverse_dynamics": _call(
-        Robot.inverse_dynamics, _of_robot("inverse_dynamics"), given=lambda: dict(zip("qva", STATE, strict=True))
-    ),
-    "mass_matrix": _call(Robot.mass_matrix, _of_robot("mass_matrix"), given=lambda: {"q": STATE[0]}),
-    "frame_pose": (lambda frame, q: _robot().frame_pose(q, frame), lambda: {"frame": "hand", "q": STATE[0]}),
     "with_armature": (lambda armature: _robot().with_armature(armature), lambda: {"armature": (0.1, 0.1, 0.1)}),
-    "dynamics (drone)": (
-        lambda **k: INPUTS.moving.model.dynamics(**k).M,
-        lambda: {"q": POSE, "v": STILL + 0.1, "u": torch.full((4,), 500.0).double()},
-    ),
     "Thrusters": _call(
         forces.Thrusters,
         _link_force,
@@ -343,38 +306,22 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         forces.Actuation, _link_force, given=lambda: {"matrix": np.ones((6, 2)), "names": ("one", "two")}
     ),
     "fixed_point": _call(mechanics.fixed_point, _held, given=lambda: {"frame": "body", "point": POINT, "switch": "x"}),
-    "fixed_frame": _call(mechanics.fixed_frame, _held, given=lambda: {"frame": "body", "switch": "stands"}),
-    "loop_point": _call(
-        mechanics.loop_point,
-        _held,
-        given=lambda: {"frame_a": "body", "point_a": POINT, "frame_b": "body", "point_b": POINT, "switch": "stands"},
-    ),
     "AerodynamicForce": _call(forcegp.AerodynamicForce, _flying, "frame inputs kernel observe"),
-    "BaseWrench": _call(forces.BaseWrench, _flying, "frame inputs kernel"),
     "QuadrotorConfig": _call(forcegp.simulation.QuadrotorConfig, names="seconds seed noise episodes wind lag"),
     "KukaSurfaceConfig": _call(KukaSurfaceConfig, names="seconds seed noise surface friction tool_mass"),
     "Model": _call(forcegp.Model, names="contacts forces noise baumgarte", given=lambda: {"robot": _robot()}),
     "dynamics": (lambda **k: INPUTS.data.model.dynamics(**k).A, _states),
     "Contact": (_contact, lambda: {"frame": "hand", "point": POINT, "surface": forcegp.Plane(**SURFACES)}),
     "Plane": _call(forcegp.Plane, _surface, given=lambda: dict(SURFACES)),
-    "Sphere": _call(forcegp.Sphere, _surface, given=lambda: {"center": POINT, "radius": 0.5}),
     "Baumgarte": (_baumgarte, lambda: {"omega": 5.0, "zeta": 1.0}),
     "viscous": _call(forcegp.Viscous, _forces, given=lambda: {"damping": 0.1}),
-    "coulomb": _call(forcegp.Coulomb, _forces, given=lambda: {"level": 0.1, "velocity_scale": 0.01}),
     "stribeck": _call(
         forcegp.Stribeck, _forces, given=lambda: {"level": 0.1, "breakaway": 0.1, "stribeck_velocity": 0.1}
     ),
-    "constant": _call(forcegp.Offset, _forces, given=lambda: {"value": 0.1}),
-    "direction": _call(forces.DirectionalFriction, _forces, given=lambda: {"difference": 0.1}),
-    "armature": _call(forcegp.Rotor, _forces, given=lambda: {"inertia": 0.1}),
-    "rotor": _call(forces.CoupledRotors, _forces, "transmission", lambda: {"inertia": 0.1}),
-    "load": _call(forcegp.LoadFriction, _forces, given=lambda: {"level": 0.1, "factor": 0.1}),
-    "spring": _call(forcegp.Spring, _forces, "rest", lambda: {"stiffness": 0.1}),
     "Payload": _call(
         forcegp.Payload, _forces, "inertia", lambda: {"link": "hand", "mass": 1.0, "center_of_mass": POINT}
     ),
     "Normal": _call(forcegp.Normal, _number, given=lambda: {"mean": 0.1, "std": 0.1}),
-    "LogNormal": _call(forcegp.LogNormal, _number, given=lambda: {"median": 0.1, "spread": 1.0}),
     "RigidBodies": _call(forcegp.RigidBodies, lambda kind, **k: _with(kind(**k)), given=lambda: {"learn": ("hand",)}),
     "with_forces": (
         lambda **k: INPUTS.data.model.with_forces(k["forces"], noise=k["noise"]),
@@ -382,7 +329,6 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "parse_forces": _call(forces.parse_forces, given=lambda: {"expression": "gp:joint"}),
     "parse_evidence": _call(parse_evidence, given=lambda: {"words": "torques:mean=.4"}),
-    "JointForces": _call(JointForces, _prior, "inputs kernel"),
     "JointFriction": _call(forcegp.JointFriction, _prior, "joints kernel"),
     "ToolForces": _call(forcegp.ToolForces, _prior, "point axes inputs contact kernel", lambda: {"frame": "hand"}),
     "ContactFriction": _call(forcegp.ContactFriction, _prior, "contact load kernel"),
@@ -397,12 +343,6 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         lambda kind, **k: kind(arm_model(0), **k)(*STATE[:2], *STATE),
         "",
         lambda: {**TRACKING, "on_failure": "raise"},
-    ),
-    "PDGravity": _call(
-        forcegp.control.PDGravity,
-        lambda kind, **k: kind(_robot(), **k)(*STATE[:2], *STATE),
-        "",
-        lambda: dict(TRACKING),
     ),
     "ContactMonitor": _call(
         forcegp.ContactMonitor,
@@ -436,7 +376,6 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "split_named": (forcegp.scores.split_named, lambda: {"dataset": INPUTS.free, "text": "blocks:5:3", "guard": 0.01}),
     "ColumnMapping": _call(forcegp.recordings.ColumnMapping, names="time q u joints unit sign step headerless"),
     "ImportOptions": _call(forcegp.recordings.ImportOptions, names="gap rate start end"),
-    "Body": _call(forces.Body, names="strength"),
     "load_posterior": _call(forcegp.load_posterior, given=lambda: {"path": INPUTS.folder / "carried"}),
 }
 
@@ -487,4 +426,4 @@ def require_numbers(result: Any) -> None:
                 raise DefectError("numbers that are not finite")
 
 
-TARGET = Target(CASES, check, fast=80, nightly=8000)
+TARGET = Target(CASES, check, fast=90, nightly=8000)

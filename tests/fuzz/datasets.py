@@ -175,5 +175,5 @@ def check_commands(case: DataFile, folder: Path) -> None:
     require_ended_well(lines[number % 4].split(), folder)
 
 
-TARGET = Target(CASES, check, fast=25, nightly=3000)
+TARGET = Target(CASES, check, fast=38, nightly=3000)
 COMMANDS_TARGET = Target(CASES, check_commands, fast=5, nightly=1500)

@@ -9,9 +9,6 @@ from pathlib import Path
 import numpy as np
 from hypothesis import strategies as st
 from tests.fuzz.made import INPUTS, LOGS
-from tests.fuzz.mappings import CASES as MAPPINGS
-from tests.fuzz.mappings import Mapping
-from tests.fuzz.mappings import write as write_mapping
 from tests.fuzz.oracle import Target, require_ended_well
 from tests.fuzz.values import DAMAGE, WORDS, Damage, Hostile, damaged, words
 
@@ -88,10 +85,10 @@ TABLES = st.builds(
 
 @dataclass(frozen=True)
 class Log:
-    """A log, its mapping, and more words of the command."""
+    """A log, and more words of the command."""
 
     base: str
-    change: Table | Array | Damage | Mapping
+    change: Table | Array | Damage
     more: tuple[str, ...]
 
 
@@ -106,7 +103,6 @@ CASES = st.one_of(
     st.builds(Log, st.just("log.csv"), DAMAGE, MORE),
     st.builds(Log, st.just("log.npz"), st.builds(Array, st.sampled_from(tuple(QS))), MORE),
     st.builds(Log, st.sampled_from(LOGS), DAMAGE, st.just(())),
-    st.builds(Log, st.just("log.csv"), MAPPINGS, MORE),
 )
 
 
@@ -116,10 +112,7 @@ def check(case: Log, folder: Path) -> None:
     source = INPUTS.folder / case.base
     (shutil.copytree if source.is_dir() else shutil.copyfile)(source, path)
     flags = FLAGS[case.base].split()
-    if isinstance(change, Mapping):
-        write_mapping(change, folder / "log.yaml")
-        flags = []
-    elif isinstance(change, Damage):
+    if isinstance(change, Damage):
         files = sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]
         victim = files[change.seed % len(files)]
         victim.write_bytes(damaged(victim.read_bytes(), change))

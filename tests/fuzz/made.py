@@ -73,9 +73,6 @@ def make(folder: Path) -> None:
     write_hdf5(folder / "log.h5", rows)
     write_parquet(folder / "log.parquet", table(rows))
     next(write_bag2(folder / "bag", rows).glob("*.mcap")).rename(folder / "log.mcap")
-    (folder / "log.yaml").write_text(
-        "time: time\nq: q_{joints}\nv: v_{joints}\nu: u_{joints}\njoints: shoulder,elbow\n"
-    )
     INPUTS.folder, INPUTS.data, INPUTS.posterior, INPUTS.free = folder, data, plain, free
     INPUTS.other = dataset()
     INPUTS.moving = simulate_quadrotor(QuadrotorConfig(seconds=0.1))

@@ -22,7 +22,6 @@ import forcegp.inference
 from forcegp.atomic_files import write_digests
 from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, InvalidNumber, UnreadableRobotFile
 from forcegp.model import Model
-from forcegp.recordings.mapping import read_mapping
 
 pytestmark = pytest.mark.usefixtures("unchecked")
 
@@ -49,13 +48,6 @@ def test_encodings_that_are_no_text_are_refused(tmp_path, encoding):
 def test_a_joint_beyond_the_moon_is_refused():
     with pytest.raises(InvalidNumber, match=r"xyz \[1e\+200, 0.0, 0.0\]"):
         forcegp.Robot.from_urdf_text(URDF.replace('xyz="0 0 0.25"', 'xyz="1e200 0 0"'))
-
-
-def test_a_centre_of_mass_beyond_the_moon_is_refused():
-    place = '<origin xyz="0.02'
-    assert place in URDF
-    with pytest.raises(InvalidNumber, match=r"xyz \[1e\+200, "):
-        forcegp.Robot.from_urdf_text(URDF.replace(place, '<origin xyz="1e200'))
 
 
 @pytest.mark.parametrize("where", ["header", "row"])
@@ -105,16 +97,6 @@ def test_documents_of_any_shape_are_refused(tmp_path, content):
     write_digests(run)
     with pytest.raises(FileFormatError, match=r"model\.json"):
         forcegp.load_posterior(run)
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["q: !!timestamp x\n", "step: []\n", "step: [1, 2]\n", "step: !!int ''\n", "- " * 5000 + "a", "step: " + "9" * 900],
-)
-def test_mappings_of_any_shape_are_refused(tmp_path, text):
-    (tmp_path / "log.yaml").write_text(text)
-    with pytest.raises(FileFormatError, match=r"log\.yaml"):
-        read_mapping(tmp_path / "log.yaml")
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"urdf": ' + "9" * 5000 + "}"], ids=["deep", "digits"])
@@ -168,7 +150,7 @@ WRONG = {
     "predictor": {"tolerance": "0.1"},
     "predictor()": {"q": "abc"},
     "rollout": {"baumgarte": 3},
-    "Dataset": {"sliding": 5},
+    "Dataset": {"truth": 5},
     "Dataset ": {"model": ()},
     "Dataset.rows": {"index": torch.ones(3, requires_grad=True)},
     "Dataset.load": {"path": 7},

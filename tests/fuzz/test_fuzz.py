@@ -5,8 +5,7 @@ Day by day other cases, and 40 times as many at night. What was found stands in 
 
 import numpy as np
 import pytest
-import yaml
-from tests.fuzz import arguments, command_lines, datasets, logs, mappings, robots, stored
+from tests.fuzz import arguments, command_lines, datasets, logs, robots, stored
 from tests.fuzz.oracle import CANARY, require_ended_well, search
 from tests.fuzz.values import Hostile, hostile_pickle
 
@@ -19,7 +18,6 @@ TARGETS = {
     "robot files": robots.TARGET,
     "datasets": datasets.TARGET,
     "datasets of commands": datasets.COMMANDS_TARGET,
-    "mappings": mappings.TARGET,
     "logs": logs.TARGET,
     "words": command_lines.WORDS_TARGET,
     "command lines": command_lines.TARGET,
@@ -46,9 +44,6 @@ def test_there_are_as_many_as_promised():
 def test_what_would_run_code_does_not(tmp_path, monkeypatch):
     """And would, with the libraries as they are."""
     monkeypatch.chdir(tmp_path)
-    code = f"q: !!python/object/apply:os.mkdir [{CANARY}]\n"
-    yaml.unsafe_load(code)
-    (tmp_path / CANARY).rmdir()
     np.savez("log.npz", q=np.array([Hostile()], object), time=np.zeros(1))
     with np.load("log.npz", allow_pickle=True) as file:
         file["q"]
@@ -56,10 +51,7 @@ def test_what_would_run_code_does_not(tmp_path, monkeypatch):
     folder = tmp_path / "some" / "folders" / "deep"
     folder.mkdir(parents=True)
     (folder / "log.npz").write_bytes((tmp_path / "log.npz").read_bytes())
-    (folder / "log.csv").write_text("time,q\n0,0\n1,1\n")
     (folder / "log.pkl").write_bytes(hostile_pickle())
     flags = ["--time", "time", "--q", "q", "--u", "0", "--joints", "a", "--out", "o.h5"]
     for log in ("log.npz", "log.pkl"):
         assert require_ended_well(["import", log, *flags], folder) == 2
-    (folder / "log.yaml").write_text(code)
-    assert require_ended_well(["import", "log.csv", "--out", "o.h5"], folder) == 2

@@ -1,11 +1,6 @@
 """Jobs run in order, several at once, each once; failures and kills cost only what was not finished."""
 
 import os
-import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 
 import pytest
 
@@ -67,12 +62,6 @@ def test_on_a_full_disk_nothing_more_is_begun(results):
     assert run_jobs(results, [square(2), square(3)]) == 2
 
 
-def test_a_disk_that_is_full_is_noticed_before_the_first_job(results, limited_file_size):
-    with limited_file_size(1000), pytest.raises(OSError, match="File too large"):
-        run_jobs(results, [square(2)])
-    assert not list(results.folder.rglob(".*.tmp"))
-
-
 def test_a_process_that_dies_is_reported_and_what_was_done_is_kept(results, tmp_path):
     dead = Job("dead", f"{TOY}:die_once", {"marker": str(tmp_path / "marker")}, ("square/2",))
     with pytest.raises(BackendError, match=r"processes broke off.*1 of 2 jobs are kept, so the same command goes on"):
@@ -111,47 +100,3 @@ def test_arguments_reach_the_task_wherever_it_runs(results):
         assert run_jobs(results, [after, job], at_once) == 2
         assert results.result(job.name)["value"] == 5 * 3 * 2
         assert results.result(after.name)["value"] == 31
-
-
-def test_warnings_are_kept_with_the_job(results):
-    run_jobs(results, [Job("w", f"{TOY}:warn", {})])
-    assert results.load("w")["warnings"] == ["look here"]
-
-
-@pytest.mark.nightly
-def test_kill_9_loses_only_the_job_at_work_and_leaves_no_process(tmp_path):
-    begun = tmp_path / "begun"
-    script = (
-        "from pathlib import Path\n"
-        "from tests.jobs.test_running import *\n"
-        "if __name__ == '__main__':\n"
-        f"    slow = Job('slow', TOY + ':sleep', dict(begun={str(begun)!r}, seconds=3600))\n"
-        f"    run_jobs(JobStore.open(Path({str(tmp_path / 'out')!r}), 'a test', {{}}), [square(2), slow], 2)\n"
-    )
-    (tmp_path / "script.py").write_text(script)
-    paths = [str(Path(__file__).resolve().parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-    run = subprocess.Popen([sys.executable, tmp_path / "script.py"], env=environment)
-    _wait_until(lambda: begun.exists() and begun.read_text() != "")
-    run.send_signal(signal.SIGKILL)
-    run.wait()
-    worker = int(begun.read_text())
-    _wait_until(lambda: not _alive(worker))
-    results = JobStore.open(tmp_path / "out", "a test", {})
-    first = results.load("square/2")
-    assert not results.place("slow").exists()
-    assert run_jobs(results, [square(2), square(3)]) == 1
-    assert results.load("square/2") == first
-    assert not list((tmp_path / "out").glob("**/*.tmp"))
-
-
-def _alive(process: int) -> bool:
-    status = Path(f"/proc/{process}/status")
-    return status.exists() and "State:\tZ" not in status.read_text()
-
-
-def _wait_until(condition) -> None:
-    end = time.monotonic() + 600.0  # a guard against a hang
-    while not condition():
-        assert time.monotonic() < end, "it never happened"
-        time.sleep(0.05)

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from types import ModuleType
 
 import pytest
 
@@ -41,14 +40,6 @@ def test_a_module_without_package_counts_by_itself(toolbox):
     assert now("forcegp.jobs", "alone") == before
     (toolbox / "alone.py").write_text("x = 1\n")
     assert now("forcegp.jobs", "alone") != before
-
-
-def test_modules_without_source_count_by_name(monkeypatch):
-    assert now("no_such_module") != now("no_such_module_either")
-    notebook = ModuleType("notebook")  # as __main__ is there
-    monkeypatch.setitem(sys.modules, "notebook", notebook)
-    assert not hasattr(notebook, "__file__")
-    assert now("notebook") != now("no_such_module")
 
 
 def test_equal_in_every_process():

@@ -54,4 +54,4 @@ def test_an_order_names_the_columns_that_were_read():
 )
 def test_flags_state_the_mapping(mapping):
     command = parse_arguments(["import", "log.csv", *mapping.flags(), "--out", "log.h5"])
-    assert command.columns._flags() == mapping
+    assert command.columns.mapped([], None) == mapping

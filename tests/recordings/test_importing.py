@@ -1,76 +1,32 @@
-"""From files to a Dataset: the same in every format, and what stamps become."""
+"""From files to a Dataset: what columns and stamps become."""
 
 import dataclasses
 
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
-from tests.recordings.log_files import (
-    JOINTS,
-    STEP,
-    motion,
-    table,
-    write_bag1,
-    write_bag2,
-    write_hdf5,
-    write_matlab5,
-    write_matlab73,
-    write_parquet,
-    write_text,
-)
+from tests.data.samples import model
+from tests.recordings.log_files import JOINTS, STEP, motion, table, write_text
 
 from forcegp.data import Dataset, differentiate
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings
 
 NAMES = ColumnMapping(time="time", q=("q_{joints}",), v=("v_{joints}",), u=("u_{joints}",), joints=JOINTS)
-ARRAYS = ColumnMapping(time="time", q=("q",), v=("v",), u=("u",), joints=JOINTS)
-TOPIC = ColumnMapping(
-    q=("/joint_states:position",), v=("/joint_states:velocity",), u=("/joint_states:effort",), joints=JOINTS
-)
-
-
-def in_log(mapping):
-    return dataclasses.replace(mapping, time="log/time", **{name: (f"log/{name}",) for name in "qvu"})
-
-
-def archive(path, data):
-    np.savez_compressed(path, **data)
-    return path
-
-
-FORMATS = {
-    "csv": ("log.csv", lambda p, d: write_text(p, table(d)), NAMES),
-    "csv.gz": ("log.csv.gz", lambda p, d: write_text(p, table(d)), NAMES),
-    "tsv": ("log.tsv", lambda p, d: write_text(p, table(d), delimiter="\t"), NAMES),
-    "parquet": ("log.parquet", lambda p, d: write_parquet(p, d), ARRAYS),
-    "npz": ("log.npz", archive, ARRAYS),
-    "mat 5": ("log.mat", write_matlab5, in_log(ARRAYS)),
-    "mat 7.3": ("log.mat", write_matlab73, ARRAYS),
-    "hdf5": ("log.h5", write_hdf5, in_log(ARRAYS)),
-    "bag": ("log.bag", write_bag1, TOPIC),
-    "mcap": ("log", write_bag2, TOPIC),
-    "db3": ("log", lambda p, d: write_bag2(p, d, "sqlite3"), TOPIC),
-}
 
 
 def imported(path, mapping, **options) -> Dataset:
     return import_recordings([path], mapping, options=ImportOptions(**options))
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_the_same_motion_is_the_same_dataset_in_every_format(tmp_path, name):
-    if name in ("bag", "mcap", "db3"):
-        pytest.importorskip("rosbags")
-    file, write, mapping = FORMATS[name]
+def test_a_motion_is_its_dataset(tmp_path):
     data = motion()
-    found = imported(write(tmp_path / file, data), mapping)
+    found = imported(write_text(tmp_path / "log.csv", table(data)), NAMES)
     for signal in "qvu":
         np.testing.assert_array_equal(getattr(found, signal), data[signal])
     np.testing.assert_array_equal(found.time, data["time"])
     np.testing.assert_array_equal(found.a, differentiate(data["v"], data["time"]))
-    assert found.joint_names == JOINTS
-    assert found.episodes == (0,)
+    assert (found.joint_names, found.episodes) == (JOINTS, (0,))
     assert not list(tmp_path.glob(".*"))
 
 
@@ -95,6 +51,13 @@ def test_even_times_and_differences_are_those_of_another_spline(tmp_path, logged
     for name, values in expected.items():
         rounding = 1e-13 if name in logged else 1e-13 / STEP**2
         np.testing.assert_allclose(getattr(found, name), values, rtol=0, atol=rounding * np.abs(values).max())
+
+
+def test_a_combination_that_is_not_finite_is_named_with_its_row(tmp_path):
+    columns = table(motion()) | {"b": np.where(np.arange(200) == 7, -1.0, 1.0)}
+    mapping = dataclasses.replace(NAMES, u=("u_shoulder/(1 + b)", "u_elbow"))
+    with pytest.raises(DatasetError, match=r"'u_shoulder/\(1 \+ b\)' \(u of joint 'shoulder'\) is -?inf at row 7"):
+        imported(write_text(tmp_path / "log.csv", columns), mapping)
 
 
 def test_a_rate_that_is_asked_for_is_the_rate(tmp_path):
@@ -153,20 +116,6 @@ def test_wrapped_angles_are_continued_if_told_so(tmp_path):
     np.testing.assert_allclose(found.q, data["q"], atol=1e-13)
 
 
-def test_angles_are_continued_within_an_episode(tmp_path):
-    """Another episode begins as it was logged."""
-    data = motion()
-    number = (data["time"] > 0.2).astype(float)
-    data["q"] = np.where(number[:, None] > 0, 0.2, 3.1) + 0.0 * data["q"]
-    path = write_text(tmp_path / "log.csv", {**table(data), "number": number})
-    found = imported(path, dataclasses.replace(NAMES, episode="number"), unwrap=True)
-    assert set(found.q[:, 0]) == {3.1, 0.2}
-    data["q"][number > 0] = -3.1
-    write_text(path, {**table(data), "number": number})
-    found = imported(path, dataclasses.replace(NAMES, episode="number"), unwrap=True)
-    assert set(found.q[:, 0]) == {3.1, -3.1}
-
-
 def test_coupled_angles_units_signs_and_constants(tmp_path):
     data = motion()
     columns = {
@@ -193,14 +142,12 @@ def test_coupled_angles_units_signs_and_constants(tmp_path):
 def test_joints_that_slide_are_in_metres(tmp_path):
     data = motion()
     mapping = dataclasses.replace(NAMES, unit={"q": ("rad", "mm"), "v": ("rad/s", "mm/s"), "u": ("Nm", "N")})
-    found = imported(write_text(tmp_path / "log.csv", table(data)), mapping)
+    path, rail = write_text(tmp_path / "log.csv", table(data)), model("prismatic")
+    found = import_recordings([path], mapping, model=rail)
     assert found.units["q"] == ("rad", "m")
     np.testing.assert_array_equal(found.q[:, 1], data["q"][:, 1] / 1000)
-    with pytest.raises(InvalidInput, match=r"v of joint 'elbow' is rad/s.*slides"):
-        imported(
-            tmp_path / "log.csv",
-            dataclasses.replace(mapping, unit={"q": ("rad", "mm")} | {"v": ("rad/s",)}),
-        )
+    with pytest.raises(InvalidInput, match="q of joint 'elbow' is mm, but the joint turns"):
+        imported(path, mapping)
 
 
 def test_files_side_by_side_are_one_recording(tmp_path):

@@ -8,7 +8,6 @@ from tests.examples import run_example
 
 from forcegp.cli.logs import Import
 from forcegp.cli.main import parse_arguments
-from forcegp.recordings import read_mapping
 from forcegp.recordings.mapping import UNITS
 
 
@@ -30,14 +29,6 @@ def test_the_commands_are_commands(page):
     parsed = [parse_arguments(shlex.split(line)[1:]) for line in commands.splitlines()]
     assert len(parsed) == 4
     assert all(isinstance(command, Import) for command in parsed)
-
-
-def test_the_mapping_is_one(page, tmp_path):
-    (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
-    (tmp_path / "columns.yaml").write_text(text)
-    mapping = read_mapping(tmp_path / "columns.yaml")
-    assert mapping.q == ("theta1", "theta2 - theta1")
-    assert mapping.u == ("0.083*current1", "0.041*current2")
 
 
 def test_every_unit_is_on_the_page(page):

@@ -34,33 +34,6 @@ def test_joint_states_go_by_the_names_of_joints():
         numbers(joint_state(("a", "b"), (1.0,)))
 
 
-def test_nested_messages_arrays_and_texts():
-    types = typesys.get_types_from_msg(
-        "bool flag\nint16[3] shorts\nstring text\nfloat32 f\nInner[] inner\nuint64 large\nfloat64[] free\n"
-        "string[] words\nuint8[] picture",
-        "test_msgs/msg/Outer",
-    ) | typesys.get_types_from_msg("int8 a\nfloat64 b", "test_msgs/msg/Inner")
-    store = typesys.get_typestore(typesys.Stores.EMPTY)
-    store.register(types)
-    inner = store.types["test_msgs/msg/Inner"]
-    message = store.types["test_msgs/msg/Outer"](
-        flag=True,
-        shorts=np.array([1, -2, 300], np.int16),
-        text="odd",
-        f=0.25,
-        inner=[inner(a=1, b=1.5), inner(a=-1, b=2.5)],
-        large=2**40,
-        free=np.array([3.5, 4.5]),
-        words=["a", "long word"],
-        picture=np.zeros(5000, np.uint8),
-    )
-    read = store.deserialize_cdr(store.serialize_cdr(message, message.__msgtype__), message.__msgtype__)
-    assert numbers(read) == {
-        **{"flag": 1, "shorts[0]": 1, "shorts[1]": -2, "shorts[2]": 300, "f": 0.25, "large": 2**40},
-        **{"inner[0].a": 1, "inner[0].b": 1.5, "inner[1].a": -1, "inner[1].b": 2.5, "free[0]": 3.5, "free[1]": 4.5},
-    }
-
-
 @pytest.mark.parametrize(
     "order", [np.r_[0:200:2, 1:200:2], np.r_[1:40, 0, 40:200]], ids=["chunks that overlap", "one chunk out of order"]
 )

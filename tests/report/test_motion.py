@@ -8,7 +8,6 @@ from tests.fit.test_identified_moving_bases import FEET, recorded
 from tests.robots.test_moving_bases import LIMBS
 
 from forcegp import Dataset, JointFriction, Model, Robot, fit
-from forcegp.errors import InvalidInput
 from forcegp.report import recorded_scene, scene_notes
 from forcegp.report.motion import LONGEST_ARROW
 
@@ -83,20 +82,6 @@ def test_arrows_are_drawn_to_scale(swinging, friction):
     np.testing.assert_allclose(farther / scene.arrow_length, expected, rtol=1e-9)
     assert scene.arrow_length == LONGEST_ARROW * scene.size
     assert f"{arrows.largest:.3g} Nm would be" in scene_notes(scene)[0]
-
-
-def test_a_dataset_without_robot_is_refused(swinging):
-    bare = Dataset(
-        q=swinging.q,
-        v=swinging.v,
-        u=swinging.u,
-        a=swinging.a,
-        time=swinging.time,
-        joint_names=swinging.joint_names,
-        sliding=swinging.sliding,
-    )
-    with pytest.raises(InvalidInput, match="holds no robot"):
-        recorded_scene(bare)
 
 
 def test_a_foot_that_stands_has_one_arrow():

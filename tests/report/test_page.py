@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from forcegp import Dataset, score
+from forcegp import score
 from forcegp.errors import InvalidInput
 from forcegp.report import (
     Page,
     Table,
     is_page,
     model_page,
-    recorded_scene,
     scores_sentence,
     write_page,
 )
@@ -72,8 +71,3 @@ def test_the_sentence_is_true(swinging, friction):
     sentence = scores_sentence(scores)
     assert f"is {scores.value('mae'):.3g} rad/s²" in sentence
     assert f"a factor {scores.value('known_physics_mae') / scores.value('mae'):.3g} less" in sentence
-
-
-def test_a_dataset_alone_has_a_page(swinging):
-    bare = Dataset(q=swinging.q, v=swinging.v, u=swinging.u, a=swinging.a, model=swinging.model, time=swinging.time)
-    assert recorded_scene(bare, seconds=0.2).arrows[0].title == "recorded u"

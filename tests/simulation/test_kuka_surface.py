@@ -7,7 +7,7 @@ import pytest
 import torch
 from tests.data.samples import assert_equal
 
-from forcegp.data import REVOLUTE_UNITS, Dataset, require_disjoint
+from forcegp.data import Dataset, require_disjoint, units_for
 from forcegp.errors import InvalidInput, SimulationError
 from forcegp.mechanics import Plane
 from forcegp.robots import Robot
@@ -79,7 +79,7 @@ def test_limits_of_torque_are_kept(data):
 
 def test_it_describes_itself(data):
     assert len(data) == 1200
-    assert data.units == REVOLUTE_UNITS
+    assert data.units == units_for(data.model.robot)
     assert data.episodes == (0,)
     assert data.time_ordered
     np.testing.assert_array_equal(data.noise_std, np.full(7, 0.1))

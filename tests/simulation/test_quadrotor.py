@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from forcegp import AerodynamicForce, Dataset, Model, Robot, fit
+from forcegp import AerodynamicForce, fit
 from forcegp.data import Lag, estimate_thruster_lag, recorded_motions
 from forcegp.errors import InvalidInput
 from forcegp.fit import calibrated
@@ -74,38 +74,6 @@ def test_the_lag_of_actuators_that_push_a_base_is_found(train):
     thrusts = train.u**2 * float(rotors.thrust[0])
     found, _ = estimate_thruster_lag(replace(train, model=model, u=thrusts, truth={}))
     assert found == pytest.approx(0.06, rel=0.25)
-
-
-def test_a_load_on_an_arm_beneath_is_no_lag():
-    """Six thrusters make the wrench that a robot with a loaded arm needs; the file lacks the load."""
-    body = (
-        '<inertial><origin xyz="0 0 {}"/><mass value="{}"/>'
-        '<inertia ixx="{}" iyy="{}" izz="{}" ixy="0" ixz="0" iyz="0"/></inertial>'
-    )
-    text = (
-        f'<robot name="r"><link name="hull">{body.format(0, 2.4, 0.01, 0.01, 0.015)}</link><link name="arm">{{}}</link>'
-        '<joint name="shoulder" type="continuous"><parent link="hull"/><child link="arm"/>'
-        '<axis xyz="0 1 0"/></joint></robot>'
-    )
-    known, loaded = (
-        Robot.from_urdf_text(text.format(body.format(at, mass, inertia, inertia, inertia)), base="floating")
-        for at, mass, inertia in ((-0.1, 0.2, 0.001), (-0.25, 0.4, 0.005))
-    )
-    time = np.arange(1600) / 200
-    draw = np.random.default_rng(1)
-    rates, phases = 2 * np.pi * draw.uniform(0.2, 1.5, (7, 5)), draw.uniform(0, 6, (7, 5))
-    size = 0.2 * np.array([1, 1, 1, 0.7, 0.7, 0.7, 3.0])
-    v = size[:, None] * np.sin(rates[..., None] * time + phases[..., None]).sum(1)
-    a = size[:, None] * (rates[..., None] * np.cos(rates[..., None] * time + phases[..., None])).sum(1)
-    q = [known.neutral()]
-    for step in torch.tensor(0.005 * (v + 0.0025 * a)).mT[:-1]:
-        q.append(known.integrate(q[-1], step))
-    late = loaded.inverse_dynamics(torch.stack(q), torch.tensor(v.T), torch.tensor(a.T)).numpy()
-    u = late + 0.06 * np.gradient(late, time, axis=0)
-    model = Model(known, (), (Actuation(np.eye(7), tuple("abcdefg")), RigidBodies()))
-    rows = {"q": torch.stack(q).numpy(), "v": v.T, "a": a.T, "u": u, "time": time}
-    found, _ = estimate_thruster_lag(Dataset(**rows, model=model))
-    assert found == pytest.approx(0.06, abs=0.01)
 
 
 def test_new_wind_is_observed_from_the_past(posterior, test):

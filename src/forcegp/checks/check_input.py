@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from forcegp.data import Dataset, Preparation, preparation_report, resample, uniform_step
+from forcegp.data.dataset import ROTATION, TRANSLATION
 from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
 from forcegp.data.views import consecutive, move_on, runs, white_noise, whole_windows, window_means
 from forcegp.errors import DatasetError, InvalidInput
@@ -37,11 +38,10 @@ class CheckInput:
 
     `log` is the Dataset as given; `even` its stretches without gaps at even times; `prepared` these after the filter;
     `compared` the same after a filter at half the cut-off: what torques are compared on, so that the noise of the
-    acceleration, which is strongest near the cut-off, is not taken for a wrong torque. `wraps` and `jumps` mark where
-    (rows, nv) a position of `log` jumps by a turn, or by more than pi otherwise, `dropped` where a signal is 0 because
-    it was not measured (interpolated in `mended`, a log that is otherwise as given). `compared_noise` (nv,) is the
-    standard deviation of the noise of the acceleration in `compared`, None where it is not known. `prepared` and
-    `compared` are None where jumps forbid any derivative.
+    acceleration is not taken for a wrong torque; both None where jumps forbid derivatives. `rotates` (nv,) are joints
+    that turn, `wraps` and `jumps` mark where (rows, nv) a position jumps by a turn, or by more than pi otherwise,
+    `dropped` where a signal is 0 because it was not measured (interpolated in `mended`). `compared_noise` (nv,) is the
+    standard deviation of the acceleration in `compared`, None where it is not known.
     """
 
     log: Dataset
@@ -49,6 +49,7 @@ class CheckInput:
     mended: Dataset
     wraps: Bool[np.ndarray, "rows nv"]
     jumps: Bool[np.ndarray, "rows nv"]
+    rotates: Bool[np.ndarray, " nv"]
     robot: Robot | None = None
     laws: tuple[JointLaw, ...] = ()
     contacts: int = 0
@@ -67,6 +68,7 @@ class CheckInput:
             laws = tuple(law for law in model.laws if isinstance(law, JointLaw) and not law.learned)
             known = {"robot": model.loaded_robot, "laws": laws, "contacts": len(model.contacts)}
         same = {"log": dataset, "even": dataset, "mended": dataset, "wraps": nowhere, "jumps": nowhere}
+        same["rotates"] = dataset.turns
         return cls(**same | known | more)
 
     @property
@@ -74,10 +76,9 @@ class CheckInput:
         """Names of the joints."""
         return tuple(self.log.joint_names)
 
-    @property
-    def rotates(self) -> Bool[np.ndarray, " nv"]:
-        """Whether a joint turns; others slide."""
-        return self.log.turns
+    def unit_of_each(self, name: str) -> tuple[str, ...]:
+        """The unit of a signal, one per joint."""
+        return tuple((ROTATION if turns else TRANSLATION)[name] for turns in self.rotates)
 
     def named(self, joints: Iterable[int] | np.ndarray) -> tuple[str, ...]:
         """The names of the joints with these numbers."""

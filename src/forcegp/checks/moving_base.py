@@ -92,23 +92,19 @@ def base_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         specific = _rms(change - windows.mean(measured))
         if error <= 2.0 * size:  # noise of the velocities alone makes both large
             continue
-        numbers = {"error": error, "specific": specific, "size": size}
+        kind, remedy, imu = look, "Differentiate v: a is its derivative in body axes, without gravity and w x v.", {}
+        seen = (
+            f"the acceleration of {group.name!r} is off from the change of its velocity by {error:.2g}, which itself "
+        )
+        seen += f"is {size:.2g}."
         if specific < CLEARLY * error:
+            kind, remedy, imu = wrong, "Differentiate v.", IMU
             seen = (
                 f"the acceleration of {group.name!r} is what an accelerometer measures: as the change of its velocity "
-                f"it is off by {error:.2g}, with gravity and w x v taken into account by {specific:.2g}."
             )
-            told = {"about": "base acceleration", "what": seen, "do": "Differentiate v.", "numbers": numbers}
-            yield wrong(**told, correction=IMU)
-            continue
-        yield look(
-            about="base acceleration",
-            what=f"the acceleration of {group.name!r} is off from the change of its velocity by {error:.2g}, which "
-            f"itself is {size:.2g}.",
-            do="Accelerations are derivatives of velocities in body axes, without gravity and without w x v of an "
-            "accelerometer; differentiate v, or add gravity to what an IMU measures.",
-            numbers=numbers,
-        )
+            seen += f"it is off by {error:.2g}, with gravity and w x v taken into account by {specific:.2g}."
+        numbers = {"error": error, "specific": specific, "size": size}
+        yield kind(about="base acceleration", what=seen, do=remedy, correction=imu, numbers=numbers)
 
 
 def carried_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
@@ -183,8 +179,8 @@ def _stated(dataset: Dataset) -> tuple[tuple[str, str], str]:
         mapping = dataset.metadata["import"]["mapping"]
         order = str(mapping.get("orientation", order))
         given = mapping["axes"]["v"]  # one word, or one for each part
-        *_, linear, angular = 2 * ((given,) if isinstance(given, str) else tuple(given))
-        axes = str(linear), str(angular)
+        linear, angular = ("world" if name == "world" else "body" for name in (given[0], given[-1]))
+        axes = linear, angular
     return axes, order
 
 
@@ -231,24 +227,18 @@ def _of_velocity(
         correction["axes"] = {"v": axes[:1] if len(set(axes)) == 1 else axes}
     reading = " and ".join(meant)
     numbers = {"as recorded": recorded, "speed": speed} | ({reading: other} if reading else {})
+    kind, remedy, seen = ok, "", f"positions and velocities of {group.name!r} agree."
     if reading:
-        yield wrong(
-            about="base",
-            what=f"positions of {group.name!r} change as if it had {reading}: off by {other:.2g}, as recorded by "
-            f"{recorded:.2g}, of a speed of {speed:.2g}.",
-            correction=correction,
-            numbers=numbers,
+        kind, seen = (
+            wrong,
+            f"positions of {group.name!r} change as if it had {reading}: off by {other:.2g}, as recorded",
         )
+        seen += f" by {recorded:.2g}, of a speed of {speed:.2g}."
     elif recorded > CLEARLY * speed and speed > 0.0:
-        yield look(
-            about="base",
-            what=f"positions of {group.name!r} do not change as its velocities say: off by {recorded:.2g} of "
-            f"{speed:.2g}.",
-            do="Check units and time stamps, and that v is linear, then angular velocity in the axes of the base.",
-            numbers=numbers,
-        )
-    else:
-        yield ok(about="base", what=f"positions and velocities of {group.name!r} agree.", numbers=numbers)
+        remedy = "Check units and time stamps, and that v is linear, then angular velocity in the axes of the base."
+        kind, seen = look, f"positions of {group.name!r} do not change as its velocities say: off by {recorded:.2g} of"
+        seen += f" {speed:.2g}."
+    yield kind(about="base", what=seen, do=remedy, correction=correction, numbers=numbers)
 
 
 def _in_world(q: Tensor, v: Tensor) -> Tensor:

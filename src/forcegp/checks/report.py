@@ -16,11 +16,10 @@ from forcegp.checks.moving_base import (
 )
 from forcegp.checks.signals import motion_doubts, sampling_doubts, signal_doubts
 from forcegp.checks.torque_doubts import corrected, not_compared, torque_doubts
-from forcegp.checks.torques import Comparison, parameter_doubts, torque_noise
+from forcegp.checks.torques import Comparison, parameter_doubts
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
-from forcegp.data.views import white_noise
 from forcegp.doubts import LEVELS, Doubt, Doubts, listed, look, ok
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence.bodies import base_parameters, excitation
@@ -29,7 +28,7 @@ from forcegp.robots import Robot
 from forcegp.summary import Summary, plain
 
 BEFORE_A_FIT = frozenset(
-    ("contact", "noise_std", "velocity", "acceleration", "delay", "torque unit", "torque constant", "masses", "lengths",
+    ("contact", "velocity", "acceleration", "delay", "torque unit", "torque constant", "masses", "lengths",
      "joint zero", "gravity", "dead torque")
 )  # fmt: skip
 """Subjects that a fit reports also where a person should judge."""
@@ -54,12 +53,11 @@ class CheckReport(Summary):
     def per_joint(self) -> list[dict[str, Any]]:
         """What was measured of every joint; None where it is not known.
 
-        "unexplained" share of the torque's variance, "residual" in Nm or N and "factor" of the fit to inverse dynamics
-        (see `forcegp.checks.torques`), the factor only where the torque rests on it; "noise_before" and "noise_after"
-        the filter of the acceleration in rad/s^2 or m/s^2, and "noise_torque", the latter times M in Nm or N.
+        "unexplained" share of the torque's variance, "residual" in Nm or N and "factor" of the fit to inverse dynamics;
+        "noise_before" and "noise_after" the filter of the acceleration in rad/s^2 or m/s^2.
         """
         nothing: list[Any] = [None] * self.inputs.log.nv
-        names = ("unexplained", "residual", "factor", "noise_before", "noise_after", "noise_torque")
+        names = ("unexplained", "residual", "factor", "noise_before", "noise_after")
         columns = {"joint": list(self.inputs.names), **dict.fromkeys(names, nothing)}
         if self.comparison is not None:
             fit, spread = self.comparison.fit, np.std(self.comparison.rows.u, axis=0)
@@ -68,9 +66,6 @@ class CheckReport(Summary):
             columns["factor"] = plain(np.where(fit.rests_on_robot, fit.factor, np.nan))
         if (noise := self.inputs.price.get("acceleration_noise")) is not None:
             columns["noise_before"], columns["noise_after"] = noise["before"], noise["after"]
-            if (robot := self.inputs.robot) is not None:
-                after = np.array(noise["after"], float)
-                columns["noise_torque"] = plain(torque_noise(robot, self.inputs.rows(), after))
         return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
     def to_dict(self) -> dict[str, Any]:
@@ -131,7 +126,7 @@ def quick_check(dataset: Dataset, model: Model | None = None) -> Doubts:
 
 def _doubts(inputs: CheckInput, model: Model | None) -> tuple[list[Doubt], Comparison | None]:
     """What is looked for in every log, and the comparison of torques, where there is one."""
-    doubts = [*signal_doubts(inputs), *stated_noise_doubts(inputs)]
+    doubts = signal_doubts(inputs)
     if inputs.log.time_ordered:
         doubts = [*sampling_doubts(inputs), *doubts, *motion_doubts(inputs)]
     contacts = contact_doubts(inputs.mended, model)
@@ -170,40 +165,12 @@ def _of_single_joints(dataset: Dataset, robot: Robot, preparation: Preparation |
     alone = replace(dataset, model=None, q=as_vectors(dataset), u=np.zeros_like(dataset.v), truth={}, noise_std=None)
     with contextlib.suppress(InvalidInput):  # too short
         inputs = CheckInput.quick(alone, None) if preparation is None else CheckInput.of(alone, None, preparation)
-        yield from motion_doubts(inputs, robot.space.single_rows)  # gaps may be rows whose feet are not known
+        yield from motion_doubts(
+            replace(inputs, rotates=dataset.turns), robot.space.single_rows
+        )  # gaps may be rows whose feet are not known
 
 
 MUCH = 0.2  # noise relative to the spread of the signal from which a filter is worth its name
-
-
-STATED_OFF = 3.0  # factor either way between stated and seen noise of the acceleration that is reported
-FAR_OFF = 10.0
-
-
-def stated_noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
-    """`noise_std` against the noise that the acceleration of successive rows shows."""
-    log = inputs.log
-    stated, seen = log.noise_std, white_noise(log)
-    if stated is None or seen is None:
-        return
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ratio = seen / stated
-    off = np.flatnonzero((ratio > STATED_OFF) | (ratio < 1.0 / STATED_OFF))
-    if not len(off):
-        return
-    joint = int(off[np.argmax(np.abs(np.log(ratio[off])))])
-    small = ratio[joint] > 1.0
-    yield Doubt(
-        level="wrong" if ratio[joint] > FAR_OFF else "look",
-        about="noise_std",
-        what=f"noise_std states {stated[joint]:.3g} for the acceleration of {inputs.names[joint]}; successive rows "
-        f"show noise of {seen[joint]:.3g}: {ratio[joint] if small else 1.0 / ratio[joint]:.3g} times as "
-        f"{'much' if small else 'little'}.",
-        do="Learn it (forcegp fit --noise learned), or state what was measured."
-        + ("" if small else " Noise that a filter made smooth does not show between rows: then leave it."),
-        joints=inputs.named(off),
-        numbers={"stated": plain(stated), "seen": plain(seen)},
-    )
 
 
 def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:

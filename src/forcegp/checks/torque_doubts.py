@@ -137,7 +137,7 @@ def _of_motion(now: Comparison, inputs: CheckInput) -> Iterator[Explanation]:
         if turned.any():
             change, cost = changed("qva", factor=np.where(turned, DEGREE, 1.0)), 0.0 if turned.all() else 0.5
             what = f"positions reach {largest:.4g}; taken for degrees, they fit the torques far better than taken "
-            unit = {name: _degrees(inputs.log, name, turned) for name in "qv"}
+            unit = {name: _degrees(inputs, name, turned) for name in "qv"}
             yield tried(change, cost, "degrees", f"{what}for radians.", "Use np.deg2rad.", _places(turned), unit=unit)
     joints = [joint for joint in range(nv) if few or bool(now.fit.unexplained[joint] > EXPLAINED)]
     for joint in joints:
@@ -185,7 +185,7 @@ def _of_gravity(now: Comparison) -> Iterator[Explanation]:
         yield Explanation(now.after(changed(), with_gravity(now.robot, gravity)), doubt, cost)
 
 
-def _degrees(given: Dataset, signal: str, turned: np.ndarray) -> tuple[str, ...]:
+def _degrees(given: CheckInput, signal: str, turned: np.ndarray) -> tuple[str, ...]:
     """The unit of the signal of every joint, with degrees where `turned`."""
     each = zip(given.unit_of_each(signal), turned, strict=True)
     return tuple(unit.replace("rad", "deg") if degrees else unit for unit, degrees in each)

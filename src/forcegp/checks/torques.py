@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.optimize import nnls
 
+from forcegp.checks.check_input import DEGREE
 from forcegp.data import Dataset
 from forcegp.doubts import Doubt, look
 from forcegp.forces import JointLaw
@@ -190,7 +191,6 @@ FLOOR = 1e-5  # share of a torque's power below which everything is explained
 NOISE = 3.0  # how much of the power of the noise is left to every explanation
 FEWEST_ROWS = 30
 STANDARD_GRAVITY = 9.81  # m/s^2
-NO_GRAVITY = 0.05
 FACTORS = np.exp(np.linspace(-3.5, 3.5, 351))  # values that are tried for a factor
 REMEDY = "Correct the URDF, or the unit of the signal; or let forcegp fit --forces bodies estimate it from this log."
 
@@ -200,12 +200,12 @@ class Variation:
     """One number x of the robot, of which `values` are tried.
 
     Torques at them are `weights` times `taus` (samples, rows, nv). `stated` is the value that the robot has and `least`
-    the least change of it that is reported; `what` says what a value means and `cost` is subtracted from what it
-    explains.
+    the least change of it that is reported; `text` says what a value x means, which is x times `unit` of something, and
+    `cost` is subtracted from what it explains.
     """
 
     about: str
-    what: Callable[[float], str]
+    text: str
     taus: Sequence[Float[np.ndarray, "rows nv"]]
     values: Float[np.ndarray, " values"]
     weights: Float[np.ndarray, "values samples"]
@@ -213,11 +213,11 @@ class Variation:
     least: float = 0.1
     cost: float = 0.0
     joints: tuple[str, ...] = ()
+    unit: float = 1.0
 
-
-def _interpolated(values: np.ndarray, samples: np.ndarray, functions: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Weights of what is known at the samples, at each of the values, where it is a sum of these functions."""
-    return functions(values) @ np.linalg.inv(functions(samples))
+    def what(self, x: float) -> str:
+        """What the value x means."""
+        return self.text.format(x=x, of=x * self.unit)
 
 
 def _waves(x: np.ndarray) -> np.ndarray:
@@ -307,25 +307,26 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
 
     for joint, name in enumerate(names):
         text = (
-            f"the torque of {name} is {{:.3g}} times what the motion needs, that of the others is not (its torque "
+            f"the torque of {name} is {{x:.3g}} times what the motion needs, that of the others is not (its torque "
             "constant, gear ratio or unit)"
         )
         kept = np.where(np.arange(len(names)) == joint, 0.0, tau)
-        yield factor(about="torque constant", what=text.format, taus=(kept, tau), joints=(name,))
+        yield factor(about="torque constant", text=text, taus=(kept, tau), joints=(name,))
     if len(names) > 1:
-        text = "all torques fit {:.3g} times the masses of the URDF (or the torque unit is another)"
-        yield factor(about="masses", what=text.format, taus=(0.0 * tau, tau), cost=-0.1)
+        text = "all torques fit {x:.3g} times the masses of the URDF (or the torque unit is another)"
+        yield factor(about="masses", text=text, taus=(0.0 * tau, tau), cost=-0.1)
     for body, (name, link) in enumerate(bodies):
         J = tree.inertias[body, :, :, 0]
         if float(J[3, 3]) <= 0.0:
             continue
         center = J[:, 3] / J[3, 3]
-        text = f"the torques fit a mass of {link} of {{:.3g}} times that of the URDF"
+        text = f"the torques fit a mass of {link} of {{x:.3g}} times that of the URDF"
         for part in (J, J[3, 3] * torch.outer(center, center)):  # with its inertia, and the mass alone
             inertias = tree.inertias.clone()
             inertias[body, :, :, 0] -= part
-            yield factor(about="masses", what=text.format, taus=(with_tree(inertias=inertias), tau), joints=(name,))
+            yield factor(about="masses", text=text, taus=(with_tree(inertias=inertias), tau), joints=(name,))
     samples = np.array([0.5, 1.0, 2.0])
+    parabolas = np.vander(FACTORS, 3) @ np.linalg.inv(np.vander(samples, 3))
     for body, (name, _) in enumerate(bodies):
         length = float(torch.linalg.vector_norm(tree.rest[body, :3, 3, 0]))
         if length == 0.0 or layout.parents[body] < 0:
@@ -335,34 +336,33 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
             rest[body, :3, 3] *= x
         yield Variation(
             about="lengths",
-            what=lambda x, name=name, length=length: (
-                f"the torques fit {x:.3g} times the length from {name} to the joint before ({x * length:.3g} instead "
-                f"of {length:.3g} m)"
-            ),
+            text=f"the torques fit {{x:.3g}} times the length from {name} to the joint before ({{of:.3g}} instead of "
+            f"{length:.3g} m)",
             taus=[with_tree(rest=rest) for rest in scaled],
             values=FACTORS,
-            weights=_interpolated(FACTORS, samples, lambda x: np.vander(x, 3)),
+            weights=parabolas,
             cost=0.2,
             joints=(name,),
+            unit=length,
         )
     samples, turns = 2.0 * np.pi * np.arange(5) / 5.0, np.linspace(-np.pi, np.pi, 181)
+    waves = _waves(turns) @ np.linalg.inv(_waves(samples))
     for joint, name in enumerate(names):
         if robot.joints[joint].type == "prismatic":
             continue
         one = np.eye(rows.nv)[joint]
         yield Variation(
             about="joint zero",
-            what=lambda x, name=name: (
-                f"the torques fit positions of {name} that are {x:+.3g} rad ({np.rad2deg(x):+.0f} "
-                "degrees) from the logged ones: its zero is elsewhere"
-            ),
+            text=f"the torques fit positions of {name} that are {{x:+.3g}} rad ({{of:+.0f}} degrees) from the logged "
+            "ones: its zero is elsewhere",
             taus=[needed_torques(robot, replace(rows, q=rows.q + x * one)) for x in samples],
             values=turns,
-            weights=_interpolated(turns, samples, _waves),
+            weights=waves,
             stated=0.0,
             least=0.06,
             cost=0.3,
             joints=(name,),
+            unit=1.0 / DEGREE,
         )
     # more or less gravity; none; or any where the robot has none
     nominal = robot.gravity.cpu().numpy()
@@ -371,14 +371,10 @@ def _variations(robot: Robot, rows: Dataset, tau: np.ndarray) -> Iterator[Variat
     for axis in [nominal / size] if size else [sign * axis for axis in np.eye(3) for sign in (1.0, -1.0)]:
         along = (size or STANDARD_GRAVITY) * axis
         text = ",".join(f"{value + 0.0:.3g}" for value in along)
-        stated = "" if size else f", but the robot states none (`gravity={text}`)"
+        stated = " (`gravity=0,0,0` is none)" if size else f", but the robot states none (`gravity={text}`)"
         yield Variation(
             about="gravity",
-            what=lambda x, text=text, stated=stated: (
-                "the torques show no gravity, although the robot states one (`gravity=0,0,0`)"
-                if abs(x) < NO_GRAVITY
-                else f"the torques fit {x:.3g} times gravity along ({text}) m/s²{stated}"
-            ),
+            text=f"the torques fit {{x:.3g}} times gravity along ({text}) m/s²{stated}",
             taus=[needed_torques(with_gravity(robot, x * along), rows) for x in (0.0, 1.0)],
             values=values,
             weights=np.stack([1.0 - values, values], axis=1),

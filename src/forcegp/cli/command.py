@@ -88,13 +88,13 @@ class InputPath:
 
 CONFIG = "config.json"
 LIBRARIES = ("forcegp", "torch", "gpytorch", "numpy", "scipy")
+MAPPING = InputPath(" is not a file; give --mapping a YAML file.")
 DATASET = InputPath(" is not a file; give the path of a dataset written by forcegp (.h5).")
 MODEL = InputPath(" does not exist; give the folder that `forcegp fit --out` wrote", Path.exists)
 URDF = InputPath(": no such file; give the path of a URDF file.", Path.exists)
 IDENTIFIED = InputPath(": no such file or folder; give a folder that `forcegp fit` wrote.", Path.exists)
 LOG = InputPath(" does not exist; give the path of a log.", Path.exists)
 THERE = InputPath(" does not exist; give folders of forcegp fit, and a dataset (.h5) after them.", Path.exists)
-MAPPING = InputPath(" is not a file; give --mapping a YAML file.")
 
 
 @dataclass(frozen=True)

@@ -178,7 +178,7 @@ class ColumnOptions:
         return model.with_contacts((*touching, *model.loops))
 
     def mapped(self, logs: Sequence[Path], terminal: Terminal) -> forcegp.recordings.ColumnMapping:
-        """The mapping of the file, changed by the flags. Raises InvalidInput."""
+        """What the flags state, and for those that are not given the file. Raises InvalidInput, FileFormatError."""
         path = self.mapping
         if path is None:
             found = {forcegp.recordings.beside(log) for log in logs} - {None}
@@ -188,26 +188,37 @@ class ColumnOptions:
             path = next(iter(found), None)
             if path is not None:
                 terminal.note(f"the columns are mapped by {path}")
-        stored = forcegp.recordings.ColumnMapping() if path is None else forcegp.recordings.read_mapping(path)
-        return stored.changed_by(self._flags())
+        if path is None:
+            return self._stated()
+        names = [item.name for item in fields(forcegp.recordings.ColumnMapping)]
+        stored = forcegp.recordings.read_mapping(path, names)
+        left = {name: value for name, value in stored.items() if getattr(self, name) in (None, False)}
+        try:
+            return replace(self, **left)._stated()
+        except InvalidInput as error:
+            raise InvalidInput(f"{path} and the flags: {error}") from None
 
-    def _flags(self) -> forcegp.recordings.ColumnMapping:
+    def _stated(self) -> forcegp.recordings.ColumnMapping:
         given: dict[str, Any] = {
             item.name: getattr(self, item.name) for item in fields(forcegp.recordings.ColumnMapping)
         }
+        lists = {name: text for name, text in given.items() if name in (*"qvua", "joints") and text is not None}
+        given |= {name: tuple(forcegp.recordings.listed(str(text))) for name, text in lists.items()}
         if self.delimiter is not None:
             given["delimiter"] = forcegp.recordings.DELIMITERS.get(self.delimiter, self.delimiter)
         if self.headerless is not None:
-            words = self.headerless.split(",")
+            words = str(self.headerless).split(",")
             if not all(word.strip().isdigit() for word in words):
                 raise InvalidInput(f"--headerless is {self.headerless!r}; give whole numbers such as 7 or 1,7,7.")
-            given["headerless"] = [int(word) for word in words]
-        readers = dict.fromkeys(("unit", "axes", "sign"), forcegp.recordings.by_quantity)
-        if self.sign is not None and "=" not in self.sign:
-            given["sign"] = self.sign.split(",")
-            del readers["sign"]
-        given |= {name: read(name, given[name]) for name, read in readers.items() if given[name] is not None}
-        return forcegp.recordings.mapping_of(given)
+            given["headerless"] = tuple(int(word) for word in words)
+        if self.sign is not None and "=" not in str(self.sign):  # for all signals: it turns the axis of a joint
+            given["sign"] = ",".join(f"{name}={self.sign}" for name in "qvua")
+        for name in [name for name in forcegp.recordings.EXAMPLES if given[name] is not None]:
+            stated = forcegp.recordings.by_quantity(name, given[name])
+            complaint = f"--sign is {self.sign!r}; give 1 or -1 for each joint, such as u=-1,1."
+            signs = {key: tuple(numbers_of(",".join(own), complaint)) for key, own in stated.items() if name == "sign"}
+            given[name] = signs or stated
+        return forcegp.recordings.ColumnMapping(**{name: value for name, value in given.items() if value is not None})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,7 +227,7 @@ class Import(Command):
 
     State which columns are the time, the positions, velocities and forces of the joints (or of a base that moves), and
     their units: by flags, or in a YAML file. One beside the log, log.yaml or forcegp.yaml, is found by itself. COLUMNS
-    are names, patterns such as pos{1..7}, or linear combinations: "theta2 - theta1, 0.5*b + pi".
+    are names, patterns such as pos{1..7}, or combinations: "theta2 - theta1, 0.5*b + pi".
 
     With a --cutoff, --delay, --lag, --stance, --every or --trim, rows are filtered, aligned and thinned out, and what
     that costs is reported; LOG may then be a dataset, too. The low-pass filter runs forwards and backwards, so that
@@ -387,12 +398,12 @@ def _shown(terminal: Terminal, data: Path, report: forcegp.checks.CheckReport) -
 def _numbers(report: forcegp.checks.CheckReport, content: Mapping[str, Any]) -> Any:
     cutoff = content["cutoff"]
     filtered = "not\nfiltered" if cutoff is None else f"filtered\nat {cutoff:.3g} Hz"
-    header = ["joint", "torque un-\nexplained", "rms", "factor", "noise of a\nas logged", filtered, "times M"]
+    header = ["joint", "torque un-\nexplained", "rms", "factor", "noise of a\nas logged", filtered]
     rows = [
         [
             each["joint"],
             shown(each["unexplained"], "{:.2g} %", 100.0),
-            *(shown(each[name]) for name in ("residual", "factor", "noise_before", "noise_after", "noise_torque")),
+            *(shown(each[name]) for name in ("residual", "factor", "noise_before", "noise_after")),
         ]
         for each in content["joints"]
     ]

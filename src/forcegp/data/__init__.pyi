@@ -1,11 +1,9 @@
 from .contacts import (
     contact_doubts as contact_doubts, contact_rows as contact_rows, rows_in_contact as rows_in_contact,
 )
-from .dataset import Dataset as Dataset
-from .dataset_fields import FrozenDict as FrozenDict, REVOLUTE_UNITS as REVOLUTE_UNITS, units_for as units_for
+from .dataset import Dataset as Dataset, units_for as units_for
 from .delay import (
-    Delay as Delay, estimate_delay as estimate_delay, estimate_thruster_lag as estimate_thruster_lag,
-    thruster_columns as thruster_columns, torques_of_joints as torques_of_joints,
+    Delay as Delay, estimate_delay as estimate_delay, torques_of_joints as torques_of_joints,
 )
 from .filters import (
     Filter as Filter, Lag as Lag, Later as Later, LowPass as LowPass, Mean as Mean, differentiate as differentiate,
@@ -23,4 +21,7 @@ from .views import (
     recorded_motions as recorded_motions, repeated_rows as repeated_rows, require_disjoint as require_disjoint,
     time_blocks as time_blocks, with_memory as with_memory,
 )
-from .wind import AirLaw as AirLaw, find_wind as find_wind, with_wind as with_wind
+from .wind import (
+    AirLaw as AirLaw, estimate_thruster_lag as estimate_thruster_lag, find_wind as find_wind,
+    thruster_columns as thruster_columns, with_wind as with_wind,
+)

@@ -73,9 +73,8 @@ def through(
 def rates(space: ConfigurationSpace, q: Positions, time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, "rows nv"]:
     """Velocities by differences of second order, as :func:`~forcegp.data.differentiate` has them for vectors.
 
-    At every row, its neighbours are the velocities that lead to them in one second (`Robot.difference`). The chart that
-    these are has the derivative 1 there, so the derivative of the parabola through them is the velocity in body axes.
-    Constant velocities come out exactly.
+    In the chart of `Robot.difference` about every row, the derivative of the parabola through its neighbours is the
+    velocity in body axes. Constant velocities come out exactly.
     """
     rows = np.arange(len(q))
     near = np.clip(rows, 1, len(q) - 2)[:, None] + np.array([-1, 0, 1])

@@ -1,9 +1,7 @@
-"""In which rows of a log a contact acts, and whether motion and accelerations bear out where it is."""
+"""In which rows of a log a contact acts, and whether motion and accelerations bear it out."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,10 +28,9 @@ DISTANCE_DEVIATIONS = 20.0
 def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
     """Whether each contact of `dataset.model` acts in each row, from q, v and a alone; `truth` is not looked at.
 
-    A row counts if its point moves along the surface (across it at most 2 % of that and 2 mm/s, plus what Baumgarte's
-    terms recover), `|A a - b|` is at most 4.5 standard deviations (stated, or robust ones of these rows) or 0.05 m/s^2,
-    and it is within 5 mm of the surface and where the other rows are (1 mm, or 20 robust standard deviations). A point
-    at rest or gliding just above cannot be told from one in contact. A closed loop acts in every row, a contact with a
+    A row counts if its point moves along the surface (across it at most 2 % of that and 2 mm/s), `|A a - b|` is at most
+    4.5 standard deviations or 0.05 m/s^2, and it is within 5 mm of the surface and where the other rows are. A point at
+    rest or gliding just above cannot be told from one in contact. A closed loop acts in every row, a contact with a
     switch where its flag is. Raises ContactError for a dataset without contacts, and for a contact that acts in no row.
     """
     model = dataset.model
@@ -143,13 +140,10 @@ HARDLY_ANY = 0.2  # share of rows that move along a surface, below which it is a
 BROKEN, NOISE = 0.2, 3.0
 """|A a - b| relative to the acceleration of the point, and to its noise, beyond which the contact does not hold."""
 
-MOVED, MOVED_DEVIATIONS, MOVED_GAIN = 5e-3, 5.0, 0.7  # m; of its standard deviation; of the sum of logarithms
 NO_FORCE = 0.3
 """Logarithms of what remains without a contact over what remains with it, over all joints: below, it does nothing."""
 
 MANY_ROWS = 40  # from which on friction may also turn a link about the normal of a contact
-BLOCKS = 6  # stretches that are left out in turn, for standard deviations
-STEP = 1e-3  # m
 SLOW = 0.1  # of the root mean square velocity: where dry friction turns over
 FLOOR = 1e-14
 LEAVE_OUT = "leave the contact out (`contacts=none`)."
@@ -159,8 +153,8 @@ def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> Doub
     """What the rows of `dataset` contradict about the contacts of `model` (default: its own); empty where nothing.
 
     Looks at 240 rows, in order of the file. Fewer than 10 rows, or than twice the friction that may hide among them,
-    say nothing. `numbers["kind"]` is "off" (the motion leaves the surface), "point" (forces act elsewhere) or
-    "no force". Not for contacts that hold several points of one body, closed loops, nor models without `RigidBodies`.
+    say nothing. `numbers["kind"]` is "off" (the motion leaves the surface) or "no force". Not for
+    contacts that hold several points of one body, closed loops, nor models without `RigidBodies`.
     """
     model = dataset.model if model is None else model
     few = len(dataset) < FEWEST_ROWS or not dataset.u.any()
@@ -223,79 +217,35 @@ def _on_surfaces(
 
 
 def _forces(rows: Dataset, model: forcegp.Model) -> list[Doubt]:
-    """Whether forces act at the points that the contacts state, and whether there are any."""
+    """Whether accelerations show a force of the contacts at all."""
     if len(rows) * (rows.nv - len(model.contacts)) < 2 * (3 * rows.nv + 5 * len(model.contacts)):
         return []
-    others, tangents = _moved_points(rows, model)
-    dynamics = model.dynamics(*tensors(rows)[:3])
-    friction = _friction(rows, model, dynamics)
-    given = _Residual(rows, model, friction, others)
-    solution, left, weights = given.fitted(moved=True)
-    stated = given.fitted(weights)[1]
-    free = _Residual(rows, model.with_contacts(()), friction).fitted(weights)[1]
-    improved, necessary = float(np.log(stated / left).sum()), float(np.log(free / stated).sum())
-    every = given.grams.sum(axis=0)
-    each = np.stack([given.solved(every - gram, weights, moved=True)[0] for gram in given.grams])
-    deviations, doubts = np.std(each, axis=0) * np.sqrt(BLOCKS - 1.0), list[Doubt]()
-    for index, contact in enumerate(model.contacts):
-        places = np.arange(2) + len(solution) - len(others) + 2 * index
-        shift, uncertain = solution[places], float(np.linalg.norm(deviations[places]))
-        size = float(np.linalg.norm(shift))
-        if size > max(MOVED, MOVED_DEVIATIONS * uncertain) and improved > MOVED_GAIN:
-            point = np.asarray(contact.point) + shift @ tangents[index]
-            text = ",".join(f"{value + 0.0:.3g}" for value in np.round(point, 4))
-            numbers = {"kind": "point", "contact": index, "shift": size, "std": uncertain, "point": point.tolist()}
-            seen = (
-                f"contact {index} (frame {contact.frame!r}): the accelerations show that its force acts about "
-                f"{100.0 * min(size, 1.0):.2g} cm ± {100.0 * uncertain:.1g} cm beside the stated point."
-            )
-            remedy = f"Check the contact's point (near {text}?), or what else presses against the robot."
-            doubts.append(look(about="contact", what=seen, do=remedy, numbers=numbers))
-    if not doubts and necessary < NO_FORCE:
-        seen = "the accelerations show no force of the stated contact: they fit as well without it."
-        numbers = {"kind": "no force", "gain": necessary}
-        doubts.append(look(about="contact", what=seen, do=f"If nothing was touched, {LEAVE_OUT}", numbers=numbers))
-    return doubts
+    friction = _friction(rows, model, model.dynamics(*tensors(rows)[:3]))
+    stated = _left(rows, model, friction, None)
+    free = _left(rows, model.with_contacts(()), friction, stated)
+    necessary = float(np.log(free / stated).sum())
+    if necessary >= NO_FORCE:
+        return []
+    seen = "the accelerations show no force of the stated contact: they fit as well without it."
+    numbers = {"kind": "no force", "gain": necessary}
+    return [look(about="contact", what=seen, do=f"If nothing was touched, {LEAVE_OUT}", numbers=numbers)]
 
 
-class _Residual:
-    """What friction (rows, nv, k), and points `moved` by STEP, leave of `a`, as products of all columns."""
-
-    def __init__(
-        self, rows: Dataset, model: forcegp.Model, friction: Tensor, moved: Sequence[forcegp.Model] = ()
-    ) -> None:
-        q, v, u, a = tensors(rows)
-        dynamics = model.dynamics(q, v, u)
-        given = dynamics.acceleration_map().offset
-        changes = [(other.dynamics(q, v, u).acceleration_map().offset - given) / STEP for other in moved]
-        parts = torch.cat([dynamics.H @ friction, *(x[..., None] for x in (*changes, a - given))], dim=-1).numpy()
-        size = np.linalg.norm(parts, axis=(0, 1))
-        self.used = size > 1e-9 * max(float(size.max()), 1e-300)
-        self.used[-1] = True
-        self.size, self.moved = np.where(self.used, np.maximum(size, 1e-300), 1.0), len(moved)
-        blocks = np.array_split(parts / self.size * self.used, BLOCKS)
-        self.grams = np.stack([np.einsum("rjk,rjl->jkl", block, block) for block in blocks])
-
-    def solved(
-        self, gram: Float[np.ndarray, "nv k k"], weights: Float[np.ndarray, " nv"], moved: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Coefficients (k,), and the power (nv,) that is left in every joint; with moved points or without."""
-        count = gram.shape[-1] - 1
-        used = np.flatnonzero(self.used[: count if moved else count - self.moved])
-        total, solution = np.tensordot(weights, gram, 1), np.zeros(count + 1)
-        if len(used):
-            solution[used] = -np.linalg.lstsq(total[np.ix_(used, used)], total[used, -1], rcond=1e-12)[0]
-        solution[-1] = 1.0
-        left = np.maximum(np.einsum("k,jkl,l->j", solution, gram, solution), FLOOR * gram[:, -1, -1]) + 1e-300
-        return -solution[:-1] / self.size[:-1] * self.size[-1], left * self.size[-1] ** 2
-
-    def fitted(self, weights: np.ndarray | None = None, moved: bool = False) -> tuple[np.ndarray, ...]:
-        """Coefficients, power left, and weights: those given, or in proportion to 1 over the power that is left."""
-        gram = self.grams.sum(axis=0)
-        chosen = 1.0 / np.maximum(gram[:, -1, -1], 1e-300) if weights is None else weights
-        for _ in range(3 if weights is None else 0):
-            chosen = self.size[-1] ** 2 / self.solved(gram, chosen, moved)[1]
-        return *self.solved(gram, chosen, moved), chosen
+def _left(
+    rows: Dataset, model: forcegp.Model, friction: Tensor, weights: Float[np.ndarray, " nv"] | None
+) -> Float[np.ndarray, " nv"]:
+    """Power of each joint's a that friction (rows, nv, k) leaves; joints count by 1 over `weights`, or over it."""
+    q, v, u, a = tensors(rows)
+    dynamics = model.dynamics(q, v, u)
+    X, y = (dynamics.H @ friction).numpy(), (a - dynamics.acceleration_map().offset).numpy()
+    X = X / np.maximum(np.linalg.norm(X, axis=(0, 1)), 1e-300)
+    power = np.square(y).sum(axis=0) + 1e-300
+    left = power if weights is None else weights
+    for _ in range(4 if weights is None else 1):
+        scale = left**-0.5
+        solution = np.linalg.lstsq((X * scale[:, None]).reshape(y.size, -1), (y * scale).ravel(), rcond=1e-6)[0]
+        left = np.maximum(np.square(y - X @ solution).sum(axis=0), FLOOR * power)
+    return left
 
 
 def _friction(
@@ -318,18 +268,3 @@ def _friction(
             along = turning.mT @ dynamics.normals[:, index, :, None]
             forces.append(along * torch.cat([velocity, loaded], dim=-1)[:, None])
     return torch.cat(forces, dim=-1)
-
-
-def _moved_points(rows: Dataset, model: forcegp.Model) -> tuple[list[forcegp.Model], list[np.ndarray]]:
-    """The model with each contact point moved along the surface, in both directions of the link's frame."""
-    kinematics = model.robot.kinematics(torch.tensor(rows.q))
-    others, tangents = [], []
-    for contact in model.contacts:
-        normal = contact.surface.gradient(contact.position(kinematics))
-        local = (kinematics.frame_pose(contact.frame)[:, :3, :3].mT @ normal[..., None])[..., 0].numpy()
-        tangents.append(np.linalg.eigh(local.T @ local)[1][:, :2].T)  # the directions that are least along the normal
-        for direction in tangents[-1]:
-            point = tuple(np.asarray(contact.point) + STEP * direction)
-            contacts = [replace(each, point=point) if each is contact else each for each in model.contacts]
-            others.append(model.with_contacts(contacts))
-    return others, tangents

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,19 +16,31 @@ from jaxtyping import Bool, Float, Int
 from typing_extensions import override
 
 import forcegp.model
-from forcegp.data.dataset_fields import (
-    ROTATION,
-    TRANSLATION,
-    FrozenDict,
-    finite_columns,
-    frozen_json,
-    integer_column,
-    sliding_joints,
-    units_of,
-)
+import forcegp.robots
 from forcegp.data.hdf5 import read_fields, write_fields
 from forcegp.errors import DatasetError, FileFormatError, InvalidInput, require_type, usable_arguments
+from forcegp.robots.arguments import real_array
 from forcegp.summary import Summary, listed, rounded
+
+ROTATION = {"q": "rad", "v": "rad/s", "u": "Nm", "a": "rad/s^2"}  # units of a revolute or continuous joint
+TRANSLATION = {"q": "m", "v": "m/s", "u": "N", "a": "m/s^2"}  # units of a prismatic joint
+
+
+def units_of(slides: Sequence[bool]) -> dict[str, Any]:
+    """Units of q, v, u, a and time: one text where all joints agree, else one per joint."""
+    each = {name: tuple((TRANSLATION if one else ROTATION)[name] for one in slides) for name in ROTATION}
+    return {name: texts[0] if len(set(texts)) == 1 else texts for name, texts in each.items()} | {"time": "s"}
+
+
+def sliding_joints(robot: forcegp.robots.Robot) -> tuple[str, ...]:
+    """Names of the degrees of freedom that are lengths."""
+    return tuple(name for name, joint in zip(robot.joint_names, robot.joints, strict=True) if joint.type == "prismatic")
+
+
+def units_for(robot: forcegp.robots.Robot) -> dict[str, Any]:
+    """The units that a Dataset of this robot has."""
+    return units_of([name in sliding_joints(robot) for name in robot.joint_names])
+
 
 ORDER = "a", "lambda", "Q_U", "in_contact"
 TRUTH = re.compile(r"a|lambda|Q_U|in_contact|(Q_U|force)\.[a-zA-Z0-9-]*[a-zA-Z0-9][a-zA-Z0-9-]*")
@@ -48,15 +61,13 @@ class Dataset(Summary):
     a: (rows, nv) measured acceleration, with its noise.
     time: (rows,) [s]; strictly increasing within an episode (see `time_ordered`).
     joint_names: nv names, in the order of the columns; by default, and in any case equal to, those of `model.robot`.
-    sliding: names of the joints that slide, with units m, m/s, N and m/s^2; all others turn, with rad, rad/s, Nm and
-        rad/s^2. By default, and in any case equal to, those of `model.robot`; without a model none.
     episode: (rows,) integers; rows of equal number are one continuous motion. Default: all 0.
     model: the robot and what it touches, or None.
     noise_std: standard deviation of the noise on `a`, (nv,), if known.
     truth: what a simulation provides: noise-free "a" (rows, nv), constraint multipliers "lambda" (rows, m) [N],
         the unknown joint forces "Q_U" (rows, nv), their parts "Q_U.<name>" (rows, nv), forces on the robot
         "force.<name>" (rows, 3) [N, world axes], and "in_contact" (rows, m), 1 where a contact acts and 0 elsewhere.
-    metadata: anything that JSON can hold; frozen.
+    metadata: a copy of anything that JSON can hold.
     strokes: what rows know of the motion before them (`forcegp.data.strokes`), for friction that remembers; not stored.
     time_ordered: False for rows drawn in another order (`rows`): times are then only required to differ.
 
@@ -69,7 +80,6 @@ class Dataset(Summary):
     a: Float[np.ndarray, "rows nv"]
     time: Float[np.ndarray, " rows"]
     joint_names: tuple[str, ...] = None  # type: ignore[assignment]  # None becomes the robot's
-    sliding: tuple[str, ...] = None  # type: ignore[assignment]  # None becomes the robot's
     episode: Int[np.ndarray, " rows"] = None  # type: ignore[assignment]  # None becomes zeros
     model: forcegp.model.Model | None = None
     noise_std: Float[np.ndarray, " nv"] | None = None
@@ -100,15 +110,17 @@ class Dataset(Summary):
             except InvalidInput as error:  # a quaternion of another length than 1
                 raise DatasetError(str(error)) from None
         put("time", finite_columns("time", self.time, None, rows))
-        put("episode", integer_column("episode", np.zeros(rows, int) if self.episode is None else self.episode, rows))
-        own = None if self.model is None else sliding_joints(self.model.robot)
-        put("sliding", (own or ()) if self.sliding is None else tuple(self.sliding))
-        if not set(self.sliding) <= set(names) or (own is not None and set(self.sliding) != set(own)):
-            allowed = f"joints are {list(names)}" if own is None else f"those of the robot are {list(own)}"
-            raise DatasetError(f"sliding joints are {list(self.sliding)}; {allowed}.")
+        given = real_array("episode", np.zeros(rows, int) if self.episode is None else self.episode, "iu", DatasetError)
+        if given.shape != (rows,):
+            raise DatasetError(f"episode has shape {given.shape}; expected ({rows},).")
+        put("episode", _read_only(given.astype(np.int64)))
         put("noise_std", _noise_std(self.noise_std, names))
         put("truth", _truth(self.truth, names, rows, self.model))
-        put("metadata", frozen_json(self.metadata))
+        try:
+            put("metadata", json.loads(json.dumps(self.metadata, allow_nan=False)))
+        except (TypeError, ValueError) as error:
+            allowed = "text, finite numbers, True, False, None, and lists or mappings of them"
+            raise DatasetError(f"metadata cannot be written as JSON: {error}. Allowed: {allowed}.") from error
         put("time_ordered", bool(self.time_ordered))
         _check_time(self.time, self.episode, self.time_ordered)
 
@@ -116,18 +128,15 @@ class Dataset(Summary):
         return len(self.q)
 
     @property
-    def units(self) -> FrozenDict:
+    def units(self) -> dict[str, Any]:
         """SI units of "q", "v", "u", "a" and "time": one text, or one per joint where joints differ."""
         return units_of((~self.turns).tolist())
 
     @property
     def turns(self) -> Bool[np.ndarray, " nv"]:
-        """Whether a joint turns; others slide."""
-        return np.array([name not in self.sliding for name in self.joint_names])
-
-    def unit_of_each(self, name: str) -> tuple[str, ...]:
-        """The unit of a signal, one per joint."""
-        return tuple((ROTATION if turns else TRANSLATION)[name] for turns in self.turns)
+        """Whether a joint turns; others slide. Without a model, all turn."""
+        slide = () if self.model is None else sliding_joints(self.model.robot)
+        return np.array([name not in slide for name in self.joint_names])
 
     @override
     def facts(self) -> dict[str, object]:
@@ -137,13 +146,6 @@ class Dataset(Summary):
         facts |= {"episodes": listed(self.episodes), "robot": robot}
         noise = self.noise_std
         return facts | {"noise std": "not stated" if noise is None else rounded(noise), "truth": listed(self.truth)}
-
-    __iter__: ClassVar[None] = None
-    """Rows are arrays: without this, Python would iterate by `dataset[0]`, `dataset[1]`, ..."""
-
-    def __getitem__(self, index: slice | Sequence[int] | np.ndarray) -> Dataset:
-        """`dataset[10:20]`, `dataset[mask]` and `dataset[[3, 1]]` are `rows`."""
-        return self.rows(index)
 
     def __reduce__(self) -> tuple[Any, ...]:  # pickling and copying restore writable arrays; the constructor does not
         return partial(Dataset, **self._fields()), ()
@@ -196,11 +198,15 @@ class Dataset(Summary):
     @usable_arguments("Dataset.load")
     def load(path: str | Path) -> Dataset:
         """Read a file written by `save`. Raises FileFormatError saying what is wrong with the file."""
-        given = read_fields(Path(path))
+        given, units = read_fields(Path(path))
         try:
-            return Dataset(**given)
+            found = Dataset(**given)
         except DatasetError as error:
             raise FileFormatError(f"{path} holds data that are not valid: {error}") from error
+        for name, unit in found.units.items():
+            if units[name] not in ((unit,), unit, (unit,) * found.nv):
+                raise FileFormatError(f"{path}: {name!r} has the units {', '.join(units[name])}; convert it to {unit}.")
+        return found
 
     def _fields(self) -> dict[str, Any]:
         return {item.name: getattr(self, item.name) for item in fields(self)}
@@ -238,7 +244,7 @@ def _noise_std(given: object, joint_names: tuple[str, ...]) -> np.ndarray | None
 
 def _truth(
     given: Mapping[str, object], joint_names: tuple[str, ...], rows: int, model: forcegp.model.Model | None
-) -> FrozenDict:
+) -> dict[str, np.ndarray]:
     unknown = sorted(name for name in given if not TRUTH.fullmatch(name))
     if unknown:
         raise DatasetError(f"truth has no {unknown}; allowed: a, lambda, Q_U, in_contact, Q_U.<name>, force.<name>.")
@@ -252,7 +258,42 @@ def _truth(
             raise DatasetError(
                 f"truth[{name!r}] has {values.shape[1]} columns; the model has {len(model.contacts)} contacts."
             )
-    return FrozenDict(checked)
+    return checked
+
+
+def finite_columns(
+    name: str, given: object, columns: Sequence[str] | None, rows: int | None = None, *, what: str = "rows"
+) -> np.ndarray:
+    """float64, C-contiguous, read-only copy of a table of finite numbers.
+
+    `columns` None asks for a vector, names for one column each, and an empty sequence for any number of columns.
+    """
+    values = real_array(name, given, error=DatasetError).astype(np.float64)  # astype always copies
+    expected = f"({what},)" if columns is None else f"({what}, {len(columns) or 'any'})"
+    wrong_columns = columns is not None and values.ndim == 2 and columns and values.shape[1] != len(columns)
+    if values.ndim != (1 if columns is None else 2) or wrong_columns:
+        raise DatasetError(f"{name} has shape {values.shape}; expected {expected}.")
+    if rows is not None and len(values) != rows:
+        raise DatasetError(f"{name} has {len(values)} {what}; expected {rows}.")
+    if values.shape[0] == 0:
+        raise DatasetError(f"{name} has no {what}; at least one is needed.")
+    bad = ~np.isfinite(values)
+    if bad.any():
+        position = np.argwhere(bad)[0]
+        column = ""
+        if columns is not None:
+            column = f", column {position[1]}" + (f" ({columns[position[1]]})" if columns else "")
+        raise DatasetError(
+            f"{name} is {values[tuple(position)]} at row {position[0]}{column}; "
+            f"{int(bad.sum())} values are not finite. Drop or repair these rows first."
+        )
+    return _read_only(values)
+
+
+def _read_only(values: np.ndarray) -> np.ndarray:
+    values = np.ascontiguousarray(values)
+    values.flags.writeable = False
+    return values
 
 
 def _first_disorder(time: np.ndarray, episode: np.ndarray) -> int | None:

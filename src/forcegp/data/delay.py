@@ -1,4 +1,4 @@
-"""How late forces are: torques logged later than they act, thrusters that act later than their commands."""
+"""How much later than they act torques were logged."""
 
 from __future__ import annotations
 
@@ -8,17 +8,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation
-from torch import Tensor
 
-import forcegp.forces
 import forcegp.robots
 from forcegp.data.dataset import Dataset, require_rows
-from forcegp.data.filters import Lag, episodes_in_order
-from forcegp.data.views import in_blocks
+from forcegp.data.filters import episodes_in_order
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.forces.joint_laws import law_columns, usual_columns
-from forcegp.robots.manifold import TURN, Group
 
 LEAST_DELAY, USUAL_DELAY, LARGEST_DELAY = 5e-4, 0.05, 0.2  # s
 STEPS = 100  # shifts that are tried to either side
@@ -37,10 +32,8 @@ WORTH = 0.98
 class Delay:
     """Delay of the torque behind the motion [s], with standard deviations [s]; NaN where the log shows none.
 
-    `common` is the one delay that suits all joints best: what a bus or a filter does to all of them alike. `seconds`
-    (nv,) is that of each joint alone; where friction makes up most of a torque it can be a property of the friction.
-    `remains` is what the common delay leaves of what was unexplained, as the geometric
-    mean over the joints.
+    `common` suits all joints best; `seconds` (nv,) is that of each joint alone, which may be one of friction. `remains`
+    is what the common delay leaves of what was unexplained, as the geometric mean over the joints.
     """
 
     common: float
@@ -59,8 +52,7 @@ class Delay:
     def significant(self) -> float:
         """The delay that most joints show, if it is more than three standard deviations from zero, else 0.
 
-        It is the common one, or else the median of the joints: where friction makes up most of a torque, noise of the
-        velocity can look like a delay, which the likelihood of all joints then follows.
+        It is the common one, or else the median of the joints: where friction dominates, noise of v looks like a delay.
         """
         if not np.isfinite(self.common):
             return 0.0
@@ -91,10 +83,9 @@ def estimate_delay(dataset: Dataset, robot: forcegp.robots.Robot | None = None) 
     """The delay of u behind the motion, joint by joint: `u_logged(t + delay)` acts at t.
 
     For every shift up to .2 s, u is fitted by least squares to the torque regressor of `robot` (default: that of the
-    model), acceleration, velocity, smooth signs of it of several widths, a constant, and the model's laws: so it rests
-    neither on the robot's parameters nor on one law of friction. The best shift is the vertex of a parabola; its
-    standard deviation comes from leaving out each eighth of the log (block jackknife; Kuensch 1989). Filter q, v, u and
-    a alike before. Raises InvalidInput without a robot, or with contacts; DatasetError for a log shorter than .4 s.
+    model), a rotor, friction of several widths, a constant, and the model's laws. The best shift is the vertex of a
+    parabola; its standard deviation is a block jackknife (Kuensch 1989). Filter q, v, u and a alike before. Raises
+    InvalidInput without a robot, or with contacts; DatasetError for a log shorter than .4 s.
     """
     robot = _robot(dataset, robot)
     near = _estimated(dataset, robot, USUAL_DELAY)
@@ -237,102 +228,3 @@ def torques_of_joints(dataset: Dataset) -> bool:
     """Whether u has one torque per degree of freedom."""
     model = dataset.model
     return model is None or (model.actuators == model.robot.joint_names and model.actuation.matrix is None)
-
-
-FAST = 0.1  # s: slower changes, of wind and of what controllers answer to it, do not count
-TRIED = np.linspace(0.0, 0.3, 31)  # s
-THRUST_SETTLED = 0.5  # s, of an episode, after which nothing depends on how it began
-
-
-def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
-    """Time constant [s] of thrusters that follow u by first order, T s' + s = u, and its standard deviation.
-
-    For every T, the force that accelerates the base is fitted by least squares to thrusters (Mahony et al. 2012), air,
-    attitude and bodies beside the base, all without their slow part: wind is slow, and controllers answer it. The least
-    sum of log residuals wins; its deviation is a block jackknife, and half a step of time. Raises InvalidInput without
-    `Thrusters` on a base that moves freely, and DatasetError where the recording is too short, or shows no lag below .3
-    s.
-    """
-    found = thruster_columns(dataset.model)
-    if dataset.model is None or not found:
-        raise InvalidInput("this lag is that of thrusters: give a model with Thrusters and base='floating'.")
-    columns, powers, group = list(found), np.array(list(found.values())), dataset.model.robot.layout.groups[0]
-    episodes = [
-        part for _, part, _ in episodes_in_order(dataset) if part.time[-1] - part.time[0] > 2.0 * THRUST_SETTLED
-    ]
-    if sum(map(len, episodes)) < 1000:
-        raise DatasetError(
-            "the recording is too short for the lag of thrusters; record 1,000 rows or more, or give the lag in s."
-        )
-    forces, moved = (
-        np.concatenate([_fast(values, part.time) for values, part in zip(each, episodes, strict=True)])
-        for each in zip(*(_base_forces(part, group) for part in episodes), strict=True)
-    )
-    misfits = []
-    for seconds in TRIED:
-        causes = [_causes(part, columns, powers, group, float(seconds)) for part in episodes]
-        X = np.concatenate([_fast(own, part.time) for own, part in zip(causes, episodes, strict=True)])
-        if moved.shape[1] == 0:
-            misfits.append(_misfits(X, forces))
-        else:  # each force has columns of its own
-            own = zip(np.split(moved, 3, axis=1), forces[:, :3].T, strict=True)
-            misfits.append(sum(_misfits(np.hstack([X, more]), force[:, None]) for more, force in own))
-    lags = np.array([lowest(profile, TRIED) if np.argmin(profile) else 0.0 for profile in np.array(misfits).T])
-    if not np.isfinite(lags).all():
-        raise DatasetError("the recording shows no lag of the thrusters below .3 s; give the lag in s, or 0.")
-    half = 0.5 * float(np.median(np.diff(episodes[0].time)))
-    return float(lags[0]), float(np.hypot(jackknife(lags[None, 1:])[0], half))
-
-
-def thruster_columns(model: forcegp.Model | None) -> dict[int, int]:
-    """Columns of u that push a base that floats, and the powers in which they act: `Thrusters`, and such actuators."""
-    groups = () if model is None else model.robot.layout.groups
-    if model is None or not groups or groups[0].kind != "floating":
-        return {}
-    matrix = model.actuation.matrix
-    pushes = [] if matrix is None else np.flatnonzero(torch.as_tensor(matrix)[groups[0].rows].cpu().numpy().any(0))
-    kind = forcegp.forces.Thrusters
-    thrusters = [force for force in model.forces if isinstance(force, kind)]
-    named = {model.inputs.index(name): force.power for force in thrusters for name in force.names}
-    return {**{int(column): 1 for column in pushes}, **named}
-
-
-def _causes(
-    part: Dataset, columns: list[int], powers: np.ndarray, group: Group, seconds: float
-) -> Float[np.ndarray, "rows causes"]:
-    late = Lag(seconds)(part.u[:, columns], part.time)
-    thrust = np.where(powers == 2, late * np.abs(late), late)
-    v, w = part.v[:, group.rows][:, :3], part.v[:, group.rows][:, 3:]
-    axes = Rotation.from_quat(part.q[:, group.places][:, TURN]).as_matrix().reshape(-1, 9)
-    fast = np.linalg.norm(v, axis=1, keepdims=True)
-    spinning = np.where(powers == 2, late, np.sqrt(np.abs(late)))[..., None] * v[:, None]
-    turning = [np.cross(w, v), w[:, [1, 2, 0]] * w[:, [2, 0, 1]]]
-    parts = [thrust, thrust.sum(1, keepdims=True) * v, v, fast * v, w, *turning, axes, spinning.reshape(len(v), -1)]
-    return np.concatenate(parts, axis=1)
-
-
-def _base_forces(part: Dataset, group: Group) -> tuple[np.ndarray, np.ndarray]:
-    """Forces (rows, 6) that accelerate the base, and for each of the first three k columns of bodies beside it."""
-    assert part.model is not None
-    robot = part.model.robot
-
-    def found(q: Tensor, v: Tensor, _: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
-        at = robot.kinematics(q, v)
-        base = at.mass_matrix()[:, group.rows, group.rows] @ a[:, group.rows, None]
-        a[:, group.rows] = 0.0  # what is fitted explains nothing
-        regressor = at.torque_regressor(a)[:, group.rows, group.bodies.stop :][:, :3]
-        return base[..., 0], regressor.flatten(1)
-
-    forces, moved = in_blocks(part, found, robot.device)
-    return forces, moved
-
-
-def _fast(values: Float[np.ndarray, "rows k"], time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, "kept k"]:
-    """Without what a low pass of first order leaves, where that has settled."""
-    return (values - Lag(FAST)(values, time))[time - time[0] > THRUST_SETTLED]
-
-
-def _misfits(X: Float[np.ndarray, "rows causes"], target: Float[np.ndarray, "rows k"]) -> Float[np.ndarray, " parts"]:
-    """Sums of log residuals of all rows, and without each block."""
-    left = least_squares(X / (np.linalg.norm(X, axis=0) + 1e-300), target)
-    return np.log(np.maximum(left, 1e-300)).sum(axis=1)

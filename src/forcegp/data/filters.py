@@ -27,7 +27,7 @@ FREQUENCIES = 2**15 + 1
 
 
 class Filter(ABC):
-    """A linear filter of signals in time; `(a >> b)(values, time)` is b behind a."""
+    """A linear filter of signals in time."""
 
     @abstractmethod
     def __call__(self, values: Values, time: Float[np.ndarray, " rows"]) -> Values:
@@ -48,34 +48,14 @@ class Filter(ABC):
         above, below = correlation[[after - 1, after]]
         return float(after - (0.5 - below) / (above - below)) / rate
 
-    def __rshift__(self, other: Filter) -> Filter:
-        return Chain((self, other))
-
-
-@dataclass(frozen=True)
-class Chain(Filter):
-    """Filters one after the other."""
-
-    parts: tuple[Filter, ...]
-
-    def __call__(self, values: Values, time: Float[np.ndarray, " rows"]) -> Values:
-        """Through all of them."""
-        for part in self.parts:
-            values = part(values, time)
-        return values
-
-    def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
-        """The product."""
-        return np.prod([part.gain(frequency, rate) for part in self.parts], axis=0)
-
 
 @dataclass(frozen=True)
 class LowPass(Filter):
     """Butterworth low-pass at `cutoff` Hz, run forwards and backwards so that nothing is delayed.
 
-    Both ends are continued by point reflection until the filter's transient has died out, so that straight lines pass.
-    Two passes square the gain: `1 / (1 + (tan(pi f / f_s) / tan(pi f_c / f_s))^(2 order))`, so 1/2 at the cut-off.
-    Raises InvalidInput for a cut-off at or above half the sample rate, DatasetError for too few rows.
+    Both ends are continued by point reflection until the transient has died out, so that straight lines pass; two
+    passes square the gain, which is 1/2 at the cut-off. Raises InvalidInput for a cut-off at or above half the sample
+    rate, DatasetError for too few rows.
     """
 
     cutoff: float
@@ -134,8 +114,7 @@ class Later(Filter):
 class Lag(Filter):
     """What an actuator of first order with that time constant makes of values, at rest with the first of them.
 
-    By Tustin's rule (trapezoids), exact for values that are linear between equal steps of time up to the square of
-    step over time constant.
+    By Tustin's rule (trapezoids), for equal steps of time.
     """
 
     seconds: float
@@ -178,10 +157,9 @@ class Mean(Filter):
 def low_pass(dataset: Dataset, cutoff: float, *, signals: Sequence[Signal] = ("q", "v", "u", "a")) -> Dataset:
     """The Dataset with the named signals behind a `LowPass` within each episode.
 
-    Filtering `a` changes its noise, whose standard deviation is then no longer known (`noise_std` None). Filtering q,
-    v or u drops `truth`: with it, the equation of motion would no longer hold in the changed rows. Switches of contacts
-    stay as they are. Raises as `LowPass`, naming the episode; DatasetError for rows that are not in order of time, for
-    positions that jump by a turn, and for a base that turns faster than the filter passes.
+    Filtering `a` makes `noise_std` None, filtering q, v or u drops `truth`. Switches of contacts stay as they are.
+    Raises as `LowPass`, naming the episode; DatasetError for rows that are not in order of time, for positions that
+    jump by a turn, and for a base that turns faster than the filter passes.
     """
     if not signals or not set(signals) <= {"q", "v", "u", "a"}:
         raise InvalidInput(f"signals are {tuple(signals)!r}; allowed: one or more of q, v, u, a.")
@@ -253,9 +231,9 @@ def uniform_step(time: Float[np.ndarray, " rows"], name: str = "this recording")
 def differentiated(dataset: Dataset, source: Literal["q", "v"] = "v") -> Dataset:
     """The Dataset with `a` computed from `v` by central differences, or `v` and `a` from `q`, within each episode.
 
-    Differences amplify noise: filter `source` first (`low_pass`). `noise_std` becomes None. `truth` is dropped where
-    `v` changes: the equation of motion would no longer hold with it. Raises DatasetError for rows that are not in
-    order of time, episodes of fewer than 3 rows and positions that jump by a turn; InvalidInput for another source.
+    Filter `source` first (`low_pass`). `noise_std` becomes None, and `truth` is dropped where `v` changes. Raises
+    DatasetError for rows that are not in order of time, episodes of fewer than 3 rows and positions that jump by a
+    turn; InvalidInput for another source.
     """
     if source not in ("q", "v"):
         raise InvalidInput(f"source is {source!r}; allowed: 'q' (gives v and a) or 'v' (gives a).")
@@ -274,10 +252,9 @@ def differentiated(dataset: Dataset, source: Literal["q", "v"] = "v") -> Dataset
 def resample(dataset: Dataset, step: float) -> Dataset:
     """The Dataset at uniform times, `step` [s] apart, by a cubic spline through each signal of each episode.
 
-    Switches of contacts are those of the row before.
-    Filter first (`low_pass`) when going to a longer step: a spline does not remove what the new rate cannot carry.
-    `truth` and `noise_std` are dropped, since interpolation makes neither. Raises InvalidInput for a step <= 0 or
-    longer than an episode, DatasetError for rows that are not in order of time or positions that jump by a turn.
+    Filter first (`low_pass`) when going to a longer step. Switches of contacts are those of the row before; `truth` and
+    `noise_std` are dropped. Raises InvalidInput for a step <= 0 or longer than an episode, DatasetError for rows that
+    are not in order of time or positions that jump by a turn.
     """
     if not (np.isfinite(step) and step > 0):
         raise InvalidInput(f"step is {step} s; it must be > 0.")

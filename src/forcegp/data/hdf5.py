@@ -13,7 +13,6 @@ import numpy as np
 import forcegp.mechanics
 from forcegp import __version__
 from forcegp.atomic_files import atomic_file
-from forcegp.data.dataset_fields import ROTATION, TRANSLATION
 from forcegp.errors import FileFormatError, ForceGPError
 
 FORMAT = "forcegp-dataset"
@@ -67,13 +66,14 @@ def new_file(path: Path) -> Iterator[h5py.File]:
     path.write_bytes(image)
 
 
-def read_fields(path: Path) -> dict[str, Any]:
-    """The fields of the Dataset in a file. Raises FileFormatError with the path and what is wrong."""
+def read_fields(path: Path) -> tuple[dict[str, Any], dict[str, tuple[str, ...]]]:
+    """The fields of the Dataset in a file, and the units of its columns. Raises FileFormatError."""
     if not path.is_file():
         raise FileFormatError(f"{path} is not a file; give the path of a dataset written by forcegp (.h5).")
     try:
         with h5py.File(path, "r") as file:
-            return _Reader(path, file).fields()
+            reader = _Reader(path, file)
+            return reader.fields(), {name: reader.units(name) for name in COLUMNS if name != "episode"}
     except FileFormatError:
         raise
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # whatever h5py meets in a damaged file
@@ -104,7 +104,6 @@ class _Reader:
         self.require(not missing, f" has no {', '.join(missing)}; a dataset needs {', '.join(required)}.")
         values: dict[str, Any] = {name: self.array(name) for name in COLUMNS}
         values["joint_names"] = tuple(self.texts("joint_names"))
-        values["sliding"] = self.sliding(values["joint_names"])
         values["metadata"] = json.loads(self.text("metadata"))
         self.require(isinstance(values["metadata"], dict), ": 'metadata' must be a JSON object.")
         values["noise_std"] = self.array("noise_std") if "noise_std" in file else None
@@ -148,19 +147,7 @@ class _Reader:
         self.require(len(texts) == 1, f": {name!r} must hold one text; it holds {len(texts)}.")
         return texts[0]
 
-    def sliding(self, joints: tuple[str, ...]) -> tuple[str, ...]:
-        """Joints whose units are those of a length."""
-        self.require(self.units("time", 1) == ("s",), ": 'time' must be in 's'.")
-        each = {name: self.units(name, len(joints)) for name in ROTATION}
-        of_joints = [dict(zip(each, units, strict=True)) for units in zip(*each.values(), strict=True)]
-        for joint, units in zip(joints, of_joints, strict=True):
-            allowed = f"allowed are {ROTATION} or, for a prismatic joint, {TRANSLATION}"
-            self.require(units in (ROTATION, TRANSLATION), f": joint {joint!r} has units {units}; {allowed}.")
-        return tuple(joint for joint, units in zip(joints, of_joints, strict=True) if units == TRANSLATION)
-
-    def units(self, name: str, count: int) -> tuple[str, ...]:
+    def units(self, name: str) -> tuple[str, ...]:
         units: Any = self.file[name].attrs.get("units")
         self.require(units is not None, f": {name!r} has no attribute 'units'.")
-        texts = tuple(map(str, np.atleast_1d(units)))
-        self.require(len(texts) in (1, count), f": {name!r} has {len(texts)} units for {count} joints.")
-        return texts if len(texts) == count else texts * count
+        return tuple(map(str, np.atleast_1d(units)))

@@ -9,7 +9,7 @@ from warnings import warn
 import numpy as np
 
 from forcegp.data.dataset import Dataset
-from forcegp.data.delay import estimate_delay, estimate_thruster_lag, thruster_columns, torques_of_joints
+from forcegp.data.delay import estimate_delay, torques_of_joints
 from forcegp.data.filters import (
     PASSED,
     LowPass,
@@ -22,6 +22,7 @@ from forcegp.data.filters import (
 )
 from forcegp.data.spectrum import FEWEST_ROWS, held_out_cutoff, motion_spectrum
 from forcegp.data.stance import estimate_stance
+from forcegp.data.wind import estimate_thruster_lag, thruster_columns
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.robots.arguments import whole_number
 from forcegp.summary import plain
@@ -37,12 +38,10 @@ class Preparation:
     """What to do with a raw log, the same for every episode. The default changes nothing.
 
     cutoff: zero-phase Butterworth low-pass of that many Hz on q and u (with `differentiate="v"` on v as well), after
-        which v and a are computed anew; "auto" reads it from the spectrum (`motion_spectrum`), None leaves q, v, a
-        and u as they are.
-    delay: how much later than it acts u was logged [s]: `u(t) := u_logged(t + delay)`; "auto" estimates one for all
-        joints (`estimate_delay`), used where it is sure and explains something.
-    lag: time constant of the actuators [s], of thrusters where a base has them: `u` becomes what an actuator of first
-        order makes of it, T u_a' + u_a = u; "auto" estimates that of thrusters (`estimate_thruster_lag`).
+        which v and a are computed anew; "auto" as `motion_spectrum` and `held_out_cutoff` find it, None for none.
+    delay: how much later than it acts u was logged [s]: `u(t) := u_logged(t + delay)`; "auto": `estimate_delay`.
+    lag: time constant of the actuators [s], of thrusters where a base has them: T u_a' + u_a = u; "auto":
+        `estimate_thruster_lag`.
     every: keep every so many rows.
     trim: seconds to drop at both ends of each episode, where a filter has samples of one side only.
     differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities.
@@ -109,10 +108,9 @@ class Preparation:
     def apply(self, dataset: Dataset) -> Dataset:
         """The prepared Dataset, with its price under "preparation" in the metadata.
 
-        The price holds the settings; "why"; "rows" and "sample_rate" [Hz] before and after; per joint
-        "acceleration_noise" before and after the filter [rad/s^2 or m/s^2] (None without a noise floor); and the price
-        that was paid "earlier". Raises DatasetError for rows out of order, uneven or too few, InvalidInput for a cut-
-        off above half the sample rate.
+        The price: the settings and "why", "rows" and "sample_rate" [Hz] before and after, per joint
+        "acceleration_noise" before and after [rad/s^2 or m/s^2], and what was "earlier". Raises DatasetError for rows
+        out of order, uneven or too few, InvalidInput for a cut-off above half the sample rate.
         """
         chosen = self.resolved(dataset)
         prepared, found = _prepared(chosen, dataset)

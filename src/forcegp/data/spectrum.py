@@ -102,8 +102,7 @@ def power_density(
 ) -> tuple[Float[np.ndarray, " frequencies"], Float[np.ndarray, "frequencies nv"], float, float]:
     """Frequencies > 0 [Hz], one-sided power density of `values` [unit^2/Hz], number of segments that count, time step.
 
-    Hann windows of up to 4 s with half of them in common (9/11 of the segments count then; Welch 1967). Episodes
-    shorter than a window are left out. `differences` is how often the values are differenced before.
+    Hann windows of up to 4 s (Welch 1967); shorter episodes are left out. Values are differenced so often before.
     """
     from scipy.signal import welch
 
@@ -188,10 +187,9 @@ def held_out_cutoff(
 ) -> tuple[float, dict[float, float]]:
     """The best of `FACTORS` times `cutoff` [Hz], and of each the share of the torques that it leaves unexplained.
 
-    A low cut-off smears dry friction, a high one leaves noise that makes inertias look too small. So a linear model is
-    learned behind each, and all are judged alike: signals behind the highest, torques behind the lowest (parallel
-    filtering; Gautier, ICRA 1997), in time that was held out, by geometric means over the joints. `source` is that of
-    `Preparation`. Raises DatasetError for logs too short for that, and for passive robots.
+    A low cut-off smears dry friction, a high one leaves noise. So a linear model is learned behind each, and all are
+    judged alike: signals behind the highest, torques behind the lowest (parallel filtering; Gautier, ICRA 1997), in
+    time that was held out. Raises DatasetError for logs too short for that, and for passive robots.
     """
     best, shares = _judged(dataset, robot, cutoff, source)
     if best in (min(shares), max(shares)):  # the best may lie beyond

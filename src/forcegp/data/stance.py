@@ -98,11 +98,8 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
 
     What clearly moves is free if it does not bear; what rests stands if it bears, and is free if it bears nothing. Up
     to 0.1 s in between follow decided rows on both sides that agree; all else is open (NaN), with 30 ms about it and
-    about a change. Where nothing else holds a base up, rows in which nothing stands although a fifth of the weight is
-    borne, or the other way round, are open: filters move short stances, and motion alone calls them swing. Rest is
-    slower than 1 cm/s or 2.3 times the noise of v. Feet that clearly move show what bears nothing; twice that bears, or
-    40 % of the median at rest; forces that do not differ decide nothing. Raises ContactError without contacts that have
-    a switch.
+    about a change; so are rows in which what stands contradicts the weight that is borne. Rest is slower than 1 cm/s or
+    2.3 times the noise of v. Raises ContactError without contacts that have a switch.
     """
     model = dataset.model if model is None else model
     names = () if model is None else tuple(dict.fromkeys(each.switch for each in model.contacts if each.switch))

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 
 from forcegp.data.dataset import Dataset
@@ -53,7 +54,7 @@ def joint_positions(dataset: Dataset) -> Float[np.ndarray, "rows nv"]:
     if model is None or model.robot.space.is_vector_space:
         return np.asarray(dataset.q)
     robot, out = model.robot, np.zeros((len(dataset), dataset.nv))
-    out[:, np.isin(robot.joint_names, robot.single_joint_names)] = robot.space.singles(dataset.q)
+    out[:, np.isin(robot.joint_names, robot.single_joint_names)] = robot.space.singles(torch.tensor(dataset.q)).numpy()
     return out
 
 

@@ -97,11 +97,11 @@ def with_memory(dataset: Dataset, model: Model) -> Dataset:
     columns = np.zeros((len(dataset), len(memory.names)))
     for episode in dataset.episodes:
         rows = np.flatnonzero(dataset.episode == episode)
-        given = (
-            None if x is None else torch.as_tensor(np.array(x[rows]), device=model.robot.device)
-            for x in (dataset.q, dataset.time, past, stated)
+        q, time, own_past = (
+            torch.as_tensor(np.array(x[rows]), device=model.robot.device) for x in (dataset.q, dataset.time, past)
         )  # fmt: skip
-        columns[rows] = memory.along(*given).cpu().numpy()
+        known = None if stated is None else torch.as_tensor(np.array(stated[rows]), device=model.robot.device)
+        columns[rows] = memory.along(q, time, own_past, known).cpu().numpy()
     first = model.memory_column
     u = np.concatenate([bare[:, :first], columns, bare[:, first:]], axis=1)
     known = model.known if dataset.model is None else replace(dataset.model, forces=model.laws)
@@ -259,8 +259,8 @@ def repeated_rows(trained: tuple[np.ndarray, np.ndarray, np.ndarray], test: Data
 def require_disjoint(train: Dataset, test: Dataset) -> None:
     """Refuse a pair of Datasets in which the test repeats the training.
 
-    Raises DatasetError if a row `(q, v, u)` of `test` is also in `train`, or if both were simulated or recorded with
-    the same `metadata` (same seed, same configuration) and share an episode: two samples of one trajectory.
+    Raises DatasetError if a row `(q, v, u)` of `test` is also in `train`, or if both have the same `metadata` and share
+    an episode: two samples of one trajectory.
     """
     repeated = repeated_rows((train.q, train.v, train.u), test)
     if repeated.size:
@@ -326,9 +326,6 @@ def farthest_rows(dataset: Dataset, count: int, *, start: int = 0) -> Dataset:
 def _standardized_columns(table: np.ndarray) -> np.ndarray:
     """(features, rows): contiguous columns with zero mean and unit standard deviation; constant ones become zero."""
     columns = np.ascontiguousarray(table.T, dtype=np.float64)
-    scale = np.abs(columns).max(axis=1, keepdims=True)
-    columns = columns / np.where(scale > 0, scale, 1.0)  # so that squaring in std cannot overflow or underflow
-    spread = columns.std(axis=1, keepdims=True)
-    spread[spread < ROUNDING] = 0.0
-    centred = columns - columns.mean(axis=1, keepdims=True)
-    return np.where(spread > 0, centred / np.where(spread > 0, spread, 1.0), 0.0)
+    columns = columns / np.maximum(np.abs(columns).max(axis=1, keepdims=True), 1e-300)  # so that std cannot overflow
+    centred, spread = columns - columns.mean(axis=1, keepdims=True), columns.std(axis=1, keepdims=True)
+    return np.where(spread >= ROUNDING, centred / np.maximum(spread, ROUNDING), 0.0)

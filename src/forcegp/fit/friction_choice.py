@@ -76,7 +76,7 @@ def choose_friction(model: Model, log: Dataset, parts: Sequence[str] = PARTS) ->
     strokes = with_strokes(log).strokes
     regression = _Regression(model, log, state, torque)
     single, few = np.isin(log.joint_names, bare.robot.single_joint_names), []
-    moving = [j for j in np.flatnonzero(single) if log.v[:, j].any()]
+    moving = [j for j in np.flatnonzero(single).tolist() if log.v[:, j].any()]
     for j in moving:
         turns = 0 if strokes is None else int((np.diff(np.sign(strokes[:, j, 0])) != 0).sum())
         if strokes is not None and turns >= REVERSALS:
@@ -190,7 +190,7 @@ class _Regression:
         A, b = self._normal(j, parts, sign)
         whole, right = A.sum((0, 1)), b.sum((0, 1))
         scale = np.sqrt(whole.diagonal().clip(1e-300))
-        out, place = np.zeros(self.count), self.inner.shape[-1] + 6 * j
+        out, place, numbers = np.zeros(self.count), self.inner.shape[-1] + 6 * j, np.zeros(len(scale))
         for k in range(self.count):
             if k == 0 or held_out:
                 inner = (whole - A[k].sum(0) if held_out else whole) / np.outer(scale, scale)

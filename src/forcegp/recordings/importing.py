@@ -92,7 +92,7 @@ def import_recordings(
     plans = [signal_plan(mapping, source, model, **lacks) for _, source in sources]
     plan = plans[0]
     for (label, _), other in zip(sources, plans, strict=True):
-        if (other.joints, other.sliding, other.logged) != (plan.joints, plan.sliding, plan.logged):
+        if (other.joints, other.logged) != (plan.joints, plan.logged):
             raise InvalidInput(
                 f"{label} has the signals {other.logged} and {sources[0][0]} {plan.logged}; import alike."
             )
@@ -102,7 +102,7 @@ def import_recordings(
         believed = own.joints if "q" in mapping.unit else ()
         recordings.append(read_recording(source, own, label, options, robot, believed))
     step = _even_step(recordings, options)
-    done = _what_was_done(mapping, plan, recordings, step, options, sources)
+    done = _what_was_done(mapping, plan, recordings, step, sources)
     pieces: list[dict[str, np.ndarray]] = []
     for recording in recordings:
         for number, rows in recording.stretches:
@@ -118,7 +118,7 @@ def import_recordings(
     columns: dict[str, Any] = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
     columns.setdefault("u", np.zeros((len(columns["time"]), 0)))
     done["rows"] = len(columns["time"])
-    return Dataset(**columns, joint_names=plan.joints, sliding=plan.sliding, model=model, metadata={"import": done})
+    return Dataset(**columns, joint_names=plan.joints, model=model, metadata={"import": done})
 
 
 def _sources(paths: Sequence[Path], mapping: ColumnMapping) -> list[tuple[str, Source]]:
@@ -171,7 +171,6 @@ def _what_was_done(
     plan: SignalPlan,
     recordings: Sequence[Recording],
     step: float | None,
-    options: ImportOptions,
     sources: Sequence[tuple[str, Source]],
 ) -> dict[str, Any]:
     files = dict.fromkeys(file for _, source in sources for file in source.files())
@@ -182,7 +181,11 @@ def _what_was_done(
         "mapping": mapping.plain(),
         "guessed": list(plan.guessed),
         "columns": {
-            name: [str(x) for x in plan.signals if x.signal == name and not (name == "u" and x.expression is LACKING)]
+            name: [
+                x.expression.text
+                for x in plan.signals
+                if x.signal == name and not (name == "u" and x.expression is LACKING)
+            ]
             for name in plan.logged
         },
         "open_switches": list(plan.open_switches),
@@ -192,9 +195,6 @@ def _what_was_done(
         },
         "recordings": [recording.told for recording in recordings],
         "resampled_to_step": step,
-        "unwrapped": options.unwrap,
-        "start": options.start,
-        "end": options.end,
         "episodes": [],
     }
 

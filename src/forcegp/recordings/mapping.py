@@ -1,18 +1,23 @@
-"""`ColumnMapping`: which columns are what, in which units; its YAML files, and the short forms of the command line."""
+"""`ColumnMapping`: which columns are what, in which units; names in short and guessed, and combinations of columns.
 
+Known columns are recognised letter by letter, the longest first, so most names need no quotes; backticks settle the
+rest.
+"""
+
+import ast
 import math
-from collections.abc import Mapping, Sequence
+import operator
+import re
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from jaxtyping import Float
 
-from forcegp.errors import FileFormatError, InvalidInput, require_known, usable_arguments
-from forcegp.recordings.column_names import listed
-from forcegp.recordings.source import reading
+from forcegp.doubts import stated_as
+from forcegp.errors import InvalidInput, require_known, usable_arguments
+from forcegp.recordings.source import Source
 
 
 @dataclass(frozen=True)
@@ -140,20 +145,6 @@ class ColumnMapping:
         if any(columns < 1 for columns in self.headerless):
             raise InvalidInput(f"headerless is {self.headerless}; a row has at least one number.")
 
-    def changed_by(self, other: "ColumnMapping") -> "ColumnMapping":
-        """The mapping with everything that the other one states; time and step take each other's place."""
-        stated = {
-            item.name: getattr(other, item.name)
-            for item in fields(other)
-            if getattr(other, item.name) not in (None, (), {}, False)
-        }
-        for name in ("axes", "unit", "sign"):
-            if name in stated:
-                stated[name] = {**getattr(self, name), **stated[name]}
-        if {"time", "step"} & stated.keys():
-            stated = {"time": None, "step": None} | stated
-        return replace(self, **stated)
-
     def corrected_by(
         self,
         correction: Mapping[str, Mapping[str, tuple[Any, ...]]],
@@ -192,120 +183,28 @@ class ColumnMapping:
         """The words of `forcegp import` that state columns, units and signs."""
         words: list[str] = []
         for name, value in self.plain().items():
-            each = (
-                [f"{key}={_joined(own)}" for key, own in value.items()] if isinstance(value, dict) else [_joined(value)]
+            text = (
+                stated_as(value)
+                if isinstance(value, Mapping)
+                else ",".join(map(str, value))
+                if isinstance(value, tuple)
+                else str(value)
             )
-            words += [f"--{name.replace('_', '-')}", *([] if value is True else [",".join(each)])]
+            words += [f"--{name.replace('_', '-')}", *([] if value is True else [text])]
         return words
 
     def plain(self) -> dict[str, Any]:
-        """What is stated, as JSON and YAML hold it: a list of one is written as its only entry."""
-        found: dict[str, Any] = {}
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if value in (None, (), {}, False):
-                continue
-            if isinstance(value, Mapping):
-                value = {name: _shortened(entry) for name, entry in value.items()}
-            found[item.name] = list(value) if item.name == "joints" else _shortened(value)
-        return found
+        """What is stated, by name."""
+        found = {item.name: getattr(self, item.name) for item in fields(self)}
+        return {name: value for name, value in found.items() if value not in (None, (), {}, False)}
 
 
-def _joined(value: Any) -> str:
-    return ",".join(each if isinstance(each, str) else f"{each:g}" for each in _listed(value))
+EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body"}
 
 
-def _shortened(value: Any) -> Any:
-    if not isinstance(value, tuple):
-        return value
-    alone = len(value) == 1 and "," not in str(value[0])  # a text with a comma would be read as a list
-    return value[0] if alone else list(value)
-
-
-LARGEST = 2**20  # bytes
-OF_FOLDER = "forcegp.yaml"
-
-
-class _OnceLoader(yaml.SafeLoader):
-    """Safe YAML in which no key may stand twice and nothing may refer to something else."""
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.events.AliasEvent):
-            raise yaml.constructor.ConstructorError(
-                None, None, "aliases (*name) are not read", self.peek_event().start_mark
-            )
-        return super().compose_node(parent, index)
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        repeated = [key for key in keys if keys.count(key) > 1]
-        if repeated:
-            raise yaml.constructor.ConstructorError(None, None, f"{repeated[0]!r} stands twice", node.start_mark)
-        return super().construct_mapping(node, deep)
-
-
-def read_mapping(path: Path) -> ColumnMapping:
-    """The mapping in a YAML file, whose keys are the fields of `ColumnMapping`.
-
-    Raises FileFormatError naming the file and the key.
-    """
-    if not path.is_file():
-        raise FileFormatError(f"{path} is not a file; give `mapping` a YAML file.")
-    with reading(path, "YAML", yaml.YAMLError, AttributeError, IndexError):  # !!timestamp x, !!int ''
-        if path.stat().st_size > LARGEST:
-            raise FileFormatError(f"{path} is larger than 1 MiB; that is no mapping of columns.")
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_OnceLoader)  # a SafeLoader
-    if not isinstance(content, dict):
-        raise FileFormatError(f"{path} must be a mapping such as 'q: pos{{1..7}}'.")
-    try:
-        return mapping_of(content)
-    except InvalidInput as error:
-        raise FileFormatError(f"{path}: {error}") from error
-
-
-def mapping_of(content: Mapping[Any, Any]) -> ColumnMapping:
-    """The mapping in plain values. Raises InvalidInput naming the key that is not known or has a wrong value."""
-    known = [item.name for item in fields(ColumnMapping)]
-    values: dict[str, Any] = {}
-    for key, value in content.items():
-        require_known("key", key, "a mapping of columns", known)
-        if value is None:
-            continue
-        if key in (*SIGNALS, "joints"):
-            values[key] = _texts(key, value)
-        elif key in ("unit", "axes"):
-            quantities = ", ".join(UNITS if key == "unit" else AXES)
-            _require(isinstance(value, dict), key, value, f"name the quantity, as {_EXAMPLES[key]} ({quantities})")
-            values[key] = {str(name): _texts(f"{key} of {name}", entry) for name, entry in value.items()}
-        elif key == "sign":  # for all signals, if none is named: it turns the axis of a joint
-            named = value if isinstance(value, dict) else dict.fromkeys(SIGNALS, value)
-            values[key] = {str(k): tuple(_number(f"{key} of {k}", x) for x in _listed(own)) for k, own in named.items()}
-        elif key == "step":
-            values[key] = _number(key, value)
-        else:
-            whole = key == "headerless"
-            kind, remedy = {"headerless": (int, "give the number of columns"), "side_by_side": (bool, _TRUTH),
-                            "ned": (bool, _TRUTH)}.get(key, (str, "give a text"))  # fmt: skip
-            for entry in _listed(value) if whole else [value]:
-                _require(type(entry) is kind, key, entry, remedy)
-            values[key] = tuple(_listed(value)) if whole else value
-    return ColumnMapping(**values)
-
-
-def mapping_text(mapping: ColumnMapping) -> str:
-    """The YAML of a mapping, which `read_mapping` reads."""
-    return yaml.safe_dump(mapping.plain(), sort_keys=False, allow_unicode=True, default_flow_style=False, width=120)
-
-
-def beside(log: Path) -> Path | None:
-    """The mapping that belongs to a log: STEM.yaml beside it, or forcegp.yaml in its folder."""
-    own = log.with_name(f"{log.name.split('.')[0]}.yaml")
-    return next((path for path in (own, log.parent / OF_FOLDER) if path.is_file()), None)
-
-
-def by_quantity(flag: str, text: str) -> dict[str, list[str]]:
-    """`q=deg,m,time=ms` as {"q": ["deg", "m"], "time": ["ms"]}: what follows a name up to the next one is its list."""
-    found: dict[str, list[str]] = {}
+def by_quantity(flag: str, text: str) -> dict[str, tuple[str, ...]]:
+    """`q=deg,m,time=ms` as {"q": ("deg", "m"), "time": ("ms",)}: what follows a name up to the next is its list."""
+    found: dict[str, tuple[str, ...]] = {}
     name = None
     for part in text.split(","):
         before, equals, after = part.partition("=")
@@ -314,35 +213,196 @@ def by_quantity(flag: str, text: str) -> dict[str, list[str]]:
             if name in found:
                 raise InvalidInput(f"--{flag} names {name} twice.")
         if name is None or not part.strip():
-            raise InvalidInput(f"--{flag} is {text!r}; write for example {flag} {_EXAMPLES[flag]}.")
-        found.setdefault(name, []).append(part.strip())
+            raise InvalidInput(f"--{flag} is {text!r}; write for example {flag} {EXAMPLES[flag]}.")
+        found[name] = (*found.get(name, ()), part.strip())
     return found
 
 
-_TRUTH = "give true or false"
-_EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body"}
+BRACES = re.compile(r"\{([^{}]*)\}")
+RANGE = re.compile(r"(\d+)\.\.(\d+)")
+LONGEST_LIST = 4096
+JOINTS = "joints"
 
 
-def _texts(key: str, value: Any) -> tuple[str, ...]:
-    entries = value if isinstance(value, list) else listed(value) if isinstance(value, str) else [value]
-    plain = all(isinstance(entry, str | int | float) and not isinstance(entry, bool) for entry in entries)
-    _require(bool(entries) and plain, key, value, "give a text or a list of texts")
-    return tuple(str(entry) for entry in entries)
+def expanded(pattern: str, joints: Sequence[str]) -> list[str]:
+    """Every text that a pattern stands for, in order; the braces furthest left change slowest.
+
+    `{1..7}` counts (`{01..12}` with leading zeros, `{7..1}` downwards), `{a,b}` lists, `{joints}` is every joint name.
+    Raises InvalidInput for other braces, and for lists longer than 4096.
+    """
+    found = BRACES.search(pattern)
+    if found is None:
+        if "{" in pattern or "}" in pattern:
+            raise InvalidInput(f"{pattern!r} has a brace without its partner; write for example pos{{1..7}}.")
+        return [pattern]
+    before, after = pattern[: found.start()], pattern[found.end() :]
+    rests = expanded(after, joints)
+    texts = [before + choice + rest for choice in _choices(pattern, found[1], joints) for rest in rests]
+    if len(texts) > LONGEST_LIST:
+        raise InvalidInput(f"{pattern!r} stands for more than {LONGEST_LIST} columns.")
+    return texts
 
 
-def _listed(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else [value]
+COMMA = re.compile(r",(?![^{\[]*[}\]])(?=(?:[^`]*`[^`]*`)*[^`]*$)")
 
 
-def _require(fits: bool, key: str, value: Any, remedy: str) -> None:
-    if not fits:
-        raise InvalidInput(f"{key} is {value!r}; {remedy}.")
+def listed(text: str) -> list[str]:
+    """The parts of a text between commas; commas in braces, brackets and backticks do not count."""
+    parts = [part.strip() for part in COMMA.split(text)]
+    if "" in parts:
+        raise InvalidInput(f"{text!r} has an empty place in its list; write for example: pos1,pos2")
+    return parts
 
 
-def _number(key: str, value: Any) -> float:
+def _choices(pattern: str, inside: str, joints: Sequence[str]) -> list[str]:
+    counted = RANGE.fullmatch(inside)
+    if counted:
+        first, last = int(counted[1]), int(counted[2])
+        if abs(last - first) >= LONGEST_LIST:
+            raise InvalidInput(f"{pattern!r} stands for more than {LONGEST_LIST} columns.")
+        padded = len(counted[1]) if counted[1].startswith("0") and len(counted[1]) > 1 else 0
+        step = 1 if last >= first else -1
+        return [f"{number:0{padded}d}" for number in range(first, last + step, step)]
+    if inside == JOINTS:
+        if not joints:
+            raise InvalidInput(f"{pattern!r} asks for the names of the joints, which are not known; add `joints`.")
+        return list(joints)
+    choices = [choice.strip() for choice in inside.split(",")]
+    if len(choices) > 1 and all(choices):
+        return choices
+    raise InvalidInput(f"{pattern!r}: write {{1..7}}, {{a,b}} or {{joints}} in braces, not {{{inside}}}.")
+
+
+WORDS = {
+    "q": {"q", "pos", "position", "positions", "angle", "angles", "joint_pos", "joint_position"},
+    "v": {"v", "qd", "dq", "vel", "velocity", "velocities", "joint_vel", "joint_velocity"},
+    "u": {"u", "tau", "torque", "torques", "effort", "efforts", "eff", "joint_torque", "joint_effort"},
+    "a": {"a", "qdd", "ddq", "acc", "acceleration", "accelerations"},
+    "time": {"t", "time", "timestamp", "stamp", "time_s", "seconds"},
+}
+"""What the rest of a column's name, beside that of the joint, must mean."""
+
+
+def named_after(joint: str) -> re.Pattern[str]:
+    """Matches the joint's name where no letter or digit continues it."""
+    return re.compile(rf"(?<![A-Za-z0-9]){re.escape(joint)}(?![A-Za-z0-9])")
+
+
+def guessed_columns(signal: str, joints: Sequence[str], source: Source) -> tuple[str, ...] | None:
+    """One column per joint, its name in a text that means `signal`; None for none. Raises InvalidInput for several."""
+    templates: dict[tuple[str, str], dict[str, str]] = {}
+    for column in source.columns():
+        for joint in joints:
+            for found in named_after(joint).finditer(column):
+                around = column[: found.start()], column[found.end() :]
+                templates.setdefault(around, {})[joint] = column
+    fitting = [
+        tuple(found[joint] for joint in joints)
+        for around, found in templates.items()
+        if len(found) == len(joints) and _says(signal, around)
+    ]
+    if len(fitting) > 1:
+        candidates = " or ".join(", ".join(columns) for columns in fitting)
+        raise InvalidInput(f"{source.path}: {signal} could be {candidates}; choose with --{signal}.")
+    return fitting[0] if fitting else None
+
+
+def guessed_time(source: Source, used: Sequence[str]) -> str | None:
+    """The column that must be the time: by the format, or the only one of such a name. None if there is none."""
+    by_format = source.time_beside(used)
+    if by_format is not None:
+        return by_format
+    named = [column for column in source.columns() if column.lower() in WORDS["time"]]
+    if len(named) > 1:
+        raise InvalidInput(f"{source.path}: the time could be {' or '.join(named)}; choose with `time`.")
+    return named[0] if named else None
+
+
+def _says(signal: str, around: tuple[str, str]) -> bool:
+    """Do the last word before the joint's name or the first after it name the signal?"""
+    before = re.split(r"[^A-Za-z_]+", around[0].rstrip("_.:/ -["))[-1]
+    after = re.split(r"[^A-Za-z_]+", around[1].lstrip("_.:/ -]"))[0]
+    words = {word.strip("_").lower() for word in (before, after)} - {""}
+    return bool(words & WORDS[signal])
+
+
+TOKEN = (
+    r"`(?P<quoted>[^`]*)`|(?P<name>%s)|(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?!\w))|(?P<word>[^\s+*/`()-]+)"
+)
+OPERATIONS = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv}
+MOST_PARTS = 500
+
+
+@dataclass(frozen=True)
+class Expression:
+    """Columns and numbers joined by + - * /; `weights` are the slopes by its columns where all of them are 0."""
+
+    text: str
+    weights: Mapping[str, float]
+    tree: ast.expr
+    words: tuple[str, ...]
+
+    @property
+    def is_column(self) -> bool:
+        """Is this one column as it is?"""
+        return isinstance(self.tree, ast.Name)
+
+    def __str__(self) -> str:
+        return self.text
+
+    def value(self, columns: Mapping[str, np.ndarray], rows: int) -> Float[np.ndarray, " rows"]:
+        """The combination of these columns; a column by itself comes out to the last bit."""
+        known = {name: np.asarray(columns[name], dtype=np.float64) for name in self.weights}
+        with np.errstate(all="ignore"):  # what is not finite is refused, with its row
+            return np.broadcast_to(_value(self.tree, [known.get(word) for word in self.words]), rows)
+
+
+def parse_expression(text: str, columns: Collection[str], owner: str) -> Expression:
+    """Read a combination of `columns`; `owner` is the file that has them, for messages.
+
+    Raises InvalidInput for anything else, for a column of another name, and for what is not finite where columns are 0.
+    """
+    words: list[str] = []
+
+    def placed(found: re.Match[str]) -> str:
+        """A name that Python can read in place of a column, or of a word that is none."""
+        if found.lastgroup == "number":
+            return found[0]
+        if found.lastgroup == "word" and found[0] == "pi":
+            return repr(math.pi)
+        words.append(found[found.lastgroup or 0])
+        return f" _{len(words) - 1} "
+
+    names = [] if text in columns else sorted(columns, key=len, reverse=True)
+    known = "|".join(re.escape(name) + (r"(?!\w)" if re.match(r"\w", name[-1]) else "") for name in names or [text])
     try:
-        if isinstance(value, bool):
-            raise ValueError
-        return float(value)
-    except (TypeError, ValueError, OverflowError):
-        raise InvalidInput(f"{key} is {value!r:.60}; give a number.") from None
+        tree = ast.parse(re.sub(TOKEN % (known or "(?!)"), placed, text).strip(), mode="eval").body
+        if sum(1 for _ in ast.walk(tree)) > MOST_PARTS:
+            raise ValueError(f"it has more than {MOST_PARTS} parts")
+        at_zero = _value(tree, [0.0] * len(words))
+        slopes = {name: _value(tree, [float(word == name) for word in words]) - at_zero for name in words}
+    except (SyntaxError, ValueError, ArithmeticError, RecursionError, MemoryError) as error:
+        raise InvalidInput(
+            f"{text!r:.200} is no combination of columns: {getattr(error, 'msg', error)}. For example: "
+            "theta2 - theta1, 0.5*`a-b` + pi/2."
+        ) from None
+    if not all(map(math.isfinite, (at_zero, *slopes.values()))):
+        raise InvalidInput(f"{text!r:.200} has a number that is not finite.")
+    for word in words:
+        where = "" if word == text else f" (in {text!r})"
+        require_known("column", word, f"{owner}{where}", columns)
+    return Expression(text, slopes, tree, tuple(words))
+
+
+def _value(node: ast.expr, words: Sequence[Any]) -> Any:
+    """What a tree is where names stand for these values. Raises ValueError for other operations."""
+    match node:
+        case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
+            return float(number)
+        case ast.Name(id=name):
+            return words[int(name[1:])]
+        case ast.UnaryOp(op=ast.USub() | ast.UAdd() as sign, operand=operand):
+            return _value(operand, words) if isinstance(sign, ast.UAdd) else -_value(operand, words)
+        case ast.BinOp(left=left, op=sign, right=right) if type(sign) in OPERATIONS:
+            return OPERATIONS[type(sign)](_value(left, words), _value(right, words))
+    raise ValueError("it has more than columns, numbers and + - * /")

@@ -9,23 +9,28 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation
 
 import forcegp.robots
+from forcegp.data.configurations import following
 from forcegp.errors import DatasetError, FileFormatError, MistakenUnit
-from forcegp.recordings.moving_base import Jumps, Layout, read_poses
 from forcegp.recordings.ros_bag import Read, read_on_one_clock
-from forcegp.recordings.signal_plan import SignalPlan
+from forcegp.recordings.signal_plan import Layout, SignalPlan, spans
 from forcegp.recordings.source import Columns, Source
+from forcegp.robots.manifold import POSITIONS, TURN, ConfigurationSpace
+
+Jumps = tuple[Int[np.ndarray, " jumps"], str, str]
+"""Rows before which something moves too far, what was seen, and what to do."""
 
 
 @dataclass(frozen=True)
 class Recording:
     """What was read of one table.
 
-    `label` is what people call it; `signals` those that were logged, (rows, entries) in SI, in the order of a Dataset;
-    `time` [s] from the first row on, whose stamp is `begin`; `jumps` rows before which something turns too far.
-    `stretches` are episode number and rows without gaps, `step` their median step [s] and `worst` the largest relative
-    deviation from it; `repeated` stamps and `dropped` rows of stretches that are too short were left out; `gaps` in s.
+    `told` is what people should know; `signals` those that were logged, (rows, entries) in SI, in the order of a
+    Dataset; `time` [s] from the first row on, whose stamp is `begin`; `jumps` rows before which something turns too
+    far. `stretches` are episode number and rows without gaps, `step` their median step [s] and `worst` the largest
+    relative deviation from it.
     """
 
     told: dict[str, Any]
@@ -123,6 +128,54 @@ def _continued(plan: SignalPlan, values: np.ndarray, begins: np.ndarray, unwrap:
     return jumps
 
 
+LARGEST_ERROR = 0.01  # of the length of a quaternion: more is no rounding
+ROUNDED = 1e-9  # differences from length 1 beyond this are reported
+
+
+def read_poses(
+    space: ConfigurationSpace,
+    orientation: str,
+    source: Source,
+    table: Float[np.ndarray, "rows columns"],
+    begins: Int[np.ndarray, " episodes"],
+) -> tuple[Float[np.ndarray, "rows nq"], list[Jumps], list[str]]:
+    """Positions as the log writes them, as q: turns of length 1, quaternions whose sign never jumps.
+
+    And rows before which a base turns by more than a quarter of a turn, `begins` of episodes left out; and what people
+    should know. Raises DatasetError, naming the row, where a turn is more than 1 % longer or shorter than 1.
+    """
+    turned = list(spans(space, orientation))
+    q = np.delete(table, [column for _, span in turned for column in range(span.start, span.stop)], axis=1)
+    jumps, notes = list[Jumps](), list[str]()
+    for group, span in turned:
+        given, first = table[:, span], TURN.start
+        if orientation == "angles":
+            turn = np.array(Rotation.from_euler("xyz", given[:, first:]).as_quat())
+        else:
+            length = np.linalg.norm(given[:, first:], axis=1, keepdims=True)
+            error = np.abs(length[:, 0] - 1.0)
+            row = int(error.argmax())
+            if error[row] > LARGEST_ERROR:
+                names = ", ".join(POSITIONS[TURN])
+                raise DatasetError(
+                    f"{source.path}: the orientation of {group.name!r} ({names}) has the length {length[row, 0]:.4g} "
+                    f"at {source.place(row)}; a turn has length 1. Map its columns, give `orientation` angles if they "
+                    "are roll, pitch and yaw, or repair or remove these rows."
+                )
+            if error[row] > ROUNDED:
+                notes.append(f"orientations divided by their length, which differs from 1 by up to {error[row]:.2g}")
+            turn = given[:, first:] / length
+        turn, jumped = following(turn, turn[0])
+        jumped[begins] = False
+        seen = f"{group.name!r} turns by more than a quarter of a turn"
+        remedy = (
+            "give the order of its columns (`orientation`), the unit of its angles (`unit` q=deg), or leave it out."
+        )
+        jumps.append((np.flatnonzero(jumped), seen, remedy))
+        q = np.hstack([q[:, : group.place], given[:, :first], turn, q[:, group.place :]])
+    return q, jumps, notes
+
+
 def _require_finite(
     values: np.ndarray, columns: Columns, plan: SignalPlan, source: Source, time: Float[np.ndarray, " rows"]
 ) -> None:
@@ -131,9 +184,9 @@ def _require_finite(
     row, index = (int(position) for position in np.argwhere(~np.isfinite(values))[0])
     item = plan.signals[index]
     wrong = [name for name in item.expression.weights if not np.isfinite(columns[name][row])]
-    name = wrong[0] if wrong else next(iter(item.expression.weights), "")
+    name, value = (wrong[0], columns[wrong[0]][row]) if wrong else (item.expression.text, values[row, index])
     raise DatasetError(
-        f"{source.path}: column {name!r} ({item.signal} of joint {item.joint!r}) is {_shown(columns[name][row])} at "
+        f"{source.path}: column {name!r} ({item.signal} of joint {item.joint!r}) is {_shown(value)} at "
         f"{source.place(row)}, {time[row]:.6g} s from the start; {int((~np.isfinite(values)).sum())} such values. "
         "Repair or remove these rows, or map another column."
     )

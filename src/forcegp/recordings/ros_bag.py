@@ -234,7 +234,7 @@ def read_on_one_clock(source: Source, plan: SignalPlan) -> Read:
             turns.setdefault(base, []).extend(item.expression.weights)
         if item.signal == "q" and item.unit.si == "rad":  # half a turn, in the units of the log
             half = np.pi / item.unit.in_si(np.ones(1)).item()
-            most |= {name: half / abs(weight) for name, weight in item.expression.weights.items()}
+            most |= {name: half / max(abs(weight), 1e-300) for name, weight in item.expression.weights.items()}
         if item.signal == "u" and (far := {x for x in item.expression.weights if source.topic_of(x) != clock}):
             most |= dict.fromkeys(far - measured, 0.0)
             held.add(inputs.index(item))

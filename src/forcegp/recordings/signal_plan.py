@@ -1,30 +1,43 @@
 """A mapping applied to a table: which combination of its columns each joint's signals are."""
 
+import ast
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Float
 
-import forcegp.mechanics
-import forcegp.robots
-from forcegp.data.dataset_fields import ROTATION, TRANSLATION, sliding_joints
+import forcegp
+from forcegp.data import differentiate
+from forcegp.data.configurations import in_base
+from forcegp.data.dataset import ROTATION, TRANSLATION
 from forcegp.errors import FileFormatError, InvalidInput, require_known
-from forcegp.recordings.column_names import (
-    LinearExpression,
+from forcegp.recordings.mapping import (
+    ORIENTATIONS,
+    SIGNALS,
+    ColumnMapping,
+    Expression,
+    LogUnit,
     expanded,
     guessed_columns,
     guessed_time,
+    log_unit,
     named_after,
     parse_expression,
 )
-from forcegp.recordings.mapping import ORIENTATIONS, SIGNALS, ColumnMapping, LogUnit, log_unit
-from forcegp.recordings.moving_base import TURNED, Layout, bases, columns_of, layout_of
 from forcegp.recordings.source import Columns, Source
+from forcegp.robots import Robot
+from forcegp.robots.layout import WORLD
+from forcegp.robots.manifold import POSITIONS, TURN, ConfigurationSpace, Group
 from forcegp.summary import listed
 
-LACKING = LinearExpression({}, 0.0)
+ANGLES = ("roll", "pitch", "yaw")
+TURNED = ("y", "z", "qy", "qz", "sin", "ry", "rz", "pitch", "yaw")
+"""What changes sign by half a turn of world and base about x: north, east, down becomes north, west, up."""
+LACKING = Expression("derive", {}, ast.Constant(0.0), ())
 """This very object: an entry of v or a that the log lacks, which is differentiated, or a switch of a contact."""
 LACKS = re.compile(r"derive\d*")
 EPISODE = "episode_index"  # numbers the episodes where nothing else is stated, as in datasets of LeRobot
@@ -37,12 +50,9 @@ class JointSignal:
 
     signal: str
     joint: str
-    expression: LinearExpression
+    expression: Expression
     unit: LogUnit
     sign: float
-
-    def __str__(self) -> str:
-        return "derive" if self.expression is LACKING else str(self.expression)
 
     def value(self, columns: Columns, rows: int) -> np.ndarray:
         """(rows,) in SI; a column in SI comes out to the last bit."""
@@ -51,15 +61,62 @@ class JointSignal:
 
 
 @dataclass(frozen=True)
+class Layout:
+    """What is left to do about signals once they are read: those of a base are turned, what lacks is differentiated.
+
+    Fields
+    ------
+    space: of the positions.
+    bases: joints of several degrees of freedom whose parent is the world.
+    axes: of v and a, those of the linear and of the angular part.
+    gravity: (3,) [m/s^2], for accelerometers.
+    derived: entries of v and a that the log lacks.
+    held: columns of u that hold from row to row.
+    """
+
+    space: ConfigurationSpace
+    bases: tuple[Group, ...] = ()
+    axes: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    gravity: tuple[float, ...] = (0.0, 0.0, 0.0)
+    derived: Mapping[str, list[int]] = field(default_factory=dict)
+    held: tuple[int, ...] = ()
+
+    def signals(self, logged: Mapping[str, np.ndarray], time: Float[np.ndarray, " rows"]) -> dict[str, np.ndarray]:
+        """q, v, u and a, with differences (second order) for what was not logged."""
+        found = dict(logged)
+        if not self.space.is_vector_space:  # a spline through quaternions does not end on the sphere
+            found["q"] = self.space.normalized(torch.tensor(found["q"])).numpy()
+        for name, source in (("v", "q"), ("a", "v")):
+            lacking = self.derived.get(name, [])
+            if name in found:
+                found[name] = self._in_body(name, found[name], found["q"], found["v"])
+            if name not in found or lacking:
+                made = differentiate(found[source], time, self.space if name == "v" else None)
+                own = np.isin(np.arange(self.space.nv), lacking) | (not lacking)
+                found[name] = np.where(own, made, found.get(name, made))
+        return found
+
+    def _in_body(self, signal: str, values: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """v or a (rows, nv) as a Dataset has them; `v` in body axes where a is asked for."""
+        if signal not in self.axes:
+            return values
+        found, moving, at = (torch.tensor(x) for x in (values, v, q))
+        more = {"gravity": torch.tensor(self.gravity, dtype=torch.float64)} if signal == "a" else {}
+        for group in self.bases:
+            own = {**more, "v": moving[:, group.rows]} if more else {}
+            found[:, group.rows] = in_base(at[:, group.places], found[:, group.rows], self.axes[signal], **own)
+        return found.numpy()
+
+
+@dataclass(frozen=True)
 class SignalPlan:
     """Everything that is read from a table. `signals` stand signal by signal, each in the order of `joints`."""
 
     joints: tuple[str, ...]
-    sliding: tuple[str, ...]
     signals: tuple[JointSignal, ...]
     layout: Layout
     orientation: str
-    time: LinearExpression | None
+    time: Expression | None
     time_unit: LogUnit
     step: float | None
     episode: str | None
@@ -96,7 +153,7 @@ def signal_plan(
     joints = _joints(mapping, robot)
     log, order = columns_of(mapping, model, joints)
     guessed: list[str] = []
-    found: dict[str, list[LinearExpression]] = {}
+    found: dict[str, list[Expression]] = {}
     for signal in SIGNALS:
         patterns = getattr(mapping, signal)
         if patterns is None and log[signal]:
@@ -106,7 +163,7 @@ def signal_plan(
                 patterns = guessed_columns(signal, names[: len(model.actuators)], source)
             if patterns is not None:
                 guessed.append(f"{signal} = {', '.join(patterns)}")
-                found[signal] = [LinearExpression({name: 1.0}) for name in patterns]
+                found[signal] = [parse_expression(name, [name], str(source.path)) for name in patterns]
         elif patterns is not None:
             found[signal] = _expressions(patterns, joints, source, may_lack=signal in ("v", "a"))
     switches = len({x.switch for x in (model.contacts if model and may_lack_switches else ())} - {None})
@@ -139,16 +196,13 @@ def signal_plan(
                 f"{source.path} has {listed(source.columns(), MOST_NAMES)}."
             )
         guessed.append(f"time = {name}")
-        time = LinearExpression({name: 1.0})
+        time = parse_expression(name, [name], str(source.path))
     else:
         time = parse_expression(mapping.time, source.columns(), str(source.path)) if mapping.time is not None else None
     if time is not None and not time.weights:
         raise InvalidInput(f"time is the constant {mapping.time!r}; give a column, or `step` for the time of a row.")
-    sliding = _sliding(mapping, joints) if robot is None else sliding_joints(robot)
     if robot is None:
-        log = {
-            name: {joint: (TRANSLATION if joint in sliding else ROTATION)[name] for joint in joints} for name in SIGNALS
-        }
+        log = {name: dict.fromkeys(joints, ROTATION[name]) for name in SIGNALS}
     turned = {f"{x.name}.{part}" for x in (bases(robot) if robot and mapping.ned else ()) for part in TURNED}
     signals = tuple(
         item
@@ -164,7 +218,6 @@ def signal_plan(
     [time_unit, *_] = mapping.unit.get("time", ("ns" if stamps else "s",))
     return SignalPlan(
         joints=tuple(order["v"]),
-        sliding=sliding,
         signals=signals,
         layout=layout_of(mapping, model, lacking, len(order["v"])),
         orientation=mapping.orientation or ORIENTATIONS[0],
@@ -176,7 +229,7 @@ def signal_plan(
     )
 
 
-def _joints(mapping: ColumnMapping, robot: forcegp.robots.Robot | None) -> tuple[str, ...]:
+def _joints(mapping: ColumnMapping, robot: Robot | None) -> tuple[str, ...]:
     """Joints of one degree of freedom, in the order of the log."""
     stated = [name for name in ("orientation", "axes", "ned") if getattr(mapping, name)]
     if stated and (robot is None or robot.space.is_vector_space):
@@ -192,9 +245,7 @@ def _joints(mapping: ColumnMapping, robot: forcegp.robots.Robot | None) -> tuple
     return mapping.joints or own
 
 
-def _expressions(
-    patterns: Sequence[str], joints: Sequence[str], source: Source, may_lack: bool
-) -> list[LinearExpression]:
+def _expressions(patterns: Sequence[str], joints: Sequence[str], source: Source, may_lack: bool) -> list[Expression]:
     names: list[str] = []
     columns = source.columns()
     for pattern in patterns:
@@ -208,22 +259,10 @@ def _expressions(
     ]
 
 
-def _sliding(mapping: ColumnMapping, joints: tuple[str, ...]) -> tuple[str, ...]:
-    """Without a robot, units that are stated decide which joints slide."""
-
-    def slides(index: int) -> bool:
-        own = {
-            name: _at(f"unit of {name}", units, index, joints) for name, units in mapping.unit.items() if name != "time"
-        }
-        return any(log_unit(name, unit).si == TRANSLATION[name] for name, unit in own.items())
-
-    return tuple(joint for index, joint in enumerate(joints) if slides(index))
-
-
 def _signals(
     mapping: ColumnMapping,
     signal: str,
-    expressions: list[LinearExpression],
+    expressions: list[Expression],
     columns: Mapping[str, str | None],
     order: Sequence[str],
     joints: Sequence[str],
@@ -254,7 +293,7 @@ def _signals(
         signs = (*signs * (driven // len(signs)), *[1.0] * (len(names) - driven))
     for name in order:
         index, si = names.index(name), columns[name]
-        unit = _unit(signal, given, index, columns, by_kind=not plain)
+        unit = _unit(signal, given, index, columns)
         if si not in (None, unit.si):
             kind = "is part of a turn" if si == "1" else "turns" if si in ROTATION.values() else "slides"
             raise InvalidInput(
@@ -265,15 +304,11 @@ def _signals(
         yield JointSignal(signal, name, expressions[index], unit, -sign if name in turned and signal != "u" else sign)
 
 
-def _unit(
-    signal: str, given: Sequence[LogUnit], index: int, columns: Mapping[str, str | None], by_kind: bool
-) -> LogUnit:
-    """That of a column: one for all or one for each; of a base that moves or of actuators also one for each kind."""
+def _unit(signal: str, given: Sequence[LogUnit], index: int, columns: Mapping[str, str | None]) -> LogUnit:
+    """That of a column: one for each, or one for all of its kind; SI where none is given."""
     kinds = list(columns.values())
-    if not given:
-        return log_unit(signal, kinds[index] or "1")
-    if len(given) == len(kinds) or not by_kind:
-        return _at(f"unit of {signal}", given, index, list(columns))
+    if given and len(given) == len(kinds):
+        return given[index]
     fitting = [[unit for unit in given if kind in (None, unit.si)] for kind in kinds]
     idle = [unit.name for unit in given if not any(unit in own for own in fitting)]
     if idle or any(len(own) > 1 for own in fitting):
@@ -289,3 +324,85 @@ def _at(what: str, values: Sequence[Any], index: int, joints: Sequence[str]) -> 
     if len(values) not in (1, len(joints)):
         raise InvalidInput(f"{what} has {len(values)} entries; give one, or {len(joints)}, one per joint.")
     return values[index if len(values) > 1 else 0]
+
+
+def position_columns(robot: Robot, joints: Sequence[str], orientation: str) -> tuple[str, ...]:
+    """Names of the columns of q in a log: `joints` are those of one degree of freedom, in its order."""
+    names = list(joints)
+    for group, span in spans(robot.space, orientation):
+        names[span.start : span.start] = [f"{group.name}.{part}" for part in _written(orientation)]
+    return tuple(names)
+
+
+def spans(space: ConfigurationSpace, orientation: str) -> Iterator[tuple[Group, slice]]:
+    """Every base and its columns among those of q in a log."""
+    more = 0
+    for group in space.groups:
+        start, size = group.place + more, len(_written(orientation))
+        more += size - len(POSITIONS)
+        yield group, slice(start, start + size)
+
+
+def _written(orientation: str) -> tuple[str, ...]:
+    place, turn = POSITIONS[: TURN.start], POSITIONS[TURN]
+    return place + (ANGLES if orientation == "angles" else turn[-1:] + turn[:-1] if orientation == "wxyz" else turn)
+
+
+def bases(robot: Robot) -> tuple[Group, ...]:
+    """The joints of several degrees of freedom whose parent is the world: their axes are its."""
+    return tuple(group for group in robot.space.groups if robot.layout.parents[group.body] == WORLD)
+
+
+def columns_of(
+    mapping: ColumnMapping, model: forcegp.Model | None, joints: tuple[str, ...]
+) -> tuple[dict[str, dict[str, str | None]], dict[str, tuple[str, ...]]]:
+    """By signal: name and SI unit of its columns in the order of the log, and names in the order of the Dataset.
+
+    Unit None: whatever the actuator takes.
+    """
+    if model is None:
+        return {signal: dict.fromkeys(joints) for signal in SIGNALS}, dict.fromkeys(SIGNALS, joints)
+    robot, own = model.robot, model.robot.single_joint_names
+    kinds = {joint.name: TRANSLATION if joint.type == "prismatic" else ROTATION for joint in robot.joints}
+    of_log = dict(zip(own, joints, strict=True))
+    driven = tuple(model.actuation.names) == own
+    switches = model.inputs[len(model.actuators) :]
+
+    def unit(signal: str, name: str) -> str | None:
+        if signal == "u" and not (driven and name in own):
+            return "1" if name in switches else None
+        return kinds[name][signal] if name in kinds else "rad" if name.endswith(ANGLES) else "1"
+
+    written = mapping.orientation or ORIENTATIONS[0]
+    velocities = tuple(of_log.get(name, name) for name in robot.joint_names)
+    inputs = tuple(of_log.get(name, name) if driven else name for name in model.inputs)
+    log = {"q": position_columns(robot, joints, written), "v": velocities, "u": inputs, "a": velocities}
+    stored = position_columns(robot, own, "angles" if written == "angles" else ORIENTATIONS[0])
+    order = {"q": stored, "v": robot.joint_names, "u": model.inputs, "a": robot.joint_names}
+    return {signal: {name: unit(signal, name) for name in names} for signal, names in log.items()}, order
+
+
+def layout_of(
+    mapping: ColumnMapping, model: forcegp.Model | None, lacking: Mapping[str, Sequence[bool]], nv: int
+) -> Layout:
+    """What is left to do once positions are those of a Dataset.
+
+    `lacking`: of each logged signal, which of its entries the log lacks. Raises InvalidInput for vectors that are half
+    there where their axes turn.
+    """
+    groups = () if model is None else bases(model.robot)
+    derived = {name: [row for row, lacks in enumerate(own) if lacks] for name, own in lacking.items()}
+    axes = {name: (own[0], own[-1] if own[-1] != "imu" else "body") for name, own in mapping.axes.items()}
+    for name in axes.keys() - lacking.keys():
+        raise InvalidInput(
+            f"axes of {name} are stated, but the log has no {name}; name its columns, or leave axes out."
+        )
+    for name, group in ((name, group) for name in axes for group in groups):
+        for part, words in (((0, 1, 2), "linear"), ((3, 4, 5), "angular")):
+            rows = {group.row + k for k in part}
+            if axes[name][words == "angular"] == "world" and 0 < len(rows & {*derived.get(name, ())}) < len(rows):
+                raise InvalidInput(f"{name} in the axes of the world needs all of its {words} part, or all `derive`.")
+    if model is None:
+        return Layout(ConfigurationSpace(nv), derived=derived)
+    switches = tuple(range(len(model.actuators), len(model.inputs)))
+    return Layout(model.robot.space, groups, axes, tuple(model.robot.gravity.tolist()), derived, switches)

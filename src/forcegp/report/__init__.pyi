@@ -1,5 +1,6 @@
 from .motion import (
-    Arrows as Arrows, RecordedScene as RecordedScene, recorded_scene as recorded_scene, still_scene as still_scene,
+    Arrows as Arrows, RecordedScene as RecordedScene, recorded_scene as recorded_scene, recording as recording,
+    still_scene as still_scene,
 )
 from .page import (
     Page as Page, Table as Table, is_page as is_page, write_page as write_page,
@@ -8,4 +9,3 @@ from .page import (
     model_page as model_page, scene_notes as scene_notes,
     scores_sentence as scores_sentence, scores_table as scores_table,
 )
-from .scene import recording as recording

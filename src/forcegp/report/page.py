@@ -15,8 +15,7 @@ from forcegp.atomic_files import atomic_file
 from forcegp.data import Dataset
 from forcegp.errors import MissingExtra
 from forcegp.posterior.posterior import Posterior
-from forcegp.report.motion import RecordedScene, recorded_scene
-from forcegp.report.scene import recording
+from forcegp.report.motion import RecordedScene, recorded_scene, recording
 from forcegp.scores import Picture, Scores, model_pictures, overall, unit_of
 
 
@@ -39,7 +38,7 @@ class Page:
     findings: Sequence[tuple[str, str]] = ()
     """Subjects, and what was found."""
     scene: str = ""
-    """An HTML document with the robot (`scene.recording`)."""
+    """An HTML document with the robot (`recording`)."""
     scene_notes: Sequence[str] = ()
     """What the arrows are; or why there is no robot."""
     pictures: Sequence[Picture] = ()
