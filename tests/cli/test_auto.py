@@ -118,7 +118,7 @@ def test_the_printed_command_keeps_every_option():
     others += " --forces given --forces gp:joint,viscous --out here"
     words = ["auto", "a.txt", "b.txt", *columns.split(), *others.split()]
     command = parse_arguments(words)
-    mapping = command.columns.mapping()
+    mapping = command.columns.mapped([], None)
     again = parse_arguments(shlex.split(command._command(mapping))[1:])
     assert again == command
 

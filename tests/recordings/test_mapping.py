@@ -144,13 +144,16 @@ def test_units(quantity, name, given, si):
 )
 def test_flags_that_mean_nothing_are_refused(flags):
     with pytest.raises(InvalidInput):
-        parse_arguments(["import", "log.csv", *flags.split(), "--out", "o.h5"]).columns.mapping()
+        parse_arguments(["import", "log.csv", *flags.split(), "--out", "o.h5"]).columns.mapped([], None)
 
 
 def test_short_forms_of_the_command_line():
     assert by_quantity("unit", "q=deg,m,time=ms") == {"q": ("deg", "m"), "time": ("ms",)}
     for flag, signs in (("u=1,-1", {"u": (1.0, -1.0)}), ("1,-1", dict.fromkeys("qvua", (1.0, -1.0)))):
-        assert parse_arguments(["import", "x.csv", f"--sign={flag}", "--out", "o.h5"]).columns.mapping().sign == signs
+        assert (
+            parse_arguments(["import", "x.csv", f"--sign={flag}", "--out", "o.h5"]).columns.mapped([], None).sign
+            == signs
+        )
 
 
 def test_names_are_guessed_only_where_nothing_else_can_be_meant(tmp_path):
