@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
 from tests.posterior.arm import arm_model
 
 from forcegp import Accelerations, Dataset, Torques, export_c, fit, score
-from forcegp.data import with_memory
+from forcegp.data import estimate_delay, with_memory
 from forcegp.data.strokes import encoder_step, strokes, turning_points
 from forcegp.errors import DataWarning, InvalidInput
 from forcegp.evidence import motion_residuals
@@ -269,3 +270,14 @@ def test_a_past_that_is_not_known_is_in_the_interval(lugre_log):
     spread = torch.stack(draws).var(0)
     added = unknown.variance - posterior.predict(seen.q, seen.v, seen.u).variance
     assert float((added.sqrt() / spread.sqrt()).median()) == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.012])
+def test_hysteresis_is_no_delay(delay, lugre_log):
+    """With friction of velocity alone the same logs show 20 ms more."""
+    few = lugre_log.rows(slice(0, 6000, 2))
+    late = replace(few, u=CubicSpline(few.time, few.u)(few.time - delay))
+    found = estimate_delay(late)
+    assert abs(found.significant - delay) < 0.004
+    alone = estimate_delay(replace(late, time_ordered=True, strokes=np.zeros((len(late), 3, 1))))  # nothing remembered
+    assert alone.significant > delay + 0.01
