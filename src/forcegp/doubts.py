@@ -39,9 +39,9 @@ class Doubt:
     @property
     def command(self) -> str:
         """The `forcegp import` that states the correction; empty where options cannot."""
-        flags = [f"--orientation {own[0]}" for own in self.correction.get("orientation", {}).values()]
-        each = ((name, self.correction.get(name)) for name in ("axes", "unit", "sign"))
-        flags += [f"--{name} {stated_as(values)}" for name, values in each if values]
+        each = [("orientation", own[0]) for own in self.correction.get("orientation", {}).values()]
+        stated = ((name, self.correction.get(name)) for name in ("axes", "unit", "sign"))
+        flags = [f"--{name} {text}" for name, text in (*each, *((n, stated_as(x)) for n, x in stated if x))]
         return " ".join(["forcegp import", *flags]) if flags else ""
 
     @property

@@ -42,7 +42,7 @@ FORCES: dict[str, str | type[Force]] = {
 }
 """Name -> class, or where in this package it is, so that only what is used is imported. Add yours."""
 
-UNKNOWN = "gp:"
+UNKNOWN, MEMORY = "gp:", "memory"
 SHORT: dict[str, tuple[str, Mapping[str, Any]]] = {
     "bodies": ("rigid-bodies", {"learn": "all"}),
     "joint": ("joint-forces", {}),
@@ -173,7 +173,7 @@ def called(what: str, make: Callable[..., Any], options: Sequence[str], fixed: M
     allowed = signature(make).parameters
     for option in options:
         key, equals, value = (part.strip() for part in option.partition("="))
-        if not equals and key in allowed and allowed[key].default is False:
+        if not equals and key in allowed and (key == MEMORY or allowed[key].default is False):
             value = "true"
         elif not equals and option is options[0]:
             key, value = next(iter(allowed), ""), option.strip()
@@ -210,8 +210,9 @@ def _value(what: str, key: str, text: str, make: Callable[..., Any], field: Para
     default = field.default
     if key in getattr(make, "coefficients", {}) or field.annotation in (float | None, "float | None"):
         default = 0.0
-    if key == "memory" and text not in ("true", "false"):
+    if key == MEMORY and text not in ("true", "false"):
         return tuple(part.strip() for part in text.split("/"))
+    default = False if key == MEMORY else default
     if isinstance(default, bool):
         if text not in ("true", "false"):
             raise InvalidInput(f"{what} has {key}={text}; give true or false")

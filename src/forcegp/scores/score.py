@@ -85,7 +85,7 @@ def score(
     lasts for, a folder of something else, or one where another process is at work.
     """
     log = with_strokes(require_type("log", log, Dataset))
-    recording = None if recording is None else with_strokes(recording)
+    recording = None if recording is None else with_strokes(require_type("recording", recording, Dataset))
     wrong = isinstance(models, str) or not isinstance(models, Posterior | Mapping | Sequence)
     given: Any = {"model": models} if isinstance(models, Posterior) else models
     if models is not None and wrong:
@@ -94,6 +94,8 @@ def score(
         raise InvalidInput(f"the number of seeds is {seeds}; it must be at least 1.")
     about = {"kind": KIND, "machine": machine(), "forcegp": __version__, "source": dict(source or {}), "rows": len(log),
              "preparation": preparation_lines(log.metadata)}  # fmt: skip
+    if horizons is not None and not isinstance(horizons, Sequence):
+        raise InvalidInput(f"horizons is {horizons!r}; give a sequence of seconds.")
     horizons = None if horizons is None else tuple(horizons)
     before = (
         {name: each for name, each in given.items() if isinstance(each, Posterior)}
