@@ -127,9 +127,9 @@ def _told_apart(dataset: Dataset, robot: forcegp.robots.Robot, largest: float) -
     )
     if least < REMEMBERS * left:
         return beside
-    used, again = alone.significant, beside.significant
-    near = abs(used - again) <= max(SIGNIFICANT * (alone.common_std + beside.common_std), 0.5 * abs(used))
-    return alone if not used or (again and near) else beside
+    used, width = alone.significant, 4.0 * beside.common_std
+    apart = abs(used - beside.common) > max(SIGNIFICANT * (alone.common_std + beside.common_std), 0.5 * abs(used))
+    return alone if not used or (not apart and (beside.significant or width <= APART)) else beside
 
 
 def _estimated(dataset: Dataset, robot: forcegp.robots.Robot, largest: float) -> tuple[Delay, float]:
