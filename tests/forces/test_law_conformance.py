@@ -39,8 +39,8 @@ class TestDryFrictionThatFalls(LawConformance):
 
 
 class TestGearFriction(LawConformance):
-    law = GearFriction(THREE, 0.1, 0.2, [0.2, -0.05, 0.1], memory=False)
-    given = ("memory",)
+    law = GearFriction(THREE, 0.1, 0.2, [0.2, -0.05, 0.1], 0.0, 0.6, memory=False)
+    given = ("memory", "breakaway", "stribeck_velocity")
 
 
 class TestSpring(LawConformance):

@@ -51,8 +51,10 @@ FORMULAS = {
         lambda q, v, u: -(0.7 + torch.tensor([0.5, 0.8, 0.0, 0.2], dtype=torch.float64) * u.abs()) * (v / 0.02).tanh(),
     ),
     "gear": (
-        lambda: GearFriction(0.7, 0.5, 0.02, [0.2, -0.1, 0.3, 0.0]),
-        lambda q, v, u: -(0.7 + 0.5 * u.abs() + ROOTS * v.abs().sqrt()) * (v / 0.02).tanh(),
+        lambda: GearFriction(0.7, 0.5, 0.02, [0.2, -0.1, 0.3, 0.0], 2.0, 0.3),
+        lambda q, v, u: (
+            -(0.7 + 0.5 * u.abs() + ROOTS * v.abs().sqrt() + 2.0 * (-((v / 0.3) ** 2)).exp()) * (v / 0.02).tanh()
+        ),
     ),
     "spring": (lambda: Spring(NUMBERS, 0.3), lambda q, v, u: -TENSOR * (q - 0.3)),
     "constant": (lambda: Offset(-TENSOR), lambda q, v, u: -TENSOR.expand_as(v)),

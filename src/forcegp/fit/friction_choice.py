@@ -16,7 +16,7 @@ from forcegp.forces.presliding import after_strokes
 from forcegp.mechanics import State
 from forcegp.model import Model
 
-PARTS = ("memory", "factor", "root", "direction")
+PARTS = ("memory", "factor", "root", "breakaway", "direction")
 """Of `GearFriction`, and of the law beside it."""
 BLOCKS = 10
 """Stretches of the log, each predicted from the others."""
@@ -24,11 +24,15 @@ CLEARLY = 1.5
 """Standard errors over the stretches by which a part must lower the squared residual."""
 LEAST = 0.01
 """Share of it by which it must do so."""
+COLUMNS = 7
+"""Of each joint: viscous, dry, load, root of speed, breakaway, direction, a constant."""
+FALLS = 0.3
+"""Of the root mean square velocity, what the breakaway falls over here; a fit finds it."""
 HIGHEST = 0.5
 """Largest share of the load that friction takes: beyond it something else is explained."""
 REVERSALS = 6
 """Fewest reversals of a joint that can show memory."""
-WIDTHS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)
+WIDTHS = tuple(np.geomspace(0.003, 1.0, 11).tolist())
 """Of the smooth sign, over the root mean square velocity."""
 SEEN, RIDGE = 0.003, 1e-7
 """Of the torque of bodies, the least that counts over the largest; and what is added to the normal equations."""
@@ -51,6 +55,8 @@ class FrictionChoice:
     few_reversals: tuple[str, ...]
     sigma: tuple[float, ...]
     """Stiffness of the memory of each joint in 1/rad or 1/m, roughly; 0 without."""
+    falls: tuple[float, ...]
+    """Velocity that a breakaway would fall over, roughly."""
 
     def to_dict(self) -> dict[str, Any]:
         """For the settings of a fit."""
@@ -88,7 +94,9 @@ def choose_friction(model: Model, log: Dataset, parts: Sequence[str] = PARTS) ->
         for j in moving:
             regression.choose(j, parts)
     chosen = [regression.parts.get(j, ()) for j in range(len(log.joint_names))]
-    return FrictionChoice(tuple(log.joint_names), tuple(chosen), tuple(regression.ratios), tuple(few), regression.sigma)
+    parts_found, ratios = tuple(chosen), tuple(regression.ratios)
+    sigma, falls = regression.sigma, tuple(regression.falls.tolist())
+    return FrictionChoice(tuple(log.joint_names), parts_found, ratios, tuple(few), sigma, falls)
 
 
 def _folds(log: Dataset) -> np.ndarray:
@@ -127,6 +135,7 @@ class _Regression:
         self.target = np.stack([np.einsum("nji,nj->ji", self.bodies[k], self.torque[k]) for k in rows])
         self.squares = np.stack([(self.torque[k] ** 2).sum(0) for k in rows])
         self.rows = rows
+        self.falls = FALLS * np.sqrt((self.v**2).mean(0))
         self.signs: list[dict[float, Sums]] = []
         for j in range(self.nv):
             speed = float(np.sqrt((self.v[:, j] ** 2).mean())) or 1.0
@@ -149,7 +158,8 @@ class _Regression:
 
     def _sums(self, j: int, s: Float[np.ndarray, " rows"]) -> Sums:
         v = self.v[:, j]
-        columns = [v, s, self.load[:, j] * s, np.sqrt(np.abs(v)) * s, np.abs(v), np.ones_like(v)]
+        slow = np.exp(-((v / max(self.falls[j], 1e-12)) ** 2))
+        columns = [v, s, self.load[:, j] * s, np.sqrt(np.abs(v)) * s, slow * s, np.abs(v), np.ones_like(v)]
         F, Z, y = np.stack(columns, axis=1) * self.weight[j], self.bodies[:, j], self.torque[:, j]
         return (
             np.stack([Z[k].T @ F[k] for k in self.rows]),
@@ -190,7 +200,7 @@ class _Regression:
         A, b = self._normal(j, parts, sign)
         whole, right = A.sum((0, 1)), b.sum((0, 1))
         scale = np.sqrt(whole.diagonal().clip(1e-300))
-        out, place, numbers = np.zeros(self.count), self.inner.shape[-1] + 6 * j, np.zeros(len(scale))
+        out, place, numbers = np.zeros(self.count), self.inner.shape[-1] + COLUMNS * j, np.zeros(len(scale))
         for k in range(self.count):
             if k == 0 or held_out:
                 inner = (whole - A[k].sum(0) if held_out else whole) / np.outer(scale, scale)
@@ -204,14 +214,14 @@ class _Regression:
     def _normal(self, j: int, parts: tuple[str, ...], sign: float) -> tuple[np.ndarray, np.ndarray]:
         """Of the rows of every stretch and joint, in bodies and the open columns of every joint."""
         first = self.inner.shape[-1]
-        size = first + 6 * self.nv
+        size = first + COLUMNS * self.nv
         A, b = np.zeros((self.count, self.nv, size, size)), np.zeros((self.count, self.nv, size))
         A[..., :first, :first], b[..., :first] = self.inner, self.target
         for i in range(self.nv):
             own, at = (parts, sign) if i == j else (self.parts.get(i, ()), self.at[i])
             across, inner, right = self.signs[i][at]
             open_ = np.array([True, True, *(part in own for part in PARTS[1:]), True])
-            place = slice(first + 6 * i, first + 6 * i + 6)
+            place = slice(first + COLUMNS * i, first + COLUMNS * (i + 1))
             A[:, i, :first, place], A[:, i, place, place] = across * open_, inner * np.outer(open_, open_)
             A[:, i, place, :first], b[:, i, place] = (across * open_).swapaxes(1, 2), right * open_
         return A, b
@@ -244,9 +254,11 @@ def with_choice(model: Model, choice: FrictionChoice) -> Model:
         if isinstance(force, GearFriction) and force.memory is None:
             names = tuple(name for name, has in zip(choice.joints, choice.has("memory"), strict=True) if has)
             stiffness = LogNormal([each or 1.0 for each in choice.sigma])
+            falls = LogNormal([each or 1.0 for each in choice.falls], choice.has("breakaway").astype(float).tolist())
             force = replace(
-                force, memory=names or False, factor=only("factor", 0.05), root=only("root", 0.0), sigma=stiffness
-            )
+                force, memory=names or False, factor=only("factor", 0.05), root=only("root", 0.0), sigma=stiffness,
+                breakaway=only("breakaway", 0.0), stribeck_velocity=falls,
+            )  # fmt: skip
         elif isinstance(force, DirectionalFriction) and force.difference is None:
             force = replace(force, difference=only("direction", 0.0))
         made.append(force)

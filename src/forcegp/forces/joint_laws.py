@@ -209,24 +209,30 @@ class LoadFriction(DryFriction):
 
 @dataclass(frozen=True, eq=False)
 class GearFriction(LoadFriction):
-    """-(c + mu |u| + r sqrt|v|) s: dry friction of a gear under load, with lubricant that builds up with speed.
+    """-(c + mu |u| + r sqrt|v| + b exp(-(v / v_s)^2)) s: dry friction of a gear under load, with its lubricant.
 
-    `root` r in Nm (s/rad)^.5 or N (s/m)^.5, of either sign. With `memory` of None a fit gives each joint what held-out
-    stretches of the log show: memory, load, speed, and of `DirectionalFriction` and `Offset` beside it.
+    `root` r in Nm (s/rad)^.5 or N (s/m)^.5, of either sign; `breakaway` b, `stribeck_velocity` v_s as in `Stribeck`.
+    With `memory` of None a fit gives each joint what held-out stretches of the log show: memory, load, speed,
+    breakaway, and of `DirectionalFriction` beside it.
     """
 
     root: Number = None
+    breakaway: Number = None
+    stribeck_velocity: Number = None
     memory: Memory | None = field(default=None, kw_only=True)  # type: ignore[assignment]  # open until a fit decides
     coefficients: ClassVar[Mapping[str, Coefficient]] = {
         "level": Coefficient(),
         "factor": Coefficient("1", highest=0.9),
         "root": Coefficient("force/velocity^.5", lowest=-np.inf),
+        **{name: Stribeck.coefficients[name] for name in ("breakaway", "stribeck_velocity")},
         **DryFriction.sign,
     }
 
     @override
     def level_at(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
-        return super().level_at(features, parameters) + parameters["root"] * features[0].abs().sqrt()
+        r, b, v_s = (parameters[name] for name in ("root", "breakaway", "stribeck_velocity"))
+        v = features[0]
+        return super().level_at(features, parameters) + r * v.abs().sqrt() + b * torch.exp(-((v / v_s) ** 2))
 
 
 @dataclass(frozen=True, eq=False)
