@@ -12,6 +12,8 @@ from scipy.interpolate import CubicSpline
 from tests.posterior.arm import arm_model
 
 from forcegp import Accelerations, Dataset, Torques, export_c, fit, score
+from forcegp.control import ComputedTorque, ContactMonitor
+from forcegp.control.tracking import Past
 from forcegp.data import estimate_delay, with_memory
 from forcegp.data.strokes import encoder_step, strokes, turning_points
 from forcegp.errors import DataWarning, InvalidInput
@@ -281,3 +283,39 @@ def test_hysteresis_is_no_delay(delay, lugre_log):
     assert abs(found.significant - delay) < 0.004
     alone = estimate_delay(replace(late, time_ordered=True, strokes=np.zeros((len(late), 3, 1))))  # nothing remembered
     assert alone.significant > delay + 0.01
+
+
+def test_controllers_and_monitors_see_the_past(lugre_log):
+    train, test = lugre_log.rows(slice(0, 4000)), lugre_log.rows(slice(4000, 6000))
+    left = {}
+    for law in (Coulomb(), Coulomb(memory=True)):
+        posterior = fit(arm_model(0).with_forces(Viscous(), law, noise=Noise(0.1)), train, Torques(), rows=1500)
+        monitor = ContactMonitor(posterior.predictor(), dt=DT)
+        left[law.memory] = float(monitor._residuals(test.q, test.v, test.u)[0].square().mean().sqrt())
+    assert left[True] < 0.6 * left[False]
+    predictor, z = posterior.predictor(), [0.5, -0.2, 0.7]
+    q, v, a = test.q[0], test.v[0], test.a[0]
+    u = predictor.inverse_dynamics(q, v, a, memory=z).mean
+    torch.testing.assert_close(posterior.predict(q, v, np.append(u, z)).mean, torch.tensor(a), rtol=1e-7, atol=1e-7)
+    with pytest.raises(InvalidInput, match=r"this model remembers: give memory=\(presliding of pan"):
+        predictor.inverse_dynamics(q, v, a)
+    controller, seen = ComputedTorque(predictor, stiffness=100.0), with_memory(test, posterior.model)
+    for k in range(300):
+        asked = controller(test.q[k], test.v[k], test.q[k], test.v[k], test.a[k])
+    np.testing.assert_allclose(controller.past.z, seen.u[299, 3:], atol=1e-9)
+    needed = predictor.inverse_dynamics(test.q[299], test.v[299], test.a[299], memory=controller.past.z).mean
+    torch.testing.assert_close(asked, needed, rtol=1e-7, atol=1e-7)
+    more = posterior.update(test.rows(slice(0, 200)))
+    assert len(more.training) == len(posterior.training) + 200
+
+
+def test_noise_of_an_encoder_does_not_wear_the_state_down():
+    model, chance = arm_model(0).with_forces(Coulomb(1.0, sigma=1000.0, memory=True)), np.random.default_rng(0)
+    quiet, every = Past(model, least=5e-5), Past(model)
+    for past in (quiet, every):
+        past.see(torch.zeros(3, dtype=torch.float64))
+        past.see(torch.full((3,), 0.01, dtype=torch.float64))
+        for _ in range(500):
+            past.see(torch.tensor(0.01 + 1e-5 * chance.standard_normal(3)))
+    assert bool((quiet.z > 0.99).all())
+    assert bool((every.z < 0.5).all())

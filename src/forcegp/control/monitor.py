@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from scipy.stats import chi2, gumbel_r
 from torch import Tensor
 
-from forcegp.control.tracking import Moving, joint_forces, model_of
+from forcegp.control.tracking import Moving, Past, joint_forces, model_of
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.evidence.least_squares import NoiseLevels
 from forcegp.integration.integrators import check_time_step
@@ -87,7 +87,7 @@ class ContactMonitor:
 
     def restart(self) -> None:
         """Forget earlier calls, as at the beginning of a recording."""
-        self._torque = torch.zeros(self.robot.nv, dtype=torch.float64)
+        self._torque, self.past = torch.zeros(self.robot.nv, dtype=torch.float64), Past(model_of(self.model))
         self._before: tuple[Tensor, Tensor, Tensor] | None = None
 
     def calibrate(self, free: Sequence[Motion], *, false_alarms_per_hour: float = 0.1) -> "ContactMonitor":
@@ -166,7 +166,7 @@ class ContactMonitor:
     def _motion(self, q: Any, v: Any, u: Any) -> tuple[Tensor, Tensor, Tensor]:
         """Checked samples, (nv,) each or (T, nv)."""
         named = zip("qvu", (q, v, u), strict=True)
-        found = [torch.as_tensor(real_array(name, x), dtype=torch.float64) for name, x in named]
+        found = [torch.tensor(real_array(name, x), dtype=torch.float64) for name, x in named]
         shapes = [tuple(x.shape) for x in found]
         if len({*shapes}) > 1 or shapes[0][-1:] != (self.robot.nv,) or not all(bool(x.isfinite().all()) for x in found):
             raise InvalidInput(
@@ -182,6 +182,7 @@ class ContactMonitor:
             raise InvalidInput(
                 f"a recording has shape {tuple(q.shape)}; give (T, {self.robot.nv}) of two rows or more."
             )
+        self.past = Past(model_of(self.model))
         middle = 0.5 * (q[1:] + q[:-1]), 0.5 * (v[1:] + v[:-1])
         tau, M, extra = self._torques(*middle, u[:-1], (v[1:] - v[:-1]) / self.dt)
         filtered = lfilter([1.0 - self._keep], [1.0, -self._keep], tau.numpy(), axis=0)
@@ -189,6 +190,13 @@ class ContactMonitor:
 
     def _torques(self, q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """M a - Q_K - Q_U at rows, M, and M Cov(a) M of what the posterior leaves open."""
+        if self.past.memory.names:
+            rows = []
+            for row in q:
+                self.past.see(row)
+                rows.append(self.past.z)
+            first = self.past.column
+            u = torch.cat([u[:, :first], torch.stack(rows), u[:, first:]], dim=1)
         at = joint_forces(self.model, q, v, u)
         M = at.M
         extra = M @ self.model(q, v, u)[1] @ M if self.open and isinstance(self.model, Predictor) else None

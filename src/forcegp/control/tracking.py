@@ -163,7 +163,8 @@ class ComputedTorque(TrackingController):
 
     * model: `posterior.predictor()`, or a `Model` without anything learned, which takes longer. Gains as
       `TrackingController` has them.
-    Forces are those at (q, v_d): at the measured velocity dry friction would follow noise and overshoot.
+    Forces are those at (q, v_d): at the measured velocity dry friction would follow noise and overshoot. Friction that
+    remembers has the state of the positions that were seen (`past`).
     """
 
     def __init__(self, model: Moving, **settings: Any) -> None:
@@ -173,13 +174,14 @@ class ComputedTorque(TrackingController):
                 "ComputedTorque moves a robot without contacts, and this model has one; use HybridForce, or "
                 "posterior.with_contacts([])."
             )
-        self.model = model
+        self.model, self.past = model, Past(known)
         super().__init__(known.robot, **settings)
 
     @override
     def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
-        at = joint_forces(self.model, q, v_d, self.last)  # at v dry friction would follow noise and overshoot
-        u = torques_for(self.model, q, v_d, at.M @ (a_d + self.feedback(e, e_v)), self.last, at)
+        self.past.see(q)
+        at = joint_forces(self.model, q, v_d, self.last, self.past)  # at v dry friction would follow noise
+        u = torques_for(self.model, q, v_d, at.M @ (a_d + self.feedback(e, e_v)), self.last, at, self.past)
         if u is None:
             raise NumericalError(NO_TORQUES)
         return u
@@ -194,16 +196,46 @@ def model_of(model: Moving) -> Model:
     raise InvalidInput(f"model is a {type(model).__name__}; give posterior.predictor() or a Model.")
 
 
-def joint_forces(model: Moving, q: Tensor, v: Tensor, u: Tensor) -> JointForces:
-    """Known and learned forces at a state (nv,) or states (n, nv) and what they act on."""
+class Past:
+    """What friction of a model remembers of the positions that a controller has seen.
+
+    Steps of at most `least` (rad or m) from the last position that counted are noise of the encoder.
+    """
+
+    def __init__(self, model: Model, least: float = 0.0) -> None:
+        self.memory, self.column, self.least = model.memory, model.memory_column, least
+        self.z = self.memory.start if self.memory.names else torch.zeros(0, dtype=torch.float64)
+        self._last: Tensor | None = None
+
+    def see(self, q: Float[Tensor, " nq"]) -> None:
+        """The joints are at q now."""
+        if self.memory.names and self._last is not None:
+            step = self.memory.robot.difference(self._last, q)
+            moved = torch.where(step.abs() > self.least, step, 0.0)
+            self.z = self.memory.after(self.z, moved, 0.0)
+            q = self.memory.robot.space.integrate(self._last, moved)
+        self._last = q.clone()
+
+    def beside(self, u: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch nu"]:
+        """u of the actuators with the columns of the memory."""
+        z = self.z.expand(*u.shape[:-1], -1)
+        return torch.cat([u[..., : self.column], z, u[..., self.column :]], dim=-1) if self.memory.names else u
+
+
+def joint_forces(model: Moving, q: Tensor, v: Tensor, u: Tensor, past: Past | None = None) -> JointForces:
+    """Known and learned forces at a state (nv,) or states (n, nv) and what they act on; u without its `past`."""
+    if past is not None and past.memory.names:
+        at = joint_forces(model, q, v, past.beside(u))
+        kept = [j for j in range(at.dQ_du.shape[-1]) if not 0 <= j - past.column < len(past.z)]
+        return at._replace(dQ_du=at.dQ_du[..., kept])
     if isinstance(model, Predictor):
         return model.joint_forces(q, v, u)
     at = model.dynamics(q, v, u)
-    return JointForces(at.Q_K, torch.eye(u.shape[-1], dtype=u.dtype), at.M, at.A, at.b)
+    return JointForces(at.Q_K, torch.eye(len(q), u.shape[-1], dtype=u.dtype), at.M, at.A, at.b)
 
 
 def torques_for(
-    model: Moving, q: Tensor, v: Tensor, needed: Tensor, u: Tensor, at: JointForces
+    model: Moving, q: Tensor, v: Tensor, needed: Tensor, u: Tensor, at: JointForces, past: Past | None = None
 ) -> Float[Tensor, " nv"] | None:
     """The u (nv,) that gives the forces `needed` at q, v, by Newton's method from u, where they are `at`, or None."""
     if not bool(needed.isfinite().all()):
@@ -216,7 +248,7 @@ def torques_for(
         if int(singular) or not bool(step.isfinite().all()):
             return None
         u = u + step
-        at = joint_forces(model, q, v, u)
+        at = joint_forces(model, q, v, u, past)
     return None
 
 

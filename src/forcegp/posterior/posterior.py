@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, with_memory
 from forcegp.data.dataset import require_rows
 from forcegp.errors import DataWarning, InvalidInput, NumericalError, require_type, usable_arguments
 from forcegp.evidence import Accelerations
@@ -265,7 +265,7 @@ class Posterior(Fitted):
         """
         example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, model=posterior.model)"
         require_rows("rows", rows, self.model.robot.joint_names, "the model", example)
-        own, rows = replace(self, target=None), rows_of_own_system(self, rows)
+        own, rows = replace(self, target=None), rows_of_own_system(self, with_memory(rows, self.model))
         if horizon is None:
             return replace(learn_more_rows(own, rows), target=self.target)
         return replace(learn_and_forget(own, rows, horizon), target=self.target)

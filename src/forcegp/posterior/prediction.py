@@ -301,7 +301,7 @@ def forces_around(posterior: Any, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tens
 def require_actuated(posterior: Any) -> None:
     """Raises InvalidInput for a Posterior of which no u can be solved for."""
     actuated = any(isinstance(force, Actuation) and force.known for force in posterior.model.laws)
-    nv, nu = posterior.model.sizes[1:]
+    nv, nu = posterior.model.sizes[1], posterior.model.sizes[2] - len(posterior.model.memory.names)
     if nv != nu:
         raise InvalidInput(
             f"no u makes every acceleration: {posterior.model.robot.name} has {nv} degrees of freedom and u has {nu} "
@@ -314,7 +314,9 @@ def require_actuated(posterior: Any) -> None:
         )
 
 
-def inverse_dynamics(posterior: Any, states: Sequence[Tensor], normal_force: Any, covariance: bool) -> Gaussian:
+def inverse_dynamics(
+    posterior: Any, states: Sequence[Tensor], normal_force: Any, covariance: bool, memory: Any = None
+) -> Gaussian:
     """u (n, nv) of M a = Q_K(u) + Q_U(u) + A^T lambda of a Posterior at rows of q, v and a.
 
     Friction under load and processes may depend on u: Newton's method. With J = d(Q_K + Q_U)/du and the covariance S of
@@ -329,10 +331,17 @@ def inverse_dynamics(posterior: Any, states: Sequence[Tensor], normal_force: Any
             f"normal_force has shape {tuple(wanted.shape)}; give {shape[1:]} or {shape}, one per contact."
         )
     require_finite("normal_force", wanted)
+    names, first = posterior.model.memory.names, posterior.model.memory_column
+    if names and memory is None:
+        raise InvalidInput(f"this model remembers: give memory=({', '.join(names)}), for a state without past 0.")
+    z = real_tensor("memory", [] if memory is None else memory, q.device).expand(len(q), -1) if names else q[:, :0]
+
+    def whole(u: Tensor) -> Tensor:
+        return torch.cat([u[:, :first], z, u[:, first:]], dim=1) if names else u
 
     def surplus(u: Tensor, learned: bool = True) -> Tensor:
         """What is left over of Q_K + Q_U + A^T lambda - M a."""
-        at = posterior.dynamics(q, v, u)
+        at = posterior.dynamics(q, v, whole(u))
         Q = joint_force(posterior, at) if learned else at.Q_K
         return Q + (at.A.mT @ wanted[..., None] - at.M @ a[..., None])[..., 0]
 
@@ -346,7 +355,7 @@ def inverse_dynamics(posterior: Any, states: Sequence[Tensor], normal_force: Any
             )
         if not covariance:
             return Gaussian(u, None)
-        at = posterior.dynamics(q, v, u)
+        at = posterior.dynamics(q, v, whole(u))
         response = torch.linalg.solve(rows_jacobian(surplus, u)[1], posterior.trained.unknown.direction(at))
         return Gaussian(u, posterior.latents(at, True).through(response).covariance)
 

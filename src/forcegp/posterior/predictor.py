@@ -253,16 +253,16 @@ class Predictor(Summary):
         slope, M, A, b = around.split([nv * nu, nv**2, m * nv, m], dim=-1)
         return JointForces(Q, slope.unflatten(-1, (nv, nu)), M.unflatten(-1, (nv, nv)), A.unflatten(-1, (m, nv)), b)
 
-    def inverse_dynamics(self, q: Any, v: Any, a: Any, normal_force: Any = None) -> Gaussian:
+    def inverse_dynamics(self, q: Any, v: Any, a: Any, normal_force: Any = None, memory: Any = None) -> Gaussian:
         """The actuator forces u (nv,) or (n, nv) in Nm or N that make the acceleration a (rad/s^2 or m/s^2).
 
         u = M a + h - A^T lambda - Q_U; friction under load is that of `normal_force` lambda (m,) or (n, m) in N,
-        positive where the surface pushes the robot off. The covariance is that of Q_U at u, to first order. `a` has to
-        obey A a = b, else contacts change it. Raises InvalidInput for models without bodies or actuation,
-        NumericalError where no u is found.
+        positive where the surface pushes the robot off; `memory` (m,) or (n, m) what laws remember. The covariance is
+        that of Q_U at u, to first order. `a` has to obey A a = b, else contacts change it. Raises InvalidInput for
+        models without bodies or actuation, or without a memory that they need; NumericalError where no u is found.
         """
         states, single = self._states(q, v, a, "qva")
-        found = inverse_dynamics(self.posterior, states, normal_force, self.kind != "none")
+        found = inverse_dynamics(self.posterior, states, normal_force, self.kind != "none", memory)
         if not single:
             return found
         return Gaussian(found.mean[0], None if found.covariance is None else found.covariance[0])
