@@ -57,7 +57,7 @@ def prepared(ur5: Any, seed: int, mass: float, center: np.ndarray) -> Dataset:
     q, v, u = np.deg2rad(logged[:, 1:7]), np.deg2rad(logged[:, 7:13]), logged[:, 13:] * [1, 1, -1, 1, 1, 1]
     robot = Robot.from_urdf_text(ur5.URDF)
     data = {"q": q, "v": v, "u": u, "a": np.gradient(v, rows[:, 0], axis=0), "time": rows[:, 0]}
-    raw = Dataset(**data, joint_names=robot.joint_names, model=Model(robot))
+    raw = Dataset(**data, model=Model(robot))
     return Preparation(cutoff="auto", delay="auto", trim=0.5).apply(raw)
 
 

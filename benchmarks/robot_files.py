@@ -32,7 +32,7 @@ import pinocchio as pin
 import torch
 from defusedxml import ElementTree
 
-from forcegp.errors import ForceGPError, RobotFileWarning, UnstatedBase
+from forcegp.errors import ForceGPError, RobotFileWarning
 from forcegp.robots import Robot
 from forcegp.robots.layout import BASE
 from forcegp.robots.mjcf import is_mjcf
@@ -40,7 +40,7 @@ from forcegp.robots.urdf_file import read_robot_file
 
 mujoco: Any = untyped
 CLOSE = 1e-9
-ASKED = "not bolted"  # what the message of an UnstatedBase says, also beside other problems
+ASKED = "not bolted"  # what the message says where nobody said how the base is held, also beside other problems
 SUFFIXES = (".urdf", ".xacro", ".xml", ".mjcf")
 
 
@@ -75,7 +75,7 @@ def measured(path: Path, *, mjcf: bool) -> File:
             robot = Robot.from_file(path)
         except ForceGPError as first:
             remedy, outcome = getattr(first, "remedy", {}), type(first).__name__
-            message, asked = str(first), isinstance(first, UnstatedBase) or ASKED in str(first)
+            message, asked = str(first), ASKED in str(first)
             if remedy:
                 try:
                     robot, outcome = Robot.from_file(path, **remedy), "one round"

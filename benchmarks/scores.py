@@ -30,11 +30,6 @@ def scores_of(posterior: Posterior, test: Dataset) -> dict[str, Any]:
             out[f"{key}_per_joint"] = scores.columns(name, quantity) if known else None
     out |= {"nlpd": scores.value("nlpd", "all joints"), "nlpd_per_joint": scores.columns("nlpd")}
     largest = [each or 0.0 for each in scores.columns("largest", "constraint")]
-    forces = {
-        f"force_mae.{name.removesuffix(' at the joints')}": scores.value("mae", name)
-        for name in held
-        if name.endswith(" at the joints")
-    }
     contact = {"normal_force_error": "relative_rmse", "normal_force_coverage": "coverage_95"}
     contact = {key: scores.value(name, "contact force") for key, name in contact.items() if "contact force" in held}
-    return out | {"constraint_error_max": max(largest, default=0.0)} | contact | forces
+    return out | {"constraint_error_max": max(largest, default=0.0)} | contact

@@ -18,7 +18,7 @@ class InvalidInput(ForceGPError, ValueError):
 
 
 class RobotModelError(ForceGPError):
-    """The robot description cannot be used; subclasses say why.
+    """The robot description cannot be used.
 
     `remedy` holds the arguments of `Robot.from_file` under which this file is taken, by name; empty where the file must
     be corrected first. `problems` are all that were found.
@@ -30,44 +30,8 @@ class RobotModelError(ForceGPError):
         self.problems: tuple[str, ...] = (seen + advice,)
 
 
-class MalformedUrdf(RobotModelError):
-    """Not well-formed XML, or no URDF: names that are missing, twice or of nothing, xacro that was not expanded."""
-
-
-class MalformedMjcf(RobotModelError):
-    """A file that MuJoCo cannot read or compile, or that is larger than that of a robot."""
-
-
-class InvalidNumber(MalformedUrdf):
-    """Text where a number belongs, too few or too many numbers, or a number that makes no sense there."""
-
-
-class UnreadableRobotFile(RobotModelError):
-    """The robot description does not exist, is a directory, or is not text."""
-
-
-class UnsafeXml(RobotModelError):
-    """XML with entities, a DTD or external references."""
-
-
-class UnsupportedJoint(RobotModelError):
-    """Floating, planar or otherwise unsupported joint, or one that mimics none that there is."""
-
-
-class UnstatedBase(RobotModelError):
-    """The file looks like a robot that is not bolted to the world, and nobody said that it is."""
-
-
-class MissingInertia(RobotModelError):
-    """A body that moves has no mass."""
-
-
 class NonPhysicalInertia(RobotModelError):
     """Inertial parameters that no mass distribution can have."""
-
-
-class KinematicLoop(RobotModelError):
-    """The joints do not form a tree rooted in one link."""
 
 
 class UnknownName(ForceGPError, KeyError):
@@ -75,18 +39,6 @@ class UnknownName(ForceGPError, KeyError):
 
     def __str__(self) -> str:  # KeyError would print the repr, quotes and all
         return str(self.args[0])
-
-
-class UnknownFrame(UnknownName):
-    """No frame of that name."""
-
-
-class UnknownLink(UnknownName):
-    """No link of that name."""
-
-
-class UnknownJoint(UnknownName):
-    """No joint of that name."""
 
 
 class ContactError(ForceGPError):
@@ -148,10 +100,6 @@ def required_extra(module: str, extra: str, what: str) -> Any:
 
 class NumericalWarning(UserWarning):
     """Something was repaired (jitter added, say) and the result is still usable."""
-
-
-class OutdatedWarning(UserWarning):
-    """Stored results were computed by other code or with other settings, and are computed anew."""
 
 
 class DataWarning(UserWarning):

@@ -24,7 +24,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from forcegp.atomic_files import atomic_folder, read_json, remove_leftovers, require_writable, write_json
-from forcegp.errors import BackendError, FileFormatError, FitError, ForceGPError, InvalidInput, OutdatedWarning
+from forcegp.errors import BackendError, DataWarning, FileFormatError, FitError, ForceGPError, InvalidInput
 from forcegp.parallel import Jobs, executor_for, outcome_of, stop, submit
 
 CODE = (".py", ".c", ".h", ".jinja")
@@ -85,7 +85,6 @@ class Job:
     inputs: names of the jobs whose results the task reads.
     cost: about how many CPU seconds it takes, for the remaining time and the order.
     arguments: objects for the task that JSON cannot hold; `spec` must identify them.
-    code: more modules that decide the result, those of functions among the arguments for example.
     """
 
     name: str
@@ -94,12 +93,11 @@ class Job:
     inputs: tuple[str, ...] = ()
     cost: float = field(default=1.0, compare=False)
     arguments: tuple[Any, ...] = field(default=(), compare=False, repr=False)
-    code: tuple[str, ...] = ()
 
     @property
     def code_digest(self) -> str:
         """The digest of the code that computes it."""
-        return code_digest(self.task.partition(":")[0], *self.code)
+        return code_digest(self.task.partition(":")[0])
 
 
 def digests(jobs: Sequence[Job]) -> dict[str, str]:
@@ -215,7 +213,7 @@ def run_jobs(store: JobStore, jobs: Sequence[Job], at_once: Jobs = 1, progress: 
             warnings.warn(
                 f"{len(old)} of the results in {store.folder}, {old[0]} for example, were computed by other code or "
                 "with other settings; they are computed anew.",
-                OutdatedWarning,
+                DataWarning,
                 stacklevel=2,
             )
         try:

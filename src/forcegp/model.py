@@ -48,7 +48,7 @@ class Model(Summary):
         it.
     baumgarte: stabilisation, if the motion has it.
 
-    Raises InvalidInput, UnknownFrame or ContactError for parts that do not fit the robot.
+    Raises InvalidInput, UnknownName or ContactError for parts that do not fit the robot.
     """
 
     robot: Robot

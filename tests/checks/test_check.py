@@ -83,11 +83,6 @@ def test_positions_that_jump_otherwise_end_the_check_of_motion():
     assert report.comparison is None
 
 
-def test_without_a_robot_it_says_what_was_not_compared():
-    report = check(replace(clean(1), model=None))
-    assert [item.advice for item in report.doubts.of("torque")] == ["Give the robot: `model`."]
-
-
 def test_the_report_is_json_and_sorted_by_severity():
     report = check(column(clean(2), "u", 1, np.negative))
     content = json.loads(json.dumps(report.to_dict(), allow_nan=False))

@@ -14,11 +14,10 @@ from forcegp.data import resample
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Logs with and without their robot, a clean one and one with two defects."""
+    """A clean log, one with two defects, and what is left of others."""
     place = tmp_path_factory.mktemp("check")
     data = clean(1)
     data.save(place / "clean.h5")
-    replace(data, model=None).save(place / "bare.h5")
     column(late(data, 0.02), "u", 1, np.negative).save(place / "defects.h5")
     noisy = replace(data, q=data.q + 1e-4 * np.random.default_rng(0).normal(size=data.q.shape))
     noisy.save(place / "noisy.h5")
@@ -28,9 +27,9 @@ def folder(tmp_path_factory):
 
 
 def test_a_clean_log_is_told_so(forcegp, folder):
-    done = forcegp("check", "bare.h5", "--robot", "arm.urdf", "--strict", folder=folder)
+    done = forcegp("check", "clean.h5", "--robot", "arm.urdf", "--strict", folder=folder)
     assert done.returncode == 0, done.stderr
-    assert "bare.h5: 0 wrong, 0 to look at" in done.stdout
+    assert "clean.h5: 0 wrong, 0 to look at" in done.stdout
     assert "Every joint; in Nm and rad/s²" in done.stdout
     line = next(line for line in done.stdout.splitlines() if line.strip().startswith("lift"))
     assert line.split()[2] == "%"
@@ -77,10 +76,8 @@ REFUSALS = {
     ("import", "noisy.h5", "--cutoff", "high", "--out", "x.h5"): "--cutoff is 'high'; give a frequency in Hz",
     ("import", "noisy.h5", "--cutoff", "500", "--out", "x.h5"): "it must be > 0 and below 100 Hz",
     ("import", "noisy.h5", "--delay", "0.1,x", "--out", "x.h5"): "--delay is '0.1,x'; give seconds",
-    ("import", "bare.h5", "--delay", "auto", "--out", "x.h5"): "needs the robot: give its URDF",
     ("import", "lost.h5", "--cutoff", "9", "--out", "x.h5"): "not sampled uniformly: the step after row 599",
     ("check", "clean.h5", "--cutoff", "-3"): "cutoff is -3.0",
-    ("check", "bare.h5", "--gravity", "0,0,9"): "--gravity needs --robot",  # not left out without a word
     ("check", "arm.urdf"): "is not an HDF5 file",
 }
 

@@ -27,7 +27,6 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     data = arm_data(20, seed=0)
     data.save("arm.h5")
-    dataclasses.replace(data, model=None).save("no_robot.h5")
     dataclasses.replace(data, noise_std=None).save("no_noise.h5")
     content = (tmp_path / "arm.h5").read_bytes()
     (tmp_path / "damaged.h5").write_bytes(content[: len(content) // 2])
@@ -41,7 +40,6 @@ def folder(tmp_path, monkeypatch):
 WRONG = [
     ("fit missing.h5 --out run", "missing.h5 is not a file"),
     ("fit damaged.h5 --out run", "damaged.h5 is damaged"),
-    ("fit no_robot.h5 --out run", "does not carry its robot; add --robot"),
     ("fit arm.h5 --robot other.urdf --out run", "other.urdf has joints pan, lift, wrist; arm.h5 has pan, lift, bend"),
     ("fit arm.h5 --points 1 --no-checks --out run", "--points 1 must be an integer from 2 to 20, the rows"),
     ("fit arm.h5 --noise loud --out run", "--noise is 'loud'; give learned, dataset or a number"),
@@ -97,7 +95,6 @@ def test_another_robot_keeps_gravity_armature_and_locked_joints_of_the_recording
         data,
         **two,
         model=Model(recorded),
-        joint_names=recorded.joint_names,
         noise_std=np.full(2, 0.5),
         truth={},
     ).save("locked.h5")

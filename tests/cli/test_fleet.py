@@ -15,7 +15,7 @@ from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
-pytestmark = pytest.mark.filterwarnings("ignore::forcegp.errors.DataWarning", "ignore::forcegp.errors.OutdatedWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::forcegp.errors.DataWarning", "ignore::forcegp.errors.DataWarning")
 FIT = ("--points", "8", "--restarts", "1", "--iterations", "2", "--noise", "0.1", "--no-checks")
 
 

@@ -17,7 +17,7 @@ from forcegp.atomic_files import write_digests
 from forcegp.cli.main import main, parse_arguments
 
 QUICK = "--points 8 --iterations 2 --restarts 1 --no-checks"
-IMPORT = "import log.csv --time time --q q_a --u u_a --joints a"
+IMPORT = "import log.csv --time time --q q_a,q_a,q_a --u u_a,u_a,u_a --robot arm.urdf"
 FILES = {
     "simulate": "simulate kuka-surface --overwrite --out OUT",
     "import": f"{IMPORT} --overwrite --out OUT",
@@ -165,10 +165,10 @@ def test_what_another_process_wrote_meanwhile_stays(folder, capfd, monkeypatch, 
 
 
 OVER_INPUTS = [
-    "import log.csv --time time --q q_a --u u_a --joints a --out log.csv",
-    "import log.csv --time time --q q_a --u u_a --joints a --out ./run/../log.csv",
-    "import log.csv --time time --q q_a --u u_a --joints a --out link.csv",
-    "import log.csv --time time --q q_a --u u_a --joints a --out hard.csv",
+    "import log.csv --time time --q q_a,q_a,q_a --u u_a,u_a,u_a --robot arm.urdf --out log.csv",
+    "import log.csv --time time --q q_a,q_a,q_a --u u_a,u_a,u_a --robot arm.urdf --out ./run/../log.csv",
+    "import log.csv --time time --q q_a,q_a,q_a --u u_a,u_a,u_a --robot arm.urdf --out link.csv",
+    "import log.csv --time time --q q_a,q_a,q_a --u u_a,u_a,u_a --robot arm.urdf --out hard.csv",
     "import log.csv --time time --q q_a --u u_a --robot arm.urdf --out arm.urdf",
     "import arm.h5 --every 2 --out arm.h5",
     "fit arm.h5 --robot arm.urdf --out arm.urdf",

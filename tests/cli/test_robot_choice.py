@@ -25,13 +25,12 @@ def options(*words: str):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """arm.urdf, broken.urdf, recorded.h5 with its robot and bare.h5 without, system.json with friction."""
+    """arm.urdf, broken.urdf, recorded.h5, system.json with friction."""
     folder = tmp_path_factory.mktemp("robots")
     (folder / "arm.urdf").write_text(URDF)
     (folder / "broken.urdf").write_text(BROKEN)
     data = arm_data(20, 0, arm_model(0))
     data.save(folder / "recorded.h5")
-    replace(data, model=None, truth={}).save(folder / "bare.h5")
     model = arm_model(0)
     known = (*model.forces, Coulomb([0.1, 0.2, 0.3]))
     (folder / SYSTEM_FILE).write_text(replace(model, forces=known).to_json())
@@ -79,8 +78,6 @@ def test_an_identified_system_brings_its_forces_and_keeps_the_contacts_of_the_da
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("--armature pan=0.5", "--armature needs --robot"),
-        ("--lock pan=0", "--lock needs --robot"),
         ("--robot arm.urdf --gravity 0,0", "holds 2 numbers"),
         ("--robot arm.urdf --gravity 0,0,down", "is no list of numbers"),
         ("--robot arm.urdf --lock pan", "is not JOINT=RAD"),
@@ -89,15 +86,15 @@ def test_an_identified_system_brings_its_forces_and_keeps_the_contacts_of_the_da
         ("--robot arm.urdf --armature elbow=1", "elbow"),
         ("--robot arm.urdf --lock elbow=1", "elbow"),
         ("--robot arm.urdf --identified .", "leave --robot out"),
-        ("--robot arm.urdf --lock bend=0", "has joints pan, lift; bare.h5 has pan, lift, bend"),
+        ("--robot arm.urdf --lock bend=0", "has joints pan, lift; recorded.h5 has pan, lift, bend"),
         ("--identified nowhere", "give a folder that `forcegp fit` wrote"),
     ],
 )
 def test_mistakes_are_told(folder, monkeypatch, words, said):
     monkeypatch.chdir(folder)
-    data = Dataset.load("bare.h5")
+    data = Dataset.load("recorded.h5")
     with pytest.raises(ForceGPError, match=re.escape(said)):
-        options(*words.split()).chosen_model(data, Path("bare.h5"))
+        options(*words.split()).chosen_model(data, Path("recorded.h5"))
 
 
 def test_a_pipe_is_refused_at_once(tmp_path):

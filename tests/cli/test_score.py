@@ -8,6 +8,7 @@ import shutil
 import numpy as np
 import pytest
 from tests.cli.one_line import assert_refused
+from tests.data.samples import dataset
 from tests.posterior.arm import URDF
 from tests.scores.moving_arm import moving_arm
 
@@ -26,8 +27,8 @@ def folder(forcegp, tmp_path_factory):
     log.save(path / "log.h5")
     log.select_episodes([1]).save(path / "test.h5")
     log.select_episodes([0]).save(path / "train.h5")
-    dataclasses.replace(log, joint_names=("a", "b", "c"), model=None).save(path / "other.h5")
-    dataclasses.replace(log, model=None, noise_std=None, metadata={"rig": "small"}).save(path / "raw.h5")
+    dataset().save(path / "other.h5")
+    dataclasses.replace(log, noise_std=None, metadata={"rig": "small"}).save(path / "raw.h5")
     for name in ("friction", "joint"):
         words = ("--forces", f"gp:{name.replace('friction', 'joint-friction')}", "--points", 30, "--iterations", 5)
         done = forcegp("fit", "train.h5", *words, "--restarts", 1, "--out", name, folder=path)
@@ -124,11 +125,10 @@ WRONG = [
     ("score missing.h5", "missing.h5 does not exist"),
     ("score friction", "friction is a folder; give a dataset (.h5) last"),
     ("score log.h5", "give --out FOLDER"),
-    ("score friction other.h5", "joints a, b, c; the model was trained on pan, lift, bend"),
+    ("score friction other.h5", "joints shoulder, elbow; the model was trained on pan, lift, bend"),
     ("score friction test.h5 --horizon 7", "not predicted: 7 s; held-out stretches last"),
     ("score friction test.h5 --every 0", "--every 0 must be an integer of at least 1"),
     ("score friction test.h5 --integrator euler", "did you mean 'symplectic-euler'"),
-    (f"score raw.h5 {OUT}", "does not carry its robot; add --robot"),
     (f"score log.h5 {OUT} --split thirds", "the split is 'thirds'"),
     (f"score log.h5 {OUT} --points 500", "two thirds"),
     (f"score log.h5 {OUT} --horizon soon", "'soon' is no list of numbers"),

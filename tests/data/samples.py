@@ -37,7 +37,7 @@ def dataset(rows: int = 40, seed: int = 0, **changes: object) -> Dataset:
         **columns(rows, seed=seed),
         "time": 0.01 * np.arange(rows),
         "episode": (np.arange(rows) >= rows // 2).astype(int),
-        "joint_names": NAMES,
+        "model": model(),
         **changes,
     }
     return Dataset(**fields)
@@ -49,7 +49,7 @@ def complete(rows: int = 40) -> Dataset:
     return dataset(
         rows,
         noise_std=np.array([0.1, 0.2]),
-        truth={"a": rng.normal(size=(rows, 2)), "lambda": rng.normal(size=(rows, 3)), "Q_U": np.zeros((rows, 2))},
+        truth={"a": rng.normal(size=(rows, 2)), "lambda": np.zeros((rows, 0)), "Q_U": np.zeros((rows, 2))},
         metadata={"source": "a test", "nested": {"list": [1, 2.5, None, True], "text": "µ"}},
     )
 

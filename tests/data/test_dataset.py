@@ -51,9 +51,6 @@ def test_fields_cannot_be_replaced_and_metadata_are_a_copy():
         ({"u": np.zeros((40, 2), dtype=complex)}, "u must be an array of real numbers"),
         ({"u": [[1.0, 2.0], [1.0]]}, "u is not an array of real numbers"),
         ({"episode": np.zeros(40)}, "episode must be an array of integers"),
-        ({"joint_names": ("a", "a")}, "repeats"),
-        ({"joint_names": "ab"}, "sequence of non-empty texts"),
-        ({"joint_names": ()}, "at least one joint"),
         ({"noise_std": np.array([0.1, 0.0])}, "'elbow' is 0.0; it must be > 0"),
         ({"noise_std": np.array([0.1])}, "noise_std has 1 joints; expected 2"),
         ({"noise_std": np.full((40, 2), 0.1)}, r"noise_std has shape \(40, 2\)"),
@@ -98,6 +95,11 @@ def test_time_increases_within_an_episode_but_may_start_again_in_the_next():
 # ---------------------------------------------------------------- units and model
 
 
+def test_a_robot_is_needed():
+    with pytest.raises(InvalidInput, match=r"model is a NoneType; give a Model, such as Model\(Robot.from_file"):
+        dataset(model=None)
+
+
 def test_units_may_differ_between_joints():
     units = {"q": ("rad", "m"), "v": ("rad/s", "m/s"), "u": ("Nm", "N"), "a": ("rad/s^2", "m/s^2"), "time": "s"}
     assert dataset(model=model("prismatic")).units == units_for(model("prismatic").robot) == units
@@ -116,7 +118,7 @@ def test_rows_by_slice_mask_and_numbers():
     assert_equal(data.rows([-1]), data.rows([39]))
     part = data.rows([5, 3])
     np.testing.assert_array_equal(part.q, data.q[[5, 3]])
-    np.testing.assert_array_equal(part.truth["lambda"], data.truth["lambda"][[5, 3]])
+    np.testing.assert_array_equal(part.truth["a"], data.truth["a"][[5, 3]])
     np.testing.assert_array_equal(part.noise_std, data.noise_std)
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.data.samples import arrays, dataset
+from tests.data.samples import arrays, dataset, model
 
 from forcegp.data import (
     Dataset,
@@ -34,7 +34,7 @@ def motion(time: np.ndarray = TIME, **changes: object) -> Dataset:
         "a": np.stack([-100 * np.sin(10 * time), np.full_like(time, 2)], 1),
         "u": np.stack([np.cos(time), np.sin(time)], 1),
         "time": time,
-        "joint_names": ("one", "two"),
+        "model": model("continuous"),
         **changes,
     }
     return Dataset(**fields)
@@ -136,7 +136,7 @@ def test_what_cannot_be_filtered_is_named():
 def test_an_angle_that_wraps_is_refused():
     time = np.arange(100) / 100
     turning = motion(time, q=np.stack([(7 * time + np.pi) % (2 * np.pi) - np.pi, time], 1))
-    with pytest.raises(DatasetError, match=r"episode 0: q of joint 'one' .*row 44.*unwrap"):
+    with pytest.raises(DatasetError, match=r"episode 0: q of joint 'shoulder' .*row 44.*unwrap"):
         low_pass(turning, 10.0)
     with pytest.raises(DatasetError, match="wraps"):
         differentiated(turning, "q")

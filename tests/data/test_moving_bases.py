@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from tests.robots.test_moving_bases import LIMBS
 
 from forcegp.data import Dataset, Preparation, differentiated, low_pass, motion_spectrum, resample
-from forcegp.errors import DatasetError, InvalidInput
+from forcegp.errors import DatasetError
 from forcegp.mechanics import fixed_point
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -128,5 +128,6 @@ def test_what_no_filter_can_follow_is_refused():
     with pytest.raises(DatasetError, match="episode 0: 'base' turns faster than the filter passes"):
         low_pass(fast, 3.0)
     loose = replace(log, model=Model(log.model.robot), u=log.u[:, :3])
-    with pytest.raises(InvalidInput, match=r"a base that moves.* give the delay in s"):
-        Preparation(delay="auto").apply(loose)
+    found = Preparation(delay="auto", lag="auto").resolved(loose)
+    assert (found.delay, found.lag, found.why["lag"]) == (0.0, 0.0, "u drives no thrusters")
+    assert found.why["delay"].startswith("u is taken to be on time: a delay is found from the torque of every joint")

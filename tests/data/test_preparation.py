@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import solve_ivp
-from tests.data.samples import assert_equal, dataset
+from tests.data.samples import assert_equal, dataset, model
 from tests.posterior.arm import arm_model
 
 from forcegp.data import (
@@ -40,7 +40,7 @@ def noisy(seconds: float = 12.0, seed: int = 0, sigma: float = SIGMA, rate: floa
     time = np.arange(round(seconds * rate)) / rate
     q, _, a = swings(time, seed)
     measured = q + sigma * np.random.default_rng(seed + 100).normal(size=q.shape)
-    raw = Dataset(q=measured, v=0 * q, u=q, a=0 * q, time=time, joint_names=("one", "two"))
+    raw = Dataset(q=measured, v=0 * q, u=0 * q, a=0 * q, time=time, model=model("continuous"))
     return differentiated(raw, "q"), a
 
 
@@ -108,14 +108,10 @@ def _at(prepared: Dataset, whole: Dataset) -> Dataset:
 
 
 def test_what_a_delay_needs_is_said():
-    with pytest.raises(InvalidInput, match="needs the robot: give its URDF"):
-        estimate_delay(noisy()[0])
     with pytest.raises(InvalidInput, match="forces of contacts are not known"):
         estimate_delay(replace(arm_log(), model=arm_model()))
     with pytest.raises(DatasetError, match=r"rows lie more than 0.05 s from the ends.*at least 80"):
         estimate_delay(arm_log().rows(slice(0, 60)))
-    with pytest.raises(InvalidInput, match="the joints of dataset are one, two, those of arm pan, lift, bend"):
-        estimate_delay(noisy()[0], arm_model().robot)
 
 
 # ---------------------------------------------------------------- lag

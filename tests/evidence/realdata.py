@@ -20,9 +20,9 @@ PENDULUM_LINK = """<link name="{name}"><inertial><origin xyz="0 0 {com}"/><mass 
 
 def dataset(model: Model, time, q, u, episode) -> Dataset:
     """A raw log: q and u as recorded; v and a are for `Preparation` to compute."""
-    names, nothing = model.robot.joint_names, np.zeros_like(q)
+    nothing = np.zeros_like(q)
     return Dataset(
-        q=q, v=nothing, u=u, a=nothing, time=time, joint_names=names,
+        q=q, v=nothing, u=u, a=nothing, time=time,
         model=model, episode=episode,
     )  # fmt: skip
 

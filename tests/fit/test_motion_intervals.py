@@ -13,7 +13,6 @@ from forcegp.data.views import recorded_motions
 from forcegp.errors import InvalidInput
 from forcegp.fit import calibrated as with_intervals
 from forcegp.posterior.fitted import DEVIATIONS, MotionIntervals
-from forcegp.scores.held_out import inside_interval
 
 HORIZONS = (0.1, 0.25, 0.5)
 
@@ -115,7 +114,7 @@ def test_where_the_base_moves_they_hold_as_steps(floating):
         row = round(horizon / fresh.dt)
         assert 0.8 <= float(((low <= off) & (off <= high))[:, row].double().mean()) <= 1.0
     assert float(high[:, -1].square().mean().sqrt()) < 6.0 * float(off[:, -1].square().mean().sqrt())
-    inside = inside_interval(found, recorded)
+    inside = found.contains(recorded)
     np.testing.assert_array_equal(inside[:, 1:], ((low <= off) & (off <= high)).numpy()[:, 1:])
 
 

@@ -36,7 +36,7 @@ def log(text, seed, *, seconds=30.0, noise=0.0, friction=1.0):
     dry = 2.0 * ROTORS * (1.0 + 0.5 * np.exp(-((v / 0.1) ** 2))) * np.tanh(v / 0.02)
     u = np.array([oracle.inverse_dynamics(*row) for row in zip(q, v, a, strict=True)])
     u += ROTORS * a + friction * (dry + ROTORS * v) + noise * rng.standard_normal(u.shape)
-    return Dataset(q=q, v=v, u=u, a=a, time=time, joint_names=ROBOT.joint_names, model=Model(ROBOT))
+    return Dataset(q=q, v=v, u=u, a=a, time=time, model=Model(ROBOT))
 
 
 def loaded(mass=MASS, text=TEXT):

@@ -8,7 +8,7 @@ import pytest
 import torch
 from tests.posterior.arm import arm_data, arm_model
 
-from forcegp.errors import DataWarning, InvalidInput, UnknownFrame, UnknownJoint
+from forcegp.errors import DataWarning, InvalidInput, UnknownName
 from forcegp.fit import fit as fit_model
 from forcegp.forces import (
     ContactFriction,
@@ -156,9 +156,9 @@ def test_a_tool_that_never_moves_has_no_friction(data, prior):
             InvalidInput,
             "ToolForces acts on frame 'base', which is fixed",
         ),
-        (ToolForces("tool", axes="tool"), UnknownFrame, "no frame 'tool'"),
-        (JointFriction(("pna",)), UnknownJoint, "did you mean 'pan'"),
-        (JointPositionForces(("elbow",)), UnknownJoint, "Valid joints: bend, lift, pan"),
+        (ToolForces("tool", axes="tool"), UnknownName, "no frame 'tool'"),
+        (JointFriction(("pna",)), UnknownName, "did you mean 'pan'"),
+        (JointPositionForces(("elbow",)), UnknownName, "Valid joints: bend, lift, pan"),
         (ContactFriction(contact=1), InvalidInput, "contact 1, but the model has only contact 0"),
         ((JointFriction(), ToolForces(contact=2)), InvalidInput, "acts at contact 2"),
     ],

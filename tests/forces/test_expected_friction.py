@@ -11,7 +11,7 @@ from tests.mechanics.systems import POINT, regular_states, solve_kkt
 from tests.mechanics.systems import model_with as model_of
 from tests.robots.robot_models import FRAMES
 
-from forcegp.errors import FileFormatError, InvalidInput, NumericalWarning, UnknownJoint
+from forcegp.errors import FileFormatError, InvalidInput, NumericalWarning, UnknownName
 from forcegp.forces import (
     ContactFriction,
     JointFriction,
@@ -193,7 +193,7 @@ def test_expectations_without_a_load_and_of_joints_that_are_not_there():
         ContactFriction(expected=0.3)
     line = TabulatedCurve((0.0, 1.0), (0.1, 0.1))
     prior = ContactFriction(load=True, expected=ExpectedFriction(line, (("elbow", line),)))
-    with pytest.raises(UnknownJoint, match="elbow"):
+    with pytest.raises(UnknownName, match="elbow"):
         prior.check(model_of(MODEL).robot, rows_of("plane").contacts)
 
 

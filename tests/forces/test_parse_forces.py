@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import pytest
 from tests.posterior.arm import arm_model
 
-from forcegp.errors import FileFormatError, InvalidInput, UnknownJoint, UnknownLink
+from forcegp.errors import FileFormatError, InvalidInput, UnknownName
 from forcegp.forces import (
     FORCES,
     AerodynamicForce,
@@ -144,9 +144,9 @@ def test_mistakes_are_explained(expression):
 @pytest.mark.parametrize(
     ("expression", "error", "message"),
     [
-        ("gp:joint-friction:joints=elbow", UnknownJoint, "no joint 'elbow' in arm"),
-        ("gp:joint-ripple:joints=pna", UnknownJoint, "did you mean 'pan'"),
-        ("payload:hnad", UnknownLink, "did you mean 'hand'"),
+        ("gp:joint-friction:joints=elbow", UnknownName, "no joint 'elbow' in arm"),
+        ("gp:joint-ripple:joints=pna", UnknownName, "did you mean 'pan'"),
+        ("payload:hnad", UnknownName, "did you mean 'hand'"),
         ("gp:tool-friction:contact=1", InvalidInput, "contact 1, but the model has only contact 0"),
         ("gp:joint,gp:joint", InvalidInput, "'joint-forces' twice"),
     ],

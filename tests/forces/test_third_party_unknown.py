@@ -8,7 +8,7 @@ from tests.forces.third_party_unknown import AirDrag
 from tests.posterior.arm import arm_data, arm_model
 
 from forcegp.data import Dataset
-from forcegp.errors import UnknownFrame
+from forcegp.errors import UnknownName
 from forcegp.fit import fit
 from forcegp.forces import force_to_dict, parse_forces
 from forcegp.inference import OptimizerOptions
@@ -53,5 +53,5 @@ def test_it_finds_the_drag_that_acts():
 
 def test_a_wrong_link_is_named():
     model = arm_model().with_forces(AirDrag("hnad"), noise=Noise(0.1))
-    with pytest.raises(UnknownFrame, match="did you mean 'hand'"):
+    with pytest.raises(UnknownName, match="did you mean 'hand'"):
         fit(model, arm_data(10, 1), restarts=1)

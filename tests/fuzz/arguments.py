@@ -86,7 +86,7 @@ MADE: dict[str, Callable[[], Any]] = {
 
 def _dataset() -> dict[str, Any]:
     data = INPUTS.data
-    names = ("q", "v", "u", "a", "time", "joint_names", "episode", "model", "noise_std", "truth", "metadata")
+    names = ("q", "v", "u", "a", "time", "episode", "model", "noise_std", "truth", "metadata")
     return {name: getattr(data, name) for name in names}
 
 

@@ -17,7 +17,9 @@ from forcegp.cli.command import options_of
 from forcegp.cli.main import parse_arguments
 from forcegp.errors import ForceGPError
 
-FILES = words("moving.h5 drone.xml arm.armature.json train.h5 test.h5 bare.h5 arm.urdf log.csv log.npz log.mcap")
+FILES = words(
+    "moving.h5 drone.xml arm.armature.json train.h5 test.h5 bare.h5 arm.urdf pair.urdf log.csv log.npz log.mcap"
+)
 NAMES = words("carried independent nowhere train.h5/x . .. hostile.pkl loop out.h5 out carried/model.json - -x ~")
 AIR = words(
     "gp:aerodynamic gp:aerodynamic:frame=body gp:aerodynamic:observe=0 gp:aerodynamic:observe=-1 gp: "
@@ -29,7 +31,7 @@ ODD = ("", "a" * 300, "nowhere/x.h5", "\udcff.h5", "x\udcff", "x\x00y", "\u202ex
 PATHS = st.sampled_from((*FILES, *NAMES, *ODD))
 """None is absolute, and commands run some folders deep: nothing outside of the folder of a case is ever named."""
 SMALL = "--points 6 --iterations 2 --restarts 1"
-COLUMNS = "--time time --q q_{joints} --v v_{joints} --u u_{joints} --joints shoulder,elbow"
+COLUMNS = "--time time --q q_{joints} --v v_{joints} --u u_{joints} --robot pair.urdf"
 VALID = {
     "import": f"import log.csv {COLUMNS} --out out.h5",
     "auto": "auto log.csv --robot arm.urdf --step 0 --out out",

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 from hypothesis import strategies as st
-from tests.fuzz.made import INPUTS, LOGS
+from tests.fuzz.made import INPUTS, LOGS, PAIR
 from tests.fuzz.oracle import Target, require_ended_well
 from tests.fuzz.values import DAMAGE, WORDS, Damage, Hostile, damaged, words
 
-TABLE = "--time time --q q_{joints} --v v_{joints} --u u_{joints} --joints shoulder,elbow"
-ARRAYS = "--time time --q q --v v --u u --joints shoulder,elbow"
+TABLE = "--time time --q q_{joints} --v v_{joints} --u u_{joints} --robot pair.urdf"
+ARRAYS = "--time time --q q --v v --u u --robot pair.urdf"
 FLAGS = {
     "log.csv": TABLE,
     "log.parquet": TABLE,
@@ -21,7 +21,7 @@ FLAGS = {
     "log.mat": ARRAYS.replace("time", "log.time", 2).replace("--log.time", "--time"),
     "log73.mat": ARRAYS,
     "log.h5": ARRAYS,
-    "log.mcap": "--q /joint_states:position --u /joint_states:effort --joints shoulder,elbow",
+    "log.mcap": "--q /joint_states:position --u /joint_states:effort --robot pair.urdf",
 }
 CELLS = st.sampled_from(
     ("0", "1", "", "nan", "inf", "x", "1e400", "-", "1,5", '"', "'", "\x00", "a" * 140_000, "é", "1 2", "#", "\r")
@@ -108,6 +108,7 @@ CASES = st.one_of(
 
 def check(case: Log, folder: Path) -> None:
     """`forcegp import` of the changed log."""
+    (folder / "pair.urdf").write_text(PAIR)
     path, change = folder / case.base, case.change
     source = INPUTS.folder / case.base
     (shutil.copytree if source.is_dir() else shutil.copyfile)(source, path)

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from tests.data.samples import dataset
+from tests.data.samples import dataset, model
 from tests.posterior.arm import URDF, arm_data, arm_model
 from tests.recordings.log_files import (
     motion,
@@ -38,6 +38,9 @@ INPUTS: Any = SimpleNamespace(folder=None)
 """`folder` with the files below, `data`, `posterior`, `predictor`; filled by `make`."""
 LOGS = ("log.csv", "log.npz", "log.mat", "log73.mat", "log.h5", "log.parquet", "log.mcap")
 
+PAIR = model("continuous").robot.urdf_text
+"""The robot of the logs."""
+
 
 def make(folder: Path) -> None:
     """train.h5, test.h5, arm.urdf, the models, logs of two joints with their mappings."""
@@ -59,12 +62,13 @@ def make(folder: Path) -> None:
         "carried": plain.with_model(Model(heavier, data.model.contacts, data.model.forces)),
         "independent": fit(data.model.black_box(), data, points=8, restarts=1, options=QUICK),
     }
-    for name, model in models.items():
-        save_posterior(model, folder / name)
+    for name, posterior in models.items():
+        save_posterior(posterior, folder / name)
     data.save(folder / "train.h5")
     free.save(folder / "test.h5")
-    dataclasses.replace(data, model=None, truth={}, noise_std=None).save(folder / "bare.h5")
+    dataclasses.replace(data, truth={}, noise_std=None).save(folder / "bare.h5")
     (folder / "arm.urdf").write_text(URDF)
+    (folder / "pair.urdf").write_text(PAIR)
     rows = motion(60)
     write_text(folder / "log.csv", table(rows))
     np.savez(folder / "log.npz", **rows)

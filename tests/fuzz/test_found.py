@@ -12,7 +12,7 @@ from tests.cli.test_import import FLAGS
 from tests.durability.commands import FEW
 from tests.fuzz.arguments import CALLS
 from tests.fuzz.datasets import OTHERS
-from tests.fuzz.made import INPUTS
+from tests.fuzz.made import INPUTS, PAIR
 from tests.fuzz.oracle import require_ended_well
 from tests.fuzz.stored import CHANGES, TENSORS
 from tests.posterior.arm import URDF
@@ -20,7 +20,7 @@ from tests.posterior.arm import URDF
 import forcegp
 import forcegp.inference
 from forcegp.atomic_files import write_digests
-from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, InvalidNumber, UnreadableRobotFile
+from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, RobotModelError
 from forcegp.model import Model
 
 pytestmark = pytest.mark.usefixtures("unchecked")
@@ -41,12 +41,12 @@ def place(tmp_path):
 def test_encodings_that_are_no_text_are_refused(tmp_path, encoding):
     text = f'<?xml version="1.0" encoding="{encoding}"?><robot name="\xe4\xff"><link name="a"/></robot>'
     (tmp_path / "arm.urdf").write_bytes(text.encode("latin-1"))
-    with pytest.raises(UnreadableRobotFile, match="save the URDF as UTF-8"):
+    with pytest.raises(RobotModelError, match="save the URDF as UTF-8"):
         forcegp.Robot.from_urdf(tmp_path / "arm.urdf")
 
 
 def test_a_joint_beyond_the_moon_is_refused():
-    with pytest.raises(InvalidNumber, match=r"xyz \[1e\+200, 0.0, 0.0\]"):
+    with pytest.raises(RobotModelError, match=r"xyz \[1e\+200, 0.0, 0.0\]"):
         forcegp.Robot.from_urdf_text(URDF.replace('xyz="0 0 0.25"', 'xyz="1e200 0 0"'))
 
 
@@ -55,7 +55,9 @@ def test_fields_of_more_letters_than_csv_reads_are_refused_in_one_line(place, wh
     long = "1" * 140_000
     header, row = ("time,q_a,u_a" + f",{long}" * (where == "header")), "0,0," + ("0" if where == "header" else long)
     (place / "log.csv").write_text(f"{header}\n{row}\n0.1,0,0\n")
-    words = ["import", "log.csv", "--time", "time", "--q", "q_a", "--u", "u_a", "--joints", "a", "--out", "o.h5"]
+    words = ["import", "log.csv", "--time", "time", "--q", "q_a,q_a", "--u", "u_a,u_a", "--robot", "pair.urdf"]
+    words += ["--out", "o.h5"]
+    (place / "pair.urdf").write_text(PAIR)
     assert require_ended_well(words, place) == 2
 
 

@@ -6,6 +6,7 @@ Day by day other cases, and 40 times as many at night. What was found stands in 
 import numpy as np
 import pytest
 from tests.fuzz import arguments, command_lines, datasets, logs, robots, stored
+from tests.fuzz.made import PAIR
 from tests.fuzz.oracle import CANARY, require_ended_well, search
 from tests.fuzz.values import Hostile, hostile_pickle
 
@@ -52,6 +53,7 @@ def test_what_would_run_code_does_not(tmp_path, monkeypatch):
     folder.mkdir(parents=True)
     (folder / "log.npz").write_bytes((tmp_path / "log.npz").read_bytes())
     (folder / "log.pkl").write_bytes(hostile_pickle())
-    flags = ["--time", "time", "--q", "q", "--u", "0", "--joints", "a", "--out", "o.h5"]
+    flags = ["--time", "time", "--q", "q", "--u", "0", "--robot", "pair.urdf", "--out", "o.h5"]
+    (folder / "pair.urdf").write_text(PAIR)
     for log in ("log.npz", "log.pkl"):
         assert require_ended_well(["import", log, *flags], folder) == 2

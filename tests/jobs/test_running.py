@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from forcegp.errors import BackendError, FitError, OutdatedWarning
+from forcegp.errors import BackendError, DataWarning, FitError
 from forcegp.jobs import Job, JobStore, digests, run_jobs
 
 TOY = "tests.jobs.toy_tasks"
@@ -77,7 +77,7 @@ def test_other_settings_of_an_input_are_seen_and_computed_anew_with_one_sentence
     kept = results.load("square/4")
     changed = Job("square/3", f"{TOY}:square", {"number": 3, "more": 1})
     assert digests([changed, next_to(square(3))])["next/3"] != digests([square(3), next_to(square(3))])["next/3"]
-    with pytest.warns(OutdatedWarning, match="2 of the results in .* for example, were computed by other code or with"):
+    with pytest.warns(DataWarning, match="2 of the results in .* for example, were computed by other code or with"):
         assert run_jobs(results, [changed, next_to(changed), square(4)]) == 2
     assert results.load("square/3")["spec"] == {"number": 3, "more": 1}
     assert results.load("square/4") == kept
@@ -87,7 +87,7 @@ def test_other_settings_of_an_input_are_seen_and_computed_anew_with_one_sentence
 def test_other_code_is_seen_and_computed_anew_with_one_sentence(results, monkeypatch):
     run_jobs(results, [square(3), next_to(square(3))])
     monkeypatch.setattr("forcegp.jobs.code_digest", lambda *modules: "other")
-    with pytest.warns(OutdatedWarning, match="2 of the results in .*they are computed anew"):
+    with pytest.warns(DataWarning, match="2 of the results in .*they are computed anew"):
         assert run_jobs(results, [square(3), next_to(square(3))]) == 2
     assert results.load("square/3")["code"] == "other"
 

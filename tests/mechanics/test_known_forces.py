@@ -9,7 +9,7 @@ from tests.mechanics.systems import assert_close, robot, states
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import CHAIN, MODELS
 
-from forcegp.errors import InvalidInput, UnknownJoint
+from forcegp.errors import InvalidInput, UnknownName
 from forcegp.forces import (
     Actuation,
     Coulomb,
@@ -137,7 +137,7 @@ def test_armature_adds_to_the_diagonal_and_to_that_of_the_robot():
         (CoupledRotors, (-1.0,), InvalidInput, "CoupledRotors inertia"),
         (CoupledRotors, (1.0, [[1.0, 0.0]]), InvalidInput, r"has shape \(1, 2\); chain needs a finite matrix \(4, 4\)"),
         (CoupledRotors, (1.0, "gears"), InvalidInput, "CoupledRotors transmission is 'gears'"),
-        (Viscous, ({"elbow": 1.0},), UnknownJoint, "no joint 'elbow' in chain"),
+        (Viscous, ({"elbow": 1.0},), UnknownName, "no joint 'elbow' in chain"),
         (Viscous, ({"tilt": None},), InvalidInput, "give a number, one per joint, or a mapping"),
         (Viscous, ("strong",), InvalidInput, "Viscous damping is 'strong'"),
         (Coulomb, (1.0, 0.0), InvalidInput, "velocity_scale is .* every joint needs a finite number > 0"),

@@ -6,7 +6,7 @@ import torch
 from tests.mechanics.systems import model_with, normal, robot, states, surfaces
 from tests.robots.robot_models import FRAMES, TREE, loaded
 
-from forcegp.errors import ContactError, InvalidInput, NumericalError, UnknownFrame
+from forcegp.errors import ContactError, InvalidInput, NumericalError, UnknownName
 from forcegp.forces import Actuation, Coulomb, RigidBodies, Rotor, Viscous
 from forcegp.mechanics import Baumgarte, Contact, ImplicitSurface, Plane, Sphere
 from forcegp.model import Model
@@ -54,7 +54,7 @@ def assert_same_dynamics(one: Model, other: Model) -> None:
 @pytest.mark.parametrize(
     ("contact", "error", "message"),
     [
-        (Contact("toool", (0.0, 0.0, 0.0), FLOOR), UnknownFrame, "no frame 'toool' in chain; did you mean 'tool'?"),
+        (Contact("toool", (0.0, 0.0, 0.0), FLOOR), UnknownName, "no frame 'toool' in chain; did you mean 'tool'?"),
         (Contact("rail", (0.0, 0.0, 0.0), FLOOR), ContactError, "frame 'rail' of chain is fixed in the world"),
     ],
 )

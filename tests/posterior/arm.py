@@ -103,7 +103,6 @@ def arm_data(rows: int, seed: int, model: Model | None = None) -> Dataset:
         u=u,
         a=a + generator.normal(0.0, NOISE, a.shape),
         time=np.arange(rows) * 0.01,
-        joint_names=model.robot.joint_names,
         model=model,
         noise_std=np.full(3, NOISE),
         truth={"a": a, "lambda": dynamics.multiplier(Q_U).numpy(), "Q_U": Q_U.numpy()},

@@ -134,7 +134,7 @@ class ModelConformance:
         speaks = not fitted.is_black_box
         assert ("unknown force" in found.quantities()) == speaks
         assert ("contact force" in found.quantities()) == speaks
-        bare = dataclasses.replace(test, truth={}, noise_std=None, model=None)
+        bare = dataclasses.replace(test, truth={}, noise_std=None)
         assert score(fitted, bare, horizons=()).value("mae") == found.value("mae")
         assert len(prediction_figure(fitted, test).axes) == 6
 

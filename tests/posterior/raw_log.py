@@ -32,7 +32,6 @@ def motion(seconds: float = 3.0, seed: int = 0, noise: float = SENSOR) -> Datase
         u=u.numpy(),
         a=np.full_like(measured, 1e3),  # nobody may look at it
         time=time,
-        joint_names=model.robot.joint_names,
         model=model,
         truth={"a": a},
     )

@@ -8,7 +8,7 @@ import torch
 from tests.posterior.arm import URDF, Weight, arm_data, arm_model, on_the_plane
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput, UnknownFrame, UnknownName
+from forcegp.errors import InvalidInput, UnknownName
 from forcegp.evidence import Accelerations
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction, UnknownForces
@@ -223,7 +223,7 @@ def test_what_cannot_move_is_refused(posterior, train):
     with pytest.raises(InvalidInput, match=r"pan, lift, bend.*yaw, lift, bend"):
         posterior.with_robot(renamed)
     handless = Robot.from_urdf_text(URDF.replace('"hand"', '"claw"'))
-    with pytest.raises(UnknownFrame, match="hand"):
+    with pytest.raises(UnknownName, match="hand"):
         posterior.with_model(arm_model(contacts=0).with_robot(handless))
     once = OptimizerOptions(iterations=1)
     zero = fit(train.model.with_forces(JointForces()).without_mean(), train, restarts=1, options=once)

@@ -20,9 +20,8 @@ from tests.recordings.log_files import (
     write_text,
 )
 
-FLAGS = "--time time --q q_{joints} --v v_{joints} --u u_{joints} --joints shoulder,elbow"
-ARRAYS = "--time time --q q --v v --u u --joints shoulder,elbow"
-TOPIC = "--q /joint_states:position --u /joint_states:effort --joints shoulder,elbow"
+FLAGS = "--time time --q q_{joints} --v v_{joints} --u u_{joints} --robot arm.urdf"
+ARRAYS = "--time time --q q --v v --u u --robot arm.urdf"
 
 URDF = """<robot name="pendulum"><link name="base"/>
 {links}
@@ -182,13 +181,14 @@ def folder_of_logs(folder: Path) -> Path:
 
 
 GOOD = csv(lambda columns: None)
-ROBOT = FLAGS.replace("--joints shoulder,elbow", "--robot arm.urdf")
 
 BROKEN = {
     "no such file": Broken(lambda folder: folder / "log.csv", "log.csv does not exist"),
     "missing column": Broken(GOOD, "no column 'p_shoulder'", FLAGS.replace("q_{", "p_{")),
-    "nothing mapped": Broken(GOOD, "no columns for q (positions)", "--time time"),
-    "joints without names": Broken(GOOD, "add --joints", "--time time --q q_shoulder,q_elbow --u 0"),
+    "nothing mapped": Broken(
+        with_urdf(GOOD, "hip", "knee"), "no columns for q (positions)", "--time time --robot arm.urdf"
+    ),
+    "no robot": Broken(GOOD, "give --robot ARM.urdf", "--time time --q q_shoulder,q_elbow --u 0"),
     "NaN": Broken(setting("v_elbow", 7, np.nan), "'v_elbow' (v of joint 'elbow') is missing (empty or NaN) at row 7"),
     "text": Broken(
         text(lambda t: t.replace(t.splitlines()[5].split(",")[2], "stop", 1)), "'q_elbow' holds 'stop' at row 4"
@@ -196,12 +196,12 @@ BROKEN = {
     "dates": Broken(
         written("log.csv", b"time,q,u\n2024-01-01 12:00:00.5,0,0\n"),
         "Write the time as a number of seconds",
-        "--time time --q q --u u --joints a",
+        "--time time --q q,q --u u,u --robot arm.urdf",
     ),
     "decimal commas": Broken(
         written("log.csv", b"time;q;u\n0,5;0;0\n"),
         "Write decimal points instead of commas",
-        "--time time --q q --u u --joints a",
+        "--time time --q q,q --u u,u --robot arm.urdf",
     ),
     "ragged": Broken(text(lambda t: t + "1.0,2.0\n"), "row 200 (line 202) has 2 fields instead of 7"),
     "duplicate names": Broken(text(lambda t: t.replace("v_elbow", "q_elbow")), "'q_elbow' stands over columns 3, 5"),
@@ -218,10 +218,10 @@ BROKEN = {
     "angle wraps": Broken(csv(wrapping), "jumps by more than half a turn", FLAGS),
     "degrees": Broken(scaled(57.3, "q_shoulder", "q_elbow"), "Give --unit q=deg if it is in degrees"),
     "beyond limits": Broken(
-        with_urdf(scaled(3.0, "q_elbow"), "shoulder", "elbow"), "beyond its limits -1.5 to 1.5 in the URDF", ROBOT
+        with_urdf(scaled(3.0, "q_elbow"), "shoulder", "elbow"), "beyond its limits -1.5 to 1.5 in the URDF"
     ),
     "another robot": Broken(
-        with_urdf(GOOD, "shoulder", "wrist"), "'pendulum' has shoulder, wrist", f"{FLAGS} --robot arm.urdf"
+        with_urdf(GOOD, "shoulder", "wrist"), "'pendulum' has shoulder, wrist", f"{FLAGS} --joints shoulder,elbow"
     ),
     "too few columns": Broken(GOOD, "u has 1 columns for 2 joints", FLAGS.replace("u_{joints}", "u_elbow")),
     "no combination": Broken(
@@ -238,7 +238,7 @@ BROKEN = {
     "two topics": Broken(
         mcap,
         "several topics are joined by their stamps",
-        "--step 0.002 --q /joint_states:position --u /wrench:wrench.force.x,0 --joints shoulder,elbow",
+        "--step 0.002 --q /joint_states:position --u /wrench:wrench.force.x,0 --robot arm.urdf",
     ),
     "episode again": Broken(csv(episode_again), "episode 0 begins again at row 100", f"{FLAGS} --episode episode"),
 }

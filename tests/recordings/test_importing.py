@@ -16,7 +16,7 @@ NAMES = ColumnMapping(time="time", q=("q_{joints}",), v=("v_{joints}",), u=("u_{
 
 
 def imported(path, mapping, **options) -> Dataset:
-    return import_recordings([path], mapping, options=ImportOptions(**options))
+    return import_recordings([path], mapping, model=model("continuous"), options=ImportOptions(**options))
 
 
 def test_a_motion_is_its_dataset(tmp_path):
@@ -165,20 +165,23 @@ def test_files_side_by_side_are_one_recording(tmp_path):
         side_by_side=True,
     )
     paths = [tmp_path / f"run_{name}.txt" for name in data]
-    found = import_recordings(paths, mapping)
+    found = import_recordings(paths, mapping, model=model())
     for signal in "qvu":
         np.testing.assert_array_equal(getattr(found, signal), data[signal])
     assert len(found.metadata["import"]["files"]) == 4
     (tmp_path / "run_u.txt").write_text("1.0\n" * 20)
     with pytest.raises(Exception, match=r"run_time\.txt 200, .*run_u\.txt 10"):
-        import_recordings(paths, mapping)
+        import_recordings(paths, mapping, model=model())
 
 
 def test_stamps_in_nanoseconds_keep_their_last_digit(tmp_path):
     data = motion()
     stamps = 1_700_000_000_123_456_789 + np.round(data["time"] * 1e9).astype(np.int64)
-    lines = ["stamp,q,u", *(f"{stamp},{q!r},0" for stamp, q in zip(stamps, data["q"][:, 0].tolist(), strict=True))]
+    lines = [
+        "stamp,q1,q2",
+        *(f"{stamp},{q!r},{q!r}" for stamp, q in zip(stamps, data["q"][:, 0].tolist(), strict=True)),
+    ]
     (tmp_path / "log.csv").write_text("\n".join(lines))
-    mapping = ColumnMapping(time="stamp", q=("q",), u=("u",), joints=("a",), unit={"time": ("ns",)})
+    mapping = ColumnMapping(time="stamp", q=("q{1..2}",), u=("0",), unit={"time": ("ns",)})
     found = imported(tmp_path / "log.csv", mapping)
     np.testing.assert_array_equal(found.time, data["time"])

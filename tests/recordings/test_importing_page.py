@@ -4,6 +4,7 @@ import re
 import shlex
 
 import pytest
+from tests.data.samples import model
 from tests.examples import run_example
 
 from forcegp.cli.logs import Import
@@ -18,6 +19,7 @@ def page(repository):
 
 def test_the_example_runs(page, tmp_path):
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "arm.urdf").write_text(model("continuous").robot.urdf_text)
     printed = run_example(example, tmp_path)
     described, _, error = printed.rstrip().rpartition("\n")
     assert described.splitlines()[:4] == ["Dataset(", "  rows: 375", "  joints: shoulder, elbow", "  episodes: 0"]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from tests.data.samples import model as arm
 
 from forcegp.data import Preparation
 from forcegp.model import Model
@@ -59,10 +60,9 @@ def test_a_passive_pendulum_with_absolute_angles(shared, tmp_path):
         q=("[0] + pi", "[1] - [0]"),
         v=("[2]", "[3] - [2]"),
         u=("0",),
-        joints=("shoulder", "elbow"),
         unit={"q": ("rad",)},
     )
-    data = import_recordings([path], mapping, options=ImportOptions(end=0.5))
+    data = import_recordings([path], mapping, model=arm("continuous"), options=ImportOptions(end=0.5))
     pieces = np.load(path)
     assert data.episodes == tuple(range(26))
     last = data.select_episodes([25])

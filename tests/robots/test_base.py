@@ -9,7 +9,7 @@ import torch
 from tests.robots.robot_models import MODELS
 from tests.robots.test_urdf_errors import SMALL, changed
 
-from forcegp.errors import NonPhysicalInertia, RobotFileWarning, RobotModelError, UnstatedBase
+from forcegp.errors import NonPhysicalInertia, RobotFileWarning, RobotModelError
 from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.robots.arguments import LISTED, Problems
@@ -50,7 +50,7 @@ BOLTED = {
 
 @pytest.mark.parametrize("name", LOOSE)
 def test_robots_that_walk_drive_or_fly_are_asked(name):
-    with pytest.raises(UnstatedBase, match=r"not bolted.*base='floating' lets.*base='fixed' takes") as caught:
+    with pytest.raises(RobotModelError, match=r"not bolted.*base='floating' lets.*base='fixed' takes") as caught:
         Robot.from_urdf_text(LOOSE[name])
     assert caught.value.remedy == {"base": "floating"}
     assert "--base floating" in str(caught.value)

@@ -15,12 +15,11 @@ from tests.robots.robot_models import CHAIN, MODELS, loaded
 from tests.robots.test_urdf_errors import SMALL
 
 from forcegp.errors import (
-    InvalidNumber,
-    MalformedUrdf,
     MissingExtra,
     NonPhysicalInertia,
     RobotFileWarning,
-    UnknownJoint,
+    RobotModelError,
+    UnknownName,
 )
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -51,7 +50,7 @@ def test_without_rotors_nothing_is_beside_the_file_and_nothing_in_it(tmp_path):
 def test_another_file_beside_is_refused(tmp_path, text):
     (tmp_path / "arm.urdf").write_text(SMALL)
     (tmp_path / "arm.armature.json").write_bytes(text.encode("utf-8", "surrogatepass"))
-    with pytest.raises(InvalidNumber, match=r"arm\.armature\.json: holds no rotor inertia per joint"):
+    with pytest.raises(RobotModelError, match=r"arm\.armature\.json: holds no rotor inertia per joint"):
         Robot.from_urdf(tmp_path / "arm.urdf")
 
 
@@ -73,7 +72,7 @@ def test_xacro_files_are_expanded(tmp_path, name):
     (tmp_path / name).write_text(MACRO)
     assert Robot.from_urdf(tmp_path / name).link("arm").mass == 2.0
     (tmp_path / name).write_text(MACRO.replace("1 + 1", "1 / 0"))
-    with pytest.raises(MalformedUrdf, match="xacro could not expand it"):
+    with pytest.raises(RobotModelError, match="xacro could not expand it"):
         Robot.from_urdf(tmp_path / name)
 
 
@@ -111,7 +110,7 @@ def test_inertials_and_dynamics_are_replaced_or_added_and_the_rest_stays(before)
     for _ in range(2):
         written = replace_inertial(written, "b", 2.0, np.zeros(3), np.eye(3), source="a test")
     assert Robot.from_urdf_text(written).mass == 2.0
-    with pytest.raises(UnknownJoint, match="a test: no joint 'two'"):
+    with pytest.raises(UnknownName, match="a test: no joint 'two'"):
         replace_dynamics(TEXT % "", "two", {"damping": 0.1}, source="a test")
 
 

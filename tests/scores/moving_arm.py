@@ -69,7 +69,6 @@ def moving_arm(seconds: float = 2.0, episodes: int = 2, seed: int = 0, stribeck:
         **{**arrays, "a": arrays["a"] + NOISE * generator.normal(size=arrays["a"].shape)},
         time=np.tile(time, episodes),
         episode=np.repeat(np.arange(episodes), rows),
-        joint_names=given.robot.joint_names,
         model=given,
         noise_std=np.full(3, NOISE),
     )

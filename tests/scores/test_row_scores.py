@@ -15,13 +15,12 @@ from forcegp import score
 from forcegp.data.views import BLOCK
 from forcegp.errors import InvalidInput
 from forcegp.fit import fit
-from forcegp.forces import ContactFriction, JointForces, JointFriction, Rotor, ToolForces
+from forcegp.forces import ContactFriction, JointFriction, Rotor
 from forcegp.model import Model
 from forcegp.scores.accuracy import (
     LEVELS,
     force_errors,
     mass_matrices,
-    normal_force_rests_on_prior,
     predict_rows,
     row_scores,
 )
@@ -67,7 +66,7 @@ def test_learning_helps_and_the_constraint_holds(scores):
 
 
 def test_without_truth_only_measurements_are_scored_and_the_rest_is_named(posterior, test_data, scores):
-    bare = scored(posterior, dataclasses.replace(test_data, truth={}, noise_std=None, model=None))
+    bare = scored(posterior, dataclasses.replace(test_data, truth={}, noise_std=None))
     assert set(bare.quantities()) == {"acceleration", "all joints", "force", "constraint"}
     assert bare.value("mae") == scores.value("mae")
     assert bare.value("mae", "constraint") == scores.value("mae", "constraint")  # of the model's own contact
@@ -184,66 +183,3 @@ def data():
 @pytest.fixture(scope="module")
 def friction():
     return fitted(JointFriction(), ContactFriction(kernel="linear"))
-
-
-def test_components_are_scored_against_the_parts_of_the_truth(friction, data):
-    scores = scored(friction, data)
-    components = friction.components(data.q, data.v, data.u)
-    for name, part in (("joint-friction", "joint-friction"), ("contact-friction", "tool-friction")):
-        force, truth, quantity = components[name].joint_force, data.truth[f"Q_U.{part}"], f"{name} at the joints"
-        error = force.mean.numpy() - truth
-        np.testing.assert_allclose(scores.columns("mae", quantity), np.abs(error).mean(0), rtol=1e-9)
-        np.testing.assert_allclose(scores.value("rmse", quantity), np.sqrt((error**2).mean()), rtol=1e-9)
-        relative = np.linalg.norm(error) / np.linalg.norm(truth)
-        assert scores.value("relative_rmse", quantity) == pytest.approx(relative, rel=1e-9)
-        inside = np.abs(error) <= norm.ppf(0.975) * force.std.numpy()
-        np.testing.assert_allclose(scores.columns("coverage_95", quantity), inside.mean(0), atol=1e-12)
-        assert relative < 0.1, "the right prior knows these forces, each by itself"
-    error = components["contact-friction"].point_force.mean.numpy() - data.truth["force.tool-friction"]
-    at = "contact-friction at its point"
-    np.testing.assert_allclose(scores.columns("mae", at), np.abs(error).mean(0), rtol=1e-9)
-    assert "joint-friction at its point" not in scores.quantities()
-    assert scores.value("relative_rmse", "contact force") < 0.05
-    # twice the true tool friction and the prediction is half of it
-    doubled = {name: values * (2.0 if name.endswith("tool-friction") else 1.0) for name, values in data.truth.items()}
-    wrong = scored(friction, dataclasses.replace(data, truth=doubled))
-    assert wrong.value("relative_rmse", at) == pytest.approx(0.5, abs=0.05)
-    assert wrong.value("coverage_95", at) < 0.2
-
-
-@pytest.mark.filterwarnings("ignore:the accelerations show no force")  # one iteration finds none
-@pytest.mark.parametrize(
-    ("forces", "how"),
-    [((ContactFriction(kernel="linear"), ToolForces(inputs=("position",))), {}), ((JointFriction(),), {"mean": False})],
-    ids=["two that claim one truth", "without a mean friction is not alone"],
-)
-def test_components_whose_truth_is_not_their_own_are_not_scored(data, forces, how):
-    found = scored(fitted(*forces, iterations=1, **how), data).quantities()
-    assert not any(name.endswith((" the joints", " its point")) for name in found if name != "all joints")
-    assert "contact force" in found
-
-
-@pytest.mark.parametrize(
-    ("forces", "rests"),
-    [
-        ((JointForces(), JointFriction()), True),
-        ((ToolForces(frame="hand", point=(0.0, 0.0, 0.2), axes="world"),), True),
-        ((ToolForces(),), False),
-        ((JointFriction(), ContactFriction()), False),
-        ((), False),
-    ],
-    ids=str,
-)
-def test_only_a_force_that_is_free_along_the_normal_rests_on_the_prior(forces, rests):
-    assert normal_force_rests_on_prior(fitted(*forces, points=15, iterations=1)) is rests
-
-
-def test_a_force_that_rests_on_the_prior_may_be_anything_and_accelerations_stay(data, without_contact):
-    """The criterion against its meaning: add a function times A^T to the joint forces, and only lambda changes."""
-    states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
-    dynamics = data.model.dynamics(*states)
-    pressing = 7.0 * torch.cos(states[0][:, :1]) * dynamics.A[:, 0]
-    zero = torch.zeros_like(pressing)
-    torch.testing.assert_close(dynamics.acceleration(pressing), dynamics.acceleration(zero), rtol=0.0, atol=1e-9)
-    assert (dynamics.multiplier(pressing) - dynamics.multiplier(zero)).abs().min() > 1.0
-    assert not normal_force_rests_on_prior(without_contact), "without contacts there is none"

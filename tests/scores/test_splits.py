@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.data.samples import model
 from tests.posterior.arm import arm_data
 
 from forcegp.data import Dataset
@@ -16,10 +17,10 @@ from forcegp.scores.experiment import training_subset
 
 def recording(rows: int = 60, episodes: int = 3, seed: int = 0, **changes) -> Dataset:
     generator = np.random.default_rng(seed)
-    values = {name: generator.normal(size=(rows, 1)) for name in "qvua"}
+    values = {name: generator.normal(size=(rows, 2)) for name in "qvua"}
     episode = np.repeat(np.arange(episodes), rows // episodes)
     time = np.concatenate([np.cumsum(generator.uniform(0.005, 0.03, rows // episodes)) for _ in range(episodes)])
-    return Dataset(**{**values, "time": time, "episode": episode, "joint_names": ("j",), **changes})
+    return Dataset(**{**values, "time": time, "episode": episode, "model": model(), **changes})
 
 
 @settings(max_examples=30, deadline=None)

@@ -50,7 +50,7 @@ class CheckInput:
     wraps: Bool[np.ndarray, "rows nv"]
     jumps: Bool[np.ndarray, "rows nv"]
     rotates: Bool[np.ndarray, " nv"]
-    robot: Robot | None = None
+    robot: Robot
     laws: tuple[JointLaw, ...] = ()
     contacts: int = 0
     prepared: Dataset | None = None
@@ -60,13 +60,11 @@ class CheckInput:
     most_rows: int = MOST_ROWS
 
     @classmethod
-    def as_recorded(cls, dataset: Dataset, model: Model | None, **more: Any) -> "CheckInput":
+    def as_recorded(cls, dataset: Dataset, model: Model, **more: Any) -> "CheckInput":
         """A log of which nothing is filtered, compared or mended, but for `more`."""
-        model, nowhere = dataset.model if model is None else model, np.zeros(dataset.v.shape, dtype=bool)
-        known: dict[str, Any] = {}
-        if model is not None:
-            laws = tuple(law for law in model.laws if isinstance(law, JointLaw) and not law.learned)
-            known = {"robot": model.loaded_robot, "laws": laws, "contacts": len(model.contacts)}
+        nowhere = np.zeros(dataset.v.shape, dtype=bool)
+        laws = tuple(law for law in model.laws if isinstance(law, JointLaw) and not law.learned)
+        known: dict[str, Any] = {"robot": model.loaded_robot, "laws": laws, "contacts": len(model.contacts)}
         same = {"log": dataset, "even": dataset, "mended": dataset, "wraps": nowhere, "jumps": nowhere}
         same["rotates"] = dataset.turns
         return cls(**same | known | more)
@@ -104,7 +102,7 @@ class CheckInput:
         return None if self.prepared is None else preparation_report(self.prepared.metadata)["cutoff"]
 
     @classmethod
-    def of(cls, dataset: Dataset, model: Model | None, preparation: Preparation) -> "CheckInput":
+    def of(cls, dataset: Dataset, model: Model, preparation: Preparation) -> "CheckInput":
         """Prepare a log for the checks. Raises InvalidInput for one that is too short, or whose rows lack an order."""
         if not dataset.time_ordered:
             raise InvalidInput("the rows are not in order of time (a sample of rows?); check the whole recording.")
@@ -131,7 +129,7 @@ class CheckInput:
         return cls.as_recorded(dataset, model, **found)
 
     @classmethod
-    def quick(cls, dataset: Dataset, model: Model | None) -> "CheckInput":
+    def quick(cls, dataset: Dataset, model: Model) -> "CheckInput":
         """The same without filters and from few rows, for a look before a fit; also for short and unordered logs."""
         found: dict[str, Any] = {"compared": dataset, "compared_noise": dataset.noise_std, "most_rows": QUICK_ROWS}
         if dataset.time_ordered and not move_on(dataset):

@@ -1,9 +1,10 @@
 """`check`: one log against itself and its robot, as a list of doubts that a person acts on."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from forcegp.checks.moving_base import (
     unmeasured_base_doubts,
 )
 from forcegp.checks.signals import motion_doubts, sampling_doubts, signal_doubts
-from forcegp.checks.torque_doubts import corrected, not_compared, torque_doubts
+from forcegp.checks.torque_doubts import TOUCHES, corrected, torque_doubts
 from forcegp.checks.torques import Comparison, parameter_doubts
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.configurations import as_vectors
@@ -39,7 +40,7 @@ class CheckReport(Summary):
     """The doubts, worst first, and what they rest on.
 
     `inputs` holds the log at even times and after the filter; `comparison` measured torques and inverse dynamics
-    with the errors corrected that were found (None without a robot, or with contacts).
+    with the errors corrected that were found (None with contacts).
     """
 
     doubts: Doubts
@@ -83,7 +84,7 @@ class CheckReport(Summary):
 def check(dataset: Dataset, model: Model | None = None, *, preparation: Preparation | None = None) -> CheckReport:
     """Look for what would spoil a model: wrong units, signs, joints, delays; dead channels; motion that shows nothing.
 
-    `model` is the robot that was recorded (default: that of the dataset); without one, torques are not compared.
+    `model` is the robot that was recorded (default: that of the dataset).
     `preparation` sets how to filter for the comparison (default: cut-off from the spectrum); its `delay`, `every` and
     `trim` are not used. Nothing is changed.
 
@@ -93,12 +94,11 @@ def check(dataset: Dataset, model: Model | None = None, *, preparation: Preparat
     preparation = Preparation(cutoff="auto") if preparation is None else preparation
     require_type("preparation", preparation, Preparation)
     model = dataset.model if model is None else model
-    if model is not None:
-        robot = require_type("model", model, Model).robot
-        require_rows("dataset", dataset, robot.joint_names, robot.name)
-        if robot.layout.groups:  # torques and filters are not looked at
-            inputs = CheckInput.as_recorded(dataset, model)
-            return CheckReport(doubts=_of_base(dataset, model, preparation), inputs=inputs, comparison=None)
+    robot = require_type("model", model, Model).robot
+    require_rows("dataset", dataset, robot.joint_names, robot.name)
+    if robot.layout.groups:  # torques and filters are not looked at
+        inputs = CheckInput.as_recorded(dataset, model)
+        return CheckReport(doubts=_of_base(dataset, model, preparation), inputs=inputs, comparison=None)
     inputs = CheckInput.of(dataset, model, preparation)
     doubts, comparison = _doubts(inputs, model)
     if inputs.prepared is not None:
@@ -113,10 +113,9 @@ def quick_check(dataset: Dataset, model: Model | None = None) -> Doubts:
     short logs are taken, of which less can be checked. Raises InvalidInput for a robot with other joints.
     """
     model = dataset.model if model is None else model
-    if model is not None:
-        require_rows("dataset", dataset, model.robot.joint_names, model.robot.name)
-        if model.robot.layout.groups:
-            return Doubts(each for each in _of_base(dataset, model) if each.level != "ok")
+    require_rows("dataset", dataset, model.robot.joint_names, model.robot.name)
+    if model.robot.layout.groups:
+        return Doubts(each for each in _of_base(dataset, model) if each.level != "ok")
     doubts, _ = _doubts(CheckInput.quick(dataset, model), model)
     said = [each for each in doubts if each.level == "look" and each.about in BEFORE_A_FIT]
     if dataset.nv == 1:  # friction of one joint can look like a delay
@@ -124,18 +123,18 @@ def quick_check(dataset: Dataset, model: Model | None = None) -> Doubts:
     return Doubts([*said, *(each for each in doubts if each.level == "wrong")])
 
 
-def _doubts(inputs: CheckInput, model: Model | None) -> tuple[list[Doubt], Comparison | None]:
+def _doubts(inputs: CheckInput, model: Model) -> tuple[list[Doubt], Comparison | None]:
     """What is looked for in every log, and the comparison of torques, where there is one."""
     doubts = signal_doubts(inputs)
     if inputs.log.time_ordered:
         doubts = [*sampling_doubts(inputs), *doubts, *motion_doubts(inputs)]
     contacts = contact_doubts(inputs.mended, model)
-    doubts += [*contacts, *(stance_doubts(inputs.log, model) if model is not None else ())]
+    doubts += [*contacts, *stance_doubts(inputs.log, model)]
     comparison = None
     if inputs.compared is None:
         return doubts, None
-    if inputs.robot is None or inputs.contacts:
-        return [*doubts, not_compared(inputs)], None
+    if inputs.contacts:
+        return [*doubts, TOUCHES], None
     if inputs.log.u.any() and not contacts:
         comparison, corrections = corrected(inputs)
         compared = torque_doubts(inputs, comparison)
@@ -162,12 +161,24 @@ def _of_single_joints(dataset: Dataset, robot: Robot, preparation: Preparation |
     """Whether q, v and a of the joints of one degree of freedom belong together; quick where there is no filter."""
     if not robot.space.single_rows or not dataset.time_ordered:
         return
-    alone = replace(dataset, model=None, q=as_vectors(dataset), u=np.zeros_like(dataset.v), truth={}, noise_std=None)
+    own = _chain(robot.joint_names)
+    alone = replace(dataset, model=own, q=as_vectors(dataset), u=np.zeros_like(dataset.v), truth={}, noise_std=None)
     with contextlib.suppress(InvalidInput):  # too short
-        inputs = CheckInput.quick(alone, None) if preparation is None else CheckInput.of(alone, None, preparation)
+        inputs = CheckInput.quick(alone, own) if preparation is None else CheckInput.of(alone, own, preparation)
         yield from motion_doubts(
             replace(inputs, rotates=dataset.turns), robot.space.single_rows
         )  # gaps may be rows whose feet are not known
+
+
+def _chain(names: Sequence[str]) -> Model:
+    """A fixed base and joints of these names, for checks of positions as vectors; its masses are looked at by none."""
+    body = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    links = "".join(f'<link name="{k}">{body}</link>' for k in range(len(names) + 1))
+    joints = "".join(
+        f'<joint name={quoteattr(name)} type="continuous"><parent link="{k}"/><child link="{k + 1}"/></joint>'
+        for k, name in enumerate(names)
+    )
+    return Model(Robot.from_urdf_text(f'<robot name="chain">{links}{joints}</robot>'))
 
 
 MUCH = 0.2  # noise relative to the spread of the signal from which a filter is worth its name
@@ -277,8 +288,6 @@ def _held(inputs: CheckInput, still: list[str]) -> Iterator[Doubt]:
 
 
 def _base_parameters(inputs: CheckInput) -> Iterator[Doubt]:
-    if inputs.robot is None:
-        return
     rows = inputs.rows()
     try:
         seen = excitation(inputs.robot, rows.q, rows.v, rows.a)

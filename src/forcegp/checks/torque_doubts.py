@@ -16,6 +16,7 @@ from forcegp.checks.torques import Change, Comparison, TorqueFit, estimated_grav
 from forcegp.data import Dataset, estimate_delay
 from forcegp.doubts import Doubt, listed, look, ok, wrong
 from forcegp.errors import DatasetError
+from forcegp.model import Model
 from forcegp.summary import plain
 
 SMALLEST = 1e-3  # unexplained shares below this are all the same: a log fits
@@ -60,20 +61,19 @@ def _score(fit: TorqueFit) -> float:
 def changed(signals: str = "", order: np.ndarray | None = None, factor: np.ndarray | float = 1.0) -> Change:
     """Every joint's signals from another column, times a factor.
 
-    Without robot, truth and metadata, which belong to the log as it was.
+    Without forces, truth and metadata, which belong to the log as it was.
     """
 
     def change(dataset: Dataset) -> Dataset:
         places = np.arange(dataset.nv) if order is None else order
         columns = {name: getattr(dataset, name)[:, places] * factor for name in signals}
-        return replace(dataset, **columns, model=None, noise_std=None, truth={}, metadata={})
+        return replace(dataset, **columns, model=Model(dataset.model.robot), noise_std=None, truth={}, metadata={})
 
     return change
 
 
 def corrected(inputs: CheckInput) -> tuple[Comparison, list[Doubt]]:
     """The corrected log and one doubt for each correction, chosen greedily. Needs a robot, without contacts."""
-    assert inputs.robot is not None
     now = Comparison(robot=inputs.robot, laws=inputs.laws, rows=inputs.rows()).after(changed())
     found: list[Doubt] = []
     for _ in range(MAX_CORRECTIONS):
@@ -298,7 +298,7 @@ def _delays(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
         return  # without an order
     data = log.changed(inputs.even if inputs.most_rows == QUICK_ROWS else inputs.prepared)
     try:
-        delay = estimate_delay(data, log.robot)
+        delay = estimate_delay(replace(data, model=Model(log.robot)))
     except DatasetError:
         return  # too short
     seconds, remains = delay.significant, delay.remains
@@ -315,10 +315,8 @@ def _delays(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
         )
 
 
-def not_compared(inputs: CheckInput) -> Doubt:
-    """The doubt where torques cannot be compared."""
-    seen = "not compared with inverse dynamics: "
-    if inputs.contacts:
-        seen += "the robot touches something, and the forces of contacts are not known. Check free motion, too."
-        return ok(about="torque", what=seen)
-    return look(about="torque", what=f"{seen}no robot was given.", do="Give the robot: `model`.")
+TOUCHES = ok(
+    about="torque",
+    what="not compared with inverse dynamics: the robot touches something, and the forces of contacts are not known. "
+    "Check free motion, too.",
+)

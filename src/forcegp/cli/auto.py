@@ -22,7 +22,7 @@ import forcegp.scores
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json
 from forcegp.cli.command import CONFIG, LOG, Command, options_of, unless_given
 from forcegp.cli.fit import DRY, LAWS, payload_dict, with_payload, write_estimates
-from forcegp.cli.logs import ColumnOptions, FilterOptions, prepared_rows, stance_text, with_delay_that_shows
+from forcegp.cli.logs import ColumnOptions, FilterOptions, prepared_rows, resolved, stance_text
 from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal, doubts_table, facts
 from forcegp.doubts import Doubt, Doubts, wrong
@@ -30,7 +30,7 @@ from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUn
 from forcegp.scores.page import number
 
 MOST_CORRECTIONS = 8
-SCORES = ("models", "joint_names", "units", "recommended", "winners", "rival", "against_rival", "failures")
+SCORES = ("models", "joint_names", "units", "recommended", "winners", "failures")
 """What the answer holds of the scores."""
 
 
@@ -75,8 +75,6 @@ class Auto(Command):
         """Do all of it. Raises DatasetError for mistakes that nobody has corrected yet."""
         if not self.logs:
             raise InvalidInput("give at least one log.")
-        if self.robot.robot is None and self.robot.identified is None:
-            raise InvalidInput("give --robot ARM.urdf, or --identified with a system that carries its robot.")
         begin = time.process_time()
         self.filter.preparation()  # refused now, not after minutes
         present = {each.name for each in self.out.iterdir()} if self.out.is_dir() else set()
@@ -85,7 +83,6 @@ class Auto(Command):
         if not self.out.parent.is_dir():
             raise InvalidInput(f"the folder {self.out.parent} does not exist; create it first.")
         model, mapping = self.columns.model(self.robot), self.columns.mapped(self.logs, terminal)
-        assert model is not None
         for note in forces_of(model):
             terminal.note(note)
         dataset, done, mapping, mistakes = self._imported(terminal, model, mapping)
@@ -112,7 +109,6 @@ class Auto(Command):
             rows, recording = self._prepared_rows(terminal, dataset, bool(done["open_switches"]))
         settings = dict(rows.metadata["preparation"])
         named = forcegp.scores.named_model
-        assert recording.model is not None, "it has one"
         expression, _, evidence = identification(model).partition("@")
         laws = forcegp.scores.summands(expression)
         with terminal.progress("identifying") as progress:
@@ -190,23 +186,12 @@ class Auto(Command):
         self, terminal: Terminal, raw: forcegp.Dataset, open_switches: bool
     ) -> tuple[forcegp.Dataset, forcegp.Dataset]:
         """Rows to learn from, and the same at the full rate."""
-        wanted, flies, lag = self.filter.preparation(), forcegp.data.thruster_columns(raw.model), self.filter.lag
-        if lag == "auto" and flies:
-            wanted = replace(wanted, delay=0.0 if wanted.delay == "auto" else wanted.delay)
-        else:
-            wanted = with_delay_that_shows(terminal, replace(wanted, lag=0.0 if lag == "auto" else wanted.lag), raw)
-        first = replace(wanted, every=1, stance="log")
-        try:
-            numbers = first.resolved(raw)
-        except DatasetError as error:
-            if lag != "auto" or not flies:
-                raise
-            terminal.note(f"rotors are taken to follow at once: {error}")
-            numbers = replace(first, lag=0.0).resolved(raw)
+        wanted = self.filter.preparation()
+        numbers = resolved(terminal, replace(wanted, every=1, stance="log"), raw)
         period = 0.0 if numbers.cutoff is None else 1.0 / float(numbers.cutoff)  # in which a filter spoils the ends
         stance, every = "auto" if open_switches else "log", wanted.every
         numbers = replace(numbers, trim=max(self.filter.trim, period), stance=stance, every=every)
-        rows, recording = prepared_rows(numbers, raw, thin=self.filter.every is None)
+        rows, recording = prepared_rows(terminal, numbers, raw, thin=self.filter.every is None)
         with atomic_file(self.out / "prepared.h5", overwrite=True) as temporary:
             rows.save(temporary)
         return rows, recording

@@ -34,7 +34,7 @@ from forcegp.cli.command import (
     unless_given,
     values_of,
 )
-from forcegp.cli.logs import FilterOptions, with_delay_that_shows
+from forcegp.cli.logs import FilterOptions
 from forcegp.cli.robot_options import (
     CONTACTS,
     SYSTEM_FILE,
@@ -390,7 +390,7 @@ class Payload(Command):
             return model, dataset
         with terminal.progress(f"preparing {path}"):
             raw = replace(dataset, model=model)
-            prepared = with_delay_that_shows(terminal, self.filter.preparation(), raw).apply(raw)
+            prepared = self.filter.preparation().apply(raw)
         why = forcegp.data.preparation_report(prepared.metadata)["why"]
         notes += [f"{path}: {name}: {why[name]}" for name in ("cutoff", "delay") if name in why]
         return model, prepared

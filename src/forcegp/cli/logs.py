@@ -68,29 +68,26 @@ class FilterOptions(CutoffOptions):
 
 
 def prepared_rows(
-    preparation: forcegp.data.Preparation, raw: forcegp.Dataset, *, thin: bool
+    terminal: Terminal, preparation: forcegp.data.Preparation, raw: forcegp.Dataset, *, thin: bool
 ) -> tuple[forcegp.Dataset, forcegp.Dataset]:
     """Rows to learn from, with `thin` as many as the filter leaves, and the same at the full rate."""
     if preparation.changes_nothing:
         return raw, raw
-    preparation = preparation.resolved(raw)
+    preparation = resolved(terminal, preparation, raw)
     every = preparation.thinning(raw) if thin else preparation.every
     rows = replace(preparation, every=every).apply(raw)
     return rows, rows if every == 1 else replace(preparation, every=1).apply(raw)
 
 
-def with_delay_that_shows(
+def resolved(
     terminal: Terminal, preparation: forcegp.data.Preparation, dataset: forcegp.Dataset
 ) -> forcegp.data.Preparation:
-    """The same with a delay of 0 instead of "auto" where a log shows none, which is reported on stderr."""
-    contacts = dataset.model is not None and dataset.model.contacts
-    if preparation.delay != "auto" or (forcegp.data.torques_of_joints(dataset) and not contacts):
-        return preparation
-    terminal.note(
-        "u is taken to be on time: delays are estimated where it holds the torques of all joints and nothing is "
-        "touched; give --delay in s where it is late"
-    )
-    return replace(preparation, delay=0.0)
+    """The same with numbers in place of "auto"; what is assumed without a look is reported on stderr."""
+    found = preparation.resolved(dataset)
+    for why in found.why.values():
+        if "taken to" in why:
+            terminal.note(why)
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,16 +162,15 @@ class ColumnOptions:
             [given["rate"]] = numbers_of(self.rate, complaint, one=True)
         return forcegp.recordings.ImportOptions(stance="auto", **given)
 
-    def model(self, robot: RobotOptions) -> forcegp.Model | None:
-        """The robot, with the known forces and contacts of --identified, or with feet."""
-        touching = parse_feet(self.feet)
-        model = robot.chosen()
+    def model(self, robot: RobotOptions) -> forcegp.Model:
+        """The robot, with the known forces and contacts of --identified, or with feet. Raises InvalidInput for none."""
+        touching, model = parse_feet(self.feet), robot.chosen()
+        if model is None:
+            raise InvalidInput("give --robot ARM.urdf, or --identified with a system that carries its robot.")
         if not touching:
             return model
         if robot.identified is not None:
             raise InvalidInput("--identified brings its contacts along; leave --feet out.")
-        if model is None:
-            raise InvalidInput("--feet needs --robot ROBOT.urdf.")
         return model.with_contacts((*touching, *model.loops))
 
     def mapped(self, logs: Sequence[Path], terminal: Terminal) -> forcegp.recordings.ColumnMapping:
@@ -235,7 +231,7 @@ class Import(Command):
 
     For example:
       forcegp import run.csv --time t --q 'pos{1..2}' --u 'tau{1..2}' --robot arm.urdf --out log.h5
-      forcegp import run.mcap --q /joint_states:position --u /joint_states:effort --joints a,b --out log.h5
+      forcegp import run.mcap --q /joint_states:position --u /joint_states:effort --robot arm.urdf --out log.h5
       forcegp import walk.mcap --q '/odom:pose,/joints:position.{joints}' --robot dog.urdf --base floating --out log.h5
       forcegp import walk.csv --mapping dog.yaml --robot dog.urdf --base floating --feet FL_foot,FR_foot --out log.h5
       forcegp import log.h5 --cutoff auto --delay auto --every 10 --out data.h5
@@ -292,7 +288,7 @@ class Import(Command):
                 "--stance, --every or --trim."
             )
         dataset = forcegp.Dataset.load(path)
-        return replace(dataset, model=self.robot.model_if_any(dataset, path))
+        return replace(dataset, model=self.robot.chosen_model(dataset, path))
 
 
 REPAIRED = {
@@ -370,7 +366,7 @@ class Check(Command):
         """Check, and show. Raises DatasetError with `strict` where something is wrong."""
         preparation = self.filter.preparation()
         dataset = forcegp.Dataset.load(self.log)
-        model = self.robot.model_if_any(dataset, self.log)
+        model = self.robot.chosen_model(dataset, self.log)
         with terminal.progress("checking"):
             report = forcegp.check(dataset, model, preparation=preparation)
         content = {"data": str(self.log), **report.to_dict()}

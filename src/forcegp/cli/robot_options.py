@@ -98,18 +98,9 @@ class RobotOptions(RobotFileOptions):
         return model.with_contacts((*model.touching, *own.loops)) if own.loops else model
 
     def chosen_model(self, dataset: forcegp.Dataset, path: Path) -> forcegp.Model:
-        """The dataset's own system, with what is replaced. Raises InvalidInput for none, and where joints differ."""
-        model = self.model_if_any(dataset, path)
-        if model is None:
-            raise InvalidInput(
-                f"{path} does not carry its robot; add --robot ARM.urdf, and --contact if it touches something."
-            )
-        return model
-
-    def model_if_any(self, dataset: forcegp.Dataset, path: Path) -> forcegp.Model | None:
-        """The same, or None where there is no robot and no option asks for one."""
-        model = self.chosen(dataset.model)
-        if model is not None and model.robot.joint_names != tuple(dataset.joint_names):
+        """The dataset's own system, with what is replaced. Raises InvalidInput where joints differ."""
+        model = self.chosen(dataset.model) or dataset.model
+        if model.robot.joint_names != tuple(dataset.joint_names):
             raise InvalidInput(
                 f"{self.robot or self.identified or 'the robot'} has joints {', '.join(model.robot.joint_names)}; "
                 f"{path} has {', '.join(dataset.joint_names)}. Give the robot that was recorded, or "

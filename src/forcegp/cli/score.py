@@ -134,8 +134,6 @@ class Score(Command):
         if self.system == "model":
             return posterior
         model = log.model
-        if model is None:
-            raise InvalidInput("--system data: the data carry no robot and contacts; leave the option out.")
         if posterior.parameters:
             model = replace(posterior.model, contacts=model.contacts, baumgarte=model.baumgarte)
             terminal.note("--system data: contacts of the data; the robot stays the identified one")
@@ -149,7 +147,9 @@ class Score(Command):
         for note in forces_of(model):
             terminal.note(note)
         preparation = self.filter.preparation()
-        rows, recording = prepared_rows(preparation, replace(raw, model=model), thin=self.filter.every is None)
+        rows, recording = prepared_rows(
+            terminal, preparation, replace(raw, model=model), thin=self.filter.every is None
+        )
         cutoff = forcegp.data.preparation_report(rows.metadata).get("cutoff")
         if cutoff is not None and not preparation.changes_nothing and (self.split or "auto")[0] in "ab":
             # a filter mixes what lies on both sides of a border

@@ -2,9 +2,7 @@ from .contacts import (
     contact_doubts as contact_doubts, contact_rows as contact_rows, rows_in_contact as rows_in_contact,
 )
 from .dataset import Dataset as Dataset, units_for as units_for
-from .delay import (
-    Delay as Delay, estimate_delay as estimate_delay, torques_of_joints as torques_of_joints,
-)
+from .delay import Delay as Delay, estimate_delay as estimate_delay
 from .filters import (
     Filter as Filter, Lag as Lag, Later as Later, LowPass as LowPass, Mean as Mean, differentiate as differentiate,
     differentiated as differentiated, episodes_in_order as episodes_in_order, low_pass as low_pass,

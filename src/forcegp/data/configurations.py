@@ -22,8 +22,8 @@ Positions = Float[np.ndarray, "rows nq"]
 
 
 def space_of(dataset: Dataset) -> ConfigurationSpace:
-    """What positions the recorded robot can have; without a robot, vectors."""
-    return ConfigurationSpace(dataset.nv) if dataset.model is None else dataset.model.robot.space
+    """What positions the recorded robot can have."""
+    return dataset.model.robot.space
 
 
 def continuous(space: ConfigurationSpace, q: Positions) -> Positions:
@@ -127,4 +127,4 @@ def as_vectors(dataset: Dataset) -> Float[np.ndarray, "rows nv"]:
 
 def actuators(dataset: Dataset) -> int:
     """How many columns of u are forces. Those of observers and switches follow, which no filter may touch."""
-    return dataset.u.shape[1] if dataset.model is None else len(dataset.model.actuators)
+    return len(dataset.model.actuators)

@@ -34,10 +34,10 @@ def contact_rows(dataset: Dataset) -> Bool[np.ndarray, "rows m"]:
     switch where its flag is. Raises ContactError for a dataset without contacts, and for a contact that acts in no row.
     """
     model = dataset.model
-    if model is None or not model.contacts:
+    if not model.contacts:
         raise ContactError(
-            f"the dataset has {'no model' if model is None else 'a model without contacts'}; rows in contact can "
-            "only be found for a model that lists its contacts: dataclasses.replace(dataset, model=...)."
+            "the dataset has a model without contacts; rows in contact can only be found for a model that lists its "
+            "contacts: dataclasses.replace(dataset, model=...)."
         )
     recovery = recovery_of(model)
     with torch.no_grad():
@@ -158,7 +158,7 @@ def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> Doub
     """
     model = dataset.model if model is None else model
     few = len(dataset) < FEWEST_ROWS or not dataset.u.any()
-    if few or model is None or not model.contacts or model.loops or model.carries_known_forces:
+    if few or not model.contacts or model.loops or model.carries_known_forces:
         return Doubts()
     seen = [white_noise(dataset, signal=name) if move_on(dataset) else None for name in ("v", "a")]
     noise = tuple(np.zeros(dataset.nv) if each is None else np.nan_to_num(each) for each in seen)

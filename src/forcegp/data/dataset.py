@@ -26,20 +26,11 @@ ROTATION = {"q": "rad", "v": "rad/s", "u": "Nm", "a": "rad/s^2"}  # units of a r
 TRANSLATION = {"q": "m", "v": "m/s", "u": "N", "a": "m/s^2"}  # units of a prismatic joint
 
 
-def units_of(slides: Sequence[bool]) -> dict[str, Any]:
-    """Units of q, v, u, a and time: one text where all joints agree, else one per joint."""
-    each = {name: tuple((TRANSLATION if one else ROTATION)[name] for one in slides) for name in ROTATION}
-    return {name: texts[0] if len(set(texts)) == 1 else texts for name, texts in each.items()} | {"time": "s"}
-
-
-def sliding_joints(robot: forcegp.robots.Robot) -> tuple[str, ...]:
-    """Names of the degrees of freedom that are lengths."""
-    return tuple(name for name, joint in zip(robot.joint_names, robot.joints, strict=True) if joint.type == "prismatic")
-
-
 def units_for(robot: forcegp.robots.Robot) -> dict[str, Any]:
-    """The units that a Dataset of this robot has."""
-    return units_of([name in sliding_joints(robot) for name in robot.joint_names])
+    """Units of q, v, u, a and time of its Datasets: one text where all joints agree, else one per joint."""
+    kinds = [TRANSLATION if joint.type == "prismatic" else ROTATION for joint in robot.joints]
+    each = {name: tuple(kind[name] for kind in kinds) for name in ROTATION}
+    return {name: texts[0] if len(set(texts)) == 1 else texts for name, texts in each.items()} | {"time": "s"}
 
 
 ORDER = "a", "lambda", "Q_U", "in_contact"
@@ -60,9 +51,8 @@ class Dataset(Summary):
         `model.robot.position_names`, and u the columns `model.inputs`.
     a: (rows, nv) measured acceleration, with its noise.
     time: (rows,) [s]; strictly increasing within an episode (see `time_ordered`).
-    joint_names: nv names, in the order of the columns; by default, and in any case equal to, those of `model.robot`.
     episode: (rows,) integers; rows of equal number are one continuous motion. Default: all 0.
-    model: the robot and what it touches, or None.
+    model: the robot, whose joints the columns are, and what it touches.
     noise_std: standard deviation of the noise on `a`, (nv,), if known.
     truth: what a simulation provides: noise-free "a" (rows, nv), constraint multipliers "lambda" (rows, m) [N],
         the unknown joint forces "Q_U" (rows, nv), their parts "Q_U.<name>" (rows, nv), forces on the robot
@@ -79,9 +69,8 @@ class Dataset(Summary):
     u: Float[np.ndarray, "rows nu"]
     a: Float[np.ndarray, "rows nv"]
     time: Float[np.ndarray, " rows"]
-    joint_names: tuple[str, ...] = None  # type: ignore[assignment]  # None becomes the robot's
+    model: forcegp.model.Model
     episode: Int[np.ndarray, " rows"] = None  # type: ignore[assignment]  # None becomes zeros
-    model: forcegp.model.Model | None = None
     noise_std: Float[np.ndarray, " nv"] | None = None
     truth: Mapping[str, np.ndarray] = field(default_factory=dict)
     metadata: Mapping[str, Any] = field(default_factory=dict)
@@ -93,22 +82,16 @@ class Dataset(Summary):
         def put(name: str, value: object) -> None:
             object.__setattr__(self, name, value)
 
-        if self.joint_names is None:
-            if self.model is None:
-                raise DatasetError("joint_names are missing; give them, or a model whose robot has them.")
-            put("joint_names", self.model.robot.joint_names)
-        names = _joint_names(self.joint_names, self.model)
-        put("joint_names", names)
-        positions, actuators = self._columns_of("q"), self._columns_of("u")
-        put("q", finite_columns("q", self.q, positions))
+        robot = require_type("model", self.model, forcegp.model.Model, ", such as Model(Robot.from_file(file))").robot
+        names = robot.joint_names
+        put("q", finite_columns("q", self.q, robot.position_names))
         rows = len(self.q)
-        for name, columns in (("v", names), ("u", actuators), ("a", names)):
+        for name, columns in (("v", names), ("u", self.model.inputs), ("a", names)):
             put(name, finite_columns(name, getattr(self, name), columns, rows))
-        if self.model is not None and positions != names:
-            try:
-                self.model.robot.space.check(torch.tensor(self.q))
-            except InvalidInput as error:  # a quaternion of another length than 1
-                raise DatasetError(str(error)) from None
+        try:
+            robot.space.check(torch.tensor(self.q))
+        except InvalidInput as error:  # a quaternion of another length than 1
+            raise DatasetError(str(error)) from None
         put("time", finite_columns("time", self.time, None, rows))
         given = real_array("episode", np.zeros(rows, int) if self.episode is None else self.episode, "iu", DatasetError)
         if given.shape != (rows,):
@@ -130,18 +113,17 @@ class Dataset(Summary):
     @property
     def units(self) -> dict[str, Any]:
         """SI units of "q", "v", "u", "a" and "time": one text, or one per joint where joints differ."""
-        return units_of((~self.turns).tolist())
+        return units_for(self.model.robot)
 
     @property
     def turns(self) -> Bool[np.ndarray, " nv"]:
-        """Whether a joint turns; others slide. Without a model, all turn."""
-        slide = () if self.model is None else sliding_joints(self.model.robot)
-        return np.array([name not in slide for name in self.joint_names])
+        """Whether a joint turns; others slide."""
+        return np.array([joint.type != "prismatic" for joint in self.model.robot.joints])
 
     @override
     def facts(self) -> dict[str, object]:
         """Rows, joints, episodes, robot, and what else is known."""
-        robot = f"{self.model.robot.name!r}, {len(self.model.contacts)} contacts" if self.model else "none"
+        robot = f"{self.model.robot.name!r}, {len(self.model.contacts)} contacts"
         facts: dict[str, object] = {"rows": len(self), "joints": listed(self.joint_names, most=7)}
         facts |= {"episodes": listed(self.episodes), "robot": robot}
         noise = self.noise_std
@@ -155,11 +137,10 @@ class Dataset(Summary):
         """Number of degrees of freedom."""
         return self.v.shape[1]
 
-    def _columns_of(self, name: str) -> tuple[str, ...]:
-        """Names of the columns of an array; q and u can have their own where the base moves."""
-        if self.model is not None and name == "q":
-            return self.model.robot.position_names
-        return self.model.inputs if self.model is not None and name == "u" else self.joint_names
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the columns of v and a, which are the robot's."""
+        return self.model.robot.joint_names
 
     @property
     def episodes(self) -> tuple[int, ...]:
@@ -212,23 +193,6 @@ class Dataset(Summary):
         return {item.name: getattr(self, item.name) for item in fields(self)}
 
 
-def _joint_names(given: Sequence[str], model: forcegp.model.Model | None) -> tuple[str, ...]:
-    if isinstance(given, str) or not all(isinstance(name, str) and name for name in given):
-        raise DatasetError(f"joint_names must be a sequence of non-empty texts; given: {given!r}.")
-    names = tuple(given)
-    if not names:
-        raise DatasetError("joint_names is empty; a Dataset has at least one joint.")
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise DatasetError(f"joint_names repeats {repeated}; every column needs its own name.")
-    if model is not None and names != tuple(model.robot.joint_names):
-        raise DatasetError(
-            f"joint_names are {list(names)}, but {model.robot.name!r} has {list(model.robot.joint_names)}. "
-            "Give the columns in the robot's order, with its names."
-        )
-    return names
-
-
 def _noise_std(given: object, joint_names: tuple[str, ...]) -> np.ndarray | None:
     if given is None:
         return None
@@ -243,7 +207,7 @@ def _noise_std(given: object, joint_names: tuple[str, ...]) -> np.ndarray | None
 
 
 def _truth(
-    given: Mapping[str, object], joint_names: tuple[str, ...], rows: int, model: forcegp.model.Model | None
+    given: Mapping[str, object], joint_names: tuple[str, ...], rows: int, model: forcegp.model.Model
 ) -> dict[str, np.ndarray]:
     unknown = sorted(name for name in given if not TRUTH.fullmatch(name))
     if unknown:
@@ -254,7 +218,7 @@ def _truth(
         if not name.startswith(("a", "Q_U")):
             columns = () if of_contacts else ("x", "y", "z")
         checked[name] = values = finite_columns(f"truth[{name!r}]", given[name], columns, rows)
-        if of_contacts and model is not None and values.shape[1] != len(model.contacts):
+        if of_contacts and values.shape[1] != len(model.contacts):
             raise DatasetError(
                 f"truth[{name!r}] has {values.shape[1]} columns; the model has {len(model.contacts)} contacts."
             )

@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
-import forcegp.robots
-from forcegp.data.dataset import Dataset, require_rows
+from forcegp.data.dataset import Dataset
 from forcegp.data.filters import episodes_in_order
 from forcegp.data.strokes import joint_positions, with_strokes
 from forcegp.errors import DatasetError, InvalidInput
@@ -95,23 +94,32 @@ class Delay:
         return f"{size}, but not more than three standard deviations in most joints: none is assumed"
 
 
-def estimate_delay(dataset: Dataset, robot: forcegp.robots.Robot | None = None) -> Delay:
+def estimate_delay(dataset: Dataset) -> Delay:
     """The delay of u behind the motion, joint by joint: `u_logged(t + delay)` acts at t.
 
-    For every shift up to .2 s, u is fitted by least squares to the torque regressor of `robot` (default: that of the
-    model), a rotor, friction of several widths, a constant, and the model's laws; and to friction that remembers, which
+    For every shift up to .2 s, u is fitted by least squares to the torque regressor of the model's robot, a rotor,
+    friction of several widths, a constant, and the model's laws; and to friction that remembers, which
     may take the delay's place. The best shift is the vertex of a parabola; its standard deviation is a block jackknife
-    (Kuensch 1989). Filter q, v, u and a alike before. Raises InvalidInput without a robot, or with contacts;
+    (Kuensch 1989). Filter q, v, u and a alike before. Raises InvalidInput with contacts, or without torques;
     DatasetError for a log shorter than .4 s.
     """
-    robot = _robot(dataset, robot)
-    near = _told_apart(dataset, robot, USUAL_DELAY)
+    if dataset.model.contacts:
+        raise InvalidInput(
+            "the forces of contacts are not known, so a delay cannot be found in this log. Give the delay in s, or use "
+            "a log without contact."
+        )
+    if not torques_of_joints(dataset):
+        raise InvalidInput(
+            "a delay is found from the torque of every joint, which u does not hold for a base that moves or actuators "
+            "of another kind; give the delay in s."
+        )
+    near = _told_apart(dataset, USUAL_DELAY)
     open_ones = np.isnan(near.seconds) & np.array([bool(np.ptp(u)) for u in dataset.u.T])
     at_end = np.isnan(near.common + near.common_std)  # that of a part of the log lies beyond
     if not (open_ones.any() or at_end):
         return near
     try:
-        far = _told_apart(dataset, robot, LARGEST_DELAY)
+        far = _told_apart(dataset, LARGEST_DELAY)
     except DatasetError:  # too short for that
         return near
     if at_end:
@@ -120,10 +128,10 @@ def estimate_delay(dataset: Dataset, robot: forcegp.robots.Robot | None = None) 
     return replace(near, **parts)
 
 
-def _told_apart(dataset: Dataset, robot: forcegp.robots.Robot, largest: float) -> Delay:
+def _told_apart(dataset: Dataset, largest: float) -> Delay:
     """The delay under friction of velocity if it shows beside friction that remembers, too, else that beside memory."""
     (alone, left), (beside, least) = (
-        _estimated(log, robot, largest) for log in (replace(dataset, strokes=None), with_strokes(dataset))
+        _estimated(log, largest) for log in (replace(dataset, strokes=None), with_strokes(dataset))
     )
     if least < REMEMBERS * left:
         return beside
@@ -132,7 +140,7 @@ def _told_apart(dataset: Dataset, robot: forcegp.robots.Robot, largest: float) -
     return alone if not used or (not apart and (beside.significant or width <= APART)) else beside
 
 
-def _estimated(dataset: Dataset, robot: forcegp.robots.Robot, largest: float) -> tuple[Delay, float]:
+def _estimated(dataset: Dataset, largest: float) -> tuple[Delay, float]:
     """The delay, and the geometric mean over joints of what it leaves of the square sums."""
     thin, shifts = max(1, -(-len(dataset) // MOST_ROWS)), np.linspace(-largest, largest, 2 * STEPS + 1)
     episodes = []
@@ -146,7 +154,7 @@ def _estimated(dataset: Dataset, robot: forcegp.robots.Robot, largest: float) ->
             f"{len(compared)} rows lie more than {largest} s from the ends of their episodes; a delay needs at "
             f"least {10 * BLOCKS}. Record longer, or give the delay in s."
         )
-    features = torque_columns(robot, dataset.rows(compared))
+    features = torque_columns(dataset.rows(compared))
     profiles = np.full((dataset.nv, BLOCKS + 1, len(shifts)), np.nan)  # of all rows, and of all but one block
     for joint in range(dataset.nv):
         splines = [(CubicSpline(dataset.time[own], dataset.u[own, joint]), dataset.time[at]) for own, at in episodes]
@@ -190,8 +198,9 @@ def jackknife(each: Float[np.ndarray, "estimates blocks"]) -> np.ndarray:
     return np.sqrt((each.shape[-1] - 1) * np.var(each, axis=-1))
 
 
-def torque_columns(robot: forcegp.robots.Robot, dataset: Dataset) -> Float[np.ndarray, "nv rows columns"]:
+def torque_columns(dataset: Dataset) -> Float[np.ndarray, "nv rows columns"]:
     """What the torque of each joint may be made of, except for its parameters; with the laws of the dataset's model."""
+    robot = dataset.model.robot
     q, v, a = (torch.tensor(getattr(dataset, name), device=robot.device) for name in ("q", "v", "a"))
     with torch.no_grad():
         if len(dataset) > ROWS_PER_PARAMETER * 10 * robot.nv:
@@ -201,8 +210,8 @@ def torque_columns(robot: forcegp.robots.Robot, dataset: Dataset) -> Float[np.nd
             parts = (robot.inverse_dynamics(q, v, a) - bias, bias - gravity, gravity)
             torque = torch.stack(parts, dim=-1)
     rows = dataset.q, dataset.v, dataset.u, dataset.a
-    laws = () if dataset.model is None or dataset.model.robot is not robot else dataset.model.laws
-    own = [*usual_columns(robot, *rows, FRICTION_WIDTHS), *law_columns(laws, robot, *rows), *_memory_columns(dataset)]
+    own = [*usual_columns(robot, *rows, FRICTION_WIDTHS), *law_columns(dataset.model.laws, robot, *rows)]
+    own += _memory_columns(dataset)
     return np.concatenate([torque.cpu().numpy(), np.stack(own, axis=-1)], axis=-1).transpose(1, 0, 2)
 
 
@@ -240,31 +249,7 @@ def lowest(values: Float[np.ndarray, " shifts"], shifts: Float[np.ndarray, " shi
     return float(shifts[at] + offset * (shifts[1] - shifts[0]))
 
 
-def _robot(dataset: Dataset, robot: forcegp.robots.Robot | None) -> forcegp.robots.Robot:
-    model = dataset.model
-    if robot is None and model is None:
-        raise InvalidInput(
-            "a delay is found by comparing torques with inverse dynamics, which needs the robot: give its URDF, or the "
-            "delay in s."
-        )
-    if model is not None and model.contacts:
-        raise InvalidInput(
-            "the forces of contacts are not known, so a delay cannot be found in this log. Give the delay in s, or use "
-            "a log without contact."
-        )
-    if robot is None:
-        assert model is not None
-        robot = model.robot
-    require_rows("dataset", dataset, robot.joint_names, robot.name)
-    if not torques_of_joints(dataset):
-        raise InvalidInput(
-            "a delay is found from the torque of every joint, which u does not hold for a base that moves or actuators "
-            "of another kind; give the delay in s."
-        )
-    return robot
-
-
 def torques_of_joints(dataset: Dataset) -> bool:
     """Whether u has one torque per degree of freedom."""
     model = dataset.model
-    return model is None or (model.actuators == model.robot.joint_names and model.actuation.matrix is None)
+    return model.actuators == model.robot.joint_names and model.actuation.matrix is None

@@ -37,10 +37,9 @@ def write_fields(path: Path, fields: Mapping[str, Any], units: Mapping[str, Any]
         file.attrs["time_ordered"] = fields["time_ordered"]
         for name, unit in units.items():
             file[name].attrs.create("units", unit, dtype=_TEXT)
-        file.create_dataset("joint_names", data=list(fields["joint_names"]), dtype=_TEXT)
+        file.create_dataset("joint_names", data=list(fields["model"].robot.joint_names), dtype=_TEXT)
         file.create_dataset("metadata", data=json.dumps(fields["metadata"]), dtype=_TEXT)
-        if fields["model"] is not None:
-            file.create_dataset("model", data=fields["model"].to_json(), dtype=_TEXT)
+        file.create_dataset("model", data=fields["model"].to_json(), dtype=_TEXT)
 
 
 def is_dataset(path: Path) -> bool:
@@ -91,7 +90,7 @@ class _Reader:
             raise FileFormatError(f"{self.path}{problem}")
 
     def fields(self) -> dict[str, Any]:
-        file, required = self.file, (*COLUMNS, "joint_names", "metadata")
+        file, required = self.file, (*COLUMNS, "joint_names", "metadata", "model")
         kind, version = file.attrs.get("format"), file.attrs.get("format_version")
         ours = f"is an HDF5 file, but not a forcegp dataset (its 'format' is {kind!r}, not {FORMAT!r})."
         self.require(kind == FORMAT, f" {ours}")
@@ -103,7 +102,6 @@ class _Reader:
         missing = [name for name in required if name not in file]
         self.require(not missing, f" has no {', '.join(missing)}; a dataset needs {', '.join(required)}.")
         values: dict[str, Any] = {name: self.array(name) for name in COLUMNS}
-        values["joint_names"] = tuple(self.texts("joint_names"))
         values["metadata"] = json.loads(self.text("metadata"))
         self.require(isinstance(values["metadata"], dict), ": 'metadata' must be a JSON object.")
         values["noise_std"] = self.array("noise_std") if "noise_std" in file else None
@@ -112,12 +110,12 @@ class _Reader:
         names = list(truth) if isinstance(truth, h5py.Group) else []
         values["truth"] = {name: self.array(f"truth/{name}") for name in names}
         values["time_ordered"] = bool(file.attrs.get("time_ordered", True))
-        values["model"] = None
-        if "model" in file:
-            try:
-                values["model"] = forcegp.Model.from_json(self.text("model"))
-            except ForceGPError as error:
-                raise FileFormatError(f"{self.path}: its robot or contacts cannot be used: {error}") from error
+        try:
+            values["model"] = forcegp.Model.from_json(self.text("model"))
+        except ForceGPError as error:
+            raise FileFormatError(f"{self.path}: its robot or contacts cannot be used: {error}") from error
+        names, own = self.texts("joint_names"), list(values["model"].robot.joint_names)
+        self.require(names == own, f": its columns are those of {names}, but its robot has {own}.")
         return values
 
     def stored(self, name: str) -> h5py.Dataset:

@@ -39,9 +39,10 @@ class Preparation:
 
     cutoff: zero-phase Butterworth low-pass of that many Hz on q and u (with `differentiate="v"` on v as well), after
         which v and a are computed anew; "auto" as `motion_spectrum` and `held_out_cutoff` find it, None for none.
-    delay: how much later than it acts u was logged [s]: `u(t) := u_logged(t + delay)`; "auto": `estimate_delay`.
+    delay: how much later than it acts u was logged [s]: `u(t) := u_logged(t + delay)`; "auto": `estimate_delay`, 0
+        where u does not hold the torques of all joints, or something is touched.
     lag: time constant of the actuators [s], of thrusters where a base has them: T u_a' + u_a = u; "auto":
-        `estimate_thruster_lag`.
+        `estimate_thruster_lag`, 0 where that finds none.
     every: keep every so many rows.
     trim: seconds to drop at both ends of each episode, where a filter has samples of one side only.
     differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities.
@@ -88,17 +89,29 @@ class Preparation:
         return self == Preparation(differentiate=self.differentiate)
 
     def resolved(self, dataset: Dataset) -> "Preparation":
-        """The same with numbers in place of "auto", and `why`. Raises as `motion_spectrum` and `estimate_delay`."""
+        """The same with numbers in place of "auto", and `why`. DatasetError as `motion_spectrum`, `estimate_delay`."""
         reasons, chosen = dict(self.why), self
         if self.cutoff == "auto":
             cutoff, reasons["cutoff"] = _cutoff(dataset, self.differentiate)
             chosen = replace(chosen, cutoff=cutoff)
         if self.lag == "auto":
-            seconds, std = estimate_thruster_lag(_filtered(replace(chosen, lag=0.0, delay=0.0), dataset))
-            chosen, reasons["lag"] = replace(chosen, lag=seconds), f"{1e3 * seconds:.1f} ms ± {1e3 * std:.1f} ms"
+            chosen, reasons["lag"] = replace(chosen, lag=0.0), "u drives no thrusters"
+            if thruster_columns(dataset.model):
+                try:
+                    seconds, std = estimate_thruster_lag(_filtered(replace(chosen, delay=0.0), dataset))
+                    chosen, reasons["lag"] = (
+                        replace(chosen, lag=seconds),
+                        f"{1e3 * seconds:.1f} ms ± {1e3 * std:.1f} ms",
+                    )
+                except (DatasetError, InvalidInput) as error:
+                    reasons["lag"] = f"rotors are taken to follow at once: {error}"
         if self.delay == "auto":
-            found = estimate_delay(_filtered(replace(chosen, delay=0.0), dataset))
-            chosen, reasons["delay"] = replace(chosen, delay=found.significant), found.reason
+            chosen = replace(chosen, delay=0.0)
+            try:
+                found = estimate_delay(_filtered(chosen, dataset))
+                chosen, reasons["delay"] = replace(chosen, delay=found.significant), found.reason
+            except InvalidInput as error:
+                reasons["delay"] = f"u is taken to be on time: {error}"
         return replace(chosen, why=reasons)
 
     def rows(self, dataset: Dataset) -> Dataset:
@@ -140,7 +153,7 @@ def _cutoff(dataset: Dataset, source: Literal["q", "v"]) -> tuple[float | None, 
     """What the spectrum shows, not far beyond a base on contacts, and what torques make of it [Hz]; and why."""
     spectrum, model = motion_spectrum(dataset, source), dataset.model
     fastest = decisive = spectrum.cutoff
-    for group in model.robot.layout.groups[:1] if model is not None and model.touching else ():
+    for group in model.robot.layout.groups[:1] if model.touching else ():
         if np.isfinite(fastest[group.rows]).any():
             decisive = np.minimum(fastest, BEYOND_BASE * np.nanmax(fastest[group.rows]))
     if not np.isfinite(decisive).any():
@@ -151,9 +164,9 @@ def _cutoff(dataset: Dataset, source: Literal["q", "v"]) -> tuple[float | None, 
         why += f"joints do up to {np.nanmax(fastest):.3g} Hz, where accelerations of the base are noise"
     else:
         why += "no other joint moves faster"
-    if model is not None and not model.contacts and torques_of_joints(dataset):
+    if not model.contacts and torques_of_joints(dataset):
         with contextlib.suppress(DatasetError):  # too short, or sampled too slowly: the spectrum has to do
-            cutoff, tried = held_out_cutoff(dataset, model.robot, cutoff, source)
+            cutoff, tried = held_out_cutoff(dataset, cutoff, source)
             shares = ", ".join(f"{100.0 * share:.2g} % at {frequency:g} Hz" for frequency, share in tried.items())
             why += f"; of held-out torques stay unexplained {shares}"
     return cutoff, why

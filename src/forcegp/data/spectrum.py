@@ -8,7 +8,6 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-import forcegp.robots
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import Dataset
 from forcegp.data.delay import estimate_delay, torque_columns
@@ -183,7 +182,7 @@ SETTLED = 2.0  # periods of the lowest cut-off at the ends of an episode that fi
 
 
 def held_out_cutoff(
-    dataset: Dataset, robot: forcegp.robots.Robot, cutoff: float, source: Literal["q", "v"] = "q"
+    dataset: Dataset, cutoff: float, source: Literal["q", "v"] = "q"
 ) -> tuple[float, dict[float, float]]:
     """The best of `FACTORS` times `cutoff` [Hz], and of each the share of the torques that it leaves unexplained.
 
@@ -191,22 +190,20 @@ def held_out_cutoff(
     judged alike: signals behind the highest, torques behind the lowest (parallel filtering; Gautier, ICRA 1997), in
     time that was held out. Raises DatasetError for logs too short for that, and for passive robots.
     """
-    best, shares = _judged(dataset, robot, cutoff, source)
+    best, shares = _judged(dataset, cutoff, source)
     if best in (min(shares), max(shares)):  # the best may lie beyond
-        best, more = _judged(dataset, robot, best, source)
+        best, more = _judged(dataset, best, source)
         shares = shares | more
     return best, dict(sorted(shares.items()))
 
 
-def _judged(
-    dataset: Dataset, robot: forcegp.robots.Robot, cutoff: float, source: Literal["q", "v"]
-) -> tuple[float, dict[float, float]]:
-    columns = 10 * robot.nv + 10
-    rows = int(min(MOST_ROWS, MOST_NUMBERS / (robot.nv * columns)))
+def _judged(dataset: Dataset, cutoff: float, source: Literal["q", "v"]) -> tuple[float, dict[float, float]]:
+    nv, columns = dataset.nv, 10 * dataset.nv + 10
+    rows = int(min(MOST_ROWS, MOST_NUMBERS / (nv * columns)))
     log = dataset.rows(slice(0, rows))
     step = uniform_step(log.time[log.episode == log.episodes[0]])
     tried = [cutoff * factor for factor in FACTORS if cutoff * factor < 0.4 / step]
-    if len(log) < 5 * FOLDS * columns // robot.nv or len(tried) < 2:
+    if len(log) < 5 * FOLDS * columns // nv or len(tried) < 2:
         raise DatasetError(f"{len(log)} rows are too few to choose a cut-off by prediction.")
     if not log.u.any():
         raise DatasetError("no torque acts, so none shows a cut-off.")
@@ -215,14 +212,14 @@ def _judged(
     def behind(frequency: float) -> Dataset:
         return differentiated(low_pass(log, frequency, signals=signals), source)
 
-    delay = np.nan_to_num(estimate_delay(behind(cutoff), robot).common)  # the best guess, sure or not
+    delay = np.nan_to_num(estimate_delay(behind(cutoff)).common)  # the best guess, sure or not
     log = shifted(log, float(delay))
     away = SETTLED / tried[0] + abs(delay)
     times = [rows.time for _, rows, _ in episodes_in_order(log)]
     inner = np.concatenate([(time >= time[0] + away) & (time <= time[-1] - away) for time in times])
     folds = np.array_split(np.arange(int(inner.sum())), FOLDS)
     sides = [np.concatenate(folds[first::2]) for first in (0, 1)]
-    sharp = torque_columns(robot, behind(tried[-1]))
+    sharp = torque_columns(behind(tried[-1]))
 
     def judged(values: Float[np.ndarray, "rows columns"]) -> np.ndarray:
         own = [log.episode == number for number in log.episodes]
@@ -233,7 +230,7 @@ def _judged(
     seen = [judged(each) for each in sharp]
     for k, frequency in enumerate(tried):
         smooth = behind(frequency)
-        for joint, each in enumerate(torque_columns(robot, smooth)):
+        for joint, each in enumerate(torque_columns(smooth)):
             size = np.linalg.norm(each, axis=0) + 1e-300
             learned, u, left = each[inner] / size, smooth.u[inner, joint], 0.0
             for one, other in (sides, sides[::-1]):

@@ -102,8 +102,8 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
     2.3 times the noise of v. Raises ContactError without contacts that have a switch.
     """
     model = dataset.model if model is None else model
-    names = () if model is None else tuple(dict.fromkeys(each.switch for each in model.contacts if each.switch))
-    if model is None or not names:
+    names = tuple(dict.fromkeys(each.switch for each in model.contacts if each.switch))
+    if not names:
         raise ContactError(
             "no contact of the model has a switch, so there is no stance to find; give one, for example "
             "fixed_point('foot', switch='foot_stands')."

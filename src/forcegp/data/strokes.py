@@ -51,7 +51,7 @@ def strokes(dataset: Dataset, count: int = COUNT) -> Float[np.ndarray, "rows nv 
 def joint_positions(dataset: Dataset) -> Float[np.ndarray, "rows nv"]:
     """Positions of joints of one degree of freedom; 0 for the others."""
     model = dataset.model
-    if model is None or model.robot.space.is_vector_space:
+    if model.robot.space.is_vector_space:
         return np.asarray(dataset.q)
     robot, out = model.robot, np.zeros((len(dataset), dataset.nv))
     out[:, np.isin(robot.joint_names, robot.single_joint_names)] = robot.space.singles(torch.tensor(dataset.q)).numpy()

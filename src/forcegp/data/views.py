@@ -83,7 +83,7 @@ def with_memory(dataset: Dataset, model: Model) -> Dataset:
     """
     from forcegp.data.strokes import strokes  # of views
 
-    memory, own = model.memory, () if dataset.model is None else dataset.model.memory.names
+    memory, own = model.memory, dataset.model.memory.names
     if not memory.names or (own == memory.names and dataset.strokes is None):
         return dataset
     if dataset.strokes is None and not dataset.time_ordered:
@@ -91,7 +91,7 @@ def with_memory(dataset: Dataset, model: Model) -> Dataset:
             f"{', '.join(memory.titles)} remembers, and the rows are not in order of time; give the whole log."
         )
     past = strokes(dataset) if dataset.strokes is None else dataset.strokes
-    remembered = np.isin(() if dataset.model is None else dataset.model.inputs, own)
+    remembered = np.isin(dataset.model.inputs, own)
     bare, stated = (dataset.u[:, ~remembered], dataset.u[:, remembered]) if own else (dataset.u, None)
     stated = stated if own == memory.names else None
     columns = np.zeros((len(dataset), len(memory.names)))
@@ -104,8 +104,7 @@ def with_memory(dataset: Dataset, model: Model) -> Dataset:
         columns[rows] = memory.along(q, time, own_past, known).cpu().numpy()
     first = model.memory_column
     u = np.concatenate([bare[:, :first], columns, bare[:, first:]], axis=1)
-    known = model.known if dataset.model is None else replace(dataset.model, forces=model.laws)
-    return replace(dataset, u=u, model=known, strokes=past)
+    return replace(dataset, u=u, model=replace(dataset.model, forces=model.laws), strokes=past)
 
 
 @dataclass(frozen=True, eq=False)

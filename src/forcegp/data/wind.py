@@ -135,7 +135,6 @@ def steady_forces(dataset: Dataset) -> Float[np.ndarray, "rows 3"] | None:
 
 def with_wind(dataset: Dataset, wind: Float[np.ndarray, "rows 3"]) -> Dataset:
     """The recording with an `ObservedWind` in its model, whose columns of u hold the wind [m/s, world]."""
-    assert dataset.model is not None, "wind was found in a recording with a model"
     forces = (*dataset.model.forces, forcegp.forces.ObservedWind())
     model = replace(dataset.model, forces=forces)
     first = model.inputs.index(forcegp.forces.ObservedWind.names[0])
@@ -144,7 +143,7 @@ def with_wind(dataset: Dataset, wind: Float[np.ndarray, "rows 3"]) -> Dataset:
 
 
 def _flies(dataset: Dataset) -> bool:
-    if dataset.model is None or dataset.model.contacts:
+    if dataset.model.contacts:
         return False
     groups = dataset.model.robot.layout.groups
     return bool(groups) and groups[0].kind == "floating"
@@ -162,7 +161,6 @@ class _Forces:
 
     @classmethod
     def of(cls, dataset: Dataset) -> _Forces:
-        assert dataset.model is not None, "forces need a model"
         robot = dataset.model.robot
         model, group = dataset.model, robot.layout.groups[0]
 
@@ -289,7 +287,7 @@ def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
     recording is too short, or shows no lag below .3 s.
     """
     columns = thruster_columns(dataset.model)
-    if dataset.model is None or not columns or dataset.nv > 6:
+    if not columns or dataset.nv > 6:
         raise InvalidInput("this lag is that of thrusters on one body; give base='floating' and Thrusters, or S in s.")
     episodes = [part for _, part, _ in episodes_in_order(dataset) if np.ptp(part.time) > 2.0 * SETTLED]
     if sum(map(len, episodes)) < 1000:
@@ -324,10 +322,10 @@ def _fast(values: Float[np.ndarray, "rows k"], time: Float[np.ndarray, " rows"])
     return (values - Lag(FAST)(values, time))[time - time[0] > SETTLED]
 
 
-def thruster_columns(model: forcegp.Model | None) -> dict[int, int]:
+def thruster_columns(model: forcegp.Model) -> dict[int, int]:
     """Columns of u that push a base that floats, and the powers in which they act: `Thrusters`, and such actuators."""
-    groups = () if model is None else model.robot.layout.groups
-    if model is None or not groups or groups[0].kind != "floating":
+    groups = model.robot.layout.groups
+    if not groups or groups[0].kind != "floating":
         return {}
     matrix, kind = model.actuation.matrix, forcegp.forces.Thrusters
     pushes = [] if matrix is None else np.flatnonzero(torch.as_tensor(matrix)[groups[0].rows].cpu().numpy().any(0))

@@ -243,7 +243,6 @@ class _Functions:
             return replace(self, model=plain).fitted(dataset, points)
         if found := in_air(self.model, dataset):
             settings, seen = found
-            assert seen.model is not None, "it was given one"
             learned: Any = replace(self, model=seen.model).fitted(replace(seen, model=seen.model.known), points)
             return learned.with_model(unobserved(learned.model)).with_settings(**settings)
         return self._of_rows(dataset, points)

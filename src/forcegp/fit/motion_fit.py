@@ -269,7 +269,6 @@ def refine_on_motions(
         )
     seen = in_own_air(posterior, dataset)
     if seen is not dataset:
-        assert seen.model is not None, "it was given one"
         posterior = posterior.with_model(seen.model)
     recorded, stride = all_motions(seen, seconds, STEP)
     unknowns = Unknowns.of(posterior, seen, bodies, stated)

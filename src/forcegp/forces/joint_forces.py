@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, UnknownJoint, require_known, usable_arguments
+from forcegp.errors import InvalidInput, UnknownName, require_known, usable_arguments
 from forcegp.forces.force import joint_unit, slides
 from forcegp.forces.kernels import checked_kernel, periodic
 from forcegp.forces.unknown import ExpressedKernels, Scaling, SharedInputs, as_names
@@ -172,10 +172,10 @@ class PerJoint(ExpressedKernels):
 
 
 def joint_indices(joints: Sequence[str] | None, robot: Robot) -> list[int]:
-    """Places in v of the joints, None: all of one degree of freedom. Raises UnknownJoint for a name of none."""
+    """Places in v of the joints, None: all of one degree of freedom. Raises UnknownName for a name of none."""
     names = robot.joint_names
     for joint in joints or ():
-        require_known("joint", joint, robot.name, names, UnknownJoint)
+        require_known("joint", joint, robot.name, names, UnknownName)
     return [names.index(joint) for joint in (robot.single_joint_names if joints is None else joints)]
 
 

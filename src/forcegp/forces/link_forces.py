@@ -29,7 +29,7 @@ class ToolPoint:
 
     @classmethod
     def of(cls, dynamics: ConstrainedDynamics, frame: str, point: Sequence[float]) -> "ToolPoint":
-        """At every state of the dynamics. Raises UnknownFrame."""
+        """At every state of the dynamics. Raises UnknownName."""
         kinematics = dynamics.state.kinematics
         axes, position = placed(kinematics, frame, point)
         return cls(position, kinematics.frame_jacobian(frame, tuple(point)), axes)
@@ -83,7 +83,7 @@ def require_contact(force: str, contact: int, contacts: Sequence[Contact]) -> No
 
 
 def require_moving(prior: str, frame: str, robot: Robot) -> None:
-    """Raise UnknownFrame for a frame that does not exist, InvalidInput for one that is fixed in the world."""
+    """Raise UnknownName for a frame that does not exist, InvalidInput for one that is fixed in the world."""
     body, _ = robot.frame(frame)
     if body < 0:
         moving = [name for name in robot.link_names if robot.frame(name)[0] >= 0]

@@ -79,7 +79,7 @@ class Contact:
         object.__setattr__(self, "point", tuple(point.tolist()))
 
     def check(self, robot: Robot) -> None:
-        """Raise UnknownFrame for a frame that is not there, ContactError where the contact constrains nothing."""
+        """Raise UnknownName for a frame that is not there, ContactError where the contact constrains nothing."""
         if robot.frame(self.frame)[0] < 0:
             raise ContactError(
                 f"frame {self.frame!r} of {robot.name} is fixed in the world, so a contact there constrains nothing; "

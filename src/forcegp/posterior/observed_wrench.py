@@ -165,7 +165,6 @@ def _in_observed_wind(posterior: Posterior, dataset: Dataset) -> tuple[Posterior
         return posterior, dataset
     rows = replace(dataset, model=posterior.model)
     seen = with_wind(rows, AirLaw.from_dict(stored).wind_before(rows))
-    assert seen.model is not None, "it was given one"
     return posterior.with_model(seen.model), seen
 
 

@@ -218,8 +218,21 @@ class Rollout:
                 f"this rollout has {count} samples, {least} are needed; ask for rollout(..., samples=20)."
             )
         values: Tensor = getattr(self.samples, quantity)
-        on_manifold = quantity == "q" and not self.space.is_vector_space
-        return self.space.difference(self.q, values) if on_manifold else values
+        return values if quantity != "q" or self.space.is_vector_space else self.steps_to(values)
+
+    def steps_to(self, q: Tensor) -> Tensor:
+        """From the q here to others (..., T+1, nq), as steps (..., T+1, nv); NaN where one of them has diverged."""
+        if self.space.is_vector_space:
+            return q - self.q
+        lost = (torch.isnan(q).any(-1) | torch.isnan(self.q).any(-1))[..., None]
+        here, there = (torch.where(lost, self.space.neutral().to(q), x) for x in (self.q, q))
+        return torch.where(lost, torch.nan, self.space.difference(here, there))
+
+    def contains(self, q: Tensor) -> Tensor:
+        """Whether positions (..., T+1, nq) lie in the 95 % interval (..., T+1, nv), 1 or 0; NaN after a divergence."""
+        low, high = self.interval()
+        off = q if self.space.is_vector_space else self.steps_to(q)
+        return torch.where(torch.isnan(high - low), torch.nan, ((low <= off) & (off <= high)).to(off))
 
 
 def roll_out(

@@ -71,11 +71,11 @@ def import_recordings(
     paths: Sequence[str | Path],
     mapping: ColumnMapping,
     *,
-    model: forcegp.Model | None = None,
+    model: forcegp.Model,
     options: ImportOptions | None = None,
     report: Progress = lambda done, total, note: None,
 ) -> Dataset:
-    """The dataset that these logs hold; `metadata["import"]` is what was done.
+    """The dataset of this robot that these logs hold; `metadata["import"]` is what was done.
 
     Each log is at least one episode; gaps and the episode numbers of a log make more. Only the columns that are used
     have to fit into memory.
@@ -86,7 +86,6 @@ def import_recordings(
     options = options or ImportOptions()
     if not paths:
         raise InvalidInput("no logs are given.")
-    robot = None if model is None else model.robot
     sources = _sources([Path(path) for path in paths], mapping)
     lacks = {"may_lack_switches": options.stance == "auto"}
     plans = [signal_plan(mapping, source, model, **lacks) for _, source in sources]
@@ -100,7 +99,7 @@ def import_recordings(
     for index, ((label, source), own) in enumerate(zip(sources, plans, strict=True)):
         report(index, len(sources), f"reading {label}")
         believed = own.joints if "q" in mapping.unit else ()
-        recordings.append(read_recording(source, own, label, options, robot, believed))
+        recordings.append(read_recording(source, own, label, options, model.robot, believed))
     step = _even_step(recordings, options)
     done = _what_was_done(mapping, plan, recordings, step, sources)
     pieces: list[dict[str, np.ndarray]] = []
@@ -118,7 +117,7 @@ def import_recordings(
     columns: dict[str, Any] = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
     columns.setdefault("u", np.zeros((len(columns["time"]), 0)))
     done["rows"] = len(columns["time"])
-    return Dataset(**columns, joint_names=plan.joints, model=model, metadata={"import": done})
+    return Dataset(**columns, model=model, metadata={"import": done})
 
 
 def _sources(paths: Sequence[Path], mapping: ColumnMapping) -> list[tuple[str, Source]]:

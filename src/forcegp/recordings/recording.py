@@ -64,7 +64,7 @@ def read_recording(
     plan: SignalPlan,
     label: str,
     options: Any,
-    robot: forcegp.robots.Robot | None,
+    robot: forcegp.robots.Robot,
     believed: Collection[str],
 ) -> Recording:
     """Read a table as the `ImportOptions` say; `believed` joints may turn often.
@@ -224,11 +224,11 @@ def _require_plausible_positions(
     label: str,
     values: Float[np.ndarray, "rows signals"],
     plan: SignalPlan,
-    robot: forcegp.robots.Robot | None,
+    robot: forcegp.robots.Robot,
     believed: Collection[str],
 ) -> None:
-    """Refuse positions far beyond the limits of the URDF; without a robot, those that look like degrees."""
-    limits = {} if robot is None else {joint.name: (joint.lower, joint.upper) for joint in robot.joints}
+    """Refuse positions far beyond the limits of the URDF; without limits, those that look like degrees."""
+    limits = {joint.name: (joint.lower, joint.upper) for joint in robot.joints}
     for item, column in zip(plan.signals, values.T, strict=True):
         if item.signal != "q":
             continue

@@ -141,15 +141,15 @@ class SignalPlan:
 
 
 def signal_plan(
-    mapping: ColumnMapping, source: Source, model: forcegp.Model | None, *, may_lack_switches: bool = False
+    mapping: ColumnMapping, source: Source, model: forcegp.Model, *, may_lack_switches: bool = False
 ) -> SignalPlan:
-    """What a mapping means for this table, with joints in the order of the robot if there is one.
+    """What a mapping means for this table, with joints in the order of the robot.
 
     Signals that the mapping does not name are looked for by the names of the joints (`guessed` lists what was found).
     With `may_lack_switches`, u may end with the actuators.
     Raises InvalidInput for columns, joints and numbers of them that do not fit, FileFormatError for missing columns.
     """
-    robot = None if model is None else model.robot
+    robot = model.robot
     joints = _joints(mapping, robot)
     log, order = columns_of(mapping, model, joints)
     guessed: list[str] = []
@@ -159,34 +159,27 @@ def signal_plan(
         if patterns is None and log[signal]:
             names = tuple(log[signal])
             patterns = guessed_columns(signal, names, source)
-            if patterns is None and signal == "u" and may_lack_switches and model is not None and model.actuators:
+            if patterns is None and signal == "u" and may_lack_switches and model.actuators:
                 patterns = guessed_columns(signal, names[: len(model.actuators)], source)
             if patterns is not None:
                 guessed.append(f"{signal} = {', '.join(patterns)}")
                 found[signal] = [parse_expression(name, [name], str(source.path)) for name in patterns]
         elif patterns is not None:
             found[signal] = _expressions(patterns, joints, source, may_lack=signal in ("v", "a"))
-    switches = len({x.switch for x in (model.contacts if model and may_lack_switches else ())} - {None})
-    if model is not None and switches and len(found.get("u", ())) == len(model.inputs) - switches:
+    switches = len({x.switch for x in (model.contacts if may_lack_switches else ())} - {None})
+    if switches and len(found.get("u", ())) == len(model.inputs) - switches:
         found["u"] = [*found.get("u", ()), *[LACKING] * switches]
     for signal, why in (("q", "positions"), ("u", "forces of the actuators; 0 for a passive robot")):
-        if signal not in found and (model is None or log[signal]):
+        if signal not in found and log[signal]:
             lacking = [name for name in joints if not any(map(named_after(name).search, source.columns()))]
             raise InvalidInput(
                 f"no columns for {signal} ({why}); name them with --{signal}"
-                + (
-                    f", in the order {', '.join(log[signal])} (angles: `orientation`)"
-                    if robot is not None and robot.space.groups
-                    else ""
-                )
+                + (f", in the order {', '.join(log[signal])} (angles: `orientation`)" if robot.space.groups else "")
                 + f". {source.path} has {listed(source.columns(), MOST_NAMES)}"
                 + f"; no column is named after {listed(lacking)} (`locked` holds what was not recorded)"
                 * (0 < len(lacking) < len(joints))
                 + "."
             )
-    if model is None and not joints:
-        example = ",".join(f"joint{index + 1}" for index in range(len(found["q"])))
-        raise InvalidInput(f"the joints have no names; add `joints`, for example {example}, or `model`.")
     if mapping.time is None and mapping.step is None:
         used = [name for expressions in found.values() for item in expressions for name in item.weights]
         name = guessed_time(source, used)
@@ -201,9 +194,7 @@ def signal_plan(
         time = parse_expression(mapping.time, source.columns(), str(source.path)) if mapping.time is not None else None
     if time is not None and not time.weights:
         raise InvalidInput(f"time is the constant {mapping.time!r}; give a column, or `step` for the time of a row.")
-    if robot is None:
-        log = {name: dict.fromkeys(joints, ROTATION[name]) for name in SIGNALS}
-    turned = {f"{x.name}.{part}" for x in (bases(robot) if robot and mapping.ned else ()) for part in TURNED}
+    turned = {f"{x.name}.{part}" for x in (bases(robot) if mapping.ned else ()) for part in TURNED}
     signals = tuple(
         item
         for name, expressions in found.items()
@@ -229,13 +220,11 @@ def signal_plan(
     )
 
 
-def _joints(mapping: ColumnMapping, robot: Robot | None) -> tuple[str, ...]:
+def _joints(mapping: ColumnMapping, robot: Robot) -> tuple[str, ...]:
     """Joints of one degree of freedom, in the order of the log."""
     stated = [name for name in ("orientation", "axes", "ned") if getattr(mapping, name)]
-    if stated and (robot is None or robot.space.is_vector_space):
+    if stated and robot.space.is_vector_space:
         raise InvalidInput(f"{stated[0]} is about a base that moves; give a robot with one, by base='floating'.")
-    if robot is None:
-        return mapping.joints
     own = robot.single_joint_names
     if mapping.joints and sorted(mapping.joints) != sorted(own):
         raise InvalidInput(
@@ -354,14 +343,12 @@ def bases(robot: Robot) -> tuple[Group, ...]:
 
 
 def columns_of(
-    mapping: ColumnMapping, model: forcegp.Model | None, joints: tuple[str, ...]
+    mapping: ColumnMapping, model: forcegp.Model, joints: tuple[str, ...]
 ) -> tuple[dict[str, dict[str, str | None]], dict[str, tuple[str, ...]]]:
     """By signal: name and SI unit of its columns in the order of the log, and names in the order of the Dataset.
 
     Unit None: whatever the actuator takes.
     """
-    if model is None:
-        return {signal: dict.fromkeys(joints) for signal in SIGNALS}, dict.fromkeys(SIGNALS, joints)
     robot, own = model.robot, model.robot.single_joint_names
     kinds = {joint.name: TRANSLATION if joint.type == "prismatic" else ROTATION for joint in robot.joints}
     of_log = dict(zip(own, joints, strict=True))
@@ -382,15 +369,13 @@ def columns_of(
     return {signal: {name: unit(signal, name) for name in names} for signal, names in log.items()}, order
 
 
-def layout_of(
-    mapping: ColumnMapping, model: forcegp.Model | None, lacking: Mapping[str, Sequence[bool]], nv: int
-) -> Layout:
+def layout_of(mapping: ColumnMapping, model: forcegp.Model, lacking: Mapping[str, Sequence[bool]], nv: int) -> Layout:
     """What is left to do once positions are those of a Dataset.
 
     `lacking`: of each logged signal, which of its entries the log lacks. Raises InvalidInput for vectors that are half
     there where their axes turn.
     """
-    groups = () if model is None else bases(model.robot)
+    groups = bases(model.robot)
     derived = {name: [row for row, lacks in enumerate(own) if lacks] for name, own in lacking.items()}
     axes = {name: (own[0], own[-1] if own[-1] != "imu" else "body") for name, own in mapping.axes.items()}
     for name in axes.keys() - lacking.keys():
@@ -402,7 +387,5 @@ def layout_of(
             rows = {group.row + k for k in part}
             if axes[name][words == "angular"] == "world" and 0 < len(rows & {*derived.get(name, ())}) < len(rows):
                 raise InvalidInput(f"{name} in the axes of the world needs all of its {words} part, or all `derive`.")
-    if model is None:
-        return Layout(ConfigurationSpace(nv), derived=derived)
     switches = tuple(range(len(model.actuators), len(model.inputs)))
     return Layout(model.robot.space, groups, axes, tuple(model.robot.gravity.tolist()), derived, switches)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput, required_extra
+from forcegp.errors import required_extra
 from forcegp.forces import Actuation, BaseWrench, CoupledRotors, ObservedWrench, RigidBodies, Rotor, Thrusters, Unknown
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.posterior.posterior import Posterior
@@ -100,11 +100,9 @@ def recorded_scene(
     Forces are those of the posterior: each of its priors by itself, and the friction laws of its system. Without one,
     the recorded u. `shapes` is a URDF with visual elements (`link_shapes`).
 
-    Raises InvalidInput for a Dataset and posterior without system or rows in that time, MissingExtra without trimesh.
+    Raises InvalidInput for a Dataset without rows in that time, MissingExtra without trimesh.
     """
     model = dataset.model if posterior is None else posterior.model
-    if model is None:
-        raise InvalidInput("the dataset holds no robot; import it with one, or give a fitted model, too.")
     rows = style.window(dataset, start, seconds)
     first, last = rows.time[[0, -1]]
     steps = int(np.clip((last - first) * FRAMES_PER_SECOND, 1, min(MOST_FRAMES, len(rows) - 1) or 1))

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import ForceGPError, InvalidInput, RobotFileWarning, RobotModelError, UnknownJoint, require_known
+from forcegp.errors import ForceGPError, InvalidInput, RobotFileWarning, RobotModelError, UnknownName, require_known
 
 LARGEST = 2**63 - 1
 """Of the integers that every library takes."""
@@ -156,7 +156,7 @@ def by_joint(given: Any, joints: tuple[str, ...], robot: str) -> Any:
     if not isinstance(given, Mapping):
         return given
     for name in given:
-        require_known("joint", name, robot, joints, UnknownJoint)
+        require_known("joint", name, robot, joints, UnknownName)
     return [given.get(name, 0.0) for name in joints]
 
 

@@ -13,12 +13,8 @@ import numpy as np
 
 from forcegp.errors import (
     InvalidInput,
-    KinematicLoop,
     RobotModelError,
-    UnknownJoint,
-    UnknownLink,
-    UnstatedBase,
-    UnsupportedJoint,
+    UnknownName,
     require_known,
 )
 from forcegp.robots.arguments import Problems
@@ -70,7 +66,7 @@ def check_base(description: RobotDescription, standing: Sequence[str], problems:
             seen = f"its base {root!r} has {mass:.3g} kg, and there is {', '.join(map(repr, found[:4]))}"
             doubt = f"{problems.source}: this looks like a robot that is not bolted to the world: {seen}"
             question = ". base='floating' lets it move freely; base='fixed' takes it as bolted."
-            problems.errors.append(UnstatedBase(doubt, question, {"base": "floating"}))
+            problems.errors.append(RobotModelError(doubt, question, {"base": "floating"}))
             return
 
 
@@ -110,12 +106,12 @@ def followed(
     return held, drives
 
 
-def _objection(source: str, joint: Joint, at: Joint, found: bool) -> UnsupportedJoint:
+def _objection(source: str, joint: Joint, at: Joint, found: bool) -> RobotModelError:
     """Why a joint cannot be followed to one with a coordinate: at the last one passed."""
     last = (joint if found else at).mimics
     seen = f"{source}: joint {joint.name!r} mimics {last.joint if last else None!r}"
     why = ", and so at last itself, or a joint of several degrees of freedom" if found else ", which the file lacks"
-    return UnsupportedJoint(seen, f"{why}; correct its <mimic>, or lock the joint.", {"locked": {joint.name: 0.0}})
+    return RobotModelError(seen, f"{why}; correct its <mimic>, or lock the joint.", {"locked": {joint.name: 0.0}})
 
 
 def with_followers(
@@ -200,7 +196,7 @@ class Layout:
 
     def require_moving(self, link: str, robot: str) -> None:
         """Raise where ``link`` has no inertia that matters: it does not exist, or it is fixed in the world."""
-        require_known("link", link, robot, self.links, UnknownLink)
+        require_known("link", link, robot, self.links, UnknownName)
         if self.links[link].body == WORLD:
             raise InvalidInput(
                 f"link {link!r} of {robot} is fixed in the world, so its inertia never enters the dynamics and "
@@ -282,7 +278,7 @@ def lay_out(
 def _check_locked(description: RobotDescription, locked: Mapping[str, float]) -> None:
     by_name = {joint.name: joint for joint in description.joints}
     for name, position in locked.items():
-        require_known("joint", name, description.source, by_name, UnknownJoint)
+        require_known("joint", name, description.source, by_name, UnknownName)
         if by_name[name].type == "fixed":
             raise InvalidInput(f"{description.source}: joint {name!r} is fixed already; remove it from `locked`.")
         if by_name[name].type == "floating" and position != 0.0:
@@ -292,13 +288,13 @@ def _check_locked(description: RobotDescription, locked: Mapping[str, float]) ->
 
 
 def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]]:
-    """Root link and the joints below each link; :class:`KinematicLoop` where the joints form no single tree."""
+    """Root link and the joints below each link; :class:`RobotModelError` where the joints form no single tree."""
     source = description.source
     above: dict[str, Joint] = {}
     children: dict[str, list[Joint]] = {link: [] for link in description.links}
     for joint in description.joints:
         if joint.child in above:
-            raise KinematicLoop(
+            raise RobotModelError(
                 f"{source}: link {joint.child!r} has two parents, through joints {above[joint.child].name!r} and "
                 f"{joint.name!r}; a link can be the child of one joint only, remove one of them."
             )
@@ -306,7 +302,7 @@ def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]
         children[joint.parent].append(joint)
     roots = [link for link in description.links if link not in above]
     if len(roots) > 1:
-        raise KinematicLoop(
+        raise RobotModelError(
             f"{source}: the links form {len(roots)} separate parts, with base links {', '.join(map(repr, roots))}; "
             "connect them by (fixed) joints so that one base link remains."
         )
@@ -323,7 +319,7 @@ def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]
             loop.append(link)
             link = above[link].parent
         loop = [*loop[loop.index(link) :], link]
-        raise KinematicLoop(
+        raise RobotModelError(
             f"{source}: the links {' <- '.join(map(repr, loop))} form a loop; remove one of its joints "
             "(a closed mechanism needs a tree plus constraints)."
         )

@@ -14,7 +14,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from forcegp.errors import MalformedMjcf, RobotModelError, UnreadableRobotFile, required_extra
+from forcegp.errors import RobotModelError, required_extra
 from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import inverse, transform
 from forcegp.robots.layout import BASE, OUTSIDE, followed, joint_motion
@@ -40,7 +40,7 @@ def is_mjcf(text: str) -> bool:
 def translate(text: str, path: Path | None, for_system: bool, problems: Problems) -> Translation:
     """The robot of MJCF text beside its file; notes what is left out.
 
-    Raises MalformedMjcf, MissingExtra, errors of XML.
+    Raises RobotModelError, MissingExtra, errors of XML.
     """
     included: dict[str, bytes] = {}
     _require_bounded(text, [] if path is None else [path.parent], problems.source, included)
@@ -62,7 +62,7 @@ def translate(text: str, path: Path | None, for_system: bool, problems: Problems
         reason = " ".join(str(error).removeprefix("Error: ").split())
         missing = needed and any(word in reason for word in ("file", "mesh", "resource"))
         advice = f"; the mass of {', '.join(needed[:4])} comes from meshes: give an <inertial>" if missing else ""
-        raise MalformedMjcf(f"{problems.source}: MuJoCo refuses it ({reason}){advice}; correct that place.") from None
+        raise RobotModelError(f"{problems.source}: MuJoCo refuses it ({reason}){advice}; correct that place.") from None
     finally:
         made.set_mju_user_warning(before)
     for warning in dict.fromkeys((*noted, *(str(each.message) for each in warned))):
@@ -81,7 +81,7 @@ def _require_bounded(text: str, folders: Sequence[Path], source: str, included: 
         points = _product(element, SIZED)
         times *= _product(element, COPIED)
         if count + times > MOST_TAGS or points > MOST_POINTS or deepest > DEEPEST:
-            raise MalformedMjcf(
+            raise RobotModelError(
                 f"{source}: holds more than {MOST_TAGS} elements, copies included, {MOST_POINTS} points of a shape or "
                 f"{DEEPEST} levels; give the file of one robot."
             )
@@ -91,7 +91,7 @@ def _require_bounded(text: str, folders: Sequence[Path], source: str, included: 
             continue
         found = next((folder / name for folder in folders if (folder / name).is_file()), None)
         if found is None:
-            raise UnreadableRobotFile(f"{source}: includes {name!r}, which is not there; give the file beside it.")
+            raise RobotModelError(f"{source}: includes {name!r}, which is not there; give the file beside it.")
         inner = read_text(found)
         included[name] = inner.encode()
         _require_bounded(inner, [*folders, found.parent], str(found), included)

@@ -7,7 +7,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from forcegp.errors import UnsupportedJoint
+from forcegp.errors import RobotModelError
 from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import rotation_about, rpy_from_rotation, transform
 from forcegp.robots.manifold import VELOCITIES
@@ -71,7 +71,7 @@ class CompiledModel:
         for k in range(model.njnt):
             kind, body = ("free", "ball", "slide", "hinge")[model.jnt_type[k]], self.bodies[model.jnt_bodyid[k]]
             if kind == "ball":
-                raise UnsupportedJoint(f"{problems.source}: body {body!r} has a ball joint; give it three hinges.")
+                raise RobotModelError(f"{problems.source}: body {body!r} has a ball joint; give it three hinges.")
             self.joints.append(self._named(model.joint(k).name or f"{body}_{kind}", taken))
         self.taken_joints = taken
 

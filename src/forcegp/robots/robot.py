@@ -109,7 +109,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         Bodies, and named sites, are links; joints follow in MuJoCo's order, with armature, damping, dry friction and
         limits; a linear equality of two is a mimic joint. q is `qpos` with quaternions x, y, z, w; the linear velocity
         of a free body is in its axes. Parameters and errors are those of :meth:`from_urdf_text`, by default as in the
-        file; MalformedMjcf has MuJoCo's reason. A RobotFileWarning names what acts in MuJoCo only (`Model.from_mjcf`
+        file; RobotModelError has MuJoCo's reason. A RobotFileWarning names what acts in MuJoCo only (`Model.from_mjcf`
         has springs and closed loops).
         """
         return cls.read_mjcf(read_text(path), str(path), Path(path), **options)[0]
@@ -218,7 +218,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
     def with_link(self, name: str, mass: float, center_of_mass: Vector, inertia: Any) -> "Robot":
         """A robot whose moving link has this mass (kg), centre (3,) (m) and inertia (3, 3) about it (kg m^2).
 
-        Axes are those of the link. Raises UnknownLink, InvalidInput for a fixed link, NonPhysicalInertia for what no
+        Axes are those of the link. Raises UnknownName, InvalidInput for a fixed link, NonPhysicalInertia for what no
         body has.
         """
         self.layout.require_moving(name, self.name)

@@ -13,12 +13,9 @@ from typing_extensions import override
 
 from forcegp.errors import (
     InvalidInput,
-    MissingInertia,
     NonPhysicalInertia,
     RobotModelError,
-    UnknownFrame,
-    UnknownJoint,
-    UnknownLink,
+    UnknownName,
     require_known,
 )
 from forcegp.robots.arguments import JointValues, Positions, checked_tensor, usable_device
@@ -312,7 +309,7 @@ class RobotStructure(Summary):
 
     def link(self, name: str) -> Link:
         """One link by name."""
-        require_known("link", name, self.name, self.layout.links, UnknownLink)
+        require_known("link", name, self.name, self.layout.links, UnknownName)
         body = self.layout.links[name].body
         joint = None if body == WORLD else self.layout.bodies[body].name
         inertial = self.description.links[name] or MASSLESS
@@ -321,7 +318,7 @@ class RobotStructure(Summary):
 
     def joint(self, name: str) -> Joint:
         """One movable joint by name."""
-        require_known("joint", name, self.name, self.joint_names, UnknownJoint)
+        require_known("joint", name, self.name, self.joint_names, UnknownName)
         return self.joints[self.joint_names.index(name)]
 
     @override
@@ -338,7 +335,7 @@ class RobotStructure(Summary):
 
     def frame(self, name: str) -> tuple[int, Float[Tensor, "4 4"]]:
         """Body (``WORLD`` = -1) that carries a frame, and the frame's pose in that body's frame."""
-        require_known("frame", name, self.name, self._frames, UnknownFrame)
+        require_known("frame", name, self.name, self._frames, UnknownName)
         body, offset = self._frames[name]
         return body, offset.clone()
 
@@ -386,7 +383,7 @@ def bodies_without_inertia(
         if pseudo[body, 3, 3] == 0.0:
             seen = f"{link} moves with joint {name!r} but has no mass, and nor has what it carries"
             advice = "; add an <inertial> element, make the joint fixed, or lock it."
-            found.append((drive.joint, MissingInertia(seen, advice, remedy)))
+            found.append((drive.joint, RobotModelError(seen, advice, remedy)))
         elif body in whole and not turns_with_inertia(pseudo[body]):
             seen = f"{link} turns with joint {name!r} but has no rotational inertia about some axis"
             found.append((drive.joint, NonPhysicalInertia(seen, "; correct its <inertial> element.", remedy)))

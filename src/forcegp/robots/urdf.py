@@ -11,7 +11,7 @@ import numpy as np
 from defusedxml import DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden
 from defusedxml import ElementTree as SafeElementTree
 
-from forcegp.errors import InvalidNumber, MalformedUrdf, UnsafeXml, UnsupportedJoint
+from forcegp.errors import RobotModelError
 from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import rotation_from_rpy, transform
 
@@ -24,21 +24,21 @@ DEFINITIONS = ("}arg", "}property", "}macro")
 
 
 def parse_xml(text: str, source: str) -> Element:
-    """The root element of XML text without entities and of a size that a robot has. Raises MalformedUrdf, UnsafeXml."""
+    """The root element of XML text without entities and of a size that a robot has. Raises RobotModelError."""
     text = with_prefixes(text.lstrip())  # as other readers do: nothing may stand before an XML declaration
     if text.count("<") > MOST_TAGS:
-        raise MalformedUrdf(f"{source}: holds more than {MOST_TAGS} tags; give the URDF file of one robot.")
+        raise RobotModelError(f"{source}: holds more than {MOST_TAGS} tags; give the URDF file of one robot.")
     if not text:
-        raise MalformedUrdf(f"{source}: is empty; give a URDF file that starts with <robot name=...>.")
+        raise RobotModelError(f"{source}: is empty; give a URDF file that starts with <robot name=...>.")
     try:
         return SafeElementTree.fromstring(text, forbid_dtd=True, forbid_entities=True, forbid_external=True)
     except (DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden):
-        raise UnsafeXml(
+        raise RobotModelError(
             f"{source}: contains a DTD, an entity definition or an external reference, which can read files or exhaust "
             "the memory; no URDF needs them, remove the <!DOCTYPE ...> block."
         ) from None
     except (ParseError, UnicodeError) as error:
-        raise MalformedUrdf(f"{source}: is not well-formed XML ({error}); correct that place.") from None
+        raise RobotModelError(f"{source}: is not well-formed XML ({error}); correct that place.") from None
 
 
 def with_prefixes(text: str) -> str:
@@ -65,7 +65,7 @@ def refuse_xacro(root: Element, source: str) -> None:
         if "xacro}" in element.tag and not element.tag.endswith(left)
     ]
     for element in (*macros, *(each for each in read if re.search(r"\$[{(]", " ".join(each.attrib.values())))):
-        raise MalformedUrdf(
+        raise RobotModelError(
             f"{source}: is an unexpanded xacro file (see <{element.tag.rsplit('}', 1)[-1]}>); "
             "name it .xacro, or run xacro first: xacro robot.urdf.xacro > robot.urdf."
         )
@@ -136,7 +136,7 @@ def parse_urdf(text: str, problems: Problems) -> RobotDescription:
     source, element = problems.source, parse_xml(text, problems.source)
     if element.tag != "robot":
         other = "Robot.from_mjcf reads this file" if element.tag == "mujoco" else "give a URDF file"
-        raise MalformedUrdf(f"{source}: the root element is <{element.tag}>, not <robot>; {other}.")
+        raise RobotModelError(f"{source}: the root element is <{element.tag}>, not <robot>; {other}.")
     refuse_xacro(element, source)
     name = (element.get("name") or "").strip() or "robot"
     if "name" not in element.attrib:
@@ -148,7 +148,7 @@ def parse_urdf(text: str, problems: Problems) -> RobotDescription:
         with problems.collected(link):
             links[link] = _inertial(_Part(part, f"link {link!r}", problems))
     if not links:
-        raise MalformedUrdf(f"{source}: <robot> holds no <link>; a robot needs at least a base link and one joint.")
+        raise RobotModelError(f"{source}: <robot> holds no <link>; a robot needs at least a base link and one joint.")
     joints = []
     for joint, part in parts.items():
         with problems.collected():
@@ -162,10 +162,10 @@ def _named(root: Element, kind: str, problems: Problems) -> dict[str, Element]:
         with problems.collected():
             name = element.get("name", "")
             if not name.strip():
-                raise MalformedUrdf(f'{problems.source}: a <{kind}> has no name; write <{kind} name="...">.')
+                raise RobotModelError(f'{problems.source}: a <{kind}> has no name; write <{kind} name="...">.')
             if name in found:
                 seen = f"{problems.source}: two {kind}s are called {name!r}"
-                raise MalformedUrdf(seen, f"; {kind} names must be unique, rename one.")
+                raise RobotModelError(seen, f"; {kind} names must be unique, rename one.")
             found[name] = element
     return found
 
@@ -186,7 +186,7 @@ class _Part:
         if len(children) > 1:  # as in other readers
             self.problems.note(f"the first of several <{tag}> counts", self.owner)
         if needed and not children:
-            raise MalformedUrdf(f"{self}: <{self.element.tag}> has no <{tag}>; add it.")  # type: ignore[union-attr]
+            raise RobotModelError(f"{self}: <{self.element.tag}> has no <{tag}>; add it.")  # type: ignore[union-attr]
         return _Part(children[0] if children else None, self.owner, self.problems)
 
     def get(self, attribute: str) -> str | None:
@@ -196,7 +196,7 @@ class _Part:
         value = self.get(attribute)
         if value is None:
             tag = "" if self.element is None else self.element.tag
-            raise MalformedUrdf(f"{self}: <{tag}> has no attribute {attribute!r}; add it.")
+            raise RobotModelError(f"{self}: <{tag}> has no attribute {attribute!r}; add it.")
         return value
 
     def parsed(self, text: str, what: str) -> float:
@@ -205,7 +205,7 @@ class _Part:
                 raise ValueError
             return float(text)
         except ValueError:
-            raise InvalidNumber(f"{self}: {what} is {text!r}, not a number; write it like 0.5 or 1e-3.") from None
+            raise RobotModelError(f"{self}: {what} is {text!r}, not a number; write it like 0.5 or 1e-3.") from None
 
     def number(self, attribute: str, default: float, negative: str = "") -> float:
         """A number that may be absent and infinite, but not NaN; `negative` is what one below 0 is taken as."""
@@ -214,7 +214,7 @@ class _Part:
         what = f"<{self.element.tag}> {attribute}"
         value = self.parsed(text, what)
         if math.isnan(value) or (default == 0.0 and negative and math.isinf(value)):
-            raise InvalidNumber(f"{self}: {what} is {'NaN' if math.isnan(value) else 'inf'}; give a finite number.")
+            raise RobotModelError(f"{self}: {what} is {'NaN' if math.isnan(value) else 'inf'}; give a finite number.")
         if negative and value < 0.0:
             self.problems.note(f"a negative {what} is taken as {negative}", self.owner)
             return default
@@ -225,7 +225,9 @@ class _Part:
             return np.array(default, dtype=np.float64)
         words, what = text.split(), f"<{self.element.tag}> {attribute}"
         if len(words) != len(default):
-            raise InvalidNumber(f"{self}: {what} holds {len(words)} numbers ({' '.join(words)!r}), not {len(default)}.")
+            raise RobotModelError(
+                f"{self}: {what} holds {len(words)} numbers ({' '.join(words)!r}), not {len(default)}."
+            )
         return np.array([self.parsed(word, what) for word in words])
 
     def origin(self) -> np.ndarray:
@@ -233,9 +235,9 @@ class _Part:
         at = self.child("origin")
         xyz, rpy = (at.vector(name, (0.0, 0.0, 0.0)) for name in ("xyz", "rpy"))
         if not np.isfinite(rpy).all():
-            raise InvalidNumber(f"{self}: <origin> rpy {rpy.tolist()} is not finite; give angles in rad.")
+            raise RobotModelError(f"{self}: <origin> rpy {rpy.tolist()} is not finite; give angles in rad.")
         if not (np.abs(xyz) < FARTHEST).all():
-            raise InvalidNumber(f"{self}: <origin> xyz {xyz.tolist()} is not finite or far; give metres.")
+            raise RobotModelError(f"{self}: <origin> xyz {xyz.tolist()} is not finite or far; give metres.")
         return transform(rotation_from_rpy(rpy), xyz)
 
 
@@ -249,7 +251,7 @@ def _inertial(link: _Part) -> InertialDescription | None:
         return None
     mass = link.parsed(text, "<mass> value")
     if 0.0 < mass < LIGHTEST:
-        raise InvalidNumber(f"{link}: <mass> value is {mass!r} kg, too small for a body; give 0 for a mere frame.")
+        raise RobotModelError(f"{link}: <mass> value is {mass!r} kg, too small for a body; give 0 for a mere frame.")
     entries = element.child("inertia")
     if entries.element is None:  # a mere frame has none
         moments = np.full((3, 3), np.nan if mass else 0.0)
@@ -272,14 +274,14 @@ def _joint(at: _Part, name: str, links: dict[str, InertialDescription | None]) -
     if kind not in kinds:
         close = difflib.get_close_matches(kind, kinds, n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
-        raise UnsupportedJoint(f"{at} has the unknown type {kind!r}; allowed: {', '.join(kinds)}.{hint}")
+        raise RobotModelError(f"{at} has the unknown type {kind!r}; allowed: {', '.join(kinds)}.{hint}")
     ends = {}
     for end in ("parent", "child"):
         ends[end] = at.child(end, needed=True).text("link")
         if ends[end] not in links:
             close = difflib.get_close_matches(ends[end], links, n=1)
             hint = f" (did you mean {close[0]!r}?)" if close else ""
-            raise MalformedUrdf(
+            raise RobotModelError(
                 f"{at} names the {end} link {ends[end]!r}, which the file does not define{hint}",
                 f"; correct the name or add the link. Links: {', '.join(sorted(links))}",
             )
@@ -289,7 +291,7 @@ def _joint(at: _Part, name: str, links: dict[str, InertialDescription | None]) -
         if (at.problems.given.get("locked") or {}).get(name) != 0.0:
             seen = f"{at}: <axis> {axis.tolist()} has no direction"
             advice = "; give a non-zero, finite vector, or lock the joint."
-            at.problems.errors.append(InvalidNumber(seen, advice, {"locked": {name: 0.0}}))
+            at.problems.errors.append(RobotModelError(seen, advice, {"locked": {name: 0.0}}))
         directed = False
     limit, dynamics, mimic = (at.child(tag) for tag in ("limit", "dynamics", "mimic"))
     lower, upper = -math.inf, math.inf
@@ -304,7 +306,7 @@ def _joint(at: _Part, name: str, links: dict[str, InertialDescription | None]) -
     elif mimic.element is not None:
         ratio = mimic.number("multiplier", 1.0), mimic.number("offset", 0.0)
         if not np.isfinite(ratio).all():
-            raise InvalidNumber(f"{at}: <mimic> holds numbers that are not finite; correct multiplier and offset.")
+            raise RobotModelError(f"{at}: <mimic> holds numbers that are not finite; correct multiplier and offset.")
         mimics = Mimic(mimic.text("joint"), *ratio)
     return Joint(
         name=name,

@@ -14,14 +14,10 @@ from jaxtyping import Float
 from forcegp.atomic_files import write_bytes, write_json
 from forcegp.errors import (
     InvalidInput,
-    InvalidNumber,
-    MalformedUrdf,
     NonPhysicalInertia,
     RobotFileWarning,
-    UnknownJoint,
-    UnknownLink,
+    RobotModelError,
     UnknownName,
-    UnreadableRobotFile,
     required_extra,
 )
 from forcegp.robots.arguments import Problems
@@ -36,32 +32,32 @@ LARGEST_FILE = 16 << 20
 
 
 def read_text(path: str | Path) -> str:
-    """Decode a URDF file; :class:`UnreadableRobotFile` where there is none or it is not text."""
+    """Decode a URDF file; :class:`RobotModelError` where there is none or it is not text."""
     path = Path(path)
     if path.is_fifo():  # to open it would wait for a writer for ever
-        raise UnreadableRobotFile(f"{path}: is not a regular file; give the path of a URDF file.")
+        raise RobotModelError(f"{path}: is not a regular file; give the path of a URDF file.")
     try:
         if path.is_file() and path.stat().st_size > LARGEST_FILE:
-            raise UnreadableRobotFile(
+            raise RobotModelError(
                 f"{path}: holds {path.stat().st_size >> 20} MiB, more than the {LARGEST_FILE >> 20} MiB that a robot "
                 "file may have; give the URDF file of one robot."
             )
         data = path.read_bytes()
     except FileNotFoundError:
-        raise UnreadableRobotFile(f"{path}: no such file; give the path of a URDF file.") from None
+        raise RobotModelError(f"{path}: no such file; give the path of a URDF file.") from None
     except IsADirectoryError:
         inside = sorted(entry.name for entry in path.iterdir() if entry.suffix == ".urdf")
         hint = f" It holds {', '.join(inside)}." if inside else ""
-        raise UnreadableRobotFile(f"{path}: is a directory; give the path of the URDF file itself.{hint}") from None
+        raise RobotModelError(f"{path}: is a directory; give the path of the URDF file itself.{hint}") from None
     except OSError as error:
-        raise UnreadableRobotFile(
+        raise RobotModelError(
             f"{path}: cannot be read ({error.strerror}); check the path and its permissions."
         ) from None
     encoding = declared_encoding(data)
     try:
         return data.decode(encoding)
     except (ValueError, LookupError):  # codecs raise more than UnicodeDecodeError
-        raise UnreadableRobotFile(
+        raise RobotModelError(
             f"{path}: is not {encoding} text; save the URDF as UTF-8, or declare its encoding in the first line "
             '(<?xml version="1.0" encoding="..."?>).'
         ) from None
@@ -87,7 +83,7 @@ def replace_inertial(
     text: str, link: str, mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, *, source: str
 ) -> str:
     """URDF text with the ``<inertial>`` (kg, m, kg m^2, link axes) of ``link`` replaced or added, read back exactly."""
-    document, owner = _found(text, "link", link, UnknownLink(f"{source}: no link {link!r} in the URDF text."))
+    document, owner = _found(text, "link", link, UnknownName(f"{source}: no link {link!r} in the URDF text."))
     parts = "".join(inertial_parts(mass, center_of_mass, inertia))
     new = minidom.parseString(f"<inertial>{parts}</inertial>").documentElement
     old = _child(owner, "inertial")
@@ -97,7 +93,7 @@ def replace_inertial(
 
 def replace_dynamics(text: str, joint: str, values: Mapping[str, float], *, source: str) -> str:
     """URDF text with attributes ('damping', 'friction') of the ``<dynamics>`` of ``joint`` replaced or added."""
-    document, owner = _found(text, "joint", joint, UnknownJoint(f"{source}: no joint {joint!r} in the URDF text."))
+    document, owner = _found(text, "joint", joint, UnknownName(f"{source}: no joint {joint!r} in the URDF text."))
     dynamics = _child(owner, "dynamics") or owner.appendChild(document.createElement("dynamics"))
     for name, value in values.items():
         dynamics.setAttribute(name, repr(value))
@@ -224,7 +220,7 @@ IN_THE_FILE = (
 
 
 def read_robot_file(path: str | Path) -> str:
-    """URDF text of a file, .xacro expanded. Raises UnreadableRobotFile, MissingExtra, MalformedUrdf."""
+    """URDF text of a file, .xacro expanded. Raises RobotModelError, MissingExtra."""
     text = read_text(path)
     if Path(path).suffix != ".xacro":
         return text
@@ -233,7 +229,7 @@ def read_robot_file(path: str | Path) -> str:
         document: Any = xacro.process_file(str(path))  # a document of minidom; its annotation is too wide
         return document.toxml()
     except (Exception, SystemExit) as error:  # whatever the expressions of the file raise
-        raise MalformedUrdf(
+        raise RobotModelError(
             f"{path}: xacro could not expand it ({' '.join(str(error).split())}); correct it, or "
             "expand it where its packages are: xacro robot.xacro > robot.urdf."
         ) from None
@@ -245,7 +241,7 @@ def armature_path(path: str | Path) -> Path:
 
 
 def read_armature(path: str | Path) -> dict[str, float] | None:
-    """The rotor inertias that stand beside a URDF file; None where there are none. Raises InvalidNumber for others."""
+    """The rotor inertias that stand beside a URDF file; None where there are none, RobotModelError for others."""
     beside = armature_path(path)
     if not beside.is_file():
         return None
@@ -253,7 +249,7 @@ def read_armature(path: str | Path) -> dict[str, float] | None:
         given = json.loads(beside.read_text(encoding="utf-8"))
         return {str(joint): float(value) for joint, value in given.items()}
     except (OSError, ValueError, TypeError, AttributeError, RecursionError):
-        raise InvalidNumber(f"{beside}: holds no rotor inertia per joint; correct it, or remove it.") from None
+        raise RobotModelError(f"{beside}: holds no rotor inertia per joint; correct it, or remove it.") from None
 
 
 def warn_of_rotors(armature: Mapping[str, float], *, source: str, stacklevel: int) -> None:

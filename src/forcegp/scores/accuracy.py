@@ -40,10 +40,6 @@ STRETCHES = 20  # parts of the time in which models are compared by themselves
 CONSTANT = 1e-6  # of the largest standard deviation: less is rounding
 ROUNDING = 1e-9  # relative to the size of the truth: widths of intervals below it are none
 
-AT_THE_TOOL = ("tool-friction", "tool-forces", "contact-friction", "load-friction")
-TRUE_NAMES: dict[str, str] = dict.fromkeys(AT_THE_TOOL, "tool-friction")
-"""Component of a model -> what a Dataset calls that force (`Q_U.<name>`, `force.<name>`), where it is not the same."""
-
 
 @dataclass(frozen=True, eq=False)
 class PredictedRows:
@@ -72,7 +68,7 @@ class PredictedRows:
 def predict_rows(
     posterior: Posterior, dataset: Dataset, progress: Callable[[int, int], None] | None = None
 ) -> PredictedRows:
-    """Predict all rows, some at a time. The constraint is that of the Dataset's own system, else the model's."""
+    """Predict all rows, some at a time. The constraint is that of the Dataset's own system."""
     dataset = with_memory(dataset, posterior.model)
     device, held, done = posterior.model.robot.device, list(posterior.model.held_inputs), 0
     names: list[str] = []
@@ -80,7 +76,7 @@ def predict_rows(
     def predicted(q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, ...]:
         nonlocal done, names
         prediction, dynamics = posterior.predict(q, v, u), posterior.dynamics(q, v, u)
-        own = dynamics if dataset.model is None else dataset.model.to(device).dynamics(q, v, u)
+        own = dataset.model.to(device).dynamics(q, v, u)
         covariance, mean = prediction.covariance, prediction.mean
         assert covariance is not None, "predict computes the covariance unless asked not to"
         noise = prediction.noise_covariance
@@ -149,7 +145,7 @@ def row_scores(
     """
     rows = predict_rows(posterior, test, progress)
     mass = rows.mass if mass is None else mass
-    pairs = _pairs(rows, test, mass) | _components(posterior, test)
+    pairs = _pairs(rows, test, mass)
     table = {name: metrics(*each) for name, each in pairs.items() if each[0].shape == each[2].shape and each[2].size}
     table[ALL_JOINTS] = {"nlpd": [float(rows.negative_log_density.mean())]}
     measured = table[ACCELERATION]
@@ -240,43 +236,6 @@ def _spread(a: Rows) -> Float[np.ndarray, " nv"]:
     """Standard deviations of the acceleration; NaN where rounding is all there is, as of a cart across its wheels."""
     spread = a.std(axis=0)
     return np.where(spread > CONSTANT * spread.max(initial=0.0), spread, np.nan)
-
-
-def _components(posterior: Posterior, test: Dataset) -> dict[str, Pair]:
-    """Every component of the unknown force whose truth is known."""
-    if posterior.is_black_box or posterior.carries_known_forces:
-        return {}
-    named = true_names([name for name, *_ in posterior.trained.unknown.named(posterior.model.robot)], test)
-    if not named:
-        return {}
-
-    first = posterior.components(test.q[:1], test.v[:1], test.u[:1])
-    of = {"Q_U": "joint_force", "force": "point_force"}
-    wanted = [
-        (name, kind)
-        for name in named
-        for kind in of
-        if f"{kind}.{named[name]}" in test.truth and getattr(first[name], of[kind]) is not None
-    ]
-
-    def forces(q: Tensor, v: Tensor, u: Tensor, _: Tensor) -> tuple[Tensor, ...]:
-        found = posterior.components(q, v, u)
-        each = [getattr(found[name], of[kind]) for name, kind in wanted]
-        return tuple(x for force in each for x in (force.mean, force.variance))
-
-    arrays, where = in_blocks(test, forces, posterior.model.robot.device), {"Q_U": "the joints", "force": "its point"}
-    return {
-        f"{name} at {where[kind]}": (mean, variance, test.truth[f"{kind}.{named[name]}"])
-        for (name, kind), mean, variance in zip(wanted, arrays[::2], arrays[1::2], strict=True)
-    }
-
-
-def true_names(components: Sequence[str], dataset: Dataset) -> dict[str, str]:
-    """Component -> what the truth of the Dataset calls it; without those that the truth does not hold alone."""
-    pairs = [(name, kept) for name in components for kept in (TRUE_NAMES.get(name, name), name)]
-    found = {name: kept for name, kept in pairs if {f"Q_U.{kept}", f"force.{kept}"} & set(dataset.truth)}
-    claimed = list(found.values())
-    return {name: kept for name, kept in found.items() if claimed.count(kept) == 1}
 
 
 def _by_stretch(predicted: PredictedRows, test: Dataset, forces: Rows) -> dict[str, list[float | None]]:
@@ -372,38 +331,6 @@ def poor_scores(posterior: Posterior, dataset: Dataset, table: Table) -> Iterato
         )
 
 
-STATES = 20  # training states that are looked at; each alone decides
-INVISIBLE = 1e-7
-"""Singular values of H B below this, relative to the largest one, are zero: accelerations show nothing there."""
-
-
-def normal_force_rests_on_prior(posterior: Posterior) -> bool:
-    """Whether processes of the model can press on a contact together without moving the robot.
-
-    True where, at some training state, processes of the same inputs have a combination f with H B f = 0 that changes
-    lambda: any function of those inputs may then be added to the normal force, and accelerations show nothing of it.
-    So it is for a free force at every joint, not for friction curves that each have an input of their own.
-    """
-    if not posterior.trained.contacts:
-        return False
-    training = posterior.training
-    q, v, u = (x[:STATES] for x in (training.q, training.v, training.u))
-    with torch.no_grad():
-        dynamics = posterior.trained.dynamics(q, v, u)
-        forces = posterior.trained.unknown
-        B, features = forces.direction(dynamics), forces.features(dynamics)
-        moving, pressing = dynamics.H @ B, dynamics.multiplier_map().matrix @ B
-        for z in features:
-            alike = [k for k, other in enumerate(features) if torch.equal(z, other)]
-            if (z == z[:1]).all():  # constant, also without any feature
-                alike = alike[:1]
-            here, there = moving[..., alike], pressing[..., alike]
-            unseen = torch.eye(len(alike)).to(B) - torch.linalg.pinv(here, rtol=INVISIBLE) @ here
-            if ((there @ unseen).abs().amax((-2, -1)) > INVISIBLE * there.abs().amax((-2, -1))).any():
-                return True
-    return False
-
-
 def overlaps(posterior: Posterior, dataset: Dataset) -> Iterator[Doubt]:
     """Rows that training and test share, and contacts that differ."""
     repeated = repeated_rows(tuple(getattr(posterior.training, name).cpu().numpy() for name in "qvu"), dataset)
@@ -414,7 +341,7 @@ def overlaps(posterior: Posterior, dataset: Dataset) -> Iterator[Doubt]:
             f"row {repeated[0]}); where they are the same rows, these scores flatter the model: test on another one.",
         )
     own, model = dataset.model, posterior.model
-    differ = own is not None and (own.contacts, own.baumgarte) != (model.contacts, model.baumgarte)
+    differ = (own.contacts, own.baumgarte) != (model.contacts, model.baumgarte)
     if differ and not posterior.is_black_box:  # which has no contacts, and can be carried nowhere
         yield look(
             about="contacts",

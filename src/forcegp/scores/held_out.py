@@ -11,15 +11,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
+from jaxtyping import Bool
 
 from forcegp.data import Dataset, require_disjoint
 from forcegp.data.views import EVEN_STEPS, RecordedMotions, recorded_motions
 from forcegp.errors import InvalidInput, require_type, usable_arguments
 from forcegp.posterior import Posterior, observing
-from forcegp.posterior.rollout import Rollout
-from forcegp.robots.manifold import ConfigurationSpace
 from forcegp.scores.accuracy import Table
 from forcegp.summary import plain
 
@@ -250,9 +247,9 @@ def motion_scores(
         motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, integrator=integrator, baumgarte=None
     )
     recorded = torch.as_tensor(motions.q.copy(), device=rollout.q.device)
-    off = apart_from(recorded, rollout.q, rollout.space)
+    off = rollout.steps_to(recorded)
     found = {"position": off, "velocity": torch.as_tensor(motions.v.copy(), device=rollout.q.device) - rollout.v}
-    inside = inside_interval(rollout, recorded)
+    inside = None if rollout.intervals is None else rollout.contains(recorded)
     table: Table = {}
     facts: dict[str, Any] = {"horizons": list(held_out.horizons), "motions": len(motions.q), "integrator": integrator}
     facts |= {"dt": motions.dt, "diverged": [], "squared": []}
@@ -267,42 +264,6 @@ def motion_scores(
         facts["diverged"].append(int((~lasting).sum()))
         facts["squared"].append(plain(off[:, row].square().mean(-1).cpu().numpy()))
     return table, facts
-
-
-def apart_from(q0: Tensor, q1: Tensor, space: ConfigurationSpace) -> Float[Tensor, "*batch nv"]:
-    """The way from q0 to q1: their difference, on the manifold where a base moves; NaN where one of them is."""
-    if space.is_vector_space:
-        return q1 - q0
-    lost = torch.isnan(q0).any(-1) | torch.isnan(q1).any(-1)
-    neutral = space.neutral().to(q1)
-    way = space.difference(*(torch.where(lost[..., None], neutral, q) for q in (q0, q1)))
-    return torch.where(lost[..., None], torch.nan, way)
-
-
-def interval_about(rollout: Rollout, q0: Tensor) -> tuple[Float[Tensor, "*batch nv"], Float[Tensor, "*batch nv"]]:
-    """Ends of the 95 % interval of q as ways from q0."""
-    space = rollout.space
-    if space.is_vector_space:
-        low, high = rollout.interval()
-        return low - q0, high - q0
-    if rollout.intervals is None:
-        levels = torch.tensor(INTERVAL, dtype=q0.dtype, device=q0.device)
-        assert rollout.samples is not None, "without them there is no interval"
-        low, high = torch.quantile(apart_from(q0, rollout.samples.q, space), levels, dim=0)
-        return low, high
-    # what steps from the motion change of the way to it: entries of a step are as if independent
-    way, (_, wide) = apart_from(q0, rollout.q, space), rollout.interval()
-    half = (space.chart_matrix(way).square() * wide.square()[..., None, :]).sum(-1).sqrt()
-    return way - half, way + half
-
-
-def inside_interval(rollout: Rollout, recorded: Tensor) -> Float[Tensor, "motions rows nv"] | None:
-    """Whether the recorded q lies in the 95 % interval, NaN after a divergence; None where there is no interval."""
-    if rollout.samples is None and rollout.intervals is None:
-        return None
-    low, high = interval_about(rollout, rollout.q)
-    off = apart_from(rollout.q, recorded, rollout.space)
-    return torch.where(torch.isnan(high - low), torch.nan, ((low <= off) & (off <= high)).to(off))
 
 
 def _step(recording: Dataset) -> float:

@@ -116,8 +116,6 @@ def score(
             write(scores, Path(folder))
         return scores
     robot = log.model if model is None else model
-    if robot is None:
-        raise InvalidInput("the log does not carry its robot; give model=Model(robot, contacts).")
     splits = split_named(log, split or "auto") if split is None or isinstance(split, str) else tuple(split)
     settings: Any = (points, horizons, starts, integrator, identification, restarts, iterations)
     experiment = Experiment(log, recording or log, robot, splits, *settings)

@@ -27,9 +27,8 @@ from forcegp.forces import (
 from forcegp.mechanics import Contact, Held, LoopClosure
 from forcegp.model import Model
 from forcegp.posterior.posterior import Posterior
-from forcegp.scores.accuracy import ACCELERATION, predict_rows, true_names
+from forcegp.scores.accuracy import ACCELERATION, predict_rows
 from forcegp.scores.figures import style
-from forcegp.scores.held_out import apart_from, interval_about
 from forcegp.scores.page import unit_of
 from forcegp.scores.scores import Scores
 
@@ -163,11 +162,10 @@ def _draw_curve(axes: Axes, posterior: Posterior, panel: CurvePanel, dataset: Da
 
 def _truth(posterior: Posterior, dataset: Dataset, panel: CurvePanel) -> tuple[np.ndarray, np.ndarray] | None:
     """Velocity and true friction of a joint, with its laws, at rows of the Dataset; None where unknown."""
-    components = [name for name, *_ in posterior.trained.unknown.named(posterior.model.robot)]
-    key = f"Q_U.{true_names(components, dataset).get(panel.component)}"
+    key = f"Q_U.{panel.component}"
     if posterior.carries_known_forces or panel.joint is None or key not in dataset.truth:
         return None
-    rows, model = dataset.rows(evenly(dataset, TRUE_POINTS)), dataset.model or posterior.model
+    rows, model = dataset.rows(evenly(dataset, TRUE_POINTS)), dataset.model
     at = rows.v[:, panel.joint]
     return at, law_forces(model, panel.joint, at) - rows.truth[key][:, panel.joint]
 
@@ -248,7 +246,7 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
     with torch.no_grad():
         multiplier, dynamics = posterior.predict(q, v, u).multiplier, posterior.dynamics(q, v, u)
         assert multiplier is not None, "models with forces predict lambda"
-        own = dynamics if rows.model is None else rows.model.dynamics(q, v, u)
+        own = rows.model.dynamics(q, v, u)
         size, other = (torch.linalg.vector_norm(each.normals, dim=-1).numpy() for each in (dynamics, own))
         mean, spread = size * multiplier.mean.numpy(), style.QUANTILE * size * multiplier.std.numpy()
         nominal, truth = size * dynamics.multiplier_map().offset.numpy(), rows.truth.get("lambda")
@@ -298,7 +296,7 @@ def motion_bands_figure(
     rollout = posterior.rollout(q0, v0, u, recorded.dt, integrator="rk4", samples=samples)
     half_widths = None
     if calibrated or samples:
-        low, high = interval_about(rollout, rollout.q)
+        low, high = rollout.interval()
         half_widths = 0.5 * (high - low).cpu().numpy()
     joints = min(rows.nv, LARGEST_GRID)
     columns = 1 if joints < 3 else 2 if joints < 9 else 3
@@ -306,7 +304,7 @@ def motion_bands_figure(
     names, units = style.short_joint_names(rows.joint_names), style.joint_units(rows, "q")
     panels = style.joint_panels(figure, joints, columns)
     there = torch.as_tensor(recorded.q.copy(), device=rollout.q.device)
-    signed = apart_from(there, rollout.q, rollout.space).cpu().numpy()
+    signed = -rollout.steps_to(there).cpu().numpy()
     for joint, (axes, lowest) in enumerate(panels):
         axes.axhline(0.0, color="#B8BCC2", linewidth=0.8)
         for motion, row in enumerate(recorded.rows):
