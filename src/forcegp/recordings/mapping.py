@@ -329,7 +329,12 @@ def _says(signal: str, around: tuple[str, str]) -> bool:
 TOKEN = (
     r"`(?P<quoted>[^`]*)`|(?P<name>%s)|(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?!\w))|(?P<word>[^\s+*/`()-]+)"
 )
-OPERATIONS = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv}
+OPERATIONS: dict[type[ast.operator], Any] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+}
 MOST_PARTS = 500
 
 
@@ -405,4 +410,5 @@ def _value(node: ast.expr, words: Sequence[Any]) -> Any:
             return _value(operand, words) if isinstance(sign, ast.UAdd) else -_value(operand, words)
         case ast.BinOp(left=left, op=sign, right=right) if type(sign) in OPERATIONS:
             return OPERATIONS[type(sign)](_value(left, words), _value(right, words))
-    raise ValueError("it has more than columns, numbers and + - * /")
+        case _:
+            raise ValueError("it has more than columns, numbers and + - * /")
