@@ -11,6 +11,7 @@ import pytest
 from forcegp import Dataset, Robot, load_posterior
 from forcegp.cli.auto import best_sentence
 from forcegp.cli.main import parse_arguments
+from forcegp.cli.terminal import Terminal
 from forcegp.evidence import motion_residuals
 from forcegp.scores import Scores
 from forcegp.simulation import FreeArmConfig
@@ -118,7 +119,7 @@ def test_the_printed_command_keeps_every_option():
     others += " --forces given --forces gp:joint,viscous --out here"
     words = ["auto", "a.txt", "b.txt", *columns.split(), *others.split()]
     command = parse_arguments(words)
-    mapping = command.columns.mapped([], None)
+    mapping = command.columns.mapped([], Terminal(json=False))
     again = parse_arguments(shlex.split(command._command(mapping))[1:])
     assert again == command
 

@@ -50,6 +50,7 @@ def test_a_model_becomes_a_program(forcegp, folder):
     assert "arm_mean" not in shown.stdout  # nothing was compared
 
 
+@pytest.mark.usefixtures("unchecked")  # explicit steps add and scale CasADi's expressions as they do tensors
 def test_a_model_becomes_casadi_functions(forcegp, folder):
     casadi = pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
     words = ("export", "run", "--to", "casadi", "--out", "planner", "--steps", 0.02, "--integrator", "rk4")

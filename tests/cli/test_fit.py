@@ -1,6 +1,7 @@
 """`forcegp fit`: forces and evidence by name, what is written and printed, and what is refused."""
 
 import json
+import math
 import re
 
 import numpy as np
@@ -11,7 +12,9 @@ from tests.fit.test_motion_fit import line, recording
 from tests.posterior.arm import arm_data
 
 from forcegp import Dataset, JointFriction, Model, Robot, Viscous, load_posterior
+from forcegp.cli.fit import estimates_table
 from forcegp.evidence import motion_residuals
+from forcegp.posterior import Estimate
 from forcegp.simulation import FreeArmConfig
 from forcegp.simulation.free_arms import simulate_free_arm
 
@@ -143,3 +146,10 @@ WRONG = [
 def test_what_makes_no_sense_is_one_line(folder, monkeypatch, capfd, words, message):
     monkeypatch.chdir(folder)
     assert_refused(f"fit arm.h5 {words} --noise 0.1 --no-checks --out new", message, folder, capfd)
+
+
+def test_decimals_show_two_digits_of_the_interval():
+    cases = {"a": (0.123456, 0.0123), "b": (12.3456, 1.23), "c": (1234.56, 123.0), "d": (2.0, 0.0), "e": (0.0, 0.0)}
+    entries = {k: Estimate(k, "1", value, std, value, math.inf, "log", "") for k, (value, std) in cases.items()}
+    shown = [str(cell) for cell in estimates_table("", entries).columns[2].cells if str(cell)]
+    assert shown == ["0.123", "12.3", "1235", "2.0000", "0.0000"]

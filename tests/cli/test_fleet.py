@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from forcegp.cli.fleet import fleet
+from forcegp.cli.fleet import fleet, numbers_of
 from forcegp.cli.main import main
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
+from forcegp.posterior import Estimate
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 pytestmark = pytest.mark.filterwarnings("ignore::forcegp.errors.DataWarning", "ignore::forcegp.errors.DataWarning")
@@ -63,6 +64,17 @@ def test_each_log_is_a_row_and_one_that_fails_says_so(listed, capsys):
     assert main(words("out")) == 0
     assert "5 of 5 logs are done" in capsys.readouterr().out
     assert Path("out/robot1/model.json").stat().st_mtime_ns == written
+
+
+def test_an_estimate_is_one_column():
+    estimate = Estimate("viscous.elbow", "Nms/rad", 0.4, 0.1, 0.0, 1.0, "log", "")
+    content = {
+        "estimates": {estimate.name: estimate.to_dict()},
+        "value": {"interval": 3, "value": 2},
+        "settings": {"a": 1},
+    }
+    found = {"estimates.viscous.elbow": 0.4, "value.interval": 3, "value.value": 2}
+    assert numbers_of(content) == found
 
 
 def bytes_of_the_first(listed: Path) -> bytes:

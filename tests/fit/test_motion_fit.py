@@ -165,6 +165,11 @@ def test_support_of_a_function_is_its_evidence_over_none(along_the_law):
 
     expected = density(slice(None)) - density(slice(size - count))
     torch.testing.assert_close(found, expected, rtol=1e-6, atol=0.0)
+    # all weights equal and told by the rows: the scale is what they are, less with twice the step, and within bounds
+    for weight, scale in ((1.4, 1.4), (0.35, 0.175), (45.0, 30.0), (1e-3, 1e-3)):
+        x = torch.full((size,), weight, dtype=torch.float64)
+        scaled = unknowns.rescaled(x, 1e12 * torch.eye(size, dtype=torch.float64)).scales
+        assert float(scaled[0]) == pytest.approx(scale, rel=1e-6)
 
 
 def test_what_is_stored_predicts_the_same(beyond_the_law, tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from tests.robots.robot_models import loaded
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, RobotFileWarning
 from forcegp.evidence import Accelerations, Torques, base_parameters, motion_residuals, standard_parameters
+from forcegp.evidence.least_squares import Fit
 from forcegp.fit import fit
+from forcegp.fit.physical import _with_noise_in_both
 from forcegp.forces import (
     Actuation,
     Body,
@@ -218,3 +221,16 @@ def test_rotor_inertias_are_whole_in_reports_and_in_files(tmp_path):
     )
     q, v, _ = (torch.tensor(np.array(x)) for x in (data.q, data.v, data.u))
     torch.testing.assert_close(written.mass_matrix(q), found.model.mass_matrix_at(found.model.robot.kinematics(q, v)))
+
+
+@pytest.mark.usefixtures("unchecked")  # equations are only what the searches ask them for
+def test_searches_beside_noise_of_accelerations_end_where_little_is_left_to_gain():
+    one, gains = np.ones(1), iter([5.0, 1.0, 0.06, 0.03, 0.0])  # nats, of two numbers
+    levels = SimpleNamespace(scaled=lambda factor: None)
+    equations = SimpleNamespace(levels=lambda *_: levels, parts=[], measured=[], a=one[None], whitened=max)
+
+    def search(*_, start, **more) -> Fit:
+        return Fit(start, one[None], np.zeros((1, 1, 2)), one, np.eye(2), 1, True, expected=next(gains))
+
+    found, _ = _with_noise_in_both(equations, search, np.zeros(2), lambda *_: None)
+    assert (found.expected, found.evaluations, found.settled) == (0.03, 4, True)

@@ -224,6 +224,7 @@ def test_compiled_motions_carry_the_state_along(integrator, lugre_log):
     torch.testing.assert_close(posterior.rollout(*given[:2], other, DT, integrator=integrator).q, again.q)
 
 
+@pytest.mark.usefixtures("unchecked")  # explicit steps add and scale CasADi's expressions as they do tensors
 def test_programs_carry_the_state_along(lugre_log, tmp_path):
     casadi = pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
     law = Coulomb([0.8, 0.5, 0.3], 0.1, sigma=300.0, memory=("pan", "bend"))

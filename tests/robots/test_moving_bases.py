@@ -7,6 +7,7 @@ import torch
 
 from forcegp.errors import InvalidInput
 from forcegp.robots import Robot
+from forcegp.robots.manifold import ConfigurationSpace
 
 LIMBS = """<robot name="crab">
   <link name="trunk"><inertial><origin xyz="0.02 -0.03 0.05" rpy="0.2 0.1 -0.3"/><mass value="6"/>
@@ -141,6 +142,12 @@ def test_integrate_and_difference(pair):
         other[turn] *= -1.0  # the same turn
         assert min(inside, torch.linalg.vector_norm(moved[k] - torch.as_tensor(other))) < 1e-11
         close(back[k], pin.difference(pair.model, q, flipped[k])[pair.to_v], 10.0)
+
+
+def test_positions_of_a_fixed_base_add_up():
+    space, (q, step) = ConfigurationSpace(2), torch.rand(2, 3, 2, dtype=torch.float64)
+    assert torch.equal(space.integrate(q, step), q + step)
+    assert torch.equal(space.difference(q, step), step - q)
 
 
 def test_derivatives_of_forward_dynamics_on_the_manifold(pair):

@@ -146,7 +146,7 @@ def numbers_of(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, value in content.items():
         if isinstance(value, Mapping):
-            if "value" in value and "interval" in value:
+            if "interval_95" in value:
                 found[f"{prefix}{name}"] = value["value"]
             elif name != "settings":
                 found |= numbers_of(value, f"{prefix}{name}.")

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -52,6 +52,7 @@ PLAIN_SECONDS = 10.0  # between two lines about progress where there is no termi
 UNLIMITED = 10_000  # columns of a terminal that cuts nothing
 
 
+@runtime_checkable
 class ProgressCallback(Protocol):
     """Called as `report(done, total)`, if wished with a note for people."""
 

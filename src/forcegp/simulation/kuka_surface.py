@@ -118,7 +118,7 @@ class PointFriction:
         tangential = velocity - (normal @ velocity) * normal
         return -self.viscous * velocity, -self._per_velocity(np.sqrt(tangential @ tangential)) * tangential
 
-    def _per_velocity(self, speed: Float[np.ndarray, "*batch"] | float) -> Float[np.ndarray, "*batch"]:
+    def _per_velocity(self, speed: Float[np.ndarray, "*batch"] | float) -> Float[np.ndarray, "*batch"] | float:
         level = self.coulomb + (self.static - self.coulomb) * np.exp(-((speed / self.breakaway_velocity) ** 2))
         return level / np.sqrt(speed**2 + self.smoothing**2)
 
