@@ -110,7 +110,7 @@ def test_feet_whose_stance_no_column_states(folder, forcegp):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (f"{DOG} --feet front_left_foot", "--feet needs --robot ROBOT.urdf"),
+        (f"{DOG} --feet front_left_foot", "give --robot ARM.urdf, or --identified"),
         (f"{DOG} --feet front_left_foot --identified drone.json", "brings its contacts along; leave --feet out"),
         (f"{DOG} --robot dog.urdf --feet front_left_foot", "base='floating'"),
         ("auto flight.csv --out x", "give --robot ARM.urdf, or --identified"),
