@@ -19,7 +19,7 @@ from forcegp.data.strokes import encoder_step, strokes, turning_points
 from forcegp.errors import DataWarning, InvalidInput
 from forcegp.evidence import motion_residuals
 from forcegp.forces import Coulomb, GearFriction, LoadFriction, Stribeck, Viscous
-from forcegp.forces.presliding import after_step, after_strokes, forgotten
+from forcegp.forces.presliding import after_step, after_strokes
 from forcegp.noise import Noise
 from forcegp.posterior import casadi_function
 
@@ -92,7 +92,7 @@ def test_it_is_smooth_in_sigma_and_bounded():
     assert torch.autograd.gradcheck(lambda s: after_strokes(past, s), sigma)
     assert float(after_strokes(past, SIGMA).abs().max()) < 1.0
     between = after_strokes(past, SIGMA, 1.0) - after_strokes(past, SIGMA, -1.0)
-    torch.testing.assert_close(between, 2.0 * forgotten(past, SIGMA))  # what a start of either sign leaves
+    torch.testing.assert_close(between, 2.0 * torch.exp(-SIGMA * past.abs().sum(-1)))  # what a start leaves
 
 
 def test_a_thinned_log_has_the_same_past():
@@ -300,6 +300,8 @@ def test_controllers_and_monitors_see_the_past(lugre_log):
     torch.testing.assert_close(posterior.predict(q, v, np.append(u, z)).mean, torch.tensor(a), rtol=1e-7, atol=1e-7)
     with pytest.raises(InvalidInput, match=r"this model remembers: give memory=\(presliding of pan"):
         predictor.inverse_dynamics(q, v, a)
+    noisy = ComputedTorque(predictor, stiffness=100.0, position_noise=1e-3)
+    assert noisy.past.least == 1e-3
     controller, seen = ComputedTorque(predictor, stiffness=100.0), with_memory(test, posterior.model)
     for k in range(300):
         asked = controller(test.q[k], test.v[k], test.q[k], test.v[k], test.a[k])

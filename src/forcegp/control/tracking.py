@@ -164,17 +164,20 @@ class ComputedTorque(TrackingController):
     * model: `posterior.predictor()`, or a `Model` without anything learned, which takes longer. Gains as
       `TrackingController` has them.
     Forces are those at (q, v_d): at the measured velocity dry friction would follow noise and overshoot. Friction that
-    remembers has the state of the positions that were seen (`past`).
+    remembers has the state of the positions that were seen (`past`); steps of at most `position_noise` (rad or m) are
+    those of the encoder, which would wear it down.
     """
 
-    def __init__(self, model: Moving, **settings: Any) -> None:
+    def __init__(self, model: Moving, *, position_noise: float = 0.0, **settings: Any) -> None:
         known = model_of(model)
+        if not (isinstance(position_noise, int | float) and 0.0 <= position_noise < float("inf")):
+            raise InvalidInput(f"position_noise is {position_noise!r}; give rad (m) of at least 0.")
         if known.contacts:
             raise InvalidInput(
                 "ComputedTorque moves a robot without contacts, and this model has one; use HybridForce, or "
                 "posterior.with_contacts([])."
             )
-        self.model, self.past = model, Past(known)
+        self.model, self.past = model, Past(known, position_noise)
         super().__init__(known.robot, **settings)
 
     @override

@@ -1,4 +1,4 @@
-"""Which parts of gear friction a log shows, joint by joint: memory, load, speed, direction, by stretches held out."""
+"""Which parts of gear friction a log shows, joint by joint, by stretches held out: memory, load, speed, breakaway."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -27,10 +27,3 @@ def after_strokes(
     for step in strokes.flip(-1).unbind(-1):
         z = after_step(z, step, sigma)
     return z
-
-
-def forgotten(
-    strokes: Float[Tensor, "*batch nv strokes"], sigma: Float[Tensor, "*#batch nv"]
-) -> Float[Tensor, "*batch nv"]:
-    """The share of the state that is still that before these strokes: 1 for a joint that has not moved."""
-    return torch.exp(-sigma * strokes.abs().sum(-1))
