@@ -83,7 +83,7 @@ def test_the_answer_holds_what_was_simulated(answered):
     _, content = answered
     values = content["identified"]["parameters"]
     for joint in ("upper_hinge", "lower_hinge"):
-        assert values[f"stribeck.level.{joint}"]["value"] == pytest.approx(0.4, rel=0.05)  # 0.02 of 20 Nm
+        assert values[f"gear.level.{joint}"]["value"] == pytest.approx(0.4, rel=0.05)  # 0.02 of 20 Nm
         assert values[f"viscous.{joint}"]["value"] == pytest.approx(0.2, rel=0.1)
     answer = "\n".join(content["answer"])
     assert "payload: none" in answer

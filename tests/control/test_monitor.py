@@ -209,7 +209,7 @@ def test_a_log_becomes_a_table_of_contacts(workshop, monkeypatch, tmp_path, caps
     assert {"contacts.csv", "contacts.json", "contacts.png", "config.json", "SHA256SUMS"} == {
         f.name for f in out.iterdir()
     }
-    assert json.loads((out / "config.json").read_text())["bandwidth"] == 5.0
+    assert json.loads((out / "config.json").read_text())["bandwidth"] == 2.0
 
 
 @pytest.mark.parametrize(

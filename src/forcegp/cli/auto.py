@@ -21,7 +21,7 @@ import forcegp.report
 import forcegp.scores
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json
 from forcegp.cli.command import CONFIG, LOG, Command, options_of, unless_given
-from forcegp.cli.fit import DRY, LAWS, payload_dict, with_payload, write_estimates
+from forcegp.cli.fit import LAWS, payload_dict, with_payload, write_estimates
 from forcegp.cli.logs import ColumnOptions, FilterOptions, prepared_rows, resolved, stance_text
 from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal, doubts_table, facts
@@ -134,7 +134,8 @@ class Auto(Command):
             **{name: value for name, value in scores.to_dict().items() if name in SCORES},
             "code": self._code(terminal, posterior),
         }
-        answer, best = answer_lines(content, dataset, identified, held, scores), best_sentence(scores, dataset)
+        answer = answer_lines(content, dataset, recording, identified, held, scores)
+        best = best_sentence(scores, dataset)
         content |= {"answer": [": ".join(line) for line in answer], "best": best}
         self._write_report(terminal, posterior, recording, content, answer, scores)
         content |= {"cpu_seconds": time.process_time() - begin}
@@ -285,9 +286,16 @@ def default_models(model: forcegp.Model) -> tuple[str, ...]:
 
 
 def answer_lines(
-    content: Mapping[str, Any], dataset: forcegp.Dataset, identified: Any, held: str, scores: forcegp.scores.Scores
+    content: Mapping[str, Any],
+    dataset: forcegp.Dataset,
+    recording: forcegp.Dataset,
+    identified: Any,
+    held: str,
+    scores: forcegp.scores.Scores,
 ) -> list[tuple[str, str]]:
     """What was found, in ten lines."""
+    from forcegp.fit.friction_choice import friction_in_words  # PyTorch is not needed for a page of help
+
     values, robot, best = identified.estimates, identified.model.robot, scores.recommended
     assert best is not None, "a model was scored"
     done, prepared, seconds, out = content["import"], content["preparation"], content["seconds"], content["out"]
@@ -314,7 +322,7 @@ def answer_lines(
         return ", ".join(f"{values[f'{field}.{name}'].value:.3g}" for name in joints)
 
     of_joints = [
-        ("dry friction", f"{each(f'{DRY}.level')} {force}, near rest {each(f'{DRY}.breakaway')} more"),
+        ("dry friction", friction_in_words(identified.model, recording, force)),
         ("viscous", f"{each('viscous')} {force} per {q}/s"),
         ("rotors", f"{each('rotor')} {inertia}"),
     ] if joints else []  # fmt: skip

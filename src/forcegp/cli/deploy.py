@@ -121,7 +121,7 @@ class Monitor(Command):
     searched, or another log."""
     false_alarms: Annotated[float, arg(metavar="N")] = 0.1
     """Accepted false alarms per hour."""
-    bandwidth: Annotated[float, arg(metavar="HZ")] = 5.0
+    bandwidth: Annotated[float, arg(metavar="HZ")] = 2.0
     """Cut-off of the low-pass filter on the torques. A higher one is faster, a lower one finds smaller forces."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:

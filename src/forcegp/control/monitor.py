@@ -65,7 +65,7 @@ class ContactMonitor:
     and a monitor that was not calibrated, DatasetError for free motion that is too short.
     """
 
-    def __init__(self, model: Moving, *, dt: float, bandwidth: float = 5.0) -> None:
+    def __init__(self, model: Moving, *, dt: float, bandwidth: float = 2.0) -> None:
         self.model, plain = model, model_of(model)
         plain.robot.require_vectors("monitors of contacts")
         if plain.contacts:

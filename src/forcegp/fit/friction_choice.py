@@ -7,27 +7,29 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from torch import Tensor
 
-from forcegp.data import Dataset, with_strokes
+from forcegp.data import Dataset, evenly, with_memory, with_strokes
+from forcegp.data.views import tensors
 from forcegp.evidence import Torques, motion_residuals
 from forcegp.fit.physical import fit_physical
-from forcegp.forces import Coulomb, DirectionalFriction, GearFriction, LogNormal, Normal, Viscous
+from forcegp.forces import Coulomb, DirectionalFriction, DryFriction, GearFriction, LogNormal, Normal, Viscous
 from forcegp.forces.presliding import after_strokes
 from forcegp.mechanics import State
 from forcegp.model import Model
 
-PARTS = ("memory", "factor", "root", "breakaway", "direction")
+PARTS = "memory", "factor", "root", "direction", "breakaway"
 """Of `GearFriction`, and of the law beside it."""
 BLOCKS = 10
 """Stretches of the log, each predicted from the others."""
-CLEARLY = 1.5
-"""Standard errors over the stretches by which a part must lower the squared residual."""
-LEAST = 0.01
-"""Share of it by which it must do so."""
-COLUMNS = 7
-"""Of each joint: viscous, dry, load, root of speed, breakaway, direction, a constant."""
-FALLS = 0.3
-"""Of the root mean square velocity, what the breakaway falls over here; a fit finds it."""
+CLEARLY, LIKELY = 1.5, 0.5
+"""Standard errors over the stretches by which a part must lower the squared residual; and memory, which gears have."""
+LEAST = 0.02
+"""Share of it by which it must do so; for memory as much less."""
+FALLS = 0.05, 0.1, 0.2, 0.4
+"""Of the root mean square velocity, what a breakaway may fall over here; a fit finds the rest."""
+COLUMNS = 6 + len(FALLS)
+"""Of each joint: viscous, dry, load, root of speed, direction, a constant, and breakaways."""
 HIGHEST = 0.5
 """Largest share of the load that friction takes: beyond it something else is explained."""
 REVERSALS = 6
@@ -36,8 +38,12 @@ WIDTHS = tuple(np.geomspace(0.003, 1.0, 11).tolist())
 """Of the smooth sign, over the root mean square velocity."""
 SEEN, RIDGE = 0.003, 1e-7
 """Of the torque of bodies, the least that counts over the largest; and what is added to the normal equations."""
+FINER = 3
+"""Times that the distance of widths, and of stiffnesses, is halved around the best one."""
 PASSES = 2
 """Over the joints."""
+MOST_ROWS = 10_000
+"""Of the log that are asked, evenly spread: each knows its past."""
 FIRST_ROWS = 2000
 """Rows of the first fit."""
 STIFFNESS = tuple(np.geomspace(10.0, 10000.0, 13).tolist())
@@ -75,11 +81,13 @@ def choose_friction(model: Model, log: Dataset, parts: Sequence[str] = PARTS) ->
     viscous and dry friction of all joints, on parameters of bodies, which may be off, and on the parts. At each joint
     the part that helps most is added while it helps by more than `CLEARLY` standard errors over the stretches.
     """
+    log = with_strokes(log)
+    log = log.rows(evenly(log, MOST_ROWS))
     friction = (Viscous, Coulomb, GearFriction, DirectionalFriction)
     bare = replace(model, forces=tuple(force for force in model.forces if not isinstance(force, friction)))
     torque = motion_residuals(replace(log, strokes=None), bare)[0]
     state = bare.state(*(torch.as_tensor(np.array(x), device=bare.robot.device) for x in (log.q, log.v, log.u)))
-    strokes = with_strokes(log).strokes
+    strokes = log.strokes
     regression = _Regression(model, log, state, torque)
     single, few = np.isin(log.joint_names, bare.robot.single_joint_names), []
     moving = [j for j in np.flatnonzero(single).tolist() if log.v[:, j].any()]
@@ -95,7 +103,7 @@ def choose_friction(model: Model, log: Dataset, parts: Sequence[str] = PARTS) ->
             regression.choose(j, parts)
     chosen = [regression.parts.get(j, ()) for j in range(len(log.joint_names))]
     parts_found, ratios = tuple(chosen), tuple(regression.ratios)
-    sigma, falls = regression.sigma, tuple(regression.falls.tolist())
+    sigma, falls = regression.sigma, tuple((regression.speed * np.array(FALLS)[regression.fall]).tolist())
     return FrictionChoice(tuple(log.joint_names), parts_found, ratios, tuple(few), sigma, falls)
 
 
@@ -135,13 +143,11 @@ class _Regression:
         self.target = np.stack([np.einsum("nji,nj->ji", self.bodies[k], self.torque[k]) for k in rows])
         self.squares = np.stack([(self.torque[k] ** 2).sum(0) for k in rows])
         self.rows = rows
-        self.falls = FALLS * np.sqrt((self.v**2).mean(0))
-        self.signs: list[dict[float, Sums]] = []
-        for j in range(self.nv):
-            speed = float(np.sqrt((self.v[:, j] ** 2).mean())) or 1.0
-            self.signs.append({-width: self._sums(j, np.tanh(self.v[:, j] / (width * speed))) for width in WIDTHS})
-        self.at = [-WIDTHS[1]] * self.nv
-        """The sign of each joint: minus a width, or the stiffness of a memory."""
+        self.speed = np.maximum(np.sqrt((self.v**2).mean(0)), 1e-12)
+        self.past: dict[int, torch.Tensor] = {}
+        self.signs = [{-width: self._sums(j, -width) for width in WIDTHS} for j in range(self.nv)]
+        self.at, self.fall = [-WIDTHS[1]] * self.nv, [len(FALLS) // 2] * self.nv
+        """The sign of each joint: minus a width, or the stiffness of a memory; and which of `FALLS` it has."""
         self.parts: dict[int, tuple[str, ...]] = {}
         self.ratios = [1.0] * self.nv
 
@@ -152,14 +158,14 @@ class _Regression:
 
     def remember(self, j: int, strokes: Float[np.ndarray, "rows strokes"], stiffness: Sequence[float]) -> None:
         """Let a joint have memory."""
-        past = torch.as_tensor(np.array(strokes))
-        for sigma in stiffness:
-            self.signs[j][sigma] = self._sums(j, after_strokes(past, torch.tensor(sigma)).numpy())
+        self.past[j] = torch.as_tensor(np.array(strokes))
+        self.signs[j] |= {sigma: self._sums(j, sigma) for sigma in stiffness}
 
-    def _sums(self, j: int, s: Float[np.ndarray, " rows"]) -> Sums:
+    def _sums(self, j: int, at: float) -> Sums:
         v = self.v[:, j]
-        slow = np.exp(-((v / max(self.falls[j], 1e-12)) ** 2))
-        columns = [v, s, self.load[:, j] * s, np.sqrt(np.abs(v)) * s, slow * s, np.abs(v), np.ones_like(v)]
+        s = after_strokes(self.past[j], torch.tensor(at)).numpy() if at > 0.0 else np.tanh(v / (-at * self.speed[j]))
+        slow = (np.exp(-((v / (fall * self.speed[j])) ** 2)) * s for fall in FALLS)
+        columns = [v, s, self.load[:, j] * s, np.sqrt(np.abs(v)) * s, np.abs(v), np.ones_like(v), *slow]
         F, Z, y = np.stack(columns, axis=1) * self.weight[j], self.bodies[:, j], self.torque[:, j]
         return (
             np.stack([Z[k].T @ F[k] for k in self.rows]),
@@ -169,7 +175,7 @@ class _Regression:
 
     def choose(self, j: int, parts: Sequence[str]) -> None:
         """Parts of one joint, those of the others being as they are."""
-        best, here = self._fitted(j, ()), ()
+        best, here = self._refined(j, ()), ()
         first = best
         steps = [(part,) for part in parts] + [("memory", "root")]  # a level that rises with speed hides reversals
         while True:
@@ -179,23 +185,44 @@ class _Regression:
                 break
             tried = {each: self._fitted(j, each) for each in left}
             there = min(left, key=lambda each: tried[each][1].sum())
-            gain = best[1] - tried[there][1]
-            if not np.isfinite(gain).all():
+            if not self._clearly(best[1], tried[there][1], LIKELY if "memory" in {*there} - {*here} else CLEARLY):
                 break
-            noise = CLEARLY * np.sqrt(self.count) * gain.std(ddof=1) if self.count > 1 else 0.0
-            if gain.sum() <= max(noise, LEAST * best[1].sum()):
-                break
-            best, here = tried[there], there
-        self.at[j], self.parts[j] = best[0], here
+            best, here = self._refined(j, there) if "memory" in {*there} - {*here} else tried[there], there
+        rest = tuple(part for part in here if part != "root")  # which stands in for a breakaway that came later
+        if rest != here and "breakaway" in here and not self._clearly((without := self._fitted(j, rest))[1], best[1]):
+            best, here = without, rest
+        self.at[j], self.fall[j], self.parts[j] = *best[0], here
         self.ratios[j] = float(np.sqrt(best[1].sum() / max(first[1].sum(), 1e-300)))
 
-    def _fitted(self, j: int, parts: tuple[str, ...]) -> tuple[float, Float[np.ndarray, " stretches"]]:
-        """The sign that fits all rows best, and squared residuals of the joint in every stretch by the others."""
-        signs = [each for each in self.signs[j] if (each > 0.0) == ("memory" in parts)]
-        at = min(signs, key=lambda sign: self._residuals(j, parts, sign, False).sum())
-        return at, self._residuals(j, parts, at, True)
+    def _clearly(self, without: np.ndarray, best: np.ndarray, errors: float = CLEARLY) -> bool:
+        """Whether squared residuals of held-out stretches are lower by more than chance and by a share that counts."""
+        gain = without - best
+        if not np.isfinite(gain).all():
+            return bool(np.isfinite(best).all())
+        noise = errors * np.sqrt(self.count) * gain.std(ddof=1) if self.count > 1 else 0.0
+        return bool(gain.sum() > max(noise, LEAST * errors / CLEARLY * without.sum()))
 
-    def _residuals(self, j: int, parts: tuple[str, ...], sign: float, held_out: bool) -> np.ndarray:
+    def _refined(self, j: int, parts: tuple[str, ...]) -> tuple[tuple[float, int], Float[np.ndarray, " stretches"]]:
+        """`_fitted`, with signs between those of the grid."""
+        step = WIDTHS[1] / WIDTHS[0]
+        for _ in range(FINER):
+            step **= 0.5
+            at = self._fitted(j, parts)[0][0]
+            self.signs[j] |= {each: self._sums(j, each) for each in (at * step, at / step)}
+        return self._fitted(j, parts)
+
+    def _fitted(self, j: int, parts: tuple[str, ...]) -> tuple[tuple[float, int], Float[np.ndarray, " stretches"]]:
+        """The sign and fall that fit all rows best, and squared residuals of the joint in every stretch by the others.
+
+        The fall is sought at the sign that fits best under the usual one.
+        """
+        signs, at = [each for each in self.signs[j] if (each > 0.0) == ("memory" in parts)], self.fall[j]
+        sign = min(signs, key=lambda sign: self._residuals(j, parts, (sign, at), False).sum())
+        falls = range(len(FALLS)) if "breakaway" in parts else (at,)
+        best = sign, min(falls, key=lambda fall: self._residuals(j, parts, (sign, fall), False).sum())
+        return best, self._residuals(j, parts, best, True)
+
+    def _residuals(self, j: int, parts: tuple[str, ...], sign: tuple[float, int], held_out: bool) -> np.ndarray:
         """Squared residuals of a joint in every stretch, by numbers from all rows or from the other stretches."""
         A, b = self._normal(j, parts, sign)
         whole, right = A.sum((0, 1)), b.sum((0, 1))
@@ -211,16 +238,17 @@ class _Regression:
             out[k] = self.squares[k, j] - 2.0 * numbers @ b[k, j] + numbers @ A[k, j] @ numbers
         return out
 
-    def _normal(self, j: int, parts: tuple[str, ...], sign: float) -> tuple[np.ndarray, np.ndarray]:
+    def _normal(self, j: int, parts: tuple[str, ...], sign: tuple[float, int]) -> tuple[np.ndarray, np.ndarray]:
         """Of the rows of every stretch and joint, in bodies and the open columns of every joint."""
         first = self.inner.shape[-1]
         size = first + COLUMNS * self.nv
         A, b = np.zeros((self.count, self.nv, size, size)), np.zeros((self.count, self.nv, size))
         A[..., :first, :first], b[..., :first] = self.inner, self.target
         for i in range(self.nv):
-            own, at = (parts, sign) if i == j else (self.parts.get(i, ()), self.at[i])
+            own, (at, fall) = (parts, sign) if i == j else (self.parts.get(i, ()), (self.at[i], self.fall[i]))
             across, inner, right = self.signs[i][at]
-            open_ = np.array([True, True, *(part in own for part in PARTS[1:]), True])
+            breaks = ("breakaway" in own and each == fall for each in range(len(FALLS)))
+            open_ = np.array([True, True, *(part in own for part in PARTS[1:-1]), True, *breaks])
             place = slice(first + COLUMNS * i, first + COLUMNS * (i + 1))
             A[:, i, :first, place], A[:, i, place, place] = across * open_, inner * np.outer(open_, open_)
             A[:, i, place, :first], b[:, i, place] = (across * open_).swapaxes(1, 2), right * open_
@@ -238,7 +266,7 @@ def with_friction_chosen(model: Model, log: Dataset, evidence: Torques) -> tuple
     plain = tuple(Coulomb().bound_to(model.robot) if force in gears else force for force in model.laws)
     found = fit_physical(replace(model, forces=plain), [log], evidence, rows=FIRST_ROWS).model
     beside = any(isinstance(law, DirectionalFriction) and law.learned for law in model.laws)
-    choice = choose_friction(found, log, PARTS if beside else PARTS[:-1])
+    choice = choose_friction(found, log, [part for part in PARTS if beside or part != "direction"])
     return with_choice(model, choice), choice
 
 
@@ -263,3 +291,23 @@ def with_choice(model: Model, choice: FrictionChoice) -> Model:
             force = replace(force, difference=only("direction", 0.0))
         made.append(force)
     return replace(model, forces=tuple(made))
+
+
+def friction_in_words(model: Model, log: Dataset, unit: str) -> str:
+    """Dry friction of the joints at the speed and load of the log (root mean squares), near rest, and its memory."""
+    [law] = [law for law in model.laws if isinstance(law, DryFriction)]
+    state = model.state(*tensors(with_memory(log, model), model.robot.device)[:3])
+    v, load = (x.square().mean(0).sqrt() for x in (state.v, state.delivered))
+    numbers = (law.level_at((speed, load), law.values).expand(v.shape) for speed in (v, 0.0 * v))
+    joints = [log.joint_names.index(name) for name in model.robot.single_joint_names]
+    moving, rest = (each[joints] for each in numbers)
+    text = f"{_listed(moving)} {unit}, near rest {_listed(rest - moving)} more"
+    if not (remember := law.memory_joints(model.robot)):
+        return text
+    ways = 1e3 / law.values["sigma"].expand(v.shape)[remember]
+    who = "all joints" if len(remember) == len(joints) else ", ".join(log.joint_names[j] for j in remember)
+    return f"{text}; {who} remember reversals, over {_listed(ways)} mrad or mm"
+
+
+def _listed(numbers: Tensor) -> str:
+    return ", ".join(f"{each:.3g}" for each in numbers.tolist())

@@ -55,7 +55,7 @@ SHORT: dict[str, tuple[str, Mapping[str, Any]]] = {
 """Names that `parse_forces` takes besides, with fields that differ from their defaults."""
 
 
-USUAL_DRY = "stribeck"
+USUAL_DRY = "gear"
 """The law of dry friction that most joints need."""
 
 
