@@ -14,8 +14,9 @@ from tests.posterior.arm import arm_model
 from forcegp import Accelerations, Dataset, Torques, export_c, fit, score
 from forcegp.control import ComputedTorque, ContactMonitor
 from forcegp.control.tracking import Past
-from forcegp.data import estimate_delay, with_memory
+from forcegp.data import estimate_delay, with_memory, with_strokes
 from forcegp.data.strokes import encoder_step, strokes, turning_points
+from forcegp.data.views import FORGOTTEN, past_known
 from forcegp.errors import DataWarning, InvalidInput
 from forcegp.evidence import motion_residuals
 from forcegp.forces import Coulomb, GearFriction, LoadFriction, Stribeck, Viscous
@@ -322,3 +323,20 @@ def test_noise_of_an_encoder_does_not_wear_the_state_down():
             past.see(torch.tensor(0.01 + 1e-5 * chance.standard_normal(3)))
     assert bool((quiet.z > 0.99).all())
     assert bool((every.z < 0.5).all())
+
+
+def test_rows_before_a_joint_has_moved_are_left_out():
+    _, q, v, a = motion(1500, 2)
+    rest = np.zeros((500, 3))
+    q, v, a = np.vstack([q[0] + rest, q]), np.vstack([rest, v]), np.vstack([rest, a])
+    log = with_strokes(log_of(q, v, a, a, DT * np.arange(len(q))))
+    model = arm_model(0).with_forces(Coulomb(sigma=500.0, memory=("lift",)))
+    known = past_known(log, model)
+    first = int(np.argmax(known))
+    assert known[first:].all()
+    assert first >= 500
+    way = np.abs(np.diff(q[: first + 1, 1])).sum()
+    assert FORGOTTEN / 500.0 - 0.005 < way < FORGOTTEN / 500.0 + 0.005
+    q[:, 1] = q[0, 1]  # a joint that never moves keeps its rows
+    assert past_known(with_strokes(log_of(q, v, a, a, log.time)), model).all()
+    assert past_known(log, arm_model(0)).all()

@@ -107,6 +107,27 @@ def with_memory(dataset: Dataset, model: Model) -> Dataset:
     return replace(dataset, u=u, model=replace(dataset.model, forces=model.laws), strokes=past)
 
 
+FORGOTTEN = 3.0
+"""Way times sigma after which what a joint remembered before an episode counts for less than a twentieth."""
+
+
+def past_known(dataset: Dataset, model: Model) -> Bool[np.ndarray, " rows"]:
+    """Rows in which what joints remember does not depend on what was before their episode.
+
+    A joint that never goes so far in an episode does not count: what sticks there is in its offset.
+    """
+    known = np.ones(len(dataset), dtype=bool)
+    for law in model.laws:
+        if dataset.strokes is None or not (joints := law.memory_joints(model.robot)):
+            continue
+        sigma = law.values["sigma"].expand(model.robot.nv).cpu().numpy()[joints]
+        near = np.abs(dataset.strokes[:, joints]).sum(-1) * sigma < FORGOTTEN
+        for episode in dataset.episodes:
+            rows = dataset.episode == episode
+            known[rows] &= ~(near[rows] & ~near[rows].all(0)).any(1)
+    return known
+
+
 @dataclass(frozen=True, eq=False)
 class RecordedMotions:
     """B recorded motions of T steps of `dt` seconds; in row k of a motion u[k] acts until row k + 1.

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset, farthest_rows
 from forcegp.data.dataset import require_rows
-from forcegp.data.views import with_memory
+from forcegp.data.views import past_known, with_memory
 from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
 from forcegp.evidence import Accelerations, Evidence, Motions, Torques, TrainingData
 from forcegp.evidence.likelihood import MarginalLikelihood, check_distance, problem_size
@@ -110,7 +110,8 @@ def fit(
         and while numbers of laws and bodies are sought.
 
     Gear friction without a stated `memory` gets the parts that held-out stretches of the log show at each joint
-    (`settings["gear_friction"]`).
+    (`settings["gear_friction"]`). Where friction remembers, rows in which a joint has hardly moved since its episode
+    began are left out (`settings["rows_before_a_past"]`): what it remembers there, no log tells.
 
     Friction in proportion to the normal force, with no `expected` friction, is fitted again under the normal force that
     was found, until it settles.
@@ -130,6 +131,8 @@ def fit(
     how = Torques() if model.robot.space.is_vector_space else Torques(noisy="both")
     model, choice = (model, None) if isinstance(start, Posterior) else with_friction_chosen(model, dataset, how)
     dataset = dataset if choice is None else with_memory(dataset, model)
+    known = past_known(dataset, model)
+    dataset = dataset if known.all() else dataset.rows(np.flatnonzero(known))
     logs = [dataset] if baseline is None else [dataset, _checked(model, baseline, rest, None)]
     if isinstance(start, Posterior):
         posterior: Any = start
@@ -149,6 +152,8 @@ def fit(
         posterior = _Functions(model, search, engine, learning_points).fitted(dataset, points)
     if choice is not None:
         posterior = posterior.with_settings(gear_friction=choice.to_dict())
+    if not known.all():
+        posterior = posterior.with_settings(rows_before_a_past=int((~known).sum()))
     if refinement is None:
         return posterior
     report = None if progress is None else partial(progress, ALL_ROWS)

@@ -175,6 +175,7 @@ class _Regression:
 
     def choose(self, j: int, parts: Sequence[str]) -> None:
         """Parts of one joint, those of the others being as they are."""
+        self.beside = self._beside(j)
         best, here = self._refined(j, ()), ()
         first = best
         steps = [(part,) for part in parts] + [("memory", "root")]  # a level that rises with speed hides reversals
@@ -224,34 +225,52 @@ class _Regression:
 
     def _residuals(self, j: int, parts: tuple[str, ...], sign: tuple[float, int], held_out: bool) -> np.ndarray:
         """Squared residuals of a joint in every stretch, by numbers from all rows or from the other stretches."""
-        A, b = self._normal(j, parts, sign)
-        whole, right = A.sum((0, 1)), b.sum((0, 1))
+        across, inner, right = self._open(j, parts, sign)
+        (A, b), first = self.beside, across.shape[1]
+        n, m = b.shape[1], b.shape[1] + right.shape[1]
+        own, own_b = np.r_[0:first, n:m], np.concatenate([self.target[:, j], right], axis=1)
+        own_A = np.block([[self.inner[:, j], across], [across.swapaxes(1, 2), inner]])
+
+        def joined(rows: slice | list[int]) -> tuple[np.ndarray, np.ndarray]:
+            normal, target = np.zeros((m, m)), np.zeros(m)
+            normal[:n, :n], target[:n] = A[rows].sum(0), b[rows].sum(0)
+            normal[np.ix_(own, own)] += own_A[rows].sum(0)
+            target[own] += own_b[rows].sum(0)
+            return normal, target
+
+        whole, given = joined(slice(None))
         scale = np.sqrt(whole.diagonal().clip(1e-300))
-        out, place, numbers = np.zeros(self.count), self.inner.shape[-1] + COLUMNS * j, np.zeros(len(scale))
+        out, numbers = np.zeros(self.count), np.zeros(m)
         for k in range(self.count):
             if k == 0 or held_out:
-                inner = (whole - A[k].sum(0) if held_out else whole) / np.outer(scale, scale)
-                given = right - b[k].sum(0) if held_out else right
-                numbers = np.linalg.solve(inner + RIDGE * np.eye(len(scale)), given / scale) / scale
-                if "factor" in parts and not 0.0 <= numbers[place + 2] <= HIGHEST:
+                without = joined([k]) if held_out else (0.0, 0.0)
+                normal = (whole - without[0]) / np.outer(scale, scale)
+                numbers = np.linalg.solve(normal + RIDGE * np.eye(m), (given - without[1]) / scale) / scale
+                if "factor" in parts and not 0.0 <= numbers[n + 2] <= HIGHEST:
                     return np.full(self.count, np.inf)
-            out[k] = self.squares[k, j] - 2.0 * numbers @ b[k, j] + numbers @ A[k, j] @ numbers
+            x = numbers[own]
+            out[k] = self.squares[k, j] - 2.0 * x @ own_b[k] + x @ own_A[k] @ x
         return out
 
-    def _normal(self, j: int, parts: tuple[str, ...], sign: tuple[float, int]) -> tuple[np.ndarray, np.ndarray]:
-        """Of the rows of every stretch and joint, in bodies and the open columns of every joint."""
+    def _open(self, j: int, parts: tuple[str, ...], sign: tuple[float, int]) -> Sums:
+        """Of the columns of a joint that these parts need."""
+        across, inner, right = self.signs[j][sign[0]]
+        breaks = ("breakaway" in parts and fall == sign[1] for fall in range(len(FALLS)))
+        open_ = np.flatnonzero([True, True, *(part in parts for part in PARTS[1:-1]), True, *breaks])
+        return across[..., open_], inner[:, open_][..., open_], right[:, open_]
+
+    def _beside(self, j: int) -> tuple[np.ndarray, np.ndarray]:
+        """Normal equations of all other joints by stretch, in bodies and the columns that they need."""
+        joints = [i for i in range(self.nv) if i != j]
+        sums = [self._open(i, self.parts.get(i, ()), (self.at[i], self.fall[i])) for i in joints]
         first = self.inner.shape[-1]
-        size = first + COLUMNS * self.nv
-        A, b = np.zeros((self.count, self.nv, size, size)), np.zeros((self.count, self.nv, size))
-        A[..., :first, :first], b[..., :first] = self.inner, self.target
-        for i in range(self.nv):
-            own, (at, fall) = (parts, sign) if i == j else (self.parts.get(i, ()), (self.at[i], self.fall[i]))
-            across, inner, right = self.signs[i][at]
-            breaks = ("breakaway" in own and each == fall for each in range(len(FALLS)))
-            open_ = np.array([True, True, *(part in own for part in PARTS[1:-1]), True, *breaks])
-            place = slice(first + COLUMNS * i, first + COLUMNS * (i + 1))
-            A[:, i, :first, place], A[:, i, place, place] = across * open_, inner * np.outer(open_, open_)
-            A[:, i, place, :first], b[:, i, place] = (across * open_).swapaxes(1, 2), right * open_
+        size = first + sum(right.shape[1] for *_, right in sums)
+        A, b, end = np.zeros((self.count, size, size)), np.zeros((self.count, size)), first
+        A[:, :first, :first], b[:, :first] = self.inner[:, joints].sum(1), self.target[:, joints].sum(1)
+        for across, inner, right in sums:
+            place = slice(end, end + right.shape[1])
+            A[:, :first, place], A[:, place, place], b[:, place] = across, inner, right
+            A[:, place, :first], end = across.swapaxes(1, 2), place.stop
         return A, b
 
 
