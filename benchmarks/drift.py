@@ -47,7 +47,7 @@ from forcegp.posterior import Posterior
 SECONDS, LOST = 600, 0.3
 HORIZON = 2.0 * SECONDS / LOST**2
 """Under which a force changes by 30 % of its prior standard deviation within ten minutes."""
-ENGINE = Inducing(points=60, refine=0)
+ENGINE = Inducing(points=60)
 EVALUATED = 5
 
 

@@ -59,7 +59,7 @@ def condition(engine: str, count: int) -> dict[str, Any]:
     posterior = load_posterior(hyperparameters(engine))
     data = recording(SEED, SECONDS)
     rows = data.rows(np.linspace(0, len(data) - 1, count).round().astype(int))
-    chosen = {"inducing": Inducing(refine=0)}
+    chosen = {"inducing": Inducing()}
     before, cpu = psutil.Process().memory_info().rss, time.process_time()
     conditioned = on_all_rows(posterior, rows, chosen.get(engine, ENGINES[engine]()), {}, True)
     conditioned.predict(rows.q[:100], rows.v[:100], rows.u[:100], covariance=False)

@@ -1,18 +1,15 @@
 """The wind of a recording: found exactly where the law of air is exact, and observed from the past only."""
 
-import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from forcegp import AerodynamicForce, Dataset, Model, Robot, fit
+from forcegp import Dataset, Model, Robot
 from forcegp.data import find_wind
-from forcegp.data.wind import steady_forces
 from forcegp.forces import Actuation, RigidBodies, Thrusters
 from forcegp.mechanics import fixed_point
-from forcegp.posterior import load_posterior, observing, save_posterior
 
 BODY = (
     '<robot name="drone"><link name="body"><inertial><mass value="1.2"/>'
@@ -94,44 +91,3 @@ def test_nothing_is_found_where_rows_do_not_show_it(case, seed):
     if case == "contact":
         dataset = replace(dataset, model=dataset.model.with_contacts(fixed_point("body", (0.0, 0.0, 0.0))))
     assert find_wind(dataset) is None
-
-
-def pushed(forces, rows=120, seed=4, noise=0.0):
-    """Flights in still air, each with a constant force of the world."""
-    dataset = flight([(0.0, 0.0, 0.0)] * len(forces), episodes=len(forces), rows=rows, seed=seed, noise=noise)
-    state = dataset.model.dynamics(*map(torch.tensor, (dataset.q, dataset.v, dataset.u))).state
-    rotation = state.kinematics.frame_pose("body")[:, :3, :3].numpy()
-    a = dataset.a.copy()
-    a[:, :3] += np.einsum("nji,nj->ni", rotation, np.array(forces)[dataset.episode]) / 1.2
-    return replace(dataset, a=a)
-
-
-def test_the_force_of_each_episode_is_found():
-    forces = np.array([(2.0, -1.0, 0.5), (-3.0, 0.0, 1.0), (0.0, 4.0, -1.0)])
-    found = steady_forces(pushed(forces))
-    expected = forces - forces.mean(0)
-    np.testing.assert_allclose(found, expected[np.repeat(range(3), 120)], atol=1e-6)
-    assert steady_forces(pushed(forces[:1])) is None
-
-
-def test_a_fit_leaves_the_force_of_each_episode_to_its_observer(tmp_path):
-    """So no function has to explain it; later flights, stored models and rows that are added have one of their own."""
-    from forcegp.cli.fit import fit_summary
-
-    train = pushed([(6.0, 0.0, 0.0), (-6.0, 0.0, 0.0)], noise=0.02)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        posterior = fit(train.model.with_forces(AerodynamicForce(kernel="linear"), noise=0.02), train, restarts=1)
-    assert posterior.model.inputs == train.model.inputs
-    np.testing.assert_allclose(posterior.settings["steady_forces"]["0"], (6.0, 0.0, 0.0), atol=1.0)
-    assert fit_summary(posterior, 1.0)["wind_not_found"]
-    there = pushed([(0.0, 9.0, 0.0)], seed=5, noise=0.02)
-    seeing, seen = observing(posterior, there)
-    a = seeing.predict(seen.q, seen.v, seen.u, covariance=False).mean.numpy()
-    assert np.abs(a - seen.a)[:, :3].mean() < 0.1  # of 7.5 m/s^2
-    save_posterior(posterior, tmp_path / "drone")
-    loaded = load_posterior(tmp_path / "drone")
-    more = [each.update(there.rows(np.arange(60))) for each in (posterior, loaded)]
-    means = [each.predict(there.q, there.v, there.u, covariance=False).mean for each in more]
-    torch.testing.assert_close(*means, rtol=1e-9, atol=1e-9)
-    assert len(more[0].training) > len(posterior.training)

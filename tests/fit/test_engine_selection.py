@@ -34,7 +34,7 @@ def fit(data, engine="auto", prior=None, **how):
 
 
 def test_enough_inducing_points_predict_what_the_exact_engine_does(data, states):
-    engine = Inducing(points=60, tolerance=0.0, refine=0)
+    engine = Inducing(points=60, tolerance=0.0)
     expected, given = fit(data, "exact").predict(*states), fit(data, engine).predict(*states)
     torch.testing.assert_close(given.mean, expected.mean, rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(given.covariance, expected.covariance, rtol=1e-5, atol=1e-6)
@@ -69,7 +69,6 @@ def test_few_features_take_inducing_points(data, monkeypatch):
     posterior = fit(data, prior=JointFriction(), learning_points=60)
     assert posterior.engine == Inducing()
     assert posterior.latent.left_out <= 0.02
-    assert "refined" in posterior.settings
     exact = fit(
         data, "exact", prior=JointFriction(), start=posterior.hyperparameters, options=OptimizerOptions(iterations=0)
     )
@@ -77,13 +76,6 @@ def test_few_features_take_inducing_points(data, monkeypatch):
     expected, given = (p.predict(test.q, test.v, test.u).mean for p in (exact, posterior))
     torch.testing.assert_close(given, expected, rtol=0.0, atol=2e-2)
     assert posterior.negative_log_likelihood == pytest.approx(exact.negative_log_likelihood, abs=1.0)
-
-
-def test_refining_on_all_rows_lowers_the_objective(data):
-    prior = JointFriction()
-    rough = fit(data, Inducing(refine=0), prior=prior, learning_points=15, points=60)
-    refined = fit(data, Inducing(), prior=prior, learning_points=15, points=60)
-    assert refined.negative_log_likelihood < rough.negative_log_likelihood
 
 
 def test_stored_and_loaded_it_predicts_the_same(data, states, tmp_path):
@@ -145,7 +137,6 @@ def test_too_few_inducing_points_are_said(data):
     with pytest.warns(NumericalWarning, match=r"15 inducing points leave out \S+"):
         posterior = fit(data, Inducing(points=5))
     assert posterior.latent.left_out > 0.02
-    assert "refined" not in posterior.settings
 
 
 def test_far_rows_beyond_the_learning_rows_are_said(data):
@@ -168,5 +159,5 @@ def test_a_damaged_engine_is_refused(data, stored, tmp_path):
 
 def test_many_rows_of_many_features_take_inducing_points():
     chosen = choose_engine(ProblemSize(60_000, 7, 6, 7, 21), torch.device("cpu"))
-    assert chosen.engine == Inducing(points=1000, refine=0)
+    assert chosen.engine == Inducing(points=1000)
     assert chosen.reason.startswith("inducing: the exact covariance of 60000 rows needs")

@@ -111,7 +111,7 @@ def test_systems_of_any_shape_are_refused(text):
     "stated",
     [{"data": {"episodes": value}} for value in (5, [[]], ["x"], {"a": 1}, None)]
     + [{"widening": value} for value in ("x", -1.0, float("nan"), None)]
-    + [{"rows_added": "x"}, {"correlated_rows": "2"}, {"steady_forces": {"0": [1.0]}}, {"air": {"wind": [0.0] * 3}}]
+    + [{"rows_added": "x"}, {"correlated_rows": "2"}, {"air": {"wind": [0.0] * 3}}]
     + [{"motion_intervals": {"horizons": [1.0], "rms": [[[1.0]] * 2], "factors": [[[[1.0]] * 2]] * 2}}],
     ids=str,
 )

@@ -170,8 +170,8 @@ def test_learning_needs_two_more_matrices_for_each_latent():
 def test_the_engine_follows_rows_features_and_memory(free):
     assert choose_engine(replace(SIZE, rows=1500), CPU).engine == Exact()
     assert choose_engine(replace(SIZE, rows=8000), CPU).engine == Exact()  # rN = 16,000
-    assert choose_engine(replace(SIZE, rows=8001), CPU).engine == Inducing(points=1000, refine=0)
-    assert choose_engine(replace(SIZE, rows=60_000), CPU).engine == Inducing(points=1000, refine=0)
+    assert choose_engine(replace(SIZE, rows=8001), CPU).engine == Inducing(points=1000)
+    assert choose_engine(replace(SIZE, rows=60_000), CPU).engine == Inducing(points=1000)
     assert choose_engine(replace(SIZE, rows=1501, features=3), CPU).engine == Inducing()
     assert choose_engine(replace(SIZE, rows=1501, features=4), CPU).engine == Exact()
     assert choose_engine(replace(SIZE, rows=1501, features=3), CPU, inducing=False).engine == Exact()
@@ -191,7 +191,6 @@ def test_the_engine_follows_rows_features_and_memory(free):
     [
         (Inducing, {"points": 1}, {"points": 0}),
         (Inducing, {"tolerance": 0.0}, {"tolerance": -1e-9}),
-        (Inducing, {"refine": 0}, {"refine": -1}),
     ],
     ids=str,
 )

@@ -3,7 +3,6 @@
 import json
 import os
 import random
-from dataclasses import replace
 
 import pytest
 import torch
@@ -52,15 +51,6 @@ def test_what_comes_back_is_the_same(posterior, run, data):
     assert json.loads(json.dumps(posterior.settings)) == loaded.settings
     assert loaded.model.carries_known_forces
     assert loaded.model.noise == posterior.model.noise
-
-
-def test_steady_forces_of_episodes_are_three_numbers(posterior, tmp_path):
-    for name, force in (("whole", [1.0, -2.0, 0.5]), ("short", [1.0, -2.0])):
-        settings = {**posterior.settings, "steady_forces": {"0": force}}
-        save_posterior(replace(posterior, settings=settings), tmp_path / name)
-    assert load_posterior(tmp_path / "whole").settings["steady_forces"] == {"0": [1.0, -2.0, 0.5]}
-    with pytest.raises(FileFormatError, match=r"steady_forces\.0 is \[1\.0, -2\.0\]"):
-        load_posterior(tmp_path / "short")
 
 
 def test_nothing_is_overwritten_unasked_and_only_models_ever(posterior, run, tmp_path):

@@ -26,7 +26,6 @@ MOST_ROWS, FEWEST_ROWS = 3000, 400
 STRONGEST, SURE = 40.0, 2.0  # m/s: a wind beyond, or a standard deviation beyond, is none that was found
 APART = 0.5  # s, between rows that count as independent of each other
 STEP = 0.05  # m/s, of derivatives
-LIKELIER = 3.0  # forces of episodes a priori, over what one cause adds
 MOVING = 12  # causes that vanish with the velocity
 
 
@@ -105,32 +104,6 @@ def find_wind(dataset: Dataset) -> tuple[AirLaw, Float[np.ndarray, "rows 3"]] | 
     wind = law._smoothed(forces, dataset, start, SECONDS, after=True)
     wind = forces.law(wind)._smoothed(forces, dataset, start, SECONDS, after=True)
     return forces.law(wind), wind
-
-
-def steady_forces(dataset: Dataset) -> Float[np.ndarray, "rows 3"] | None:
-    """The force [N, world] by which each episode differs from the others; None for one, and where no base flies freely.
-
-    By the law of air in still air and a constant force in every episode; the mean over the rows is left to the law.
-    """
-    numbers, own = np.unique(dataset.episode, return_inverse=True)
-    if len(numbers) < 2 or not _flies(dataset) or len(dataset) < FEWEST_ROWS // 2:
-        return None
-    thin = np.arange(0, len(dataset), max(1, len(dataset) // MOST_ROWS))
-    forces, count = _Forces.of(dataset.rows(thin)), 3 * len(numbers)
-    X, _ = forces.causes(np.zeros((len(thin), 3)))
-    X = X / (np.sqrt(np.square(X).mean(0)) + 1e-300)
-    constant = np.zeros((len(thin), 3, len(numbers), 3))
-    constant[np.arange(len(thin)), :, own[thin]] = np.swapaxes(forces.rotation, 1, 2)
-    of_law = np.einsum("nk,ij->nikj", X, np.eye(3)).reshape(3 * len(thin), -1)
-    A = np.hstack([LIKELIER * constant.reshape(3 * len(thin), count), of_law])
-    target = forces.wrench[:, :3].ravel()
-    U, s, Vt = np.linalg.svd(A, full_matrices=False)
-    shares = U.T @ target
-    left = np.square(target).mean() - np.square(shares[s > 1e-10 * s[0]]).sum() / len(target)
-    ridge = max(left, 0.0) / (np.square(target).mean() + 1e-300)
-    steady = LIKELIER * (Vt.T @ (s * shares / (np.square(s) + ridge + 1e-20 * s[0] ** 2)))[:count]
-    of_rows = steady.reshape(-1, 3)[own]
-    return of_rows - of_rows.mean(0)
 
 
 def with_wind(dataset: Dataset, wind: Float[np.ndarray, "rows 3"]) -> Dataset:

@@ -1,6 +1,5 @@
 """Where physics and Gaussian processes meet: rows, from states and checked forces to (m, W), features, likelihood."""
 
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +20,6 @@ from forcegp.inference import (
     LatentPosterior,
     ProblemSize,
     Terms,
-    collapsed_bound,
     negative_log_likelihood,
 )
 from forcegp.mechanics import AffineMap, ConstrainedDynamics
@@ -293,19 +291,6 @@ class MarginalLikelihood:
     def of_terms(self, terms: Terms, matrices: Sequence[Float[Tensor, "N N"]]) -> Float[Tensor, ""]:
         """-log p of rows with these terms."""
         return negative_log_likelihood(terms.W, terms.residual, terms.noise, matrices)
-
-    def bound(
-        self, kernels: LatentKernels, parameters: Mapping[str, Tensor], points: Sequence[Float[Tensor, "_ _"]]
-    ) -> Float[Tensor, ""]:
-        """`collapsed_bound` with these inducing points. Where k rows count as one, densities have the power 1/k."""
-        terms, k = self.terms(parameters), self.training.correlated_rows
-        bound = collapsed_bound(terms, kernels, parameters, points)
-        if k == 1.0:
-            return bound
-        spread = 2.0 * math.pi * terms.noise  # of k R
-        logs = spread.log().sum(-1) if spread.ndim == 2 else torch.linalg.slogdet(spread).logabsdet
-        rows, outputs = terms.residual.shape
-        return bound - 0.5 * ((1.0 - 1.0 / k) * logs.expand(rows).sum() + rows * outputs * math.log(k) / k)
 
     def condition(
         self,

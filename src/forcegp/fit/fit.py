@@ -106,8 +106,8 @@ def fit(
     engine: "exact", "inducing", one of `forcegp.inference.ENGINES` with its settings, or "auto", with the reason in
         `settings["engine_reason"]`.
     learning_points: find the hyper-parameters on this many of the points; None: all up to 1500, and 600 beyond.
-    progress: called as progress(restart, iteration, objective); the restart is `ALL_ROWS` while all rows are taken in,
-        and while numbers of laws and bodies are sought.
+    progress: called as progress(restart, iteration, objective); the restart is `ALL_ROWS` while numbers of laws and
+        bodies are sought.
 
     Gear friction without a stated `memory` gets the parts that held-out stretches of the log show at each joint
     (`settings["gear_friction"]`). Where friction remembers, rows in which a joint has hardly moved since its episode
@@ -268,12 +268,10 @@ class _Functions:
             all_rows = rows
         rows = learning_rows(rows, self.learning_points, ordered=ordered)
         described = described_rows(all_rows, dataset)
-        progress = self.search.progress
         own = replace(self, search=replace(self.search, start=self._continuation(rows, dataset)))
         fitted = widened(own._with_numbers(rows, dataset))
         warn_of_contacts(self.model, dataset)  # last: what refuses the rows comes first
-        report = None if progress is None else partial(progress, ALL_ROWS)
-        return on_all_rows(fitted, with_memory(all_rows, fitted.model), chosen, described, report)
+        return on_all_rows(fitted, with_memory(all_rows, fitted.model), chosen, described)
 
     def _continuation(self, rows: Dataset, dataset: Dataset) -> Mapping[str, Tensor] | None:
         """Where a single search on many rows begins: at the end of searches on fewer of them."""

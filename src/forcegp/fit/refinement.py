@@ -12,7 +12,6 @@ from forcegp.data import Dataset, farthest_rows
 from forcegp.data.preparation import memory
 from forcegp.errors import DataWarning, InvalidInput, NumericalWarning
 from forcegp.evidence.likelihood import MarginalLikelihood, TrainingData, check_distance
-from forcegp.fit.search import FitObjective
 from forcegp.forces import UnknownForces
 from forcegp.forces.contact_friction import JAMMING, TabulatedCurve, refined_loads
 from forcegp.inference import (
@@ -21,10 +20,8 @@ from forcegp.inference import (
     Exact,
     Inducing,
     InducingPosterior,
-    OptimizerOptions,
     ProblemSize,
     choose_engine,
-    minimize_objective,
 )
 from forcegp.inference.engines import ENOUGH, MOST_EXACT_ROWS
 from forcegp.inference.memory import blas_threads, require_memory
@@ -35,9 +32,6 @@ from forcegp.robots.arguments import whole_number
 FEWEST_INDEPENDENT, WARNED_OF = 10, 0.9  # rows that noise is learned from, and the share of them that needs no word
 LEARNING_ROWS = 600
 """Rows that hyper-parameters are found on where there are more than `MOST_EXACT_ROWS`."""
-
-Iteration = Callable[[int, float], None]
-"""Called as report(iteration, objective)."""
 
 
 def learning_rows(rows: Dataset, learning_points: int | None, *, ordered: bool) -> Dataset:
@@ -96,7 +90,6 @@ def on_all_rows(
     rows: Dataset,
     engine: Engine | None,
     described: Mapping[str, Any],
-    report: Iteration | None = None,
 ) -> Posterior:
     """`fitted`, conditioned on all `rows` by the engine, or by one that is chosen for their number where it is None.
 
@@ -127,45 +120,12 @@ def on_all_rows(
         settings = {**fitted.settings, **described, "learning_points": len(reference.q)}
         settings |= {"engine": choice.engine.to_dict(), "engine_reason": choice.reason}
         posterior = replace(fitted, likelihood=likelihood, settings=settings, latent=latent, engine=choice.engine)
-        return refined(posterior, report)
-
-
-TOLERANCE = 1e-6
-"""Fraction of the bound by which an iteration must lower it for the search to go on."""
-
-
-def refined(posterior: Posterior, report: Callable[[int, float], None] | None = None) -> Posterior:
-    """The posterior at hyper-parameters that its engine improves on all rows; itself where the engine does not.
-
-    Warns where inducing points leave out so much that the posterior is an approximation.
-    """
-    engine, latent = posterior.engine, posterior.latent
-    if not isinstance(latent, InducingPosterior):
-        return posterior
-    left_out, tolerance = latent.left_out, engine.tolerance if isinstance(engine, Inducing) else 0.0
-    if not posterior.estimates and isinstance(engine, Inducing) and engine.refine and left_out <= tolerance:
-        likelihood, kernels = posterior.likelihood, posterior.kernels
-        noise, (_, fixed) = posterior.likelihood.noise, posterior.likelihood.split_noise
-        held = {name: posterior.hyperparameters[name] for name in fixed}
-        start = {name: value for name, value in posterior.hyperparameters.items() if name not in held}
-        objective = FitObjective(likelihood, kernels, noise, held, points=latent.features)
-        options = OptimizerOptions(iterations=engine.refine, tolerance=TOLERANCE)
-        result = minimize_objective(objective, start, options, report)
-        parameters = {**posterior.hyperparameters, **result.parameters}
-        latent = likelihood.condition(kernels, parameters, engine)
-        assert isinstance(latent, InducingPosterior), "its engine is"
-        left_out = latent.left_out
-        change = f"{result.history[0]:.1f} -> {result.value:.1f}"
-        note = f"on all rows, {result.evaluations} evaluations: {change} ({result.status})"
-        spent = replace(posterior.result, cpu_seconds=posterior.result.cpu_seconds + result.cpu_seconds)
-        posterior = replace(posterior, hyperparameters=parameters, result=spent, latent=latent).with_settings(
-            refined=note
-        )
-    if left_out > max(ENOUGH, tolerance):
-        points = sum(map(len, posterior.latent.features))
+    tolerance = choice.engine.tolerance if isinstance(choice.engine, Inducing) else 0.0
+    if isinstance(latent, InducingPosterior) and latent.left_out > max(ENOUGH, tolerance):
         warnings.warn(
-            f"{points} inducing points leave out {left_out:.2g} of the noise variance of a row, so that the posterior "
-            "is an approximation with wider intervals than the exact one; give more points, or take `engine='exact'`",
+            f"{sum(map(len, latent.features))} inducing points leave out {latent.left_out:.2g} of the noise variance "
+            "of a row, so that the posterior is an approximation with wider intervals than the exact one; give more "
+            "points, or take `engine='exact'`",
             NumericalWarning,
             stacklevel=4,
         )

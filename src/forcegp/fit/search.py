@@ -117,10 +117,10 @@ MOST_POINTS_FOR_RESTARTS = 400
 """Training points up to which several starts are the default."""
 
 FitProgress = Callable[[int, int, float], None]
-"""Called as progress(restart, iteration, objective), and with restart `ALL_ROWS` while an engine takes in all rows."""
+"""Called as progress(restart, iteration, objective), and with restart `ALL_ROWS` while numbers are sought."""
 
 ALL_ROWS = -1
-"""Instead of a restart: the value is then the bound on all rows."""
+"""Instead of a restart: the value is then the root mean square of residuals of all rows."""
 
 Outcome = TypeVar("Outcome")
 
@@ -198,25 +198,16 @@ Starts = Callable[[int], Mapping[str, Tensor]]
 
 @dataclass(frozen=True, eq=False)
 class FitObjective:
-    """The objective of the free hyper-parameters, with their priors; a class so that processes can receive it.
-
-    With inducing `points` the bound through them stands for the likelihood.
-    """
+    """The objective of the free hyper-parameters, with their priors; a class so that processes can receive it."""
 
     likelihood: Any  # a MarginalLikelihood, or one of another model: (kernels, parameters) -> nats, with its `training`
     kernels: LatentKernels
     noise: Noise
     fixed: Mapping[str, Tensor]
-    points: Sequence[Tensor] | None = None
 
     def __call__(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """In nats; differentiable once in every parameter."""
-        named = {**self.fixed, **parameters}
-        if self.points is None:
-            value = self.likelihood(self.kernels, named)
-        else:
-            value = self.likelihood.bound(self.kernels, named, self.points)
-        return value - self.log_prior(parameters)
+        return self.likelihood(self.kernels, {**self.fixed, **parameters}) - self.log_prior(parameters)
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """Log density of the hyper-parameters' priors."""

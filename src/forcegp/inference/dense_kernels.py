@@ -208,21 +208,6 @@ class LatentKernels(torch.nn.Module):
         """The matrices at `parameters` (names as in `initial_parameters`), differentiable in them."""
         return self._at(parameters, lambda: self.forward(features))
 
-    def crosses(
-        self,
-        parameters: Mapping[str, Tensor],
-        left: Sequence[Float[Tensor, "_ _"]],
-        right: Sequence[Float[Tensor, "_ _"]],
-    ) -> list[Float[Tensor, "_ _"]]:
-        """k_c(left_i, right_j) of every latent at `parameters`, differentiable in them."""
-        return self._at(parameters, lambda: [k.cross(x, y) for k, x, y in zip(self.dense, left, right, strict=True)])
-
-    def diagonals(
-        self, parameters: Mapping[str, Tensor], features: Sequence[Float[Tensor, "_ _"]]
-    ) -> list[Float[Tensor, " _"]]:
-        """k_c(z_i, z_i) of every latent at `parameters`, differentiable in them."""
-        return self._at(parameters, lambda: [k.diagonal(z) for k, z in zip(self.dense, features, strict=True)])
-
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """Log density of the GPyTorch priors registered on the kernels, at `parameters`; 0 where there are none."""
         return self._at(parameters, self._log_prior)

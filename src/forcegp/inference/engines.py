@@ -111,21 +111,17 @@ class Exact(Engine):
 class Inducing(Engine):
     """Variational inducing points: at most `points` for each latent, fewer where they leave out little.
 
-    `tolerance`: what they may leave out of the prior variance of a row in units of its noise, on average. With `refine`
-    iterations the hyper-parameters are improved on all rows by the collapsed bound, where no more is left out.
+    `tolerance`: what they may leave out of the prior variance of a row in units of its noise, on average.
     """
 
     name: ClassVar[str] = "inducing"
     remedy: ClassVar[str] = "give Inducing fewer points, or fewer rows"
     points: int = 500
     tolerance: float = ENOUGH
-    refine: int = 20
 
     def __post_init__(self) -> None:
-        for name, least in (("points", 1), ("refine", 0)):
-            given = getattr(self, name)
-            if isinstance(given, bool) or not isinstance(given, int) or given < least:
-                raise InvalidInput(f"Inducing {name} is {given!r}; it must be a whole number >= {least}")
+        if isinstance(self.points, bool) or not isinstance(self.points, int) or self.points < 1:
+            raise InvalidInput(f"Inducing points is {self.points!r}; it must be a whole number >= 1")
         tolerance = self.tolerance
         if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not tolerance >= 0.0:
             raise InvalidInput(f"Inducing tolerance is {tolerance!r}; it must be at least 0")
@@ -222,6 +218,6 @@ def choose_engine(size: ProblemSize, device: torch.device, *, inducing: bool = T
         return Choice(Inducing(), f"inducing: {rows}, and the processes have {size.features} features at most")
     if fits and size.rows * size.rank <= MOST_EXACT_ENTRIES:
         return Choice(exact, f"exact: {rows} need {gib(needed)}, {gib(free)} are free")
-    many = Inducing(points=MANY_POINTS, refine=0)  # on all rows an iteration would take half a minute
+    many = Inducing(points=MANY_POINTS)
     many.require_memory(size, device)
     return Choice(many, f"inducing: the exact covariance of {rows} needs {gib(needed)}, {gib(free)} are free")

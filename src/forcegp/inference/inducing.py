@@ -5,7 +5,7 @@ Weights w with k_c ~ phi_c . phi_c', phi_c(z) = L_c^-1 k_c(p_c, z), of precision
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import accumulate, pairwise
@@ -13,12 +13,10 @@ from itertools import accumulate, pairwise
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 from typing_extensions import override
 
-from forcegp.errors import NumericalError
 from forcegp.inference.dense_kernels import DenseKernel, LatentKernels
-from forcegp.inference.likelihood import CholeskyFactor, Terms, factorize, whiten
+from forcegp.inference.likelihood import CholeskyFactor, Terms, deflate, factorize, whiten
 from forcegp.inference.posterior import BLOCK_BYTES, LatentPosterior
 
 ROUNDING = 1e-13
@@ -166,14 +164,6 @@ class WeightSpace:
 CANDIDATES = 20_000
 """Rows among which inducing points are sought."""
 
-JITTER = 1e-10
-"""Added to the kernel matrices of inducing points, relative to their mean diagonal, where hyper-parameters move away
-from those that the points were chosen at."""
-
-MOST_ROUNDING = 1e-3
-"""Of the prior variance, by which rounding may take what inducing points leave out below 0: `JITTER` and rounding, both
-magnified by the condition number of at most 1 / JITTER, stay far below."""
-
 
 @dataclass(frozen=True, eq=False)
 class InducingPosterior(LatentPosterior):
@@ -264,71 +254,17 @@ def inducing_pivots(
 
 
 def collapsed_bound(
-    terms: Terms, kernels: LatentKernels, parameters: Mapping[str, Tensor], points: Sequence[Float[Tensor, "_ _"]]
-) -> Float[Tensor, ""]:
-    """An upper bound of `negative_log_likelihood`, differentiable in all but the inducing `points`; time O(N P^2).
+    terms: Terms, kernels: LatentKernels, points: Sequence[Float[Tensor, "_ _"]], k: float = 1.0
+) -> float:
+    """An upper bound of `negative_log_likelihood` through inducing points, in nats; time O(N P^2).
 
-    Blocks of rows are computed again in the backward pass. Raises NumericalError when a covariance cannot be
-    factorised, or where rounding explains more than all of the prior variance: the sum would be no bound there.
+    Where k rows count as one, the noise of `terms` is k times that of a row, and densities have the power 1/k. Raises
+    NumericalError when a covariance cannot be factorised.
     """
-    features, W, residual, noise = terms
-    count, outputs, _ = W.shape
-    W_white, y_white, log_noise = whiten(W, residual, noise)
-    lowers = [_lower(K) for K in kernels.crosses(parameters, points, points)]
-    total = sum(len(lower) for lower in lowers)
-    height = max(1, BLOCK_BYTES // (8 * max(1, total) * 4))
-    products = W.new_zeros(total, total)
-    right, left_out, prior = W.new_zeros(total), W.new_zeros(()), W.new_zeros(())
-    for start in range(0, count, height):
-        rows = slice(start, start + height)
-        block = [z[rows] for z in features]
-        statistics = checkpoint(
-            _statistics, kernels, parameters, points, lowers, W_white[rows], y_white[rows], block, use_reentrant=False
-        )
-        so_far = products, right, left_out, prior
-        products, right, left_out, prior = (a + b for a, b in zip(so_far, statistics, strict=True))
-    if bool(left_out < -MOST_ROUNDING * prior):
-        raise NumericalError("rounding hides the covariance of the inducing points; take other parameters")
-    B = _lower(products + torch.eye(total, dtype=W.dtype, device=W.device), jitter=0.0)
-    explained = torch.linalg.solve_triangular(B, right[:, None], upper=False).square().sum()
-    quadratic = y_white.square().sum() - explained
-    log_determinant = 2.0 * B.diagonal().log().sum()
-    return 0.5 * (quadratic + log_determinant + left_out) + log_noise + 0.5 * count * outputs * math.log(2.0 * math.pi)
-
-
-def _statistics(
-    kernels: LatentKernels,
-    parameters: Mapping[str, Tensor],
-    points: Sequence[Tensor],
-    lowers: Sequence[Tensor],
-    W: Float[Tensor, "n D C"],
-    y: Float[Tensor, "n D"],
-    features: Sequence[Tensor],
-) -> tuple[Float[Tensor, "P P"], Float[Tensor, " P"], Float[Tensor, ""], Float[Tensor, ""]]:
-    """Phi^T Phi, Phi^T y, what is left out of the prior variance, and that variance, of some rows."""
-    crosses = kernels.crosses(parameters, points, features)
-    phi = [torch.linalg.solve_triangular(L, K, upper=False) for L, K in zip(lowers, crosses, strict=True)]
-    diagonals = kernels.diagonals(parameters, features)
-    pairs, target = W.mT @ W, (W * y[..., None]).sum(1)  # of D equations that W weighs, once and not in each product
-    relevance = pairs.diagonal(dim1=-2, dim2=-1)
-    prior = torch.stack([relevance[:, c] @ k for c, k in enumerate(diagonals)]).sum()
-    shares = (relevance[:, c] @ (k - f.square().sum(0)) for c, (k, f) in enumerate(zip(diagonals, phi, strict=True)))
-    columns = []
-    for c, f in enumerate(phi):  # the blocks below the diagonal and half of that on it
-        below = torch.cat([other * (0.5 if d == c else 1.0) * pairs[:, d, c] for d, other in enumerate(phi) if d >= c])
-        columns.append(torch.nn.functional.pad(below @ f.mT, (0, 0, sum(map(len, phi[:c])), 0)))
-    lower = torch.cat(columns, dim=1)
-    right = torch.cat([f @ target[:, c] for c, f in enumerate(phi)])
-    return lower + lower.mT, right, sum(shares, torch.zeros_like(prior)), prior
-
-
-def _lower(matrix: Float[Tensor, "n n"], jitter: float = JITTER) -> Float[Tensor, "n n"]:
-    shift = jitter * matrix.detach().diagonal().mean() if len(matrix) else 0.0
-    lower, info = torch.linalg.cholesky_ex(
-        matrix + shift * torch.eye(len(matrix), dtype=matrix.dtype, device=matrix.device)
-    )
-    if bool(info != 0):
-        raise NumericalError(
-            "the covariance of the inducing points is not positive definite; give fewer points, or a larger tolerance"
-        )
-    return lower
+    with torch.no_grad():
+        W_white, y, log_noise = whiten(terms.W, terms.residual, terms.noise)
+        deflation = deflate(W_white, y)
+        space = WeightSpace.of(kernels, terms.features, points, deflation.C, deflation.t)
+        explained = (space.precision.lower.tril().mT @ space.mean).square().sum()
+        quadratic = y.square().sum() - explained + space.precision.log_determinant() + len(y) * space.left_out
+        return float(0.5 * quadratic + (log_noise + 0.5 * y.numel() * math.log(2.0 * math.pi / k)) / k)

@@ -33,6 +33,7 @@ from forcegp.inference import (
     LatentKernels,
     LatentPosterior,
     OptimizationResult,
+    collapsed_bound,
 )
 from forcegp.model import Model
 from forcegp.noise import ACCELERATION
@@ -373,7 +374,8 @@ class Fitted(Summary):
         """-log p(a | q, v, u) of the training data in nats, without hyperpriors; of inducing points the bound."""
         with torch.no_grad():
             if isinstance(self.latent, InducingPosterior):
-                return float(self.likelihood.bound(self.kernels, self.hyperparameters, self.latent.features))
+                terms, kernels = self.likelihood.terms(self.hyperparameters), self.kernels.at(self.hyperparameters)
+                return collapsed_bound(terms, kernels, self.latent.features, self.training.correlated_rows)
             return float(self.likelihood(self.kernels, self.hyperparameters))
 
     @override

@@ -10,7 +10,6 @@ from jaxtyping import Float, Int
 
 from forcegp.data import AirLaw, Dataset, find_wind, with_memory, with_wind
 from forcegp.data.filters import episodes_in_order, sums_before
-from forcegp.data.wind import steady_forces
 from forcegp.errors import InvalidInput
 from forcegp.forces import AerodynamicForce, ObservedWind, ObservedWrench
 from forcegp.forces.actuation import FADES
@@ -58,7 +57,8 @@ def observing(
     wrench = np.einsum("nij,nj->ni", np.linalg.pinv(effect, rcond=1e-9), unexplained)
     held = len(times) == 1 or _observes(posterior.model)
     observed = _observed(wrench, dataset, times, held)
-    model = _with_wrench(posterior.model, frame, NAMES if held else NAMES + LASTING)
+    names = NAMES if held else NAMES + LASTING
+    model = replace(posterior.model, forces=(*posterior.model.forces, ObservedWrench(frame, names)))
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
     seen = replace(dataset, u=np.concatenate([dataset.u, observed], axis=1), model=model, truth=truth)
     posterior = posterior.with_model(model)
@@ -70,28 +70,17 @@ def observing(
 def in_air(model: Model, dataset: Dataset) -> tuple[Mapping[str, Any], Dataset] | None:
     """What air did in the rows, for the settings of a fit, and the rows with columns that hold it and a model for them.
 
-    The law and velocity of the wind where rows show it, else for several episodes the force that each has of its own.
-    None where the model has no `AerodynamicForce` or observes nothing, observes already, or rows show neither.
+    None where the model has no `AerodynamicForce` or observes nothing, observes already, or rows show no wind.
     """
     of_air = [term for term in model.unknown_forces if isinstance(term, AerodynamicForce) and term.observe != 0.0]
     if not of_air or _observes(model) or dataset.u.shape[1] != model.sizes[2]:
         return None
     rows = replace(dataset, model=model, truth={})
-    if (found := find_wind(rows)) is not None:
-        law, wind = found
-        windy = (replace(x, wind=law.wind) if isinstance(x, AerodynamicForce) else x for x in model.forces)
-        return {"air": law.to_dict()}, with_wind(replace(rows, model=replace(model, forces=tuple(windy))), wind)
-    frame = of_air[0].link(model.robot)
-    if (forces := steady_forces(rows)) is None or frame != AerodynamicForce().link(model.robot):
+    if (found := find_wind(rows)) is None:
         return None
-    columns = np.concatenate([rows.u, forces, np.zeros_like(forces)], axis=1)
-    each = {str(number): forces[rows.episode == number][0].tolist() for number in rows.episodes}
-    seen = replace(rows, u=columns, model=_with_wrench(model, frame))
-    return {"steady_forces": each}, seen
-
-
-def _with_wrench(model: Model, frame: str, names: tuple[str, ...] = NAMES) -> Model:
-    return replace(model, forces=(*model.forces, ObservedWrench(frame, names)))
+    law, wind = found
+    windy = (replace(x, wind=law.wind) if isinstance(x, AerodynamicForce) else x for x in model.forces)
+    return {"air": law.to_dict()}, with_wind(replace(rows, model=replace(model, forces=tuple(windy))), wind)
 
 
 def _observes(model: Model) -> bool:
@@ -100,8 +89,7 @@ def _observes(model: Model) -> bool:
 
 def unobserved(model: Model) -> Model:
     """The system without the columns of u that :func:`in_air` gives it."""
-    own = ObservedWind.names, NAMES, NAMES + LASTING
-    return replace(model, forces=tuple(x for x in model.forces if getattr(x, "names", ()) not in own))
+    return replace(model, forces=tuple(x for x in model.forces if getattr(x, "names", ()) != ObservedWind.names))
 
 
 def require_unobserved(posterior: Posterior, what: str) -> None:
@@ -118,33 +106,20 @@ def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
     target, own = posterior.target, posterior.trained
     if target is None:
         return rows
-    in_air = {"air", "steady_forces"} & set(posterior.settings)
-    if not in_air or target.known.to_dict() != unobserved(own).known.to_dict():
+    if "air" not in posterior.settings or target.known.to_dict() != unobserved(own).known.to_dict():
         raise InvalidInput(
             "the posterior was carried to another system than the one that its rows were measured on; update it "
             "before it is carried there: posterior.update(rows).with_system(system)."
         )
-    if "steady_forces" in posterior.settings:  # what is new in their flight is to be learned
-        return _with_forces(posterior, rows, {})
     return in_own_air(posterior, rows)
 
 
 def in_own_air(posterior: Posterior, rows: Dataset) -> Dataset:
-    """Rows with the columns of the fit: wind, or the force that stays; InvalidInput where all lack .1 s of past."""
-    if (steady := posterior.settings.get("steady_forces")) is not None:
-        return _with_forces(posterior, rows, steady)
+    """Rows with the wind that the fit has columns for; InvalidInput where all lack .1 s of past."""
     if "air" not in posterior.settings:
         return rows
     _, seen = _in_observed_wind(posterior, rows)
     return seen.rows(_with_past(rows, LEAST))
-
-
-def _with_forces(posterior: Posterior, rows: Dataset, each: Mapping[str, Sequence[float]]) -> Dataset:
-    """Rows with the force of each episode, none where it is not named, in the columns of the fit's `ObservedWrench`."""
-    frame = next(x.frame for x in posterior.trained.laws if isinstance(x, ObservedWrench))
-    wrench = np.array([[*each.get(str(number), (0.0,) * 3), 0.0, 0.0, 0.0] for number in rows.episode])
-    columns = np.concatenate([rows.u, wrench], axis=1)
-    return replace(rows, u=columns, model=_with_wrench(posterior.model, frame), truth={})
 
 
 def _with_past(dataset: Dataset, seconds: float) -> Int[np.ndarray, " late"]:

@@ -158,8 +158,7 @@ def _rows(prefix: str, tensors: Mapping[str, torch.Tensor], model: Model) -> Tra
 def _require_numbers(settings: Mapping[str, Any], nv: int) -> None:
     """Raises ValueError, or what Python does, where settings that are read later are not numbers of their shape."""
     sizes = {"nv": nv}
-    forces = {f"steady_forces.{number}": (3,) for number in settings.get("steady_forces") or ()}
-    for name, shape in (SETTINGS | forces).items():
+    for name, shape in SETTINGS.items():
         group, _, key = name.rpartition(".")
         if (holder := settings.get(group) if group else {key: settings.get(key, 1.0)}) is None:
             continue

@@ -18,7 +18,6 @@ from forcegp.evidence import Accelerations, Evidence, Motions, Torques, parse_ev
 from forcegp.evidence.least_squares import ROUNDS, correlation_time
 from forcegp.evidence.recorded_rows import slides
 from forcegp.fit import ALL_ROWS, calibrated, default_options, default_restarts, fit, held_out_noise
-from forcegp.fit.refinement import refined
 from forcegp.fit.search import MOST_POINTS_FOR_RESTARTS
 from forcegp.forces import (
     IndependentAccelerations,
@@ -177,7 +176,7 @@ def all_rows_at_once(count: int, nv: int) -> dict[str, Any]:
     Beyond, inducing points leave out less than what one number adds to the variance of a row, 1 / count.
     """
     most = min(MOST_POINTS_FOR_RESTARTS, EQUATIONS // nv)
-    return {} if count <= most else {"engine": Inducing(tolerance=1.0 / count, refine=0), "learning_points": most}
+    return {} if count <= most else {"engine": Inducing(tolerance=1.0 / count), "learning_points": most}
 
 
 def with_force_noise(model: Model, dataset: Dataset) -> Model:
@@ -215,8 +214,6 @@ def allowing_for_correlation(posterior: Posterior, dataset: Dataset) -> tuple[Po
         settings = {**posterior.settings, "correlated_rows": k}
         given = posterior.training, posterior.hyperparameters, posterior.result, settings, posterior.engine
         posterior = posterior.conditioned(posterior.trained, *given, estimates=posterior.estimates)
-    if isinstance(posterior.engine, Inducing):
-        posterior = refined(replace(posterior, engine=replace(posterior.engine, refine=Inducing.refine)))
     return posterior, f"errors resemble each other over {k:.0f} rows, which count as one" if k > 1.0 else None
 
 
