@@ -22,28 +22,18 @@ class Noise:
     start values of the optimisation, else they stay fixed; the hyperprior of a learned one is log-normal around its
     start value, with a factor of e as one standard deviation. The covariance of one row is
     diag(acceleration^2) + H diag(force^2) H^T.
-
-    With `measured_torque` the noise of the forces is that of the sensor that reports u: predictions count that their u
-    is as noisy, and shrink accelerations that only its noise explains (`shrunk`). Leave it False where u is a command,
-    as in model-predictive control.
     """
 
     acceleration: float | tuple[float, ...] | None = 0.1
     force: float | tuple[float, ...] | None = None
     learn: bool = False
-    measured_torque: bool = False
 
     @usable_arguments("Noise")
     def __post_init__(self) -> None:
-        for name in ("learn", "measured_torque"):
-            require_type(name, getattr(self, name), bool)
+        require_type("learn", self.learn, bool)
         for name in ("acceleration", "force"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _positive(name, getattr(self, name)))
-        if self.measured_torque and self.force is None:
-            raise InvalidInput(
-                "Noise(measured_torque=True) needs the noise of the torque sensor; give force=SIGMA in Nm or N."
-            )
 
     def parameters(self, nv: int, device: torch.device | None = None) -> dict[str, Float[Tensor, "nv"]]:
         """Logarithms of the standard deviations, one per joint.

@@ -14,11 +14,10 @@ from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import Dataset, Model, Robot, export_c
 from forcegp.codegen.c_writer import write_function
-from forcegp.errors import InvalidInput, NumericalError
+from forcegp.errors import NumericalError
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
 from forcegp.inference import OptimizerOptions
-from forcegp.noise import Noise
 from forcegp.posterior import Posterior, c_export
 from forcegp.posterior.c_export import identifier, rounding
 
@@ -288,12 +287,6 @@ class Deciding(JointFriction):
     def features(self, dynamics):
         ways = {"if": lambda z: bool(z[0, 0] > 0.0), "numpy": lambda z: z.detach().numpy().min() > 0.0}
         return tuple(z if ways[self.how](z) else -z for z in super().features(dynamics))
-
-
-def test_measured_torques_are_refused(tmp_path):
-    measured = fitted(JointForces(), noise=Noise(force=0.1, measured_torque=True))
-    with pytest.raises(InvalidInput, match="a program is for commanded torques"):
-        export_c(measured, tmp_path / "arm")
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from forcegp.inference import (
     Terms,
     negative_log_likelihood,
 )
-from forcegp.mechanics import AffineMap, ConstrainedDynamics
+from forcegp.mechanics import ConstrainedDynamics
 from forcegp.model import Model
 from forcegp.noise import ACCELERATION, FORCE, Noise
 
@@ -92,33 +92,6 @@ class Standardization:
     def __call__(self, features: Sequence[Float[Tensor, "*batch _"]]) -> list[Float[Tensor, "*batch _"]]:
         """Standardised features."""
         return [(z - m) / s for z, m, s in zip(features, self.shift, self.scale, strict=True)]
-
-
-def second_moments(a: Float[Tensor, "N nv"]) -> Float[Tensor, "nv nv"]:
-    """S of accelerations; a joint that never moved counts as moving a millionth as much as the others."""
-    squares = a.square().mean(0)
-    return torch.diag_embed(squares + 1e-12 * squares.sum())
-
-
-def shrunk(
-    acceleration: AffineMap,
-    H: Float[Tensor, "*batch nv nv"],
-    force_std: Float[Tensor, "nv"],
-    moments: Float[Tensor, "nv nv"],
-) -> tuple[AffineMap, Float[Tensor, "*batch nv nv"]]:
-    """G a_f as a function of the unknown force, and the covariance that is left, H F H^T G^T.
-
-    Forward dynamics divides by the inertia: .05 Nm of noise at a wrist of 1e-3 kg m^2 are 50 rad/s^2. With the noise F
-    of u, and motions a ~ N(0, S), a | u, f ~ N(G a_f, H F H^T G^T), G = S (H F H^T + S)^-1: errors in variables
-    (Carroll et al., "Measurement error in nonlinear models", 2006, section 4.2), linear in f. S is diagonal:
-    correlations between joints are those of one motion and not of the next (Franka Panda: intervals held 76 to 92 %
-    with, 87 to 100 without).
-    """
-    torque_noise = (H * force_std.square()) @ H.mT
-    kept = torch.linalg.solve(torque_noise + moments, moments.expand_as(torque_noise)).mT  # G
-    covariance = torque_noise @ kept.mT
-    matrix, offset = kept @ acceleration.matrix, (kept @ acceleration.offset[..., None])[..., 0]
-    return AffineMap(offset, matrix), 0.5 * (covariance + covariance.mT)
 
 
 FAR_FROM_SURFACE = 0.01

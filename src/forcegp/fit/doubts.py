@@ -16,11 +16,11 @@ from forcegp.evidence.least_squares import Fit
 from forcegp.evidence.likelihood import CONSTANT, FAR_FROM_SURFACE, MarginalLikelihood, checked_values
 from forcegp.evidence.parameter_space import force_title
 from forcegp.evidence.recorded_rows import RecordedRows
-from forcegp.fit.payload_link import CLEARLY, left_by_least_squares
 from forcegp.forces import Offset, RigidBodies
 from forcegp.model import Model
 from forcegp.summary import listed
 
+CLEARLY_MORE = 10.0  # nats
 INVISIBLE = 1e-9  # |H B_c| over |M^-1 B_c| below which accelerations show nothing of a latent: rounding, measured 1e-15
 ROUNDING = 1e-12  # |M^-1 B_c| relative to the largest of them below which a latent moves nothing
 
@@ -209,11 +209,13 @@ def doubts_of_no_body(
     """
     payload = fit.jacobian[..., own] @ np.linalg.inv(slopes)
     white, others = fit.residual / fit.noise, np.delete(fit.jacobian, np.r_[own], axis=-1)
-    left, _ = left_by_least_squares(np.concatenate([payload, others], axis=-1) / fit.noise[:, None], white)
+    free = (np.concatenate([payload, others], axis=-1) / fit.noise[:, None]).reshape(white.size, -1)
+    free = free / np.linalg.norm(free, axis=0).clip(1e-300)
+    left = white.ravel() - free @ np.linalg.lstsq(free, white.ravel(), rcond=1e-10)[0]
     cost = 0.5 * float((white**2).sum())
     more = cost - 0.5 * float((left**2).sum())
     rough = np.linalg.norm(fit.residual) > RIGHT * np.linalg.norm(payload @ parameters)
-    if rough and more > max(CLEARLY, LEAST * cost):
+    if rough and more > max(CLEARLY_MORE, LEAST * cost):
         yield look(
             about="payload",
             what=f"no body on {link} explains the log: free numbers in place of its mass, centre and inertia leave "

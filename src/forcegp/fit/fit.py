@@ -296,7 +296,7 @@ class _Functions:
             return self._with_loads(rows, dataset)
         refuse_what_has_no_answer(self.model, rows)
         typical = typical_sizes(self.model, [rows])
-        model = with_payloads_placed(self.model, [dataset], typical)
+        model = with_payloads_placed(self.model, [dataset])
         space = ParameterSpace(model, typical)
         x = space.start
         again, found, change, rounds = self, None, np.inf, 0

@@ -27,7 +27,6 @@ from forcegp.evidence.least_squares import (
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, RecordedRows
 from forcegp.fit.doubts import doubts_of_base, doubts_of_no_body, doubts_of_offsets
-from forcegp.fit.payload_link import most_likely, possible_links
 from forcegp.forces import Payload
 from forcegp.model import Model
 from forcegp.noise import Noise
@@ -161,6 +160,8 @@ STEPS = 6
 """Evaluations in each, since the next one begins with other accelerations; twice as many after a search in vain."""
 REACHED = 0.02
 """They end where a step is to lower the cost by fewer nats per coordinate: each is within a fifth of its error."""
+WINDOW = 0.4
+"""Seconds that `forcegp payload` averages torques over."""
 FEWEST = 10 * STRETCHES
 """Rows that a payload needs."""
 
@@ -196,7 +197,7 @@ def fit_physical(
     logs = [with_memory(log, model) for log in logs]
     logs = [log.rows(evenly(log, most)) for log in logs]
     typical = typical_sizes(model, logs)
-    model = with_payloads_placed(model, logs, typical)
+    model = with_payloads_placed(model, logs)
     space = ParameterSpace(model, typical)
     equations = Equations(space, logs, evidence)
     held = equations.held if evidence.of_torque and equations.held.shape[1] and equations.windows is None else None
@@ -335,8 +336,23 @@ def typical_sizes(model: Model, logs: Sequence[Dataset]) -> dict[str, Float[np.n
     return {"force": torque, "velocity": velocity, "inertia": mass, "position": position}
 
 
-def with_payloads_placed(model: Model, logs: Sequence[Dataset], typical: dict[str, np.ndarray]) -> Model:
-    """The model whose payload without a link is on the one where it explains the log best.
+def _usual_link(robot: Robot) -> str:
+    """A base that moves, else of the last joint the last link of the file.
+
+    Joints that move several bodies, as those of fingers, count as none, if there are others: what fingers hold moves
+    with the hand.
+    """
+    if robot.base != "fixed":
+        return robot.layout.moving[0]
+    drives = [drive.joint for drive in robot.layout.drives]
+    solid = {place.body for place in robot.layout.links.values()}
+    alone = [body for body, joint in enumerate(drives) if drives.count(joint) == 1 and body in solid]
+    last = max(alone, default=len(robot.layout.bodies) - 1)
+    return [name for name, place in robot.layout.links.items() if place.body == last][-1]
+
+
+def with_payloads_placed(model: Model, logs: Sequence[Dataset]) -> Model:
+    """The model whose payload without a link is on the usual one.
 
     Raises DatasetError for logs too short for a payload.
     """
@@ -355,41 +371,8 @@ def with_payloads_placed(model: Model, logs: Sequence[Dataset], typical: dict[st
         )
     if not open_ones:
         return model
-    candidates = possible_links(model.robot)
-    chosen = candidates[0]
-    if len(candidates) > 1:
-        forces = [force for force in model.forces if force is not open_ones[0]]
-        tried = [Payload(link) for link in candidates]
-        space = ParameterSpace(replace(model, forces=(*forces, *tried)), typical)
-        evidence = Torques(mean=WINDOW)
-        equations = Equations(space, logs, evidence)
-        names = [each.name for each in space.carried]
-        places = [names.index(f"payload.{link}") for link in candidates]
-        r, jacobian = _without_payloads(equations, space, places)
-        Y = np.concatenate([motion.regressor for motion in equations.measured])[:, :, places]
-        assert equations.windows is not None, "its evidence has means"
-        free = equations.held.swapaxes(1, 2) if equations.held.shape[1] else None
-        chosen = candidates[most_likely(equations.windows.mean(without(Y, free)), r, jacobian)]
-    placed = replace(open_ones[0], link=chosen)
+    placed = replace(open_ones[0], link=_usual_link(model.robot))
     return replace(model, forces=tuple(placed if force is open_ones[0] else force for force in model.forces))
-
-
-WINDOW = 0.4
-"""Seconds that torques are averaged over where the link of a payload is sought, and by `forcegp payload`."""
-
-
-def _without_payloads(
-    equations: Equations, space: ParameterSpace, places: Sequence[int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Residual at the start without the payloads, and the Jacobian in all other coordinates."""
-    bare = []
-    for motion in equations.measured:
-        regressor = motion.regressor.copy()
-        regressor[:, :, list(places)] = 0.0
-        bare.append(replace(motion, regressor=regressor))
-    r, jacobian = equations.in_torque(space.start, bare)
-    of_payloads = np.concatenate([np.arange(10 * place, 10 * place + 10) for place in places])
-    return r, np.delete(np.asarray(jacobian), of_payloads, axis=-1)
 
 
 def _doubts_of_payloads(space: ParameterSpace, fit: Fit, averaged: bool) -> Iterator[Doubt]:

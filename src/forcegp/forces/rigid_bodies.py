@@ -73,8 +73,7 @@ WEAK = 0.01
 class Payload(Law):
     """A body that the robot carries on `link`: its weight, and what its inertia adds to the robot's.
 
-    link: None stands for the base that moves, or the link at which joints end or part, whose payload explains a log
-        best.
+    link: None stands for the base that moves, else for the last link of the last joint.
     mass [kg], center_of_mass [m] in the axes of the link, and inertia [kg m^2] (3, 3) about the centre of mass and
         along these axes; without a mass, `forcegp.fit` estimates all ten numbers. Other sizes are 0 by default.
     """

@@ -15,13 +15,12 @@ from forcegp.data import Dataset, with_memory
 from forcegp.data.dataset import require_rows
 from forcegp.errors import DataWarning, InvalidInput, NumericalError, require_type, usable_arguments
 from forcegp.evidence import Accelerations
-from forcegp.evidence.likelihood import second_moments, shrunk
 from forcegp.forces import Force
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.integration.integrators import Feedback, check_time_step
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact
 from forcegp.model import Model
-from forcegp.noise import FORCE, Noise
+from forcegp.noise import Noise
 from forcegp.posterior.fitted import Fitted
 from forcegp.posterior.observed_wrench import rows_of_own_system
 from forcegp.posterior.prediction import (
@@ -122,30 +121,17 @@ class Posterior(Fitted):
         def through(affine: AffineMap) -> Gaussian:
             return latents.through(affine.matrix @ B, affine.offset)
 
-        acceleration, torque_noise = self.acceleration_map(dynamics)
-        predicted = through(acceleration)
-        noise, spread = dict(self.hyperparameters), predicted.covariance
-        if torque_noise is not None:  # it counts as unknown, not as noise of the measured acceleration
-            del noise[FORCE]
-            spread = None if spread is None else spread + torque_noise
+        predicted, noise = through(dynamics.acceleration_map()), _noise_covariance(self.hyperparameters, dynamics)
         if self.is_black_box:  # its functions hold what contacts do, so forces are not those of anything
-            return Prediction(predicted.mean, spread, None, None, None, _noise_covariance(noise, dynamics))
+            return Prediction(predicted.mean, predicted.covariance, None, None, None, noise)
         return Prediction(
             predicted.mean,
-            spread,
+            predicted.covariance,
             multiplier=through(dynamics.multiplier_map()),
             contact_force=through(dynamics.contact_force_map()),
             unknown_force=latents.through(B),
-            noise_covariance=_noise_covariance(noise, dynamics),
+            noise_covariance=noise,
         )
-
-    def acceleration_map(self, dynamics: ConstrainedDynamics) -> tuple[AffineMap, Tensor | None]:
-        """Acceleration as a function of the unknown force, and what u's own noise leaves open; None for exact u."""
-        affine = dynamics.acceleration_map()
-        noise = self.trained.noise
-        if noise is None or not noise.measured_torque:
-            return affine, None
-        return shrunk(affine, dynamics.H, self.hyperparameters[FORCE].exp(), second_moments(self.training.a))
 
     def latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Gaussian:
         """All processes at a batch of states: mean (..., C), and their joint covariance (..., C, C) where asked for."""

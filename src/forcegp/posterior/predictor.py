@@ -314,7 +314,7 @@ class Predictor(Summary):
             features = posterior.likelihood.standardization(prior.features(dynamics))
             spread = posterior.widening**2 * self.compressed.at(posterior.latent, features)
             latents = Gaussian(latents.mean, spread)
-        affine = posterior.acceleration_map(dynamics)[0]
+        affine = dynamics.acceleration_map()
         found = latents.through(affine.matrix @ prior.direction(dynamics), affine.offset)
         return found.mean, found.covariance  # type: ignore[return-value]  # it was asked for
 

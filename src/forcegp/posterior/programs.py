@@ -61,13 +61,7 @@ class Physics:
 
     @classmethod
     def of(cls, posterior: Any, model: Model) -> "Physics":
-        """Of a `Posterior` in this model. Raises InvalidInput where u is a noisy measurement."""
-        noise = posterior.trained.noise
-        if noise is not None and noise.measured_torque:
-            raise InvalidInput(
-                "a program is for commanded torques, and in this model u comes from a noisy sensor; call predict, or "
-                "fit with Noise(..., measured_torque=False)."
-            )
+        """Of a `Posterior` in this model."""
         return cls(model, posterior.trained.unknown, posterior.likelihood.standardization)
 
     def mixing(self, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, list[Tensor]]:
