@@ -132,7 +132,8 @@ class JobStore:
         With `overwrite` everything is computed anew; None for commands that do not offer it. Raises InvalidInput for a
         folder of something else or of another configuration, naming what differs.
         """
-        store, wanted = cls(folder, kind), json.loads(json.dumps(dict(configuration)))  # as JSON stores it
+        wanted = json.loads(json.dumps(dict(configuration)))  # as JSON stores it
+        store = cls(folder.absolute(), kind)  # processes that compute may be in another folder
         description = folder / DESCRIPTION
         if description.exists():
             stored = read_json(description, f"choose another `folder`, or delete {folder}")

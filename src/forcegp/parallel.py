@@ -11,6 +11,7 @@ import time
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future
+from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 from typing_extensions import override
@@ -135,22 +136,22 @@ _own: Executor | None = None
 
 
 def _own_processes(jobs: int) -> Executor:
-    """The processes of the last call, or new ones where a process died or their number has changed."""
+    """The processes of the last call; new ones where one died, or their number or the folder of this one changed."""
     from joblib.externals.loky import get_reusable_executor
 
     global _own
-    _own = get_reusable_executor(
-        jobs, timeout=IDLE_SECONDS, initializer=_begin_process, initargs=(os.getpid(),), env=ONE_THREAD
-    )
+    here = os.getpid(), Path.cwd()
+    _own = get_reusable_executor(jobs, timeout=IDLE_SECONDS, initializer=_begin_process, initargs=here, env=ONE_THREAD)
     return _own
 
 
-def _begin_process(parent: int) -> None:
+def _begin_process(parent: int, folder: Path) -> None:
     """One thread, and no life without the parent: a killed run must not go on in its children."""
     import signal
 
     from threadpoolctl import threadpool_limits
 
+    os.chdir(folder)  # relative paths are those of the parent
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its children itself
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threadpool_limits(1)  # processes share the cores: for libraries that are loaded already

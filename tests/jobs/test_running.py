@@ -1,6 +1,7 @@
 """Jobs run in order, several at once, each once; failures and kills cost only what was not finished."""
 
 import os
+from pathlib import Path
 
 import pytest
 
@@ -36,6 +37,15 @@ def test_all_jobs_are_computed_once_and_in_order(results):
     before = results.load("square/3")
     assert run_jobs(results, [*jobs, square(5)]) == 1
     assert results.load("square/3") == before
+
+
+def test_a_relative_folder_is_that_of_the_caller_not_of_the_processes(results, tmp_path, monkeypatch):
+    run_jobs(results, [square(3), square(4)], at_once=2)  # processes begin in the folder of now
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    kept = JobStore.open(Path("kept"), "a test", {})
+    run_jobs(kept, [square(5), square(6)], at_once=2)
+    assert (tmp_path / "elsewhere" / "kept" / "jobs" / "square" / "5" / "note.txt").exists()
 
 
 def test_a_failure_stops_only_what_needs_it(results):

@@ -13,6 +13,10 @@ def seeded_sum(seed):
     return float(np.random.default_rng(seed).standard_normal(1000).sum())
 
 
+def folder_of_work(_):
+    return Path.cwd()
+
+
 def slow_first(index):
     """The first argument ends last."""
     time.sleep(0.2 if index == 0 else 0.0)

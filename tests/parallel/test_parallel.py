@@ -40,6 +40,12 @@ def test_outcomes_are_those_of_one_process_in_the_order_of_the_arguments(jobs):
     assert outcome_of(submit(executor_for(jobs), partial(pow, 2), 3)) == 8
 
 
+def test_own_processes_work_in_the_folder_of_the_caller(tmp_path, monkeypatch):
+    assert list(mapped(tasks.folder_of_work, [0, 1], 2)) == [Path.cwd()] * 2
+    monkeypatch.chdir(tmp_path)
+    assert list(mapped(tasks.folder_of_work, [0, 1], 2)) == [tmp_path] * 2
+
+
 def test_an_exception_passes_through_in_its_place(jobs, tmp_path):
     outcomes = mapped(tasks.mark_or_fail, [tmp_path / "first", None, *(tmp_path / str(k) for k in range(20))], jobs)
     assert next(outcomes) == tmp_path / "first"
