@@ -11,7 +11,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -83,6 +83,31 @@ def require_writable(path: str | Path) -> None:
     with _beside(place / target.name) as temporary:
         temporary.write_bytes(bytes(TRIAL))
         _flush(temporary)
+
+
+def require_replaceable(
+    folder: Path, writer: str, ours: Callable[[Path], bool], *, overwrite: bool, own: Iterable[str] = ()
+) -> None:
+    """Refuse what exists, but empty folders, and with `overwrite` what is `ours` and has no files of others.
+
+    Raises FileFormatError.
+    """
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    if not folder.is_dir() or not ours(folder):
+        what = f"exists and was not written by {writer}, so it is not overwritten; choose another name."
+        raise FileFormatError(f"{folder} {what}")
+    if not overwrite:
+        raise FileFormatError(f"{folder} exists already; choose another name, or add `overwrite=True`.")
+    known = {SUMS, *own}
+    with contextlib.suppress(OSError, ValueError):
+        known |= {line[66:] for line in (folder / SUMS).read_text(encoding="utf-8").splitlines()}
+    entries = (entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
+    if others := sorted({entry.relative_to(folder).as_posix() for entry in entries} - known):
+        raise FileFormatError(
+            f"{folder} holds files that {writer} did not write ({', '.join(others[:3])}), so it is not overwritten; "
+            "move them away, or choose another name."
+        )
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -237,15 +262,6 @@ def require_unchanged(folder: Path, remedy: str) -> None:
             raise FileFormatError(f"{folder} is damaged: {changed or SUMS} is not as it was written; {remedy}")
     except (OSError, ValueError) as error:
         raise FileFormatError(f"{folder} is damaged: {SUMS} cannot be read ({error}); {remedy}") from None
-
-
-def added_files(folder: Path, own: Iterable[str] = ()) -> list[str]:
-    """Files in the folder that nobody lists: neither its digests nor `own`."""
-    known = {SUMS, *own}
-    with contextlib.suppress(OSError, ValueError):
-        known |= {line[66:] for line in (folder / SUMS).read_text(encoding="utf-8").splitlines()}
-    entries = (entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
-    return sorted({entry.relative_to(folder).as_posix() for entry in entries} - known)
 
 
 def _text(folder: Path, names: Iterable[str]) -> str:

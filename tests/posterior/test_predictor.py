@@ -14,7 +14,7 @@ from forcegp.forces import ContactFriction, JointForces, JointFriction, ToolForc
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Contact, ImplicitSurface, Plane, Sphere
 from forcegp.model import Model
-from forcegp.posterior import Posterior, Predictor
+from forcegp.posterior import Posterior, Predictor, preparation
 
 TIP = (0.0, 0.0, 0.2)
 CONTACTS = {
@@ -48,7 +48,7 @@ def means(posterior) -> Predictor:
 
 @pytest.fixture(scope="module")
 def compressed(posterior) -> Predictor:
-    return posterior.predictor(tolerance=0.1)
+    return posterior.predictor()
 
 
 @pytest.fixture(scope="module")
@@ -101,9 +101,9 @@ def test_it_is_predict_with_any_prior(states, model):
     check(fitted(model), states)
 
 
-def test_gradients_of_mean_and_covariance_are_those_of_torch(posterior, states):
-    compiled = posterior.predictor(tolerance=100.0)
-    eager = posterior.predictor(tolerance=100.0, compile=False)
+def test_gradients_of_mean_and_covariance_are_those_of_torch(posterior, states, monkeypatch):
+    monkeypatch.setattr(preparation, "TOLERANCE", 100.0)
+    compiled, eager = (posterior.predictor(compile=compile) for compile in (True, False))
     assert compiled.rank == eager.rank > 1
 
     def gradients(predictor) -> tuple[torch.Tensor, ...]:
@@ -119,19 +119,23 @@ def test_gradients_of_mean_and_covariance_are_those_of_torch(posterior, states):
         assert_close(found, expected)
 
 
-def test_the_compressed_covariance_is_never_below_the_exact_one(posterior, states):
+def test_the_compressed_covariance_is_never_below_the_exact_one(posterior, states, monkeypatch):
     exact = posterior.predict(*states).covariance
+    monkeypatch.setattr(preparation, "TOLERANCE", 1e-9)
     for rank in (1, 5, 20):
+        monkeypatch.setattr(preparation, "LARGEST_RANK", rank)
         with pytest.warns(NumericalWarning, match=f"rank {rank} makes"):
-            predictor = posterior.predictor(tolerance=1e-9, largest_rank=rank, compile=False)
+            predictor = posterior.predictor(compile=False)
         assert predictor.rank == rank
         excess = predictor(*states)[1] - exact
         assert float(torch.linalg.eigvalsh(excess).min()) > -1e-9 * float(exact.abs().max())
     assert float(excess.diagonal(dim1=1, dim2=2).max()) > 1e-6 * float(exact.abs().max())  # it is a compression
 
 
-def test_the_rank_keeps_the_tolerance_and_no_more(posterior):
-    loose, tight = (posterior.predictor(tolerance=tolerance, compile=False) for tolerance in (100.0, 0.01))
+def test_the_rank_keeps_the_tolerance_and_no_more(posterior, monkeypatch):
+    tight = posterior.predictor(compile=False)
+    monkeypatch.setattr(preparation, "TOLERANCE", 100.0)
+    loose = posterior.predictor(compile=False)
     assert loose.rank < tight.rank <= 2 * 30
     assert 0.01 < float(loose.inflation.max()) <= 100.0
     assert float(tight.inflation.max()) <= 0.01
@@ -201,8 +205,6 @@ def test_errors_name_the_remedy(posterior, means, states):
         predictor(q, v, u)
     with pytest.raises(InvalidInput, match=r"'dense'.*'auto', 'compressed', 'exact', 'none'"):
         posterior.predictor(covariance="dense")
-    with pytest.raises(InvalidInput, match=r"tolerance is 0\.0 .*give a positive number"):
-        posterior.predictor(tolerance=0.0)
     with pytest.raises(NumericalError, match="not finite"):
         predictor.mean(q, v * 1e200, u)
 

@@ -60,7 +60,7 @@ def test_nothing_is_overwritten_unasked_and_only_models_ever(posterior, run, tmp
     other = tmp_path / "thesis"
     other.mkdir()
     (other / "chapter.txt").write_text("mine")
-    with pytest.raises(FileFormatError, match="not a folder written by forcegp"):
+    with pytest.raises(FileFormatError, match="was not written by forcegp"):
         save_posterior(posterior, other, overwrite=True)
     assert (other / "chapter.txt").read_text() == "mine"
 
@@ -69,7 +69,7 @@ def test_files_that_a_user_put_there_are_never_deleted(posterior, run):
     (run / "notes").mkdir()
     (run / "notes" / "monday.txt").write_text("mine")
     (run / "elsewhere").symlink_to("/nowhere")
-    with pytest.raises(FileFormatError, match=r"did not write there \(elsewhere, notes/monday\.txt\)"):
+    with pytest.raises(FileFormatError, match=r"did not write \(elsewhere, notes/monday\.txt\)"):
         save_posterior(posterior, run, overwrite=True)
     assert (run / "notes" / "monday.txt").read_text() == "mine"
     (run / "notes" / "monday.txt").unlink()

@@ -20,7 +20,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
 import forcegp.data
-from forcegp.atomic_files import SUMS, added_files, atomic_folder, require_writable, write_digests, write_json
+from forcegp.atomic_files import SUMS, atomic_folder, require_replaceable, require_writable, write_digests, write_json
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import FileFormatError, InvalidInput
 
@@ -253,20 +253,10 @@ class Command(ABC):
         """Refuse what exists, but empty folders, and with --overwrite what only this command wrote."""
         if path is None:
             return
-        if path.exists() and not (path.is_dir() and not any(path.iterdir())):
-            if not path.is_dir() or _config(path).get("kind") != self.kind:
-                raise InvalidInput(
-                    f"{path} exists and was not written by `{self.kind}`, so it is not overwritten; choose another "
-                    "name."
-                )
-            if not self.overwrite:
-                raise InvalidInput(f"{path} exists already; choose another name, or add --overwrite.")
-            others = added_files(path)
-            if others:
-                raise InvalidInput(
-                    f"{path} holds files that `{self.kind}` did not write ({', '.join(others[:3])}), so it is not "
-                    "overwritten; move them away, or choose another name."
-                )
+        kind = self.kind
+        require_replaceable(
+            path, f"`{kind}`", lambda folder: _config(folder).get("kind") == kind, overwrite=self.overwrite
+        )
         require_writable(path)
 
     def require_free_file(

@@ -205,10 +205,9 @@ def columns(
     header: Sequence[str],
     rows: Sequence[Sequence[str]],
     *,
-    last: Sequence[str] = (),
     long_names: bool = False,
 ) -> Table:
-    """A table of text and numbers, `last` set apart; texts of the first column are folded if `long_names`."""
+    """A table of text and numbers; texts of the first column are folded if `long_names`."""
     from rich import box
     from rich.table import Table
     from rich.text import Text
@@ -217,15 +216,12 @@ def columns(
     for place, name in enumerate(header):
         folded = long_names and not place
         # rich counts the longest word, where a cell must not be folded at all
-        cells = [cell for row in (header, *rows, last) for cell in row[place : place + 1]]
+        cells = [cell for row in (header, *rows) for cell in row[place : place + 1]]
         widest = max(len(line) for cell in cells for line in cell.split("\n"))
         how: Any = {} if folded else {"no_wrap": True, "min_width": widest}
         table.add_column(Text(name), justify="right" if place else "left", overflow="fold", **how)
     for row in rows:
         table.add_row(*map(Text, row))  # as a str, "[Nm]" would be a style
-    if last:
-        table.add_section()
-        table.add_row(*map(Text, last), style="bold")
     return table
 
 

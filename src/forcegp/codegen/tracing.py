@@ -381,6 +381,8 @@ def _product(graph: Graph, x: Any, y: Any) -> _Numbers:
     left, right = _numbers(graph, x).nodes, _numbers(graph, y).nodes
     shape = (*left.shape[:-1], right.shape[-1])
     count = math.prod(left.shape[:-2])
+    if left.numel() and bool((left[..., -1, 0] == ZERO).all()):  # sums of what follows share terms from the end on
+        left, right = left.flip(-1), right.flip(-2)
     stacks = (x.reshape(count, *x.shape[-2:]).tolist() for x in (left, right.mT))
     pairs = zip(*stacks, strict=True)
     results = [graph.dot(row, column) for rows, columns in pairs for row in rows for column in columns]

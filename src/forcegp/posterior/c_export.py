@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.atomic_files import atomic_folder, require_writable
+from forcegp.atomic_files import atomic_folder, require_replaceable, require_writable
 from forcegp.codegen.c_writer import c_text, filled, head, sections, write_function
 from forcegp.codegen.library import compile_library, compiler
 from forcegp.data import units_for
@@ -247,8 +247,8 @@ def export_c(
     functions is by default the robot's, `source` what the header names as the model's origin; `unchecked` neither
     compiles nor compares.
 
-    Raises InvalidInput for what cannot be exported and a folder that has files, CompilerError where the compiler fails,
-    NumericalError where the program and `predict` differ, OSError.
+    Raises InvalidInput for what cannot be exported, FileFormatError for a folder that has files, CompilerError where
+    the compiler fails, NumericalError where the program and `predict` differ, OSError.
     """
     require_type("posterior", posterior, Posterior)
     posterior = posterior.to("cpu") if posterior.training.q.device.type != "cpu" else posterior
@@ -265,8 +265,7 @@ def export_c(
             "keep the factor of all rows; export without `covariance`."
         )
     folder = Path(folder)
-    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-        raise InvalidInput(f"{folder} exists already and is not an empty folder; choose another name.")
+    require_replaceable(folder, "export_c", lambda _: False, overwrite=False)
     require_writable(folder)
     reference = posterior.predictor(covariance="compressed" if covariance else "none", compile=False)
     code = posterior.programs(compressed=reference.compressed)

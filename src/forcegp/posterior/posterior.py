@@ -168,18 +168,16 @@ class Posterior(Fitted):
         """
         return curve_of(self, latent, features, points)
 
-    def predictor(
-        self, *, covariance: str = "auto", tolerance: float = 0.01, largest_rank: int = 1536, compile: bool = True
-    ) -> Predictor:
+    def predictor(self, *, covariance: str = "auto", compile: bool = True) -> Predictor:
         """The accelerations of `predict` at control rates: one state at a time in fractions of a millisecond.
 
-        `covariance` "compressed" uses so few combinations of the data, `largest_rank` at most (a NumericalWarning says
-        where that does not suffice), that standard deviations are up to `tolerance` (relative) larger than the exact
-        ones around the training data, and never smaller; "exact", "none"; "auto" is "compressed" after exact inference,
-        else "exact". `compile=False` computes by torch, on any device, as does a computer without a C compiler, with a
-        NumericalWarning. Raises InvalidInput for arguments out of range and models that cannot be compiled.
+        `covariance` "compressed" uses so few combinations of the data, 1536 at most (a NumericalWarning says where that
+        does not suffice), that standard deviations are up to 1 % larger than the exact ones around the training data,
+        and never smaller; "exact", "none"; "auto" is "compressed" after exact inference, else "exact". `compile=False`
+        computes by torch, on any device, as does a computer without a C compiler, with a NumericalWarning. Raises
+        InvalidInput for arguments out of range and models that cannot be compiled.
         """
-        return prepared_predictor(self, covariance, tolerance, largest_rank, compile)
+        return prepared_predictor(self, covariance, compile)
 
     def checked_states(self, q: Array, v: Array, u: Array) -> tuple[list[Tensor], torch.Size]:
         """States as float64 rows on the model's device, and their batch; InvalidInput for shapes, not finite values."""

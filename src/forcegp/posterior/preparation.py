@@ -1,6 +1,5 @@
 """A posterior made ready for control rates: its programs, and its covariance, compressed at states around the data."""
 
-import math
 import time
 import warnings
 from dataclasses import replace
@@ -27,18 +26,14 @@ STEP = 0.3
 """Length of a step away from a training state, in differences of two others."""
 
 
-def prepared_predictor(
-    posterior: Any, covariance: str, tolerance: float, largest_rank: int, compile: bool
-) -> Predictor:
+TOLERANCE, LARGEST_RANK = 0.01, 1536
+"""By how much standard deviations of a compressed covariance exceed the exact ones at most, where the rank suffices."""
+
+
+def prepared_predictor(posterior: Any, covariance: str, compile: bool) -> Predictor:
     """What `Posterior.predictor` documents."""
     if not isinstance(covariance, str) or covariance not in COVARIANCES:
         raise InvalidInput(f"covariance is {covariance!r}; give one of {', '.join(map(repr, COVARIANCES))}.")
-    number = isinstance(tolerance, int | float)
-    if not (number and 0.0 < tolerance < math.inf and isinstance(largest_rank, int) and largest_rank >= 1):
-        raise InvalidInput(
-            f"tolerance is {tolerance!r} and largest_rank is {largest_rank!r}; give a positive number, for example "
-            "0.01, and an integer from 1."
-        )
     begin, latent, model = time.perf_counter(), posterior.latent, posterior.model
     physics, training = Physics.of(posterior, model), rows_for(posterior.training, posterior.trained, model)
     if covariance == "auto":
@@ -51,13 +46,12 @@ def prepared_predictor(
                 f"{type(latent).__name__} does not have; give covariance='exact', which is the one that it has, "
                 f"'none', or {latent.remedy}."
             )
-        compressed = _compressed(latent, training, physics, tolerance, largest_rank)
+        compressed = _compressed(latent, training, physics)
         reached = float(compressed.inflation.max()) if len(compressed.inflation) else 0.0
-        if reached > tolerance:
+        if reached > TOLERANCE:
             warnings.warn(
                 f"rank {compressed.rank} makes standard deviations up to {reached:.2g} (relative) too large, more "
-                f"than the tolerance {tolerance:.2g}; give a larger largest_rank or tolerance, or "
-                "covariance='exact'.",
+                f"than {TOLERANCE:.2g}; give covariance='exact' where that matters.",
                 NumericalWarning,
                 stacklevel=3,
             )
@@ -83,13 +77,7 @@ def rows_for(training: TrainingData, trained: Model, model: Model) -> TrainingDa
     return replace(training, u=with_zero[..., [had.index(name) if name in had else -1 for name in model.inputs]])
 
 
-def _compressed(
-    latent: ExactPosterior,
-    training: TrainingData,
-    physics: Physics,
-    tolerance: float,
-    largest_rank: int,
-) -> CompressedCovariance:
+def _compressed(latent: ExactPosterior, training: TrainingData, physics: Physics) -> CompressedCovariance:
     # functions of one input are rough: between two training values, what is uncertain hangs on these two alone
     rough = any(z.shape[-1] == 1 for z in latent.features)
 
@@ -101,7 +89,7 @@ def _compressed(
         return Sample([z[usable] for z in features], W[usable])
 
     chosen = sample(SAMPLES, 0, len(training.q) if rough else SAMPLES // 3)
-    return compress(latent, chosen, sample(CHECKS, 1, CHECKS // 3), tolerance=tolerance, largest=largest_rank)
+    return compress(latent, chosen, sample(CHECKS, 1, CHECKS // 3), tolerance=TOLERANCE, largest=LARGEST_RANK)
 
 
 def sample_states(

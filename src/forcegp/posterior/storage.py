@@ -5,6 +5,7 @@ It holds training points and parameters, after `with_model` also `target.urdf`; 
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
 from forcegp import __version__
-from forcegp.atomic_files import added_files, atomic_folder, require_unchanged, write_digests
+from forcegp.atomic_files import atomic_folder, require_replaceable, require_unchanged, write_digests
 from forcegp.data import units_for
 from forcegp.errors import FileFormatError, ForceGPError, require_type, usable_arguments
 from forcegp.evidence.likelihood import TrainingData
@@ -53,20 +54,8 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     """
     require_type("posterior", posterior, Posterior)
     path = Path(path)
-    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
-        if not overwrite:
-            raise FileFormatError(f"{path} exists already; choose another name or pass overwrite=True")
-        try:
-            _document(path)
-        except FileFormatError:
-            what = "exists and is not a folder written by forcegp, so it is not overwritten"
-            raise FileFormatError(f"{path} {what}") from None
-        others = added_files(path, ("model.json", "tensors.safetensors", ROBOT, TARGET))
-        if others:
-            raise FileFormatError(
-                f"{path} holds files that forcegp did not write there ({', '.join(others[:3])}), so it is not "
-                "overwritten; move them away or choose another name"
-            )
+    files = ("model.json", "tensors.safetensors", ROBOT, TARGET)
+    require_replaceable(path, "forcegp", _is_model, overwrite=overwrite, own=files)
     models = {"model": posterior.trained.to_dict()}
     if posterior.target is not None:
         models["target"] = posterior.target.to_dict()
@@ -168,6 +157,12 @@ def _require_numbers(settings: Mapping[str, Any], nv: int) -> None:
             same = same and size == (sizes.setdefault(asked, size) if isinstance(asked, str) else asked)
         if not same or (key in POSITIVE and not (given > 0.0).all()):
             raise ValueError(f"model.json has settings in which {name} is {str(value)[:60]}")
+
+
+def _is_model(path: Path) -> bool:
+    with suppress(FileFormatError):
+        return bool(_document(path))
+    return False
 
 
 def _document(path: Path) -> dict[str, Any]:
