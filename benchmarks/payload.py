@@ -31,8 +31,7 @@ from forcegp.cli.main import main
 from forcegp.data import Preparation
 from forcegp.evidence import Torques
 from forcegp.fit import fit
-from forcegp.forces import Payload, Rotor
-from forcegp.forces.registry import usual_friction
+from forcegp.forces import GearFriction, Offset, Payload, Rotor, Viscous
 
 SEEDS, SECONDS = range(1, 21), 60.0
 NUMBERS = ("mass", "center_of_mass.x", "center_of_mass.y", "center_of_mass.z")
@@ -70,7 +69,7 @@ def payloads(ur5: Any) -> dict[str, float]:
         rng = np.random.default_rng(seed)
         mass, center = rng.uniform(0.3, 3.0), rng.uniform(-0.08, 0.08, 3)
         loaded, empty = prepared(ur5, seed, mass, center), prepared(ur5, 100 + seed, 0.0, center)
-        model = loaded.model.with_forces(usual_friction(), Rotor(), Payload("tool0"))
+        model = loaded.model.with_forces(Viscous(), GearFriction(), Offset(), Rotor(), Payload("tool0"))
         for name, baseline in (("urdf", None), ("baseline", empty)):
             found = fit(model, loaded, Torques(), baseline=baseline).parameters
             place = np.array([found[f"payload.{name}"].value for name in NUMBERS[1:]])

@@ -1,6 +1,6 @@
 """Plants whose joints have friction of another form than every model: what is a model's own form worth?"""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -14,16 +14,6 @@ ASYMMETRY = 0.7  # Coulomb friction backwards over that forwards
 LOAD = 0.04, 0.015  # per torque of a joint that drives, that is driven back
 PRESLIDING = 0.01  # rad that a joint gives before it slides
 DRIFT = 0.3, 60.0  # of Coulomb friction lost as gears warm up; in s
-
-
-class PlantConfig(KukaSurfaceConfig):
-    """A config whose `joint_friction` may be one of `OF_PLANTS`."""
-
-    own_laws: ClassVar = OF_PLANTS
-
-    def joint_law(self, robot: Robot) -> Any:
-        """What `JointFrictionLaw.step` is."""
-        return JointFrictionLaw(self, robot).step
 
 
 class JointFrictionLaw:
@@ -105,3 +95,9 @@ class JointFrictionLaw:
 
     def _either_way(self, v: np.ndarray) -> np.ndarray:
         return self.coulomb * np.where(v < 0.0, ASYMMETRY, 1.0)
+
+
+class PlantConfig(KukaSurfaceConfig):
+    """A config whose `joint_friction` may be one of `OF_PLANTS`."""
+
+    own_laws: ClassVar = dict.fromkeys(OF_PLANTS, lambda config, robot: JointFrictionLaw(config, robot).step)

@@ -1,6 +1,6 @@
 """Computed torque with what was learned of friction, against PD, the URDF, least squares and the true model.
 
-KUKA iiwa without a tool load, Stribeck friction in every joint (`kuka-surface`'s), controlled at 240 Hz, simulated in
+KUKA iiwa without a tool load, GearFriction friction in every joint (`kuka-surface`'s), controlled at 240 Hz, simulated in
 steps of 1/960 s. All controllers have the same gains, omega = 10: stiffness 100 / s^2, critically damped. The reference
 moves all joints by sines for 10 s; the error is the root mean square over joints and time after the first second.
 
@@ -27,8 +27,7 @@ from forcegp import ComputedTorque, Coulomb, Dataset, JointFriction, KukaSurface
 from forcegp.control import PDGravity
 from forcegp.data import farthest_rows
 from forcegp.evidence import Accelerations
-from forcegp.forces import RigidBodies, Rotor
-from forcegp.forces.registry import usual_friction
+from forcegp.forces import GearFriction, Offset, RigidBodies, Rotor
 from forcegp.posterior import Posterior
 from forcegp.simulation.kuka_surface import kuka_urdf
 
@@ -170,7 +169,7 @@ def with_payload(seed: int) -> dict[str, dict[str, float]]:
     true, given, task = robot_of(payload=0.5), Model(robot_of(inertia=1.1)), task_of(seed)
     motion = followed(true, excitation(seed), PDGravity(given.robot.compile(), **GAINS), 30.0)
     rows = rows_of(motion, given, seed, len(motion["q"]) - 1)
-    bodies = given.with_forces(RigidBodies("all"), usual_friction(), Rotor())
+    bodies = given.with_forces(RigidBodies("all"), Viscous(), GearFriction(), Offset(), Rotor())
     identified = fit(bodies, rows, Accelerations()).model
     learned = fit(identified.with_forces(JointFriction()), rows, points=200, restarts=1, seed=seed)
     rivals = {

@@ -86,24 +86,27 @@ def require_writable(path: str | Path) -> None:
 
 
 def require_replaceable(
-    folder: Path, writer: str, ours: Callable[[Path], bool], *, overwrite: bool, own: Iterable[str] = ()
+    folder: Path, writer: str, ours: Callable[[Path], object], *, overwrite: bool, own: Iterable[str] = ()
 ) -> None:
     """Refuse what exists, but empty folders, and with `overwrite` what is `ours` and has no files of others.
 
-    Raises FileFormatError.
+    Raises FileFormatError; where `ours` does, it is not.
     """
+    known: object = False
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
-    if not folder.is_dir() or not ours(folder):
+    with contextlib.suppress(FileFormatError):
+        known = folder.is_dir() and ours(folder)
+    if not known:
         what = f"exists and was not written by {writer}, so it is not overwritten; choose another name."
         raise FileFormatError(f"{folder} {what}")
     if not overwrite:
         raise FileFormatError(f"{folder} exists already; choose another name, or add `overwrite=True`.")
-    known = {SUMS, *own}
+    listed = {SUMS, *own}
     with contextlib.suppress(OSError, ValueError):
-        known |= {line[66:] for line in (folder / SUMS).read_text(encoding="utf-8").splitlines()}
+        listed |= {line[66:] for line in (folder / SUMS).read_text(encoding="utf-8").splitlines()}
     entries = (entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
-    if others := sorted({entry.relative_to(folder).as_posix() for entry in entries} - known):
+    if others := sorted({entry.relative_to(folder).as_posix() for entry in entries} - listed):
         raise FileFormatError(
             f"{folder} holds files that {writer} did not write ({', '.join(others[:3])}), so it is not overwritten; "
             "move them away, or choose another name."

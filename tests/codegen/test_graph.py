@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from forcegp.codegen.c_writer import Program, write_function, write_program
-from forcegp.codegen.graph import BINARY, ONE, UNARY, ZERO, Copier, Graph, evaluated, jacobian
+from forcegp.codegen.graph import BINARY, FUNCTIONS, ONE, UNARY, ZERO, Copier, Graph, interpreted, jacobian
 from forcegp.codegen.library import (
     NOT_FINITE,
     NOT_POSITIVE,
@@ -19,6 +19,11 @@ from forcegp.codegen.library import (
 )
 from forcegp.codegen.tracing import StraightLineAlgebra, cholesky, pseudo_inverse, solve_lower, trace
 from forcegp.errors import InvalidInput
+
+
+def evaluated(graph, outputs, inputs):
+    with np.errstate(all="ignore"):
+        return [np.asarray(x, dtype=np.float64) for x in interpreted(graph, outputs, inputs, FUNCTIONS)]
 
 
 @pytest.fixture(params=[1, "here"], ids=["C99", "vectors"])

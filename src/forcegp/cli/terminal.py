@@ -200,13 +200,7 @@ def facts(title: str, values: Mapping[str, str]) -> Table:
     return table
 
 
-def columns(
-    title: str,
-    header: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    *,
-    long_names: bool = False,
-) -> Table:
+def columns(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], *, long_names: bool = False) -> Table:
     """A table of text and numbers; texts of the first column are folded if `long_names`."""
     from rich import box
     from rich.table import Table

@@ -262,25 +262,25 @@ FUNCTIONS: dict[str, Any] = {
     "negate": np.negative,
     "erf": erf,
     "choose": lambda m, x, y: np.where(m != 0.0, x, y),
+    "look up": lambda table, place: np.asarray(table)[np.asarray(place).astype(int)],
 }
 
 
-def evaluated(graph: Graph, outputs: Sequence[int], inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """The nodes `outputs` of a graph without calls, from one array per input."""
-    found: dict[int, Any] = {}
-    with np.errstate(all="ignore"):
-        for node in graph.needed(outputs):
-            operation, *rest = graph.nodes[node]
-            match operation:
-                case "constant":
-                    found[node] = rest[0]
-                case "input":
-                    found[node] = inputs[rest[0]]
-                case "look up":
-                    found[node] = np.asarray(rest[0])[np.asarray(found[rest[1]]).astype(int)]
-                case _:
-                    found[node] = FUNCTIONS[operation](*(found[operand] for operand in rest))
-    return [np.asarray(found[node], dtype=np.float64) for node in outputs]
+def interpreted(
+    graph: Graph, outputs: Sequence[int], inputs: Sequence[Any], functions: Mapping[str, Any], known: Any = None
+) -> list[Any]:
+    """The nodes `outputs` of a graph without calls, where `functions` compute; `known` are nodes that are there."""
+    found = dict(known or {})
+    for node in graph.needed(outputs, found):
+        operation, *rest = graph.nodes[node]
+        if node in found:
+            continue
+        if operation in LEAVES:
+            found[node] = rest[0] if operation == "constant" else inputs[rest[0]]
+        else:
+            table = rest[:1] if operation == "look up" else []
+            found[node] = functions[operation](*table, *(found[x] for x in graph.operands(node)))
+    return [found[node] for node in outputs]
 
 
 FLAT = ("less", "at_most", "equal", "look up", "input", "constant", "call")

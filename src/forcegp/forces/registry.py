@@ -55,15 +55,6 @@ SHORT: dict[str, tuple[str, Mapping[str, Any]]] = {
 """Names that `parse_forces` takes besides, with fields that differ from their defaults."""
 
 
-USUAL_DRY = "gear"
-"""The law of dry friction that most joints need."""
-
-
-def usual_friction() -> tuple[Law, ...]:
-    """The laws of joint friction that most gears need, with all numbers to be estimated."""
-    return tuple(force_class(name)() for name in ("viscous", USUAL_DRY, "offset"))
-
-
 def dry_laws() -> tuple[str, ...]:
     """Names of the laws with a `level`: dry friction."""
     return tuple(name for name in FORCES if "level" in getattr(force_class(name), "coefficients", ()))

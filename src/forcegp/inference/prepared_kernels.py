@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.codegen.c_writer import c_text, c_value, filled, sections
-from forcegp.codegen.graph import Copier, Graph, Slopes, evaluated, jacobian
+from forcegp.codegen.graph import FUNCTIONS, Copier, Graph, Slopes, interpreted, jacobian
 from forcegp.codegen.tracing import trace
 from forcegp.inference.dense_kernels import squared_exponential_parameters
 from forcegp.inference.posterior import BLOCK_BYTES, ExactPosterior, LatentPosterior
@@ -144,7 +144,9 @@ class KernelSum:
     def row_values(self) -> list[np.ndarray]:
         """The numbers of every row, one per centre."""
         inputs = [*np.zeros((self.features, 1)), *self.centers.numpy().T]
-        return [np.broadcast_to(x, len(self.centers)) for x in evaluated(self.pair, self.rows, inputs)]
+        with np.errstate(all="ignore"):
+            found = interpreted(self.pair, self.rows, inputs, FUNCTIONS)
+        return [np.broadcast_to(x, len(self.centers)) for x in found]
 
     def root_table(self) -> np.ndarray:
         """The roots of the compressed covariance, of as many centres as there are in the table."""

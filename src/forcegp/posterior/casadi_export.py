@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from forcegp.atomic_files import write_text
-from forcegp.codegen.graph import ARITHMETIC, COMPARED, Copier, Graph
+from forcegp.codegen.graph import ARITHMETIC, COMPARED, FUNCTIONS, Copier, Graph, interpreted
 from forcegp.codegen.tracing import trace
 from forcegp.errors import NumericalError, require_type, required_extra
 from forcegp.inference.one_input import OneInputCall
@@ -188,26 +188,13 @@ def expressed(
     casadi: Any, graph: Graph, nodes: Sequence[int], inputs: Sequence[Any], known: dict[int, Any] | None = None
 ) -> list[Any]:
     """Nodes of a graph without calls as CasADi expressions; `known` are those that are there already."""
-    found = dict(known or {})
-    for node in graph.needed(nodes, found):
-        if node in found:
-            continue
-        operation, *rest = graph.nodes[node]
-        given = [found[x] for x in graph.operands(node)]
-        match operation:
-            case "constant":
-                found[node] = rest[0]
-            case "input":
-                found[node] = inputs[rest[0]]
-            case str() if operation in OPERATORS:
-                found[node] = OPERATORS[operation](*given)
-            case "choose":
-                found[node] = casadi.if_else(*given)
-            case "look up":
-                value = rest[0][0]
-                for place, entry in enumerate(rest[0][1:], 1):
-                    value = casadi.if_else(given[0] >= place, entry, value)
-                found[node] = value
-            case _:
-                found[node] = getattr(casadi, NAMES.get(str(operation), str(operation)))(*given)
-    return [found[node] for node in nodes]
+
+    def looked_up(table: Sequence[float], place: Any) -> Any:
+        value = table[0]
+        for number, entry in enumerate(table[1:], 1):
+            value = casadi.if_else(place >= number, entry, value)
+        return value
+
+    special = {**OPERATORS, "choose": casadi.if_else, "look up": looked_up}
+    functions = {name: getattr(casadi, NAMES.get(name, name)) for name in FUNCTIONS if name not in special}
+    return interpreted(graph, nodes, inputs, functions | special, known)

@@ -5,7 +5,6 @@ It holds training points and parameters, after `with_model` also `target.urdf`; 
 
 import json
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,8 +53,8 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     """
     require_type("posterior", posterior, Posterior)
     path = Path(path)
-    files = ("model.json", "tensors.safetensors", ROBOT, TARGET)
-    require_replaceable(path, "forcegp", _is_model, overwrite=overwrite, own=files)
+    own = ("model.json", "tensors.safetensors", ROBOT, TARGET)
+    require_replaceable(path, "forcegp", _document, overwrite=overwrite, own=own)
     models = {"model": posterior.trained.to_dict()}
     if posterior.target is not None:
         models["target"] = posterior.target.to_dict()
@@ -157,12 +156,6 @@ def _require_numbers(settings: Mapping[str, Any], nv: int) -> None:
             same = same and size == (sizes.setdefault(asked, size) if isinstance(asked, str) else asked)
         if not same or (key in POSITIVE and not (given > 0.0).all()):
             raise ValueError(f"model.json has settings in which {name} is {str(value)[:60]}")
-
-
-def _is_model(path: Path) -> bool:
-    with suppress(FileFormatError):
-        return bool(_document(path))
-    return False
 
 
 def _document(path: Path) -> dict[str, Any]:

@@ -217,7 +217,8 @@ def simulate_episode(
     """
     settle, steps = config.settle_steps, config.settle_steps + config.rows_per_episode
     limits, table = np.array(config.torque_limits), table_of(config)
-    laws, own_law = joint_friction_of(config, robot), config.joint_law(robot)
+    laws, own = joint_friction_of(config, robot), config.own_laws.get(config.joint_friction)
+    own_law = own and own(config, robot)
     columns: dict[str, np.ndarray] = {}
     with BulletArm(urdf, gravity=config.gravity, time_step=config.time_step, tool_point=config.tool_point) as arm:
         arm.reset(np.deg2rad(config.start_degrees), np.zeros(7))

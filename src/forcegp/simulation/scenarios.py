@@ -113,7 +113,7 @@ class KukaSurfaceConfig(CommonConfig):
     joint_coulomb: ClassVar[Numbers] = (2.0, 2.0, 1.3, 1.3, 0.12, 0.12, 0.05)  # small where explicit steps oscillate
     joint_static: ClassVar[Numbers] = (3.0, 3.0, 2.0, 2.0, 0.2, 0.2, 0.08)  # near rest
     joint_viscous: ClassVar[Numbers] = (1.0, 1.0, 0.5, 0.5, 0.05, 0.05, 0.02)  # beyond `joint_damping`
-    own_laws: ClassVar[tuple[str, ...]] = ()  # names of joint friction that a subclass has by `joint_law`
+    own_laws: ClassVar[Mapping[str, Any]] = {}  # of subclasses: (config, robot) -> torques of (v, u, M, time)
     baumgarte_omega: ClassVar[float] = 10.0
     baumgarte_zeta: ClassVar[float] = 1.0
     start_degrees: ClassVar[Numbers] = (85, 50, -10, -100, -170, -25, -100)  # also the posture of the null space
@@ -138,11 +138,7 @@ class KukaSurfaceConfig(CommonConfig):
             from forcegp.forces.registry import dry_laws
 
             require_known("friction", self.friction, "the tool", ("viscous", *dry_laws()))
-        require_joint_friction(self.joint_friction, self.own_laws)
-
-    def joint_law(self, robot: Any) -> Callable[..., Any] | None:
-        """Of a subclass with `own_laws`: friction [Nm] of the next step, of velocities, torques, inertias and time."""
-        return None
+        require_joint_friction(self.joint_friction, (*self.own_laws,))
 
     @property
     def pressing_force(self) -> float:
