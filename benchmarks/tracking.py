@@ -1,6 +1,6 @@
 """Computed torque with what was learned of friction, against PD, the URDF, least squares and the true model.
 
-KUKA iiwa without a tool load, GearFriction friction in every joint (`kuka-surface`'s), controlled at 240 Hz, simulated in
+KUKA iiwa without a tool load, Stribeck friction in every joint (`kuka-surface`'s), controlled at 240 Hz, simulated in
 steps of 1/960 s. All controllers have the same gains, omega = 10: stiffness 100 / s^2, critically damped. The reference
 moves all joints by sines for 10 s; the error is the root mean square over joints and time after the first second.
 
