@@ -13,11 +13,11 @@ from tests.robots.robot_models import TREE
 from tests.robots.test_moving_bases import LIMBS
 
 from forcegp.codegen.c_writer import write_program
-from forcegp.codegen.graph import Graph, evaluated, node_of
+from forcegp.codegen.graph import ZERO
 from forcegp.codegen.library import RowFunction, compile_library
-from forcegp.errors import CompilerError, InvalidInput
+from forcegp.errors import CompilerError, InvalidInput, NumericalError
 from forcegp.robots import Robot
-from forcegp.robots.compiled import UnrolledKinematics, UnrolledRobot, factorize, trace_dynamics
+from forcegp.robots.compiled import trace_dynamics
 
 ARMATURE = {"a_hip": 0.2, "b_slide": 0.4}
 METHODS = {
@@ -60,7 +60,7 @@ def test_values_equal_those_of_the_robot(robot, compiled, method):
 def test_other_widths_of_vector_registers_and_parts(robot, tmp_path, lanes, statements):
     """What is written for other processors runs here, too, only slower; parts of any length do the same."""
     inputs, outputs = list(random(3, 13, 3)), [torch.full((13, 3), torch.nan, dtype=torch.float64)]
-    source = write_program(trace_dynamics(UnrolledRobot(robot), "forward_dynamics"), lanes, statements)
+    source = write_program(trace_dynamics(robot, "forward_dynamics"), lanes, statements)
     options = ("-std=gnu11", "-O1", "-fPIC", "-shared")
     library = compile_library(source, options, tmp_path / "one.so", "evaluate")
     assert RowFunction(library, 3, [3]).rows(13, inputs, outputs) == 0
@@ -131,35 +131,15 @@ def test_what_cannot_be_loaded_never_enters_the_folder(robot, tmp_path, monkeypa
     robot.compile(tmp_path / "dynamics").gravity_forces(random(3))
 
 
-COUNT = 6
-
-
-class Scalars:
-    """Rows of numbers (COUNT, n) as expressions, and arrays of expressions as numbers (COUNT, ...)."""
-
-    def __init__(self, *rows):
-        self.graph, self.values = Graph(), [column for given in rows for column in np.asarray(given).T]
-        self.given = [self.graph.more_inputs(np.shape(given)[1]) for given in rows]
-
-    def numbers(self, array):
-        nodes = [node_of(self.graph, scalar) for scalar in array.flat]
-        found = [np.broadcast_to(x, COUNT) for x in evaluated(self.graph, nodes, self.values)]
-        return np.stack(found, axis=-1).reshape(COUNT, *array.shape)
-
-
-def close(ours, theirs, tolerance=1e-10):
-    np.testing.assert_allclose(ours, theirs, rtol=0, atol=tolerance * np.abs(np.asarray(theirs)).max())
-
-
 def test_structure_stays_structure():
-    """Joints on different branches are coupled by the float 0.0, and nothing fills in when M is factorised."""
+    """Joints on different branches are coupled by a zero that costs nothing."""
     robot = Robot.from_urdf_text(TREE)
-    q = torch.randn(COUNT, robot.nv, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    scalars = Scalars(q)
-    M = UnrolledKinematics(UnrolledRobot(robot), *scalars.given).mass_matrix()
-    L, D = factorize(M)
-    related = robot.tree.related[..., 0].bool().numpy()
-    assert np.array_equal(M != 0.0, related)
-    assert np.array_equal(L != 0.0, np.tril(related))
-    L, D = scalars.numbers(L), scalars.numbers(D)
-    close(np.swapaxes(L, 1, 2) @ (D[:, :, None] * L), robot.mass_matrix(q))
+    M = np.reshape(trace_dynamics(robot, "mass_matrix").outputs["result 0"], (robot.nv, robot.nv))
+    assert np.array_equal(M != ZERO, robot.tree.related[..., 0].bool().numpy())
+
+
+def test_a_mass_matrix_that_is_not_positive_definite_is_an_error(compiled):
+    q, v, tau = random(3, 4, 3)
+    q[2] = torch.nan
+    with pytest.raises(NumericalError, match="not positive definite"):
+        compiled.forward_dynamics(q, v, tau)

@@ -50,11 +50,9 @@ class Graph:
         self._record(("constant", 1.0))
         self.inputs = [self._record(("input", position)) for position in range(inputs)]
 
-    def more_inputs(self, count: int) -> "list[Expression]":
+    def more_inputs(self, count: int) -> None:
         """Scalars that are given when the program runs, after those before."""
-        added = [self._record(("input", len(self.inputs) + k)) for k in range(count)]
-        self.inputs += added
-        return [Expression(self, node) for node in added]
+        self.inputs += [self._record(("input", len(self.inputs) + k)) for k in range(count)]
 
     def constant(self, value: float | int) -> int:
         """The node of a number."""
@@ -214,36 +212,6 @@ class Copier:
             else:
                 known[node] = graph.apply(operation, *(known[operand] for operand in rest))
         return [known[node] for node in nodes]
-
-
-def _operator(operation: str, swapped: bool = False) -> "Callable[..., Expression | float]":
-    def recorded(self: "Expression", *others: "Expression | float") -> "Expression | float":
-        operands = (*others, self) if swapped else (self, *others)
-        node = self.graph.apply(operation, *(node_of(self.graph, x) for x in operands))
-        value = self.graph.value(node)
-        return Expression(self.graph, node) if value is None else value
-
-    return recorded
-
-
-class Expression:
-    """A scalar that stands for a node of a `Graph`; what turns out to be known is a float."""
-
-    __slots__ = ("graph", "node")
-
-    def __init__(self, graph: Graph, node: int) -> None:
-        self.graph, self.node = graph, node
-
-    __add__ = __radd__ = _operator("add")
-    __sub__, __rsub__ = _operator("subtract"), _operator("subtract", swapped=True)
-    __mul__ = __rmul__ = _operator("multiply")
-    __truediv__, __rtruediv__ = _operator("divide"), _operator("divide", swapped=True)
-    __neg__, exp, sin, cos = map(_operator, ("negate", "exp", "sin", "cos"))
-
-
-def node_of(graph: Graph, scalar: Expression | float) -> int:
-    """The node of a scalar; floats become constants."""
-    return scalar.node if isinstance(scalar, Expression) else graph.constant(scalar)
 
 
 def _folded(operation: str, operands: Sequence[float | None]) -> float:

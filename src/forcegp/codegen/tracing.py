@@ -16,7 +16,7 @@ from torch.utils import _pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 from typing_extensions import override
 
-from forcegp.codegen.graph import ONE, UNARY, ZERO, Expression, Graph
+from forcegp.codegen.graph import ONE, UNARY, ZERO, Graph
 from forcegp.errors import InvalidInput
 
 MOVING = frozenset(
@@ -46,7 +46,7 @@ def trace(
     function: Callable[..., Sequence[Tensor]],
     examples: Sequence[Tensor],
     graph: Graph | None = None,
-    inputs: Sequence[Expression] = (),
+    inputs: Sequence[int] = (),
 ) -> tuple[Graph, list[Tensor]]:
     """The graph of function(*examples) -> tensors, and the nodes of its outputs in their shapes.
 
@@ -54,7 +54,7 @@ def trace(
     """
     examples = [x.detach().clone() for x in examples]
     graph = Graph(sum(x.numel() for x in examples)) if graph is None else graph
-    nodes = torch.tensor([x.node for x in inputs] or graph.inputs).split([x.numel() for x in examples])
+    nodes = torch.tensor(list(inputs) or graph.inputs).split([x.numel() for x in examples])
     recorded = _Recording(graph)
     for x, part in zip(examples, nodes, strict=True):
         recorded.note(x, _Numbers(part.view(x.shape)))

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from forcegp.codegen.c_writer import ROWS, Program, c_text, filled, head, sections, write_entry, write_function
-from forcegp.codegen.graph import ONE, ZERO, Copier, Expression, Graph, jacobian
+from forcegp.codegen.graph import ONE, ZERO, Copier, Graph, jacobian
 from forcegp.codegen.library import RowFunction, aligned, load_library, vector_unit
 from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput
@@ -164,8 +164,7 @@ class Programs:
             m = found[5].shape[-2]
             more = [torch.zeros(1, size, dtype=torch.float64) for size in (len(a), m, m)]
             graph.more_inputs(sum(x.numel() for x in more))
-            nodes = [Expression(graph, node) for node in graph.inputs]
-            held = [x[0].tolist() for x in trace(self.physics.held, [*inputs, *more], graph, nodes)[1]]
+            held = [x[0].tolist() for x in trace(self.physics.held, [*inputs, *more], graph)[1]]
         flat = [int(node) for values in around for node in np.ravel(values)]
         return Traced(graph, a, W, features, Q, flat, passive, held)
 
@@ -212,10 +211,9 @@ class Programs:
         (nq, nv, nu), count = self.sizes, sum(self.sizes)
         multiplier, left, r, s, t = (copied(nodes) for nodes in self.traced.held[:5])
         H, G = ([copied(row) for row in rows] for rows in self.traced.held[5:])
-        inputs = [Expression(graph, node) for node in graph.inputs[:nq]]
-        tangent = trace(lambda q: [self.space.tangent(q)], [self.space.neutral()], graph, inputs)[1][0].tolist()
+        _, (tangent,) = trace(lambda q: [self.space.tangent(q)], [self.space.neutral()], graph, graph.inputs[:nq])
         rest = [[ONE if i == j else ZERO for j in range(nv + nu)] for i in range(nv + nu)]
-        seeds = [row + [ZERO] * (nv + nu) for row in tangent] + [[ZERO] * nv + row for row in rest]
+        seeds = [row + [ZERO] * (nv + nu) for row in tangent.tolist()] + [[ZERO] * nv + row for row in rest]
         slopes = jacobian(graph, [*r, *s, *t], graph.inputs[:count], seeds)
         made = Graph(count)  # where what was held is what it is
         there = Copier(made, graph, dict(zip(graph.inputs, made.inputs, strict=False)))
