@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tests.data.test_wind import pushed
+from tests.data.test_wind import flight
 
 from forcegp import AerodynamicForce
 from forcegp.data import Dataset
@@ -137,6 +137,16 @@ def test_a_base_that_turns_is_off_by_the_angle_whatever_the_sign_of_its_quaterni
 
 
 # ---------------------------------------------------------------- observers
+
+
+def pushed(forces, rows, seed=4, noise=0.0):
+    """Flights in still air, each with a constant force of the world."""
+    dataset = flight([(0.0, 0.0, 0.0)] * len(forces), episodes=len(forces), rows=rows, seed=seed, noise=noise)
+    state = dataset.model.dynamics(*map(torch.tensor, (dataset.q, dataset.v, dataset.u))).state
+    rotation = state.kinematics.frame_pose("body")[:, :3, :3].numpy()
+    a = dataset.a.copy()
+    a[:, :3] += np.einsum("nji,nj->ni", rotation, np.array(forces)[dataset.episode]) / 1.2
+    return replace(dataset, a=a)
 
 
 @pytest.fixture(scope="module")
