@@ -113,6 +113,12 @@ def test_runs_alone_are_scored_on_the_whole_log(forcegp, folder):
     assert re.search(r"^ by +take +compared", done.stdout, re.M)
     one = forcegp("score", "friction", "test.h5", "--horizon", ".1", "--integrator", "symplectic-euler", folder=folder)
     assert re.search(r"position after 0\.1 s +– +\d\S* +", one.stdout), one.stdout
+    seen = forcegp("score", "friction", "test.h5", "--observe", 0.3, "--json", folder=folder)
+    log, learned = Dataset.load(folder / "test.h5"), load_posterior(folder / "friction")
+    first = log.time < log.time[0] + 0.3
+    expected = score(learned.update(log.rows(first)), log.rows(~first))
+    scores = json.loads(seen.stdout)["models"]["friction"]["scores"]
+    np.testing.assert_allclose(scores["acceleration"]["mae"]["each"], expected.columns("mae"), rtol=1e-6)
     told = forcegp("score", "friction", "test.h5", "--every", 2, "--json", folder=folder)
     scores = json.loads(told.stdout)["models"]["friction"]["scores"]
     rows = Dataset.load(folder / "test.h5").rows(slice(None, None, 2))
@@ -127,6 +133,7 @@ WRONG = [
     ("score log.h5", "give --out FOLDER"),
     ("score friction other.h5", "joints shoulder, elbow; the model was trained on pan, lift, bend"),
     ("score friction test.h5 --horizon 7", "not predicted: 7 s; held-out stretches last"),
+    ("score friction test.h5 --observe 99", "--observe is 99 s; give seconds that one record is longer than"),
     ("score friction test.h5 --every 0", "--every 0 must be an integer of at least 1"),
     ("score friction test.h5 --integrator euler", "did you mean 'symplectic-euler'"),
     (f"score log.h5 {OUT} --split thirds", "the split is 'thirds'"),

@@ -5,6 +5,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import scipy.io
 
 from forcegp.data import Dataset, Preparation, resample
 from forcegp.errors import DataWarning
@@ -88,3 +89,18 @@ def panda(folder: Path, model: Model) -> tuple[Dataset, Dataset]:
     test = np.isin(np.minimum((rows.time / block).astype(int), 4), (2, 4))
     near = (abs(rows.time[:, None] - block * np.array([2, 3, 4])) <= 0.25).any(1)
     return rows.rows(~test & ~near), rows.rows(test)
+
+
+def emps(folder: Path) -> tuple[Dataset, Dataset]:
+    """One prismatic axis at 1 kHz behind 20 Hz: both halves of the record, .25 s apart."""
+    record = scipy.io.loadmat(folder / "emps/DATA_EMPS.mat")
+    one = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    robot = Robot.from_urdf_text(
+        f"""<robot name="emps"><link name="base"/><link name="carriage"><inertial><mass value="100"/>{one}</inertial>
+        </link><joint name="x" type="prismatic"><parent link="base"/><child link="carriage"/><axis xyz="1 0 0"/>
+        <limit lower="-0.1" upper="0.4" effort="1000" velocity="2"/></joint></robot>"""
+    )
+    time, q, u = record["t"][:, 0], record["qm"], record["gtau"] * record["vir"]
+    log = Preparation(cutoff=20.0, trim=0.1).apply(dataset(Model(robot), time, q, u, np.zeros(len(time), dtype=int)))
+    middle = 0.5 * float(log.time[-1])
+    return log.rows(log.time < middle - 0.25), log.rows(log.time >= middle)

@@ -63,6 +63,8 @@ class Score(Command):
     integrator: Annotated[str, arg(metavar="NAME")] = "rk4"
     """How motions are predicted: rk4, symplectic-euler (as PyBullet), implicit-midpoint (stiff friction), projected
     (contacts hold exactly)."""
+    observe: Annotated[float, arg(metavar="S")] = 0.0
+    """Seconds at the beginning of LOG that a RUN learns from, as a robot at work could; the rest is scored."""
     system: Literal["model", "data"] = "model"
     """Robot and contacts that a RUN predicts for: model, those that it was trained with; data, those of the log."""
     out: Annotated[Path | None, unless_given("FOLDER", "no folder")] = None
@@ -89,6 +91,15 @@ class Score(Command):
         models: dict[str, Any] = {}
         for path in runs:
             models[path.name if path.name not in models else str(path)] = self._loaded(terminal, path, raw, data)
+        if self.observe:
+            seen = raw.time < raw.time[0] + self.observe
+            if fits or len(raw.episodes) > 1 or not 0 < seen.sum() < len(raw):
+                raise InvalidInput(
+                    f"--observe is {self.observe:g} s; give seconds that one record is longer than, with folders of "
+                    "models alone, without --forces and --split."
+                )
+            models = {name: posterior.update(raw.rows(seen)) for name, posterior in models.items()}
+            raw = raw.rows(~seen)
         models |= {name: name for name in self.models.names()}
         rows, recording, model, split = raw, raw, None, None
         if fits:

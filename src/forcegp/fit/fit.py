@@ -55,6 +55,7 @@ from forcegp.inference import Engine, OptimizationResult, OptimizerOptions, engi
 from forcegp.model import Model
 from forcegp.parallel import checked_jobs
 from forcegp.posterior import Posterior
+from forcegp.posterior.drift import with_drift
 from forcegp.posterior.fitted import Estimates
 from forcegp.posterior.observed_wrench import in_air, unobserved
 from forcegp.robots.arguments import whole_number
@@ -154,10 +155,10 @@ def fit(
         posterior = posterior.with_settings(gear_friction=choice.to_dict())
     if not known.all():
         posterior = posterior.with_settings(rows_before_a_past=int((~known).sum()))
-    if refinement is None:
-        return posterior
-    report = None if progress is None else partial(progress, ALL_ROWS)
-    return refine_on_motions(posterior, dataset, refinement.seconds, refinement.bodies, report, model)
+    if refinement is not None:
+        report = None if progress is None else partial(progress, ALL_ROWS)
+        posterior = refine_on_motions(posterior, dataset, refinement.seconds, refinement.bodies, report, model)
+    return with_drift(posterior, dataset)
 
 
 def _chosen(evidence: Evidence | Sequence[Evidence] | None, model: Model, start: Any) -> tuple[Any, Motions | None]:

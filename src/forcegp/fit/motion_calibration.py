@@ -13,7 +13,9 @@ from forcegp.data.views import RecordedMotions, recorded_motions
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence.likelihood import TrainingData
 from forcegp.fit.motion_fit import refine_on_motions
+from forcegp.forces.joint_laws import DryFriction, Viscous
 from forcegp.posterior import Posterior
+from forcegp.posterior.drift import scaled
 from forcegp.posterior.fitted import DEVIATIONS, HORIZONS, MotionIntervals
 from forcegp.posterior.observed_wrench import in_own_air, observing, require_unobserved
 from forcegp.posterior.rollout import Rollout
@@ -33,10 +35,10 @@ def calibrated(
     integrator: str = "rk4",
     report: Callable[[int, int], None] | None = None,
 ) -> Posterior:
-    """The same model with intervals of motions that hold: of four stretches of the training time, left out in turn.
+    """The same model with intervals of motions that hold: of records left out in turn, or of stretches of the only one.
 
-    Each is predicted by the model made again from the other rows at the same hyper-parameters.
-    `rollout(...).interval()` uses the widths.
+    Each is predicted by the model made again from the other rows at the same hyper-parameters. Widths from one record
+    are wider by what another level of dry friction would change. `rollout(...).interval()` uses them.
 
     dataset: the recording that the model learned from, in equal steps of time.
     horizons: lengths of the motions in s, at which widths are found; integrator: of these motions.
@@ -62,7 +64,8 @@ def _intervals(
     if not wanted or not all(math.isfinite(h) and h > 0.0 for h in wanted):
         raise InvalidInput(f"horizons are {list(horizons)}; give one or more positive numbers of seconds.")
     parts = _folds(dataset, wanted[-1])
-    errors, spreads, kept, inputs = [], [], wanted, posterior.model.inputs
+    errors, spreads, shifts, kept, inputs = [], [], [], wanted, posterior.model.inputs
+    drift = posterior.settings.get("drift") if _records(dataset, wanted[-1]) == 1 else None
     for number, inside in enumerate(parts):
         if report is not None:
             report(number, len(parts))
@@ -78,6 +81,11 @@ def _intervals(
         error = [each.abs().cpu().numpy() for each in away]
         stds = (rollout.std("q"), rollout.std("v")) if sampled else ()
         spread = [std[:, at].cpu().numpy() for std in stds] or [np.zeros_like(each) for each in error]
+        if drift is not None:  # as if all joints warm up together
+            for kind in (DryFriction, Viscous):
+                louder = replace(other, target=scaled(other.model, 1.0 + torch.as_tensor(drift["between"]), kind))
+                moved = louder.rollout(motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, integrator=integrator)
+                shifts.append(torch.stack([moved.q - rollout.q, moved.v - rollout.v], dim=2)[:, at].cpu().numpy())
         errors.append(np.stack(error, axis=2))
         spreads.append(np.stack(spread, axis=2))
     error, spread = np.concatenate(errors), np.concatenate(spreads)  # (motions, H, 2, nv)
@@ -89,17 +97,24 @@ def _intervals(
     level = min(1.0, LEVEL * (1.0 + 1.0 / len(error)))
     scores = [error / np.sqrt(np.square(s) + np.square(rms)) for s in (spread, np.zeros_like(spread))]
     factors = np.stack([np.quantile(each, level, axis=0) / DEVIATIONS for each in scores])
-    return MotionIntervals(np.array(kept), rms, factors, inputs)
+    pairs = [np.concatenate(shifts[kind::2]) for kind in (0, 1)] if shifts else []
+    shift = np.sqrt(np.nanmean(np.square(pairs), axis=1)) if shifts else None
+    return MotionIntervals(np.array(kept), rms, factors, inputs, shift)
+
+
+def _records(dataset: Dataset, seconds: float) -> int:
+    """Episodes that last so long."""
+    return sum(_lasts(dataset, dataset.episode == episode, seconds) for episode in dataset.episodes)
 
 
 def _folds(dataset: Dataset, seconds: float) -> list[np.ndarray]:
-    """Rows of stretches of time that are left out in turn: quarters of every episode, or of all episodes."""
+    """Rows that are left out in turn: episodes, where several last so long, else quarters of the only one."""
     numbers = np.zeros(len(dataset), dtype=int)
-    long = 0
+    long, several = 0, _records(dataset, seconds) > 1
     for episode in dataset.episodes:
         rows = np.flatnonzero(dataset.episode == episode)
         lasting = float(np.ptp(dataset.time[rows]))
-        if lasting >= FOLDS * seconds:
+        if lasting >= FOLDS * seconds and not several:
             numbers[rows] = np.minimum((np.arange(len(rows)) * FOLDS) // len(rows), FOLDS - 1)
         else:
             numbers[rows], long = long % FOLDS, long + (lasting >= seconds)

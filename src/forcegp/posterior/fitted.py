@@ -7,7 +7,8 @@ that errors that last count, and what the prior leaves open of what the log does
 
 with the prior's information G and the changes d_k about their mean. The half width of joint j at horizon h is
 c_hj 1.96 sqrt(s_hj^2 + r_hj^2), with the spread s of sampled functions (0 without), the rms r of errors, and c_hj that
-makes it hold 95 % of left-out motions (split conformal prediction: Lei et al. 2018, JASA 113).
+makes it hold 95 % of left-out motions (split conformal prediction: Lei et al. 2018, JASA 113). To motions of one record
+alone, what another friction level would change (`posterior.drift`) is added in squares.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,6 +38,7 @@ from forcegp.inference import (
 )
 from forcegp.model import Model
 from forcegp.noise import ACCELERATION
+from forcegp.posterior.drift import Drift
 from forcegp.summary import Summary, listed, rounded
 
 STRETCHES = 20
@@ -268,6 +270,8 @@ class MotionIntervals:
     rms: Float[np.ndarray, "H 2 nv"]
     factors: Float[np.ndarray, "2 H 2 nv"]
     inputs: tuple[str, ...] = ()
+    drift: Float[np.ndarray, "2 H 2 nv"] | None = None
+    """What one deviation of dry and of viscous friction between records changes, where all motions are of one."""
 
     def half_width(self, quantity: str, time: Tensor, spread: Tensor | None) -> Float[Tensor, "*batch rows nv"]:
         """Of the 95 % interval; `spread` is the standard deviation of samples (..., T+1, nv)."""
@@ -277,21 +281,27 @@ class MotionIntervals:
         ends = np.array([0.0, *self.horizons])
         # beyond the last horizon errors go on as they grew
         beyond = np.maximum(at / self.horizons[-1], 1.0)[:, None]
-        r = np.stack([np.interp(at, ends, [0.0, *each]) for each in rms.T], axis=-1) * beyond
+        r = beyond * _between(at, ends, rms)
         c = np.stack([np.interp(at, self.horizons, each) for each in factor.T], axis=-1)
-        r, c = (torch.as_tensor(x, device=time.device) for x in (r, c))
-        return DEVIATIONS * c * (r if spread is None else (spread.square() + r.square()).sqrt())
+        moved = [] if self.drift is None else [np.square(beyond * _between(at, ends, x[:, kind])) for x in self.drift]
+        r, c, d = (torch.as_tensor(x, device=time.device) for x in (r, c, sum(moved, np.zeros_like(r))))
+        within = c * (r if spread is None else (spread.square() + r.square()).sqrt())
+        return DEVIATIONS * (within.square() + d).sqrt()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values."""
-        arrays = {name: getattr(self, name).tolist() for name in ("horizons", "rms", "factors")}
-        return arrays | {"inputs": list(self.inputs)}
+        return {name: x.tolist() if isinstance(x, np.ndarray) else x for name, x in vars(self).items()}
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> "MotionIntervals":
         """What `to_dict` gave."""
-        arrays = {name: np.array(stored[name], dtype=np.float64) for name in ("horizons", "rms", "factors")}
-        return cls(**arrays, inputs=tuple(stored.get("inputs", ())))
+        arrays: Any = {name: None if x is None else np.array(x) for name, x in stored.items() if name != "inputs"}
+        return cls(**arrays, inputs=tuple(stored["inputs"]))
+
+
+def _between(at: np.ndarray, ends: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values (H, nv) at times, linear between 0 and the horizons."""
+    return np.stack([np.interp(at, ends, [0.0, *each]) for each in values.T], axis=-1)
 
 
 AnyFitted = TypeVar("AnyFitted", bound="Fitted")  # beartype cannot check Self where a module is hooked
@@ -381,14 +391,15 @@ class Fitted(Summary):
     @override
     def facts(self) -> dict[str, object]:
         """Model, robot, training rows, and how the search ended."""
-        rows, result = self.training, self.result
+        rows, result, drift = self.training, self.result, self.settings.get("drift")
+        level: dict[str, object] = {} if drift is None else {"friction level": str(Drift(**drift))}
         return {
             "model": self.description,
             "robot": f"{self.model.robot.name!r}, {self.model.robot.nv} joints, {len(self.model.contacts)} contacts",
             "learned from": f"{len(rows)} rows",
             "noise std": rounded(self.noise_std.tolist()),
             "search": f"{'converged' if result.converged else 'not converged'}, {result.status}",
-        }
+        } | level
 
     @property
     def description(self) -> str:
@@ -420,6 +431,8 @@ class Fitted(Summary):
         """Widths of the intervals of motions, where they were `calibrated`; a rollout has them."""
         stored = self.settings.get("motion_intervals")
         found = None if stored is None else MotionIntervals.from_dict(stored)
+        if found is not None and found.drift is not None:
+            found = replace(found, drift=Drift(**self.settings["drift"]).shares * found.drift)
         # widths of motions that an observer's columns were part of are not those of motions without
         return None if found is None or found.inputs not in ((), self.model.inputs) else found
 

@@ -104,7 +104,7 @@ def require_unobserved(posterior: Posterior, what: str) -> None:
 def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
     """Rows to `update` with, as the model's own. InvalidInput after `with_model`, and for less than .1 s of past."""
     target, own = posterior.target, posterior.trained
-    if target is None:
+    if target is None or not own.unknown_forces:  # laws alone learn nothing from rows but their level
         return rows
     if "air" not in posterior.settings or target.known.to_dict() != unobserved(own).known.to_dict():
         raise InvalidInput(

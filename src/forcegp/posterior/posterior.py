@@ -21,6 +21,7 @@ from forcegp.integration.integrators import Feedback, check_time_step
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact
 from forcegp.model import Model
 from forcegp.noise import Noise
+from forcegp.posterior.drift import followed
 from forcegp.posterior.fitted import Fitted
 from forcegp.posterior.observed_wrench import rows_of_own_system
 from forcegp.posterior.prediction import (
@@ -244,15 +245,16 @@ class Posterior(Fitted):
         """A new posterior that has learned from more rows, too; this one stays as it is.
 
         Parameters, noise level and standardization stay, so it is that of conditioning on all rows at once, in O(N^2).
-        With a `horizon` in s, for all terms or by name, it forgets. Raises InvalidInput for rows that do not fit and
-        models that would have to be trained again, ContactError for rows at which the contacts cannot hold.
+        With a `horizon` in s, for all terms or by name, it forgets. Without unknown forces the level of dry friction
+        follows rows in order of time, as far as `settings["drift"]` lets it: give the last seconds of a record, whose
+        coming motions are to be predicted. Raises InvalidInput for rows that do not fit and models that would have to
+        be trained again, ContactError for rows at which the contacts cannot hold.
         """
         example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, model=posterior.model)"
         require_rows("rows", rows, self.model.robot.joint_names, "the model", example)
         own, rows = replace(self, target=None), rows_of_own_system(self, with_memory(rows, self.model))
-        if horizon is None:
-            return replace(learn_more_rows(own, rows), target=self.target)
-        return replace(learn_and_forget(own, rows, horizon), target=self.target)
+        learned = learn_more_rows(own, rows) if horizon is None else learn_and_forget(own, rows, horizon)
+        return followed(replace(learned, target=self.target), rows)
 
     def with_model(self, model: Model) -> "Posterior":
         """The same unknown forces in another model (robot, contacts, laws, stabilisation) with the same joints.
