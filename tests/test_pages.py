@@ -185,6 +185,7 @@ def test_the_examples_of_the_page_on_deploying_run(repository: Path, tmp_path: P
 
 @pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
 @pytest.mark.nightly
+@pytest.mark.usefixtures("unchecked")  # explicit steps add and scale CasADi's expressions as they do tensors
 def test_the_page_on_deploying_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "deploy.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from html import escape
@@ -108,9 +108,10 @@ class Doubts(tuple[Doubt, ...]):
             warnings.warn(str(doubt), kind, stacklevel=stacklevel + 1)
 
 
-def stated_as(values: Mapping[str, Iterable[str | float]]) -> str:
-    """`q=deg,m,time=ms`, as options state it."""
-    return ",".join(f"{k}={','.join(x if isinstance(x, str) else f'{x:g}' for x in own)}" for k, own in values.items())
+def stated_as(values: Mapping[str, Sequence[str | float]]) -> str:
+    """`q=deg,m,time=ms`, as options state it: once what all joints share."""
+    texts = {name: [x if isinstance(x, str) else f"{x:g}" for x in own] for name, own in values.items()}
+    return ",".join(f"{name}={','.join(own[:1] if len({*own}) == 1 else own)}" for name, own in texts.items())
 
 
 def listed(names: tuple[str, ...] | list[str]) -> str:

@@ -63,6 +63,12 @@ def test_the_number_that_is_wrong_is_measured():
     assert "0.402 instead of 0.6 m" in found.what
 
 
+def test_a_unit_of_all_joints_is_stated_once():
+    data = clean(two_links(), 0)
+    (found,) = check(replace(data, v=np.rad2deg(data.v))).doubts.of("velocity")
+    assert found.command == "forcegp import --unit v=deg/s"
+
+
 def test_noise_of_the_acceleration_does_not_make_masses_smaller():
     data = clean(two_links(), 0, noise="none")
     noise = np.array([8.0, 8.0])

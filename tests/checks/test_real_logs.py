@@ -50,7 +50,7 @@ def test_defects_planted_in_a_real_log_are_found(panda):
         (exchanged(panda, "u", order), "joints exchanged", {"panda_joint2", "panda_joint4"}),
         (replace(panda, u=np.roll(panda.u, 20, axis=0)), "delay", set(panda.joint_names)),
     ):
-        (found,) = check(planted).of(subject)
+        (found,) = check(planted).doubts.of(subject)
         assert set(found.joints) == joints
 
 

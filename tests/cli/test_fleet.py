@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from forcegp.cli.fleet import fleet, numbers_of
+from forcegp.cli.fleet import Fleet, fleet, numbers_of
 from forcegp.cli.main import main
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput
@@ -106,6 +106,12 @@ def test_words_without_a_list_are_refused(listed):
         fleet(["fit", "--out", "out", "--logs-from"])
     with pytest.raises(InvalidInput, match="name no list of logs"):
         fleet(["fit", "a.h5", "--out", "out"])
+
+
+def test_processes_are_those_of_the_words_unless_others_are_given(listed, monkeypatch):
+    monkeypatch.setattr(Fleet, "run", lambda asked, _: {"rows": [asked.jobs]})
+    asked = words("out")
+    assert [*fleet(asked), *fleet([*asked, "--jobs", "3"]), *fleet([*asked, "--jobs", "3"], 2)] == [1, 3, 2]
 
 
 def test_a_cluster_whose_worker_is_killed_gives_the_same_rows(listed):

@@ -165,6 +165,9 @@ def test_an_index_that_no_graph_holds_is_named():
     called = graph.call("f", graph.inputs, 1)
     with pytest.raises(InvalidInput, match="gives no derivatives"):
         jacobian(graph, called, graph.inputs)
+    ((slope,),) = jacobian(graph, graph.call("g", graph.inputs, 1, slopes={(0, 0): 1}), graph.inputs)
+    assert graph.nodes[slope][0] == "output"
+    assert graph.nodes[slope][2] == 1  # of g, beyond its one value
 
 
 @pytest.mark.parametrize("count", [1, 4])

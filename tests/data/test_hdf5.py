@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from tests.data.samples import assert_equal, complete, dataset, model
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, is_dataset
 from forcegp.errors import FileFormatError
 
 
@@ -61,6 +61,15 @@ def change(file: Path, name: str, values: object = None) -> None:
         if values is not None:
             opened[name] = values
             opened[name].attrs.update(attributes)
+
+
+@pytest.mark.parametrize("kind", ["another", 1.0, np.zeros(0), h5py.Empty("f8")], ids=repr)
+def test_files_of_another_kind_are_refused(file, kind):
+    with h5py.File(file, "a") as opened:
+        opened.attrs["format"] = kind
+    assert not is_dataset(file)
+    with pytest.raises(FileFormatError, match="not a forcegp dataset"):
+        Dataset.load(file)
 
 
 @pytest.mark.parametrize("version", [2, 1000, 0, -1, "one", 1.5])

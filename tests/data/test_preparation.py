@@ -107,6 +107,11 @@ def _at(prepared: Dataset, whole: Dataset) -> Dataset:
     return whole.rows(np.isin(whole.time, prepared.time))
 
 
+def test_a_common_delay_that_no_joint_shows_is_none():
+    found = replace(estimate_delay(arm_log(0.02)), seconds=np.full(3, np.nan), std=np.full(3, np.nan))
+    assert found.significant == 0.0
+
+
 def test_what_a_delay_needs_is_said():
     with pytest.raises(InvalidInput, match="forces of contacts are not known"):
         estimate_delay(replace(arm_log(), model=arm_model()))

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from tests.data.samples import dataset
 
 from forcegp.data import farthest_rows, time_blocks
+from forcegp.data.views import all_motions
 
 
 def test_rows_of_one_stretch_and_episode_form_a_block_in_order_of_time():
@@ -25,3 +26,9 @@ def test_every_row_is_in_one_block_that_is_no_longer_than_said(count, seed, seco
         assert len(set(rows.episode[chosen])) == 1
         assert np.ptp(rows.time[chosen]) <= seconds * (1.0 + 1e-12)
         assert (np.diff(rows.time[chosen]) > 0).all()
+
+
+def test_motions_of_equal_steps_lie_in_one_episode_and_cross_no_gap():
+    recorded, stride = all_motions(dataset(40).rows(np.delete(np.arange(40), 26)), 0.06, 0.02)
+    assert recorded.rows == (0, 6, 12, 26, 32)  # of 20 rows and of 19; 20 to 26 has the gap
+    assert (round(recorded.dt, 9), stride) == (0.01, 2)

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 
+from tests.fuzz.made import PAIR
+
 from forcegp import Dataset, load_posterior
 from forcegp.atomic_files import require_unchanged
 
@@ -46,7 +48,7 @@ class Writing:
 
 COMMANDS = {
     "simulate": Writing("simulate kuka-surface --seconds 1 --out OUT", "file"),
-    "import": Writing("import log.csv --time time --q q_a --u u_a --joints a --out OUT", "file"),
+    "import": Writing("import log.csv --time time --q q_a,q_a --u u_a,u_a --robot pair.urdf --out OUT", "file"),
     "prepare": Writing("import train.h5 --cutoff 20 --out OUT", "file"),
     "fit": Writing(f"fit train.h5 {FEW} --out OUT"),
     "identification": Writing("fit air.h5 --forces bodies,viscous --no-checks --out OUT"),
@@ -63,6 +65,7 @@ def make_inputs(folder: Path, forcegp) -> None:
         assert done.returncode == 0, done.stderr
     assert forcegp("fit", "train.h5", *FEW.split(), "--out", "run", folder=folder).returncode == 0
     rows = (f"{k / 200},{math.sin(k / 60)},{math.cos(k / 90)}" for k in range(20_000))
+    (folder / "pair.urdf").write_text(PAIR)
     (folder / "log.csv").write_text("time,q_a,u_a\n" + "\n".join(rows) + "\n")
 
 

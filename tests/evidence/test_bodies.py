@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from tests.posterior.arm import URDF
 from tests.robots.robot_models import TREE
 
@@ -21,7 +22,7 @@ from forcegp.robots.inertia import pseudo_inertia_of_standard
 
 
 def bodies(robot=None):
-    references = body_pseudo_inertias(robot or Robot.from_urdf_text(URDF)).numpy()
+    references = list(body_pseudo_inertias(robot or Robot.from_urdf_text(URDF)).numpy())
     return Bodies(references, [Body()] * len(references))
 
 
@@ -119,7 +120,7 @@ def test_points_are_given_some_thickness():
 
 def test_joint_dynamics_stand_in_the_urdf():
     robot = Robot.from_urdf_text(TREE)
-    damping = np.arange(robot.nv) + 0.1
+    damping = torch.arange(robot.nv, dtype=torch.float64) + 0.1
     changed = robot.with_joint_dynamics(damping, None)
     assert [joint.damping for joint in changed.joints] == damping.tolist()
     assert [joint.friction for joint in changed.joints] == [joint.friction for joint in robot.joints]

@@ -195,7 +195,7 @@ def test_equal_terms_are_refused(data):
 def test_terms_that_differ_are_fitted_without_a_word(data, prior):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        fit(data, prior)
+        fit(data, *prior)
 
 
 def test_no_residual_at_all_is_refused(data):

@@ -36,12 +36,16 @@ def from_place(index, before=(), progress=None, *, options, places=(0.5, 4.5, 5.
 )
 @pytest.mark.nightly
 def test_a_fit_ends_as_low_with_fewer_evaluations(train, model, fraction):
-    """With 154 parameters of seven joints less than half (docs/benchmarks/performance.md); here there are 30."""
-    fast = fit(model(train.model), train, seed=1)
-    slow = fit(model(train.model), train, seed=1, options=UNTIL_CONVERGED)
-    assert fast.result.evaluations <= fraction * slow.result.evaluations
-    assert fast.result.value < slow.result.value + 0.5
-    assert fast.result.converged
+    """With 154 parameters of seven joints less than half (docs/benchmarks/performance.md); here there are 30.
+
+    Of four seeds together, since one gives 0.54 to 0.86 by the starts that it draws.
+    """
+    fast, slow = (
+        [fit(model(train.model), train, seed=seed, options=options).result for seed in range(1, 5)]
+        for options in (None, UNTIL_CONVERGED)
+    )
+    assert sum(each.evaluations for each in fast) <= fraction * sum(each.evaluations for each in slow)
+    assert all(each.value < other.value + 0.5 and each.converged for each, other in zip(fast, slow, strict=True))
 
 
 def test_starts_behind_those_before_are_dropped_and_say_so():

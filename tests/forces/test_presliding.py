@@ -310,7 +310,7 @@ def test_controllers_and_monitors_see_the_past(lugre_log):
     needed = predictor.inverse_dynamics(test.q[299], test.v[299], test.a[299], memory=controller.past.z).mean
     torch.testing.assert_close(asked, needed, rtol=1e-7, atol=1e-7)
     more = posterior.update(test.rows(slice(0, 200)))
-    assert len(more.training) == len(posterior.training) + 200
+    assert len(more.training) == len(more.training.strokes) == len(posterior.training) + 200
 
 
 def test_noise_of_an_encoder_does_not_wear_the_state_down():

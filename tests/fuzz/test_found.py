@@ -183,6 +183,8 @@ WRONG = {
     "check": {"preparation": np.ones(3)},
     "split_named": {"guard": {}},
     "ColumnMapping": {"unit": 5},
+    "ColumnMapping ": {"time": torch.zeros(3).to_sparse()},
+    "score": {"starts": []},
     "ImportOptions": {"gap": "x"},
     "KukaSurfaceConfig": {"tool_mass": None},
     "JointFriction": {"joints": torch.tensor(5.0)},

@@ -64,6 +64,15 @@ def test_value_and_all_gradients_with_noise_variances(shape, panel_bytes, inner,
     assert_same_value_and_gradients(given_problem)
 
 
+def test_latents_that_act_on_an_output_each_are_as_many_small_problems(monkeypatch):
+    sizes, whiten = [], likelihood.whiten
+    monkeypatch.setattr(likelihood, "whiten", lambda W, *rest: sizes.append(tuple(W.shape)) or whiten(W, *rest))
+    given_problem = problem(outputs=3, latents=3, constraints=0)
+    given_problem.W = torch.diag_embed(given_problem.W.diagonal(dim1=-2, dim2=-1))
+    assert_same_value_and_gradients(given_problem)
+    assert sizes == [(12, 1, 1)] * 3
+
+
 @pytest.mark.parametrize("shared", [False, True], ids=["one per point", "shared"])
 @pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
 def test_noise_covariances(shape, shared):

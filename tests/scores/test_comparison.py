@@ -1,13 +1,16 @@
 """Models fitted and scored side by side: one file per piece of work, resumed, extended, refused, and some that fail."""
 
+import inspect
 import json
 import shutil
+from dataclasses import fields
 
 import pytest
 from tests.fit.test_motion_fit import bump, recording
 from tests.scores.moving_arm import given_system, moving_arm
 
 from forcegp import JointForces, JointFriction, score
+from forcegp.cli.score import Score
 from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.fit import fit as fit_model
 from forcegp.jobs import JobStore
@@ -47,6 +50,13 @@ def found(data, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("forcegp.scores.experiment.learn", broken)
         return scored(models | {"before": before}, data, folder, seeds=2), folder
+
+
+def test_the_command_scores_as_the_function_does():
+    own = {name: each.default for name, each in inspect.signature(score).parameters.items()}
+    asked = {each.name: each.default for each in fields(Score)}
+    assert asked["search"].points == own["points"]
+    assert all(asked[name] == own[name] for name in ("identification", "split", "seeds", "starts", "integrator"))
 
 
 def test_every_kind_of_model_is_a_row_and_identified_is_always_among_them(found):
@@ -160,7 +170,7 @@ def test_folders_of_others_are_not_touched(data, tmp_path):
         (("gp:joint@measured",), {}, "no evidence 'measured'"),
         (("identified+viscous",), {}, "`identified` has its laws already"),
         (("given@motions:1",), {}, "nothing to refine on motions"),
-        (("given",), {"seeds": 0}, "number of seeds is 0"),
+        (("given",), {"seeds": 0}, "seeds=0"),
         (("given",), {"points": 1000}, "two thirds"),
         (("given",), {"restarts": 0}, "restarts is 0"),
         (("given",), {"integrator": "euler"}, "euler"),

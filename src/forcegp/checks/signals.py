@@ -326,7 +326,7 @@ def _differences(
             correction = {"sign": {"v": tuple(-1.0 if each in named else 1.0 for each in inputs.names)}}
         elif level == "wrong" and unit is not None and len(joints) == count:
             units = [unit if joint in fits else own for joint, own in enumerate(inputs.unit_of_each("v"))]
-            correction = {"unit": {"v": tuple(units[:1] if len(set(units)) == 1 else units)}}
+            correction = {"unit": {"v": tuple(units)}}
         each = [
             {"quantity": name, "factor": f, "delay": s if np.isfinite(s) else None, "unexplained": left}
             for f, s, left in (fits[joint] for joint in joints)

@@ -89,17 +89,17 @@ class Fleet(Command):
         return {"out": str(self.out), "table": str(self.out / TABLE), "rows": rows}
 
 
-def fleet(words: Sequence[str], jobs: Jobs = 1) -> list[dict[str, Any]]:
+def fleet(words: Sequence[str], jobs: Jobs | None = None) -> list[dict[str, Any]]:
     """The rows of `forcegp WORDS`, such as ["fit", "--logs-from", "list.txt", "--out", "fleet"].
 
-    {"log", "folder", "error", "cpu_seconds", "warnings", "numbers"} each. `jobs` is a number of processes of this
-    machine, or an `Executor` whose workers see the same files, such as Dask's `client.get_executor()`. Raises as the
-    command.
+    {"log", "folder", "error", "cpu_seconds", "warnings", "numbers"} each. `jobs`, in place of that of the
+    words, is a number of processes of this machine, or an `Executor` whose workers see the same files, such as Dask's
+    `client.get_executor()`. Raises as the command.
     """
     asked = command_of(words)
     if not isinstance(asked, Fleet):
         raise InvalidInput(f"the words {shlex.join(words)!r} name no list of logs; add {FLAG} LIST.")
-    return list(replace(asked, jobs=jobs).run(Quiet())["rows"])
+    return list((asked if jobs is None else replace(asked, jobs=jobs)).run(Quiet())["rows"])
 
 
 def command_of(words: Sequence[str]) -> Command:

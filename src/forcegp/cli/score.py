@@ -136,7 +136,7 @@ class Score(Command):
             terminal.show(*comparison(scores, f"{data}{f': medians over {count} seeds' if count > 1 else ''}"))
         if self.out is not None:
             terminal.note(f"{time.monotonic() - start:.0f} s; the page: {self.out / 'report.md'}")
-        return {name: value for name, value in content.items() if name not in ("runs", "identifications")}
+        return {name: value for name, value in content.items() if name != "runs"}
 
     def _loaded(self, terminal: Terminal, path: Path, log: forcegp.Dataset, data: Path) -> forcegp.posterior.Posterior:
         """A fitted model for the chosen system; a robot that was identified stays, with contacts of the log."""

@@ -65,9 +65,10 @@ class Delay:
 
         It is the common one, or else the median of the joints: where friction dominates, noise of v looks like a delay.
         """
-        if not np.isfinite(self.common):
+        each = self.seconds[np.isfinite(self.seconds)]
+        if not (np.isfinite(self.common) and len(each)):
             return 0.0
-        median = float(np.median(self.seconds[np.isfinite(self.seconds)]))
+        median = float(np.median(each))
         for seconds, remains in ((self.common, self.remains), (median, 0.0)):
             showing = self._showing(seconds)
             spread = max(self.common_std, float(np.std(showing)) / len(showing) ** 0.5 if len(showing) else np.inf)

@@ -46,7 +46,7 @@ def is_dataset(path: Path) -> bool:
     """Whether a file is a dataset of this or another version."""
     try:
         with h5py.File(path, "r") as file:
-            return file.attrs.get("format") == FORMAT
+            return isinstance(kind := file.attrs.get("format"), str) and kind == FORMAT
     except (OSError, RuntimeError, KeyError, ValueError, TypeError):  # whatever h5py meets in a damaged file
         return False
 
@@ -93,7 +93,7 @@ class _Reader:
         file, required = self.file, (*COLUMNS, "joint_names", "metadata", "model")
         kind, version = file.attrs.get("format"), file.attrs.get("format_version")
         ours = f"is an HDF5 file, but not a forcegp dataset (its 'format' is {kind!r}, not {FORMAT!r})."
-        self.require(kind == FORMAT, f" {ours}")
+        self.require(isinstance(kind, str) and kind == FORMAT, f" {ours}")
         self.require(
             isinstance(version, int | np.integer) and version == VERSION,
             f" has format version {version!r}; this forcegp ({__version__}) reads {VERSION}. Use what wrote it "

@@ -239,7 +239,9 @@ class Law(Force):
         """What it remembers before anything has moved."""
         return torch.zeros(len(self.memory_names(robot)), dtype=torch.float64, device=robot.device)
 
-    def remember(self, memory: Float[Tensor, "*batch m"], step: Tensor, dt: float) -> Float[Tensor, "*batch m"]:
+    def remember(
+        self, memory: Float[Tensor, "*batch m"], step: Tensor, dt: float | Tensor
+    ) -> Float[Tensor, "*batch m"]:
         """The memory after the joints have moved by `step` (..., nv) in dt: exact and differentiable."""
         return memory
 
@@ -405,7 +407,7 @@ class Memory:
         variance = torch.where(at_rest, seen.square().mean(0), (seen * seen_signs - mean).square().mean(0))
         return mean * signs, variance
 
-    def after(self, memory: Float[Tensor, "*batch m"], step: Float[Tensor, "*batch nv"], dt: float) -> Tensor:
+    def after(self, memory: Float[Tensor, "*batch m"], step: Float[Tensor, "*batch nv"], dt: float | Tensor) -> Tensor:
         """The memory after the joints have moved by `step` in dt."""
         parts = memory.split([size for _, size in self._laws], dim=-1)
         return torch.cat([law.remember(x, step, dt) for (law, _), x in zip(self._laws, parts, strict=True)], dim=-1)

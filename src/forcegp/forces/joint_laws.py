@@ -128,7 +128,7 @@ class DryFriction(JointLaw):
         return self._places
 
     @override
-    def remember(self, memory: Tensor, step: Tensor, dt: float) -> Tensor:
+    def remember(self, memory: Tensor, step: Tensor, dt: float | Tensor) -> Tensor:
         return after_step(memory, step[..., self._places], self._sigma(step)[self._places])
 
     @override

@@ -12,7 +12,9 @@ from torch import Tensor
 
 
 def after_step(
-    z: Float[Tensor, "*batch nv"], step: Float[Tensor, "*batch nv"], sigma: Float[Tensor, "*#batch nv"]
+    z: Float[Tensor, "*batch nv"],
+    step: Float[Tensor, "*batch nv"],
+    sigma: Float[Tensor, "*#batch nv"] | Float[Tensor, ""],
 ) -> Float[Tensor, "*batch nv"]:
     """The state after the joints have moved by `step` (rad or m), with sigma in 1/rad or 1/m."""
     toward = step.sign()
@@ -20,7 +22,9 @@ def after_step(
 
 
 def after_strokes(
-    strokes: Float[Tensor, "*batch nv strokes"], sigma: Float[Tensor, "*#batch nv"], start: float = 0.0
+    strokes: Float[Tensor, "*batch nv strokes"],
+    sigma: Float[Tensor, "*#batch nv"] | Float[Tensor, ""],
+    start: float = 0.0,
 ) -> Float[Tensor, "*batch nv"]:
     """The state after these displacements (rad or m), the last one first, from `start` on; smooth in sigma."""
     z = torch.full_like(strokes[..., 0], start)

@@ -277,7 +277,7 @@ class Programs:
             return None
 
         def after(z: Tensor, q: Tensor, q1: Tensor, dt: Tensor) -> list[Tensor]:
-            return [memory.after(z, space.difference(q, q1), dt)]  # type: ignore[arg-type]  # a number of the graph
+            return [memory.after(z, space.difference(q, q1), dt)]
 
         q = space.neutral()
         given = [q.new_zeros(len(memory.names)), q, q, q.new_ones(1)]

@@ -30,7 +30,8 @@ def learn_more_rows(posterior: Structured, rows: Dataset) -> Structured:
         terms = more.terms(posterior.hyperparameters)
         variance = terms.noise.expand(len(terms.W), *terms.noise.shape[1:])
         latent = with_rows(latent, terms._replace(noise=variance))
-    joined = {name: torch.cat([getattr(training, name), getattr(more.training, name)]) for name in "qvua"}
+    pairs = {name: [getattr(x, name) for x in (training, more.training)] for name in (*"qvua", "strokes")}
+    joined = {name: None if any(x is None for x in pair) else torch.cat(pair) for name, pair in pairs.items()}
     likelihood = replace(more, training=replace(training, **joined, reference=more.training.reference))
     changes = {"points": len(latent.system.alpha), "rows_added": posterior.settings.get("rows_added", 0) + len(rows)}
     return replace(posterior, likelihood=likelihood, latent=latent).with_settings(**changes)

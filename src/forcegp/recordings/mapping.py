@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from forcegp.doubts import stated_as
-from forcegp.errors import InvalidInput, require_known, usable_arguments
+from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
 from forcegp.recordings.source import Source
 
 
@@ -117,6 +117,9 @@ class ColumnMapping:
 
     @usable_arguments("ColumnMapping")
     def __post_init__(self) -> None:
+        for name in ("time", "episode", "episodes", "delimiter"):
+            if getattr(self, name) is not None:
+                require_type(name, getattr(self, name), str)
         if self.time is not None and self.step is not None:
             raise InvalidInput("give a column for the time or the step between rows, not both.")
         if self.step is not None and not 0.0 < self.step < float("inf"):

@@ -1,6 +1,7 @@
 """Options of columns in a YAML file, which belongs to many logs of one robot: their words, as on the command line."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,10 @@ class _OnceLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+KINDS = {"step": (float, "seconds"), "ned": (bool, "true or false"), "side_by_side": (bool, "true or false")}
+"""What is no text, and its name."""
+
+
 def read_mapping(path: Path, known: Sequence[str]) -> dict[str, Any]:
     """What the file states of the `known` options: a truth, a number or a text for each, lists joined by commas.
 
@@ -48,7 +53,14 @@ def read_mapping(path: Path, known: Sequence[str]) -> dict[str, Any]:
 
 
 def _words(path: Path, key: str, value: Any) -> Any:
-    if isinstance(value, bool | float | str):
+    if key in KINDS:
+        kind, what = KINDS[key]
+        with suppress(ValueError):  # YAML takes 1e-3 for a text
+            value = float(value) if kind is float and type(value) in (int, str) else value
+        if type(value) is not kind:
+            raise FileFormatError(f"{path}: {key} is {value!r:.60}; give {what}.")
+        return value
+    if isinstance(value, str):
         return value
     if isinstance(value, dict) and value:
         return ",".join(f"{name}={_words(path, key, entry)}" for name, entry in value.items())

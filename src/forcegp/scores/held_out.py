@@ -17,6 +17,7 @@ from forcegp.data import Dataset, require_disjoint
 from forcegp.data.views import EVEN_STEPS, RecordedMotions, recorded_motions
 from forcegp.errors import InvalidInput, require_type, usable_arguments
 from forcegp.posterior import Posterior, observing
+from forcegp.robots.arguments import whole_number
 from forcegp.scores.accuracy import Table
 from forcegp.summary import plain
 
@@ -202,8 +203,7 @@ def held_out_motions(
     if not all(isinstance(h, int | float) and 0.0 < h < np.inf for h in wanted):
         raise InvalidInput(f"horizons are {list(wanted)}; give positive numbers of seconds.")
     wanted = tuple(sorted(set(wanted)))
-    if starts < 1:
-        raise InvalidInput(f"the number of starts is {starts}; it must be at least 1.")
+    starts = whole_number("starts", starts, 1)
     if not wanted:
         return HeldOutMotions(None, (), ())
     if not recording.time_ordered:

@@ -19,6 +19,7 @@ from forcegp.jobs import JobStore, Progress, machine, run_jobs
 from forcegp.model import Model
 from forcegp.parallel import checked_jobs
 from forcegp.posterior.posterior import Posterior
+from forcegp.robots.arguments import whole_number
 from forcegp.scores.experiment import Experiment, fingerprint, kept, scored
 from forcegp.scores.held_out import STARTS, HeldOutMotions, Split, held_out_motions, split_named
 from forcegp.scores.models import (
@@ -90,8 +91,7 @@ def score(
     given: Any = {"model": models} if isinstance(models, Posterior) else models
     if models is not None and wrong:
         raise InvalidInput(f"models is a {type(given).__name__}; give a Posterior, a mapping from names, or names.")
-    if isinstance(seeds, bool) or seeds < 1:
-        raise InvalidInput(f"the number of seeds is {seeds}; it must be at least 1.")
+    seeds = whole_number("seeds", seeds, 1)
     about = {"kind": KIND, "machine": machine(), "forcegp": __version__, "source": dict(source or {}), "rows": len(log),
              "preparation": preparation_lines(log.metadata)}  # fmt: skip
     if horizons is not None and not isinstance(horizons, Sequence):
@@ -129,12 +129,10 @@ def score(
         runs = {name: [kept(store, job.name) for job in fits if job.spec["name"] == name] for name in chosen}
         for name in (name for name, each in chosen.items() if each.all_rows):  # they use no chance
             runs[name] = [{**run, "seed": seed} for seed in range(seeds) for run in runs[name]]
-        found = [kept(store, job.name) for job in identifications]
         about |= {
             "splits": [_split_facts(experiment, each) for each in splits],
             "configuration": experiment.configuration,
             "seeds": list(range(seeds)),
-            "identifications": [{key: each[key] for key in ("split", "error") if key in each} for each in found],
         }
         scores = _scores(log, runs, chosen, about, partial(_on_all_rows, experiment, chosen))
         if folder is not None:

@@ -12,6 +12,7 @@ from tests.robots.robot_models import CHAIN, MODELS
 from forcegp.errors import InvalidInput, UnknownName
 from forcegp.forces import (
     Actuation,
+    Body,
     Coulomb,
     CoupledRotors,
     DirectionalFriction,
@@ -107,6 +108,13 @@ def test_the_numbers_of_the_urdf(model):
     expected = torch.where(single, -damping * v - friction * (v / 0.01).tanh(), 0.0)
     laws = tuple(law for law in Model(built).forces if isinstance(law, Viscous | Coulomb))
     assert_close(Model(built, forces=laws).dynamics(q, v, u).Q_K, expected, 1e-14)
+
+
+def test_bodies_that_are_learned_are_of_links_that_move():
+    first, *_, moving = chain().link_names
+    assert dict(RigidBodies((moving,)).bound_to(chain()).learn) == {moving: Body()}
+    with pytest.raises(InvalidInput, match="does not move"):
+        RigidBodies((first,)).bound_to(chain())
 
 
 # ---------------------------------------------------------------- armature
