@@ -16,9 +16,10 @@ from forcegp.control import ComputedTorque, ContactMonitor
 from forcegp.control.tracking import Past
 from forcegp.data import estimate_delay, with_memory, with_strokes
 from forcegp.data.strokes import encoder_step, strokes, turning_points
-from forcegp.data.views import FORGOTTEN, past_known
+from forcegp.data.views import FORGOTTEN, past_known, recorded_motions
 from forcegp.errors import DataWarning, InvalidInput
 from forcegp.evidence import motion_residuals
+from forcegp.fit import calibrated
 from forcegp.forces import Coulomb, GearFriction, LoadFriction, Stribeck, Viscous
 from forcegp.forces.presliding import after_step, after_strokes
 from forcegp.noise import Noise
@@ -340,3 +341,13 @@ def test_rows_before_a_joint_has_moved_are_left_out():
     q[:, 1] = q[0, 1]  # a joint that never moves keeps its rows
     assert past_known(with_strokes(log_of(q, v, a, a, log.time)), model).all()
     assert past_known(log, arm_model(0)).all()
+
+
+def test_intervals_of_motions_under_gears_hold(lugre_log):
+    posterior = fit(arm_model(0).with_forces(Viscous(), Coulomb(memory=True)), lugre_log, Torques(), rows=1500)
+    found = calibrated(posterior, lugre_log, (0.05, 0.2))
+    motions = recorded_motions(with_memory(lugre_log, found.model), 30, 0.2)
+    moved = found.rollout(motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, integrator="rk4")
+    low, high = (end.numpy() for end in moved.interval("q"))
+    inside = (low <= motions.q) & (motions.q <= high)
+    assert min(inside[:, round(horizon / motions.dt)].mean() for horizon in (0.05, 0.2)) >= 0.85

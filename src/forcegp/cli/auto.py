@@ -61,7 +61,7 @@ class Auto(Command):
     """Correct mistakes in units, signs and the order of joints, and continue."""
     accept: bool = False
     """Continue although the log contains mistakes."""
-    link: Annotated[str | None, unless_given("LINK", "the hand or the base that explains most", str)] = None
+    link: Annotated[str | None, unless_given("LINK", "a base that moves, else the last link", str)] = None
     """Where a payload may be."""
     logs_from: Annotated[Path | None, unless_given("LIST", "one log", Path)] = None
     """In the place of LOG a text file with one in each line, and the options that differ for it, such as --robot.

@@ -244,7 +244,6 @@ def fit_report(run: Path, posterior: Any, found: Mapping[str, Any]) -> list[Any]
     settings, learned, air = posterior.settings, found["learning_points"], found["wind"]
     starts = f"; {settings['restarts']} starts" if "restarts" in settings else ""
     fewer = "" if learned == found["points"] else f" (parameters: from {learned} of them{starts})"
-    each = ", with a force in each episode" if settings.get("steady_forces") else ""
     told = with_option_names(found["status"], ("iterations",))
     values = {
         "engine": settings.get("engine_reason"),
@@ -256,7 +255,7 @@ def fit_report(run: Path, posterior: Any, found: Mapping[str, Any]) -> list[Any]
         "time": f"{found['cpu_seconds']:.1f} s CPU for the search, {found['wall_seconds']:.1f} s in all",
     }
     if found["wind_not_found"]:
-        values["wind of these rows"] = f"not found; learned as still air{each}"
+        values["wind of these rows"] = "not found; learned as still air"
     title = f"{run}: {found['model']}, learned from {found['points']} points{fewer}"
     shown: list[Any] = [facts(title, {name: text for name, text in values.items() if text is not None})]
     if posterior.estimates:
@@ -342,7 +341,7 @@ class Payload(Command):
     """The log with the payload (a dataset, raw or prepared)."""
     baseline: Annotated[Path | None, DATASET, unless_given("LOG", "the URDF", Path)] = None
     """A log of the same robot without the payload."""
-    link: Annotated[str | None, unless_given("LINK", "the hand or the base that explains most", str)] = None
+    link: Annotated[str | None, unless_given("LINK", "a base that moves, else the last link", str)] = None
     """The link that carries the payload; results are in its frame."""
     forces: Annotated[tuple[str, ...], listed(goes_on=FIELDS), arg(metavar="FORCE,...")] = LAWS
     """What is estimated beside it, as for forcegp fit."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from forcegp.data import Dataset, farthest_rows
+from forcegp.data import Dataset, farthest_rows, with_memory
 from forcegp.data.views import RecordedMotions, recorded_motions
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence.likelihood import TrainingData
@@ -60,6 +60,7 @@ def _intervals(
 ) -> MotionIntervals:
     require_type("dataset", dataset, Dataset)
     require_unobserved(posterior, "intervals of motions")
+    dataset = with_memory(dataset, posterior.model)
     wanted = tuple(sorted(set(horizons)))
     if not wanted or not all(math.isfinite(h) and h > 0.0 for h in wanted):
         raise InvalidInput(f"horizons are {list(horizons)}; give one or more positive numbers of seconds.")
