@@ -10,6 +10,7 @@ import operator
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -117,12 +118,13 @@ class ColumnMapping:
 
     @usable_arguments("ColumnMapping")
     def __post_init__(self) -> None:
-        for name in ("time", "episode", "episodes", "delimiter"):
+        kinds = dict.fromkeys("qvua", Sequence) | dict.fromkeys(("time", "episode", "episodes", "delimiter"), str)
+        for name, kind in kinds.items():
             if getattr(self, name) is not None:
-                require_type(name, getattr(self, name), str)
+                require_type(name, getattr(self, name), kind)
         if self.time is not None and self.step is not None:
             raise InvalidInput("give a column for the time or the step between rows, not both.")
-        if self.step is not None and not 0.0 < self.step < float("inf"):
+        if self.step is not None and not (isinstance(self.step, Real) and 0.0 < self.step < float("inf")):
             raise InvalidInput(f"step is {self.step} s; it must be positive and finite.")
         if len(set(self.joints)) < len(self.joints) or not all(self.joints):
             raise InvalidInput(f"joints are {', '.join(self.joints)}; every joint needs a name of its own.")
