@@ -251,7 +251,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "predictor": _call(
         Posterior.predictor,
         _of_posterior("predictor", lambda made: made(*STATE), compile=False),
-        "covariance tolerance largest_rank",
+        "covariance",
     ),
     "predictor()": (lambda **k: INPUTS.predictor(**k), _states),
     "Noise": _call(

@@ -7,8 +7,8 @@ that errors that last count, and what the prior leaves open of what the log does
 
 with the prior's information G and the changes d_k about their mean. The half width of joint j at horizon h is
 c_hj 1.96 sqrt(s_hj^2 + r_hj^2), with the spread s of sampled functions (0 without), the rms r of errors, and c_hj that
-makes it hold 95 % of left-out motions (split conformal prediction: Lei et al. 2018, JASA 113). To motions of one record
-alone, what another friction level would change (`posterior.drift`) is added in squares.
+makes it hold 95 % of left-out motions (split conformal prediction: Lei et al. 2018, JASA 113); of one record alone, what
+another friction level would change (`posterior.drift`) is added in squares.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -279,8 +279,7 @@ class MotionIntervals:
         rms, factor = self.rms[:, kind], self.factors[int(spread is None), :, kind]
         at = time.cpu().numpy()
         ends = np.array([0.0, *self.horizons])
-        # beyond the last horizon errors go on as they grew
-        beyond = np.maximum(at / self.horizons[-1], 1.0)[:, None]
+        beyond = np.maximum(at / self.horizons[-1], 1.0)[:, None]  # the last horizon errors go on as they grew
         r = beyond * _between(at, ends, rms)
         c = np.stack([np.interp(at, self.horizons, each) for each in factor.T], axis=-1)
         moved = [] if self.drift is None else [np.square(beyond * _between(at, ends, x[:, kind])) for x in self.drift]
@@ -295,8 +294,7 @@ class MotionIntervals:
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> "MotionIntervals":
         """What `to_dict` gave."""
-        arrays: Any = {name: None if x is None else np.array(x) for name, x in stored.items() if name != "inputs"}
-        return cls(**arrays, inputs=tuple(stored["inputs"]))
+        return cls(**{name: tuple(x) if name == "inputs" else x and np.array(x) for name, x in stored.items()})
 
 
 def _between(at: np.ndarray, ends: np.ndarray, values: np.ndarray) -> np.ndarray:
