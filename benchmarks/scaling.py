@@ -61,7 +61,7 @@ def condition(engine: str, count: int) -> dict[str, Any]:
     rows = data.rows(np.linspace(0, len(data) - 1, count).round().astype(int))
     chosen = {"inducing": Inducing()}
     before, cpu = psutil.Process().memory_info().rss, time.process_time()
-    conditioned = on_all_rows(posterior, rows, chosen.get(engine, ENGINES[engine]()), {}, True)
+    conditioned = on_all_rows(posterior, rows, chosen.get(engine, ENGINES[engine]()), {})
     conditioned.predict(rows.q[:100], rows.v[:100], rows.u[:100], covariance=False)
     return {"cpu_s": time.process_time() - cpu, "memory_mib": (peak_bytes() - before) / 2**20}
 

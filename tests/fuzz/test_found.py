@@ -149,7 +149,7 @@ WRONG = {
     "components": {"covariance": np.array(["a", "b"])},
     "predict": {"q": torch.ones(3, device="meta")},
     "predict ": {"q": torch.ones(2, 3).to_sparse()},
-    "predictor": {"tolerance": "0.1"},
+    "predictor": {"covariance": 0.1},
     "predictor()": {"q": "abc"},
     "rollout": {"baumgarte": 3},
     "Dataset": {"truth": 5},

@@ -99,7 +99,7 @@ def _intervals(
     scores = [error / np.sqrt(np.square(s) + np.square(rms)) for s in (spread, np.zeros_like(spread))]
     factors = np.stack([np.quantile(each, level, axis=0) / DEVIATIONS for each in scores])
     pairs = [np.concatenate(shifts[kind::2]) for kind in (0, 1)] if shifts else []
-    shift = np.sqrt(np.nanmean(np.square(pairs), axis=1)) if shifts else None
+    shift = np.sqrt(np.nanmean(np.square(pairs), axis=1)) if shifts else ()
     return MotionIntervals(np.array(kept), rms, factors, inputs, shift)
 
 

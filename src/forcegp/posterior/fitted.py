@@ -7,8 +7,8 @@ that errors that last count, and what the prior leaves open of what the log does
 
 with the prior's information G and the changes d_k about their mean. The half width of joint j at horizon h is
 c_hj 1.96 sqrt(s_hj^2 + r_hj^2), with the spread s of sampled functions (0 without), the rms r of errors, and c_hj that
-makes it hold 95 % of left-out motions (split conformal prediction: Lei et al. 2018, JASA 113); of one record alone, what
-another friction level would change (`posterior.drift`) is added in squares.
+makes it hold 95 % of left-out motions (split conformal prediction: Lei et al. 2018, JASA 113); of one record,
+what another friction level would change (`posterior.drift`) is added in squares.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -270,7 +270,7 @@ class MotionIntervals:
     rms: Float[np.ndarray, "H 2 nv"]
     factors: Float[np.ndarray, "2 H 2 nv"]
     inputs: tuple[str, ...] = ()
-    drift: Float[np.ndarray, "2 H 2 nv"] | None = None
+    drift: Float[np.ndarray, "2 H 2 nv"] | tuple[()] = ()
     """What one deviation of dry and of viscous friction between records changes, where all motions are of one."""
 
     def half_width(self, quantity: str, time: Tensor, spread: Tensor | None) -> Float[Tensor, "*batch rows nv"]:
@@ -282,8 +282,8 @@ class MotionIntervals:
         beyond = np.maximum(at / self.horizons[-1], 1.0)[:, None]  # the last horizon errors go on as they grew
         r = beyond * _between(at, ends, rms)
         c = np.stack([np.interp(at, self.horizons, each) for each in factor.T], axis=-1)
-        moved = [] if self.drift is None else [np.square(beyond * _between(at, ends, x[:, kind])) for x in self.drift]
-        r, c, d = (torch.as_tensor(x, device=time.device) for x in (r, c, sum(moved, np.zeros_like(r))))
+        moved = sum((np.square(beyond * _between(at, ends, x[:, kind])) for x in self.drift), np.zeros_like(r))
+        r, c, d = (torch.as_tensor(x, device=time.device) for x in (r, c, moved))
         within = c * (r if spread is None else (spread.square() + r.square()).sqrt())
         return DEVIATIONS * (within.square() + d).sqrt()
 
@@ -294,7 +294,7 @@ class MotionIntervals:
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> "MotionIntervals":
         """What `to_dict` gave."""
-        return cls(**{name: tuple(x) if name == "inputs" else x and np.array(x) for name, x in stored.items()})
+        return cls(**{name: tuple(x) if name == "inputs" else np.array(x) for name, x in stored.items()})  # type: ignore[arg-type]  # of two kinds
 
 
 def _between(at: np.ndarray, ends: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -429,7 +429,7 @@ class Fitted(Summary):
         """Widths of the intervals of motions, where they were `calibrated`; a rollout has them."""
         stored = self.settings.get("motion_intervals")
         found = None if stored is None else MotionIntervals.from_dict(stored)
-        if found is not None and found.drift is not None:
+        if found is not None and len(found.drift):
             found = replace(found, drift=Drift(**self.settings["drift"]).shares * found.drift)
         # widths of motions that an observer's columns were part of are not those of motions without
         return None if found is None or found.inputs not in ((), self.model.inputs) else found
