@@ -98,7 +98,7 @@ def monitors(seed: int, calibration: dict[str, np.ndarray]) -> dict[str, Contact
     models = {name: fit.predictor() for name, fit in fits(rows_of(motion, given, seed), given, seed).items()}
     made = {**models, "true model": true_system(robot)}
     made["learned, noise alone"] = models["learned"].posterior.predictor(covariance="none")
-    found = {name: ContactMonitor(model, dt=1 / RATE) for name, model in made.items()}
+    found = {name: ContactMonitor(model, dt=1 / RATE, bandwidth=5.0) for name, model in made.items()}
     return {name: each.calibrate([qvu(calibration)], false_alarms_per_hour=0.1) for name, each in found.items()}
 
 

@@ -10,7 +10,7 @@ from tests.posterior.arm import arm_model
 
 from forcegp import Torques, fit
 from forcegp.data import Dataset
-from forcegp.fit.friction_choice import choose_friction
+from forcegp.fit.friction_choice import _Regression, choose_friction
 from forcegp.forces import DirectionalFriction, GearFriction, Viscous
 
 LEVEL = np.array([0.8, 0.5, 0.3])
@@ -91,3 +91,31 @@ def test_stated_numbers_are_left_as_they_are():
     posterior = fit(model, log_with(lambda v, rigid: LEVEL * sign(v)), Torques(), rows=500)
     assert "gear_friction" not in posterior.settings
     assert {name.split(".")[1] for name in posterior.parameters} >= {"level", "factor", "root", "breakaway"}
+
+
+def gains(share: float, errors: float) -> tuple[np.ndarray, np.ndarray]:
+    """Squared residuals of ten stretches without and with a part that explains a share of them, so clearly."""
+    way = np.array([1.0, -1.0] * 5)
+    spread = 10.0 * share / (errors * np.sqrt(10.0) * way.std(ddof=1))
+    return np.ones(10), 1.0 - share - spread * way
+
+
+@pytest.mark.parametrize(
+    ("share", "errors", "memory", "expected"),
+    [
+        (0.06, 2.0, False, True),
+        (0.06, 1.0, False, False),
+        (0.04, 9.0, False, False),
+        (0.01, 0.7, True, True),
+        (0.01, 0.3, True, False),
+        (0.005, 9.0, True, False),
+    ],
+)
+def test_memory_needs_less_evidence_than_other_parts(share, errors, memory, expected):
+    regression = object.__new__(_Regression)
+    regression.count = 10
+    without, best = gains(share, errors)
+    gain = without - best
+    assert gain.sum() / without.sum() == pytest.approx(share)
+    assert gain.sum() / (np.sqrt(10.0) * gain.std(ddof=1)) == pytest.approx(errors)
+    assert regression._clearly(without, best, memory) is expected

@@ -16,7 +16,7 @@ from forcegp.control import ComputedTorque, ContactMonitor
 from forcegp.control.tracking import Past
 from forcegp.data import estimate_delay, with_memory, with_strokes
 from forcegp.data.strokes import encoder_step, strokes, turning_points
-from forcegp.data.views import FORGOTTEN, past_known, recorded_motions
+from forcegp.data.views import FORGOTTEN, FORGOTTEN_SOON, past_known, recorded_motions
 from forcegp.errors import DataWarning, InvalidInput
 from forcegp.evidence import motion_residuals
 from forcegp.fit import calibrated
@@ -328,14 +328,16 @@ def test_noise_of_an_encoder_does_not_wear_the_state_down():
 
 def test_rows_before_a_joint_has_moved_are_left_out():
     _, q, v, a = motion(1500, 2)
-    rest = np.zeros((500, 3))
+    rest = np.zeros((15, 3))
     q, v, a = np.vstack([q[0] + rest, q]), np.vstack([rest, v]), np.vstack([rest, a])
     log = with_strokes(log_of(q, v, a, a, DT * np.arange(len(q))))
     model = arm_model(0).with_forces(Coulomb(sigma=500.0, memory=("lift",)))
     known = past_known(log, model)
     first = int(np.argmax(known))
     assert known[first:].all()
-    assert first >= 500
+    assert first >= 15
+    many = log.rows(np.r_[:first, first : 30 * first])  # a share that is too large is left as it is
+    assert past_known(many, model).all() == (first > FORGOTTEN_SOON * len(many))
     way = np.abs(np.diff(q[: first + 1, 1])).sum()
     assert FORGOTTEN / 500.0 - 0.005 < way < FORGOTTEN / 500.0 + 0.005
     q[:, 1] = q[0, 1]  # a joint that never moves keeps its rows

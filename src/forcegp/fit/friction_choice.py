@@ -24,9 +24,9 @@ BLOCKS = 10
 """Stretches of the log, each predicted from the others."""
 CLEARLY, LIKELY = 1.5, 0.5
 """Standard errors over the stretches by which a part must lower the squared residual; and memory, which gears have."""
-LEAST = 0.02
-"""Share of it by which it must do so; for memory as much less."""
-FALLS = 0.05, 0.1, 0.2, 0.4
+LEAST, LITTLE = 0.05, 0.007
+"""Share of it by which a part must do so, and memory."""
+FALLS = tuple(np.geomspace(0.04, 0.6, 7).tolist())
 """Of the root mean square velocity, what a breakaway may fall over here; a fit finds the rest."""
 COLUMNS = 6 + len(FALLS)
 """Of each joint: viscous, dry, load, root of speed, direction, a constant, and breakaways."""
@@ -178,7 +178,8 @@ class _Regression:
         self.beside = self._beside(j)
         best, here = self._refined(j, ()), ()
         first = best
-        steps = [(part,) for part in parts] + [("memory", "root")]  # a level that rises with speed hides reversals
+        both = [("memory", part) for part in ("root", "breakaway")]  # a level that changes with speed hides reversals
+        steps = [(part,) for part in parts] + both
         while True:
             left = [(*here, *step) for step in steps if not set(step) & set(here)]
             left = [each for each in left if "memory" not in each or max(self.signs[j]) > 0.0]
@@ -186,7 +187,7 @@ class _Regression:
                 break
             tried = {each: self._fitted(j, each) for each in left}
             there = min(left, key=lambda each: tried[each][1].sum())
-            if not self._clearly(best[1], tried[there][1], LIKELY if "memory" in {*there} - {*here} else CLEARLY):
+            if not self._clearly(best[1], tried[there][1], "memory" in {*there} - {*here}):
                 break
             best, here = self._refined(j, there) if "memory" in {*there} - {*here} else tried[there], there
         rest = tuple(part for part in here if part != "root")  # which stands in for a breakaway that came later
@@ -195,13 +196,14 @@ class _Regression:
         self.at[j], self.fall[j], self.parts[j] = *best[0], here
         self.ratios[j] = float(np.sqrt(best[1].sum() / max(first[1].sum(), 1e-300)))
 
-    def _clearly(self, without: np.ndarray, best: np.ndarray, errors: float = CLEARLY) -> bool:
+    def _clearly(self, without: np.ndarray, best: np.ndarray, memory: bool = False) -> bool:
         """Whether squared residuals of held-out stretches are lower by more than chance and by a share that counts."""
         gain = without - best
         if not np.isfinite(gain).all():
             return bool(np.isfinite(best).all())
+        errors, share = (LIKELY, LITTLE) if memory else (CLEARLY, LEAST)
         noise = errors * np.sqrt(self.count) * gain.std(ddof=1) if self.count > 1 else 0.0
-        return bool(gain.sum() > max(noise, LEAST * errors / CLEARLY * without.sum()))
+        return bool(gain.sum() > max(noise, share * without.sum()))
 
     def _refined(self, j: int, parts: tuple[str, ...]) -> tuple[tuple[float, int], Float[np.ndarray, " stretches"]]:
         """`_fitted`, with signs between those of the grid."""
@@ -246,7 +248,8 @@ class _Regression:
                 without = joined([k]) if held_out else (0.0, 0.0)
                 normal = (whole - without[0]) / np.outer(scale, scale)
                 numbers = np.linalg.solve(normal + RIDGE * np.eye(m), (given - without[1]) / scale) / scale
-                if "factor" in parts and not 0.0 <= numbers[n + 2] <= HIGHEST:
+                loads = "factor" not in parts or 0.0 <= numbers[n + 2] <= HIGHEST
+                if not loads or ("breakaway" in parts and numbers[-1] < 0.0):
                     return np.full(self.count, np.inf)
             x = numbers[own]
             out[k] = self.squares[k, j] - 2.0 * x @ own_b[k] + x @ own_A[k] @ x
