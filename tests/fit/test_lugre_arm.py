@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.gears.lugre_arm import ENCODER, NOISE_V, STEP, LuGreArm, reference
+from tests.simulation.lugre_arm import ENCODER, NOISE_V, STEP, LuGreArm, reference
 
 from forcegp import ContactMonitor, Torques, fit
 from forcegp.control import ComputedTorque
