@@ -320,8 +320,7 @@ def what_is_open(estimates: forcegp.posterior.Estimates) -> list[str]:
 
 WINDOW = 0.4
 """Seconds that torques are averaged over: it takes noise of the acceleration, and leaves friction as sharp as it is."""
-DRY = "gear"
-LAWS = "viscous", DRY, "offset", "rotor"
+LAWS = "viscous", "gear", "offset", "rotor"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -160,8 +160,6 @@ STEPS = 6
 """Evaluations in each, since the next one begins with other accelerations; twice as many after a search in vain."""
 REACHED = 0.02
 """They end where a step is to lower the cost by fewer nats per coordinate: each is within a fifth of its error."""
-WINDOW = 0.4
-"""Seconds that `forcegp payload` averages torques over."""
 FEWEST = 10 * STRETCHES
 """Rows that a payload needs."""
 

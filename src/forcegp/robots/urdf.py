@@ -186,7 +186,8 @@ class _Part:
         if len(children) > 1:  # as in other readers
             self.problems.note(f"the first of several <{tag}> counts", self.owner)
         if needed and not children:
-            raise RobotModelError(f"{self}: <{self.element.tag}> has no <{tag}>; add it.")  # type: ignore[union-attr]
+            inside = "it" if self.element is None else f"<{self.element.tag}>"
+            raise RobotModelError(f"{self}: {inside} has no <{tag}>; add it.")
         return _Part(children[0] if children else None, self.owner, self.problems)
 
     def get(self, attribute: str) -> str | None:
