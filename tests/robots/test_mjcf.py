@@ -133,26 +133,9 @@ def test_rotor_inertias_of_actuators_count():
     same_dynamics(Robot.from_mjcf_text(text), MujocoOracle(compiled(text)))
 
 
-BOMB = '<replicate count="9999" offset="1 0 0">' * 3 + BALL + "</replicate>" * 3
 BAD = {
     "no XML": ("<mujoco", RobotModelError, "not well-formed"),
     "entities": ('<!DOCTYPE m [<!ENTITY a "b">]><mujoco/>', RobotModelError, "DTD"),
-    "copies": (f"<mujoco><worldbody>{BOMB}</worldbody></mujoco>", RobotModelError, "copies included"),
-    "points": (
-        '<mujoco><asset><mesh name="m" builtin="supersphere" params="2e4 1 1"/></asset></mujoco>',
-        RobotModelError,
-        "points",
-    ),
-    "field": (
-        '<mujoco><asset><hfield name="h" nrow="60000" ncol="60000"/></asset></mujoco>',
-        RobotModelError,
-        "points",
-    ),
-    "depth": (
-        f"<mujoco><worldbody>{'<body>' * 9000}{'</body>' * 9000}</worldbody></mujoco>",
-        RobotModelError,
-        "levels",
-    ),
     "schema": ('<mujoco><worldbody><joint what="1"/></worldbody></mujoco>', RobotModelError, "MuJoCo refuses it"),
     "no mass": (HINGE.format("", "", ""), RobotModelError, "mass and inertia"),
     "a ball joint": (HINGE.format('type="ball"', BALL, ""), RobotModelError, "three hinges"),

@@ -3,13 +3,12 @@
 Every body becomes a link; several joints of one body are a chain of links without mass, which MuJoCo does not move.
 """
 
+import base64
 import math
 import re
-import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
-from xml.etree.ElementTree import Element
+from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -19,17 +18,14 @@ from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import inverse, transform
 from forcegp.robots.layout import BASE, OUTSIDE, followed, joint_motion
 from forcegp.robots.manifold import VELOCITIES
-from forcegp.robots.mjcf_model import WORLD, CompiledModel, LoopDescription, Translation
+from forcegp.robots.mjcf_model import CompiledModel, LoopDescription, Translation
+from forcegp.robots.sandbox import read_apart
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.urdf import MOST_TAGS, Joint, free_joint, numbers, parse_xml
 from forcegp.robots.urdf_file import read_text
 
-DEEPEST = 300
-"""Levels of elements: MuJoCo's reader calls itself for each."""
-COPIED = {"replicate": ("count",), "composite": ("count",), "flexcomp": ("count",)}
-SIZED = {"hfield": ("nrow", "ncol"), "mesh": ("params", "params")}
-MOST_POINTS = 100_000_000
-"""MuJoCo's reader makes copies and points at once, and hangs at the next file after it ran out of memory."""
+DEEPEST = 20
+"""Files that include files; each is read by a function that calls itself."""
 
 
 def is_mjcf(text: str) -> bool:
@@ -42,108 +38,68 @@ def translate(text: str, path: Path | None, for_system: bool, problems: Problems
 
     Raises RobotModelError, MissingExtra, errors of XML.
     """
-    included: dict[str, bytes] = {}
-    _require_bounded(text, [] if path is None else [path.parent], problems.source, included)
+    folder = None if path is None else path.parent.resolve()
+    asked = {"text": text, "folder": str(folder or ""), "outside": _meshes_outside(text, path, problems.source)}
     made = required_extra("mujoco", "mujoco", f"{problems.source}: MJCF")
-    needed: list[str] = []
-    before, noted = made.get_mju_user_warning(), []
-    made.set_mju_user_warning(noted.append)  # otherwise they go into a file in the current folder
-    try:
-        if path is not None and path.suffix == ".xml":  # no other suffix is taken
-            spec = made.MjSpec.from_file(str(path))
-        else:
-            spec = made.MjSpec.from_string(text, include=included)
-            spec.modelfiledir = "" if path is None else str(path.parent)
-        needed = _without_appearance(made, spec)
-        with warnings.catch_warnings(record=True) as warned:
-            warnings.simplefilter("always")
-            model = spec.compile()
-    except (ValueError, TypeError, RuntimeError, IndexError, made.FatalError) as error:
-        reason = " ".join(str(error).removeprefix("Error: ").split())
-        missing = needed and any(word in reason for word in ("file", "mesh", "resource"))
-        advice = f"; the mass of {', '.join(needed[:4])} comes from meshes: give an <inertial>" if missing else ""
-        raise RobotModelError(f"{problems.source}: MuJoCo refuses it ({reason}){advice}; correct that place.") from None
-    finally:
-        made.set_mju_user_warning(before)
-    for warning in dict.fromkeys((*noted, *(str(each.message) for each in warned))):
+    answer = read_apart("mujoco", problems.source, asked)
+    if "refused" in answer:
+        advice = "; correct that place."
+        if answer["meshes"]:
+            advice = f"; the mass of {', '.join(answer['meshes'][:4])} comes from meshes: give an <inertial>{advice}"
+        raise RobotModelError(f"{problems.source}: MuJoCo refuses it ({answer['refused']}){advice}")
+    for warning in answer["notes"]:
         problems.note("MuJoCo warns", warning)
-    return CompiledModel(made, model, spec.modelname or "robot", for_system, problems).translation()
+    model = made.MjModel.from_binary_path("robot.mjb", {"robot.mjb": base64.b64decode(answer["model"])})
+    return CompiledModel(made, model, answer["name"] or "robot", for_system, problems).translation()
 
 
-def _require_bounded(text: str, folders: Sequence[Path], source: str, included: dict[str, bytes]) -> None:
-    """Refuse files that exhaust memory or stack of MuJoCo's reader; ``included`` receives the files that they name."""
-    root = parse_xml(text, source)
-    count, deepest = 0.0, 0
-    stack = [(root, 1, 1.0)]
-    while stack:
-        element, depth, times = stack.pop()
-        count, deepest = count + times, max(deepest, depth)
-        points = _product(element, SIZED)
-        times *= _product(element, COPIED)
-        if count + times > MOST_TAGS or points > MOST_POINTS or deepest > DEEPEST:
-            raise RobotModelError(
-                f"{source}: holds more than {MOST_TAGS} elements, copies included, {MOST_POINTS} points of a shape or "
-                f"{DEEPEST} levels; give the file of one robot."
-            )
-        stack += [(child, depth + 1, times) for child in element]
-    for name in (element.get("file", "") for element in root.iter("include")):
-        if name in included:
-            continue
-        found = next((folder / name for folder in folders if (folder / name).is_file()), None)
-        if found is None:
-            raise RobotModelError(f"{source}: includes {name!r}, which is not there; give the file beside it.")
-        inner = read_text(found)
-        included[name] = inner.encode()
-        _require_bounded(inner, [*folders, found.parent], str(found), included)
+def _meshes_outside(text: str, path: Path | None, source: str) -> list[str]:
+    """Meshes that are not below the folder of a file and of those that it includes; a mesh may yet be of no use.
 
+    Raises RobotModelError for other files there, and for files that name themselves.
+    """
+    folder = Path() if path is None else path.parent
+    roots = [] if path is None else [folder.resolve(), path.resolve().parent]
+    shapes, done, left, places = list[tuple[str, Path, str]](), set[Path](), MOST_TAGS, {""}
+    outside = "{}: names the file {!r}, which is not below the folder of the robot's file; move it there."
 
-def _product(element: Element, names: Mapping[str, Sequence[str]]) -> float:
-    """Of the numbers above 1 in attributes of these names."""
-    product = 1.0
-    for word in " ".join(element.get(name, "") for name in names.get(element.tag, ())).split():
-        try:
-            product *= max(1.0, float(word))
-        except ValueError:  # the kind of a mesh
-            continue
-    return product
+    def is_inside(at: Path, name: str) -> bool:
+        named, real = Path(name.replace("\\", "/")), (at / name).resolve()
+        return ".." not in named.parts and not named.is_absolute() and any(map(real.is_relative_to, roots))
 
+    def walk(text: str, source: str, at: Path, above: tuple[Path, ...]) -> None:
+        nonlocal left
+        root, left = parse_xml(text, source), left - text.count("<")
+        if left < 0 or len(above) > DEEPEST:
+            limits = f"more than {MOST_TAGS} tags, or files more than {DEEPEST} deep"
+            raise RobotModelError(f"{source}: names {limits}; give the file of one robot.")
+        for element in root.iter():
+            name = element.get("file", "")
+            if element.tag == "compiler":
+                places.update(value for key, value in element.items() if key.endswith("dir"))
+            elif element.tag in ("mesh", "flexcomp"):
+                shapes.append((element.tag, at, name))
+            elif element.tag in ("include", "model") and name:
+                found = next((each / name for each in (at, folder) if (each / name).is_file()), folder / name)
+                if not is_inside(found.parent, found.name) or not is_inside(folder, name):
+                    raise RobotModelError(outside.format(source, name))
+                if not found.is_file():
+                    raise RobotModelError(f"{source}: includes {name!r}, which is not there; give the file beside it.")
+                if found.resolve() in above:
+                    raise RobotModelError(f"{source}: names {name!r}, which names this file again; take one out.")
+                if found.resolve() not in done:
+                    walk(read_text(found), str(found), found.parent, (*above, found.resolve()))
+                    done.add(found.resolve())
 
-def _without_appearance(mujoco: Any, spec: Any) -> list[str]:
-    """Remove what changes no motion, so that no file of it is needed; the bodies whose mass comes from meshes."""
-    for name in ("keys", "sensors", "skins", "cameras", "lights", "numerics", "texts", "tuples"):
-        for element in list(getattr(spec, name)):
-            spec.delete(element)
-    for owner in (*spec.geoms, *spec.sites, *spec.tendons):
-        owner.material = ""
-    for name in (name for name in dir(spec) if name.startswith("nuser_")):
-        setattr(spec, name, -1)
-    spec.memory, spec.nuserdata, spec.compiler.fusestatic = -1, 0, False
-    meshes, bodies = set(), []
-    for geom in spec.geoms:
-        if geom.type == mujoco.mjtGeom.mjGEOM_HFIELD or (geom.meshname and not _has_mass(mujoco, spec, geom)):
-            geom.type, geom.meshname, geom.hfieldname = mujoco.mjtGeom.mjGEOM_SPHERE, "", ""
-            geom.size, geom.mass = [0.01, 0.0, 0.0], 0.0
-        elif geom.meshname:
-            meshes.add(geom.meshname)
-            bodies.append(geom.parent.name or "a body without name")
-    unused = [mesh for mesh in spec.meshes if mesh.name not in meshes] if not len(spec.flexes) else []
-    for element in (*unused, *spec.materials, *spec.textures, *spec.hfields):
-        spec.delete(element)
-    return list(dict.fromkeys(bodies))
-
-
-def _has_mass(mujoco: Any, spec: Any, geom: Any) -> bool:
-    """Whether the mass of a body contains that of this shape."""
-    compiler, kinds = spec.compiler, mujoco.mjtInertiaFromGeom
-    given = compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_AUTO and geom.parent.explicitinertial
-    low, high = compiler.inertiagrouprange
-    weighs = geom.mass != 0.0 if np.isfinite(geom.mass) else geom.density != 0.0
-    return (
-        not (given or compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_FALSE)
-        and low <= geom.group <= high
-        and weighs
-        and geom.parent.name != WORLD
-    )
+    walk(text, source, folder, () if path is None else (path.resolve(),))
+    apart = [
+        (tag, name)
+        for tag, at, name in shapes
+        if name and not all(is_inside(each, str(Path(place, name))) for place in places for each in (at, folder))
+    ]
+    for name in (name for tag, name in apart if tag == "flexcomp"):  # is opened before it is known whether it is needed
+        raise RobotModelError(outside.format(source, name))
+    return [name for _, name in apart]
 
 
 SMALLEST = 2e-15

@@ -23,6 +23,7 @@ from forcegp.errors import (
 from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import Layout
+from forcegp.robots.sandbox import read_apart
 from forcegp.robots.urdf import RobotDescription, numbers, parse_urdf, with_prefixes
 
 HEAVIEST = 1e9
@@ -224,15 +225,14 @@ def read_robot_file(path: str | Path) -> str:
     text = read_text(path)
     if Path(path).suffix != ".xacro":
         return text
-    xacro = required_extra("xacro", "xacro", f"{path}: a file that is not expanded elsewhere")
-    try:
-        document: Any = xacro.process_file(str(path))  # a document of minidom; its annotation is too wide
-        return document.toxml()
-    except (Exception, SystemExit) as error:  # whatever the expressions of the file raise
+    required_extra("xacro", "xacro", f"{path}: a file that is not expanded elsewhere")
+    answer = read_apart("xacro", str(path), {"path": str(Path(path).absolute())})
+    if "refused" in answer:
         raise RobotModelError(
-            f"{path}: xacro could not expand it ({' '.join(str(error).split())}); correct it, or "
+            f"{path}: xacro could not expand it ({answer['refused']}); correct it, or "
             "expand it where its packages are: xacro robot.xacro > robot.urdf."
-        ) from None
+        )
+    return answer["text"]
 
 
 def armature_path(path: str | Path) -> Path:

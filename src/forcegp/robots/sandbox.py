@@ -1,0 +1,168 @@
+"""Readers of robot files that others wrote, MuJoCo's and xacro's, in a process of their own with limits.
+
+What crashes, hangs or takes all memory there is an error here. `python -m forcegp.robots.sandbox` is that process: it
+takes one request as JSON and gives one answer as JSON; it imports neither torch nor the rest of forcegp.
+"""
+
+import base64
+import importlib
+import json
+import math
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+from forcegp.errors import RobotModelError
+
+SECONDS = 30
+"""CPU time of one file, and half of its wall time: whole robots with meshes take two."""
+MEMORY = 1 << 30
+"""Bytes of address space; MuJoCo itself takes 130 MB."""
+LARGEST = {"nbody": 2_000, "njnt": 2_000, "nsite": 2_000, "ngeom": 20_000}
+"""Parts of a compiled model: robots have some hundred."""
+
+ACTS = ("subprocess", "os", "socket", "ctypes", "shutil")
+"""First words of Python's audit events that no macro needs."""
+
+
+def read_apart(reader: str, source: str, request: dict[str, Any]) -> dict[str, Any]:
+    """The answer of a reader ("mujoco" or "xacro") to a request; `refused` in it is the reason of one that failed.
+
+    Raises RobotModelError where there is no answer: the reader crashed, or needed more than `SECONDS` or `MEMORY`.
+    """
+    path = os.pathsep.join(folder for folder in sys.path if folder)
+    ones = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MALLOC_ARENA_MAX", "PYTHONDONTWRITEBYTECODE")
+    settings = dict.fromkeys(ones, "1") | {"PYTHONPATH": path, "PYTHONWARNINGS": "ignore", "MUJOCO_GL": "disable"}
+    asked = json.dumps({"reader": reader, "seconds": SECONDS, "memory": MEMORY, "largest": LARGEST} | request)
+    try:
+        process = subprocess.run(
+            [sys.executable, "-P", "-m", __name__],
+            input=asked.encode(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=os.environ | settings,
+            timeout=2 * SECONDS,
+            check=False,
+        )
+        return json.loads(process.stdout)
+    except (subprocess.TimeoutExpired, ValueError):
+        raise RobotModelError(
+            f"{source}: {reader} crashed at it, or needed more than {SECONDS} s or {MEMORY >> 20} MiB; give the file "
+            "of one robot, without copies in great number."
+        ) from None
+
+
+def _answer(request: dict[str, Any]) -> dict[str, Any]:
+    if os.name == "posix":  # elsewhere only the wall time is limited
+        import resource
+
+        for limit, value in ((resource.RLIMIT_CPU, request["seconds"]), (resource.RLIMIT_AS, request["memory"])):
+            resource.setrlimit(limit, (value, value))
+    return {"mujoco": _compiled, "xacro": _expanded}[request["reader"]](request)
+
+
+def _expanded(request: dict[str, Any]) -> dict[str, Any]:
+    """The text of a .xacro file, whose expressions open files below its folder and of ROS packages only."""
+    xacro = importlib.import_module("xacro")
+    importlib.import_module("yaml")  # xacro loads it when a file asks
+    packages = os.pathsep.join(os.environ.get(name, "") for name in ("AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH"))
+    shown = [Path(request["path"]).parent, *(each for each in (*packages.split(os.pathsep), *sys.path) if each)]
+    allowed = [Path(each).resolve() for each in (*shown, request["path"] + "/..")]
+
+    def watch(event: str, given: tuple[Any, ...]) -> None:
+        refused = event.split(".")[0] in ACTS and event not in ("os.listdir", "os.scandir")
+        if event == "open" and not isinstance(given[0], int):
+            real = Path(os.fsdecode(given[0])).resolve()
+            refused = given[2] & (os.O_WRONLY | os.O_RDWR) or not any(real.is_relative_to(each) for each in allowed)
+        if refused:
+            raise PermissionError(f"its expressions only read below its folder: {event} {given[:1]}")
+
+    sys.addaudithook(watch)
+    try:
+        return {"text": xacro.process_file(request["path"]).toxml()}
+    except (Exception, SystemExit) as error:  # whatever the expressions of the file raise
+        return {"refused": " ".join(str(error).split())}
+
+
+def _compiled(request: dict[str, Any]) -> dict[str, Any]:
+    """A compiled model as MuJoCo stores it, without what changes no motion."""
+    mujoco: Any = importlib.import_module("mujoco")
+    numpy = importlib.import_module("numpy")
+    if request["folder"]:
+        os.chdir(request["folder"])  # files that it names are found from here
+    noted: list[str] = []
+    needed: list[str] = []
+    mujoco.set_mju_user_warning(noted.append)
+    try:
+        spec = mujoco.MjSpec.from_string(request["text"])
+        spec.modelfiledir = request["folder"]
+        needed = _without_appearance(mujoco, spec)
+        meshes = next((mesh.file for mesh in spec.meshes if mesh.file in request["outside"]), None)
+        if meshes is not None:
+            return {"refused": f"mesh {meshes!r} is not below the folder of the file", "meshes": needed}
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            model = spec.compile()
+    except (ValueError, TypeError, RuntimeError, IndexError, mujoco.FatalError) as error:
+        reason = " ".join(str(error).removeprefix("Error: ").split())
+        if "unknown exception" in reason or "allocate memory" in reason:
+            raise MemoryError(reason) from None
+        missing = any(word in reason for word in ("file", "mesh", "resource"))
+        return {"refused": reason, "meshes": needed if missing else []}
+    for part, most in request["largest"].items():
+        if getattr(model, part) > most:
+            return {"refused": f"{part} is {getattr(model, part)}, more than the {most} of one robot", "meshes": []}
+    stored = numpy.empty(mujoco.mj_sizeModel(model), numpy.uint8)
+    mujoco.mj_saveModel(model, None, stored)
+    notes = list(dict.fromkeys((*noted, *(str(each.message) for each in warned))))
+    return {"model": base64.b64encode(stored).decode(), "name": spec.modelname, "notes": notes}
+
+
+def _without_appearance(mujoco: Any, spec: Any) -> list[str]:
+    """Remove what changes no motion, so that no file of it is needed; the bodies whose mass comes from meshes."""
+    for name in ("keys", "sensors", "skins", "cameras", "lights", "numerics", "texts", "tuples"):
+        for element in list(getattr(spec, name)):
+            spec.delete(element)
+    for owner in (*spec.geoms, *spec.sites, *spec.tendons):
+        owner.material = ""
+    for name in (name for name in dir(spec) if name.startswith("nuser_")):
+        setattr(spec, name, -1)
+    spec.memory, spec.nuserdata, spec.nkey = -1, 0, 0
+    spec.compiler.fusestatic = spec.compiler.usethread = False
+    meshes, bodies = set(), []
+    for geom in spec.geoms:
+        if geom.type == mujoco.mjtGeom.mjGEOM_HFIELD or (geom.meshname and not _has_mass(mujoco, spec, geom)):
+            geom.type, geom.meshname, geom.hfieldname = mujoco.mjtGeom.mjGEOM_SPHERE, "", ""
+            geom.size, geom.mass = [0.01, 0.0, 0.0], 0.0
+        elif geom.meshname:
+            meshes.add(geom.meshname)
+            bodies.append(geom.parent.name or "a body without name")
+    unused = [mesh for mesh in spec.meshes if mesh.name not in meshes] if not len(spec.flexes) else []
+    for element in (*unused, *spec.materials, *spec.textures, *spec.hfields):
+        spec.delete(element)
+    return list(dict.fromkeys(bodies))
+
+
+def _has_mass(mujoco: Any, spec: Any, geom: Any) -> bool:
+    """Whether the mass of a body contains that of this shape."""
+    compiler, kinds = spec.compiler, mujoco.mjtInertiaFromGeom
+    given = compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_AUTO and geom.parent.explicitinertial
+    low, high = compiler.inertiagrouprange
+    weighs = (geom.density if math.isnan(geom.mass) else geom.mass) != 0.0
+    return (
+        not (given or compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_FALSE)
+        and low <= geom.group <= high
+        and weighs
+        and geom.parent.name != "world"
+    )
+
+
+if __name__ == "__main__":
+    channel = os.dup(1)
+    os.dup2(2, 1)  # what a library prints is no answer
+    answer = json.dumps(_answer(json.load(sys.stdin)))
+    with os.fdopen(channel, "w", encoding="utf-8") as out:
+        out.write(answer)
