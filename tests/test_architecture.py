@@ -47,6 +47,9 @@ PACKAGES["scores"] = set(PACKAGES) - {"simulation"}
 PACKAGES["report"] = set(PACKAGES) - {"simulation"}
 PACKAGES["cli"] = set(PACKAGES)
 PACKAGES["__main__"] = {"cli"}
+for allowed in PACKAGES.values():  # whatever takes long says how far it is
+    allowed.add("progress")
+PACKAGES["progress"] = set()
 
 # Optional or slow to import: imported inside the function that uses them. Modules named here may import them
 # at once, since `from forcegp import *` does not load those.
@@ -170,7 +173,7 @@ def test_the_table_in_the_docs_is_the_one_kept_here():
             assert named or allowed == "nothing", f"docs/architecture.md, row {name}: cannot read {allowed!r}"
             table[name] = named
         above.append(name)
-    assert table == PACKAGES
+    assert {name: own | ({"progress"} - {name}) for name, own in table.items()} == PACKAGES
 
 
 def test_every_module_belongs_to_a_room():

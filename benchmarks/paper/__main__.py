@@ -13,6 +13,7 @@ from pathlib import Path
 from benchmarks.paper.reproduction import ALL, PROGRAM, experiments_of, page_of, reproduce
 from forcegp.errors import ForceGPError
 from forcegp.parallel import checked_jobs
+from forcegp.progress import watched
 
 
 def _numbers(text: str) -> tuple[int, ...]:
@@ -45,7 +46,8 @@ def main(words: Sequence[str] | None = None) -> int:
                 experiments = tuple(getattr(each, change)(numbers) for each in experiments)
                 command += [f"--{option.replace('_', '-')}", ",".join(map(str, numbers))]
         how = {"command": " ".join(command), "docs": given.docs, "jobs": given.jobs}
-        summaries = reproduce(experiments, given.preset, out, **how, progress=_progress)
+        with watched(_progress):
+            summaries = reproduce(experiments, given.preset, out, **how)
     except (ForceGPError, OSError) as error:
         print(f"{PROGRAM}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

@@ -16,7 +16,7 @@ from benchmarks.paper.fits import FitSettings
 from forcegp import __version__
 from forcegp.atomic_files import require_writable, write_json, write_text
 from forcegp.errors import InvalidInput, require_known
-from forcegp.jobs import JobStore, Progress, run_jobs
+from forcegp.jobs import JobStore, run_jobs
 from forcegp.parallel import Jobs
 from forcegp.scores import save_figure
 from forcegp.scores.page import markdown_table
@@ -133,7 +133,6 @@ def reproduce(
     command: str,
     docs: Path | None = None,
     jobs: Jobs = 1,
-    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Compute what is missing in the folder `out`, then write all summaries; returns them by experiment.
 
@@ -153,7 +152,7 @@ def reproduce(
         except OSError as error:
             raise InvalidInput(f"{folder} cannot be made ({error.strerror}); choose another folder.") from None
     pieces = {job.name: job for experiment in experiments for job in experiment.jobs()}
-    run_jobs(results, list(pieces.values()), jobs, progress)
+    run_jobs(results, list(pieces.values()), jobs)
     documents, pictures = {}, {}
     for experiment in experiments:
         summary = experiment.summary(results)

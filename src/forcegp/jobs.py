@@ -11,7 +11,7 @@ import shutil
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -26,15 +26,13 @@ from filelock import FileLock, Timeout
 from forcegp.atomic_files import atomic_folder, read_json, remove_leftovers, require_writable, write_json
 from forcegp.errors import BackendError, DataWarning, FileFormatError, FitError, ForceGPError, InvalidInput
 from forcegp.parallel import Jobs, executor_for, outcome_of, stop, submit
+from forcegp.progress import tell, watched
 
 CODE = (".py", ".c", ".h", ".jinja")
 """Endings of the files that decide what a package computes."""
 DESCRIPTION, JOBS, LOCK = "jobs.json", "jobs", ".lock"
 RESULT_FILE = "job.json"
 LIBRARIES = ("torch", "gpytorch", "scipy", "numpy", "pybullet")
-
-Progress = Callable[[int, int, str], None]
-"""Called as `progress(work done, work in total, note)`; work is an estimate in CPU seconds."""
 
 
 @cache
@@ -196,7 +194,7 @@ def _is_own_start(entry: Path) -> bool:
     return entry.name in (LOCK, JOBS) or (entry.name.startswith(f".{DESCRIPTION}.") and entry.name.endswith(".tmp"))
 
 
-def run_jobs(store: JobStore, jobs: Sequence[Job], at_once: Jobs = 1, progress: Progress | None = None) -> int:
+def run_jobs(store: JobStore, jobs: Sequence[Job], at_once: Jobs = 1) -> int:
     """Compute all jobs that the store lacks, so many at once, or in an executor; returns how many.
 
     Every finished job is kept at once; one that fails stops only what depends on it. Results of other code or settings
@@ -218,14 +216,12 @@ def run_jobs(store: JobStore, jobs: Sequence[Job], at_once: Jobs = 1, progress: 
                 stacklevel=2,
             )
         try:
-            return _compute_all(store, waiting, wanted, at_once, progress)
+            return _compute_all(store, waiting, wanted, at_once)
         finally:
             remove_leftovers(store.folder)
 
 
-def _compute_all(
-    store: JobStore, waiting: dict[str, Job], wanted: Mapping[str, str], at_once: Jobs, progress: Progress | None
-) -> int:
+def _compute_all(store: JobStore, waiting: dict[str, Job], wanted: Mapping[str, str], at_once: Jobs) -> int:
     """Each job after its inputs, and of those that can begin the longest first; how many were waiting."""
     executor, at_work = executor_for(at_once), dict[Future[Any], Job]()
     count, total, cost, full = len(waiting), sum(job.cost for job in waiting.values()), 0.0, False
@@ -259,9 +255,8 @@ def _compute_all(
                     full |= isinstance(error, OSError)  # a full disk, say: what others compute could not be kept either
                 del at_work[future]
                 cost += job.cost
-                if progress is not None:
-                    note = f"{count - len(waiting) - len(at_work)} of {count} jobs, last {job.name}"
-                    progress(int(cost * 10), max(1, int(total * 10)), note)
+                note = f"{count - len(waiting) - len(at_work)} of {count} jobs, last {job.name}"
+                tell(int(cost * 10), max(1, int(total * 10)), note)
     except BackendError as error:
         raise BackendError(f"{error}. {kept()}") from None
     finally:
@@ -279,7 +274,7 @@ def compute(store: JobStore, job: Job, digests: Mapping[str, str], *arguments: A
     module, _, function = job.task.partition(":")
     task = getattr(import_module(module), function)
     start, wall = time.process_time(), time.monotonic()
-    with atomic_folder(store.place(job.name)) as folder, warnings.catch_warnings(record=True) as caught:
+    with atomic_folder(store.place(job.name)) as folder, warnings.catch_warnings(record=True) as caught, watched(None):
         folder.mkdir()
         warnings.simplefilter("always")
         result = task(store, job.spec, folder, *arguments)

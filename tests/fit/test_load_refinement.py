@@ -62,7 +62,7 @@ def sliding_data(rows: int, seed: int, joint_friction: float = 0.0) -> Dataset:
 
 def first_fit(model: Model, data: Dataset):
     """The fit under the nominal normal force, which `fit` does not stop at."""
-    search = Search(1, restarts=1, seed=0, options=OPTIONS, start=None, progress=None)
+    search = Search(1, restarts=1, seed=0, options=OPTIONS, start=None)
     return _Functions(model, search, "exact", None)._search(data, data)
 
 

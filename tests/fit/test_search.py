@@ -26,7 +26,7 @@ def valley(parameters):
     return 10.0 * x + 5.0 * (x * (x - 4.0)) ** 2 + 50.0 * (y - x**2) ** 2
 
 
-def from_place(index, before=(), progress=None, *, options, places=(0.5, 4.5, 5.0, -0.5, 5.5)):
+def from_place(index, before=(), *, options, places=(0.5, 4.5, 5.0, -0.5, 5.5)):
     start = {"x": torch.tensor([places[index], 2.0], dtype=torch.float64)}
     return minimize_objective(valley, start, options, rival=best_value(before))
 
@@ -50,7 +50,7 @@ def test_a_fit_ends_as_low_with_fewer_evaluations(train, model, fraction):
 
 def test_starts_behind_those_before_are_dropped_and_say_so():
     options = OptimizerOptions(patience=5)
-    found = run_restarts(lambda index, **how: from_place(index, **how, options=options), 5, 5, 1, None)
+    found = run_restarts(lambda index, **how: from_place(index, **how, options=options), 5, 5, 1)
     assert [each.status.startswith("dropped: 5 iterations") for each in found] == [False, False, True, False, True]
     alone = from_place(2, options=options)
     assert alone.converged
@@ -73,14 +73,14 @@ def test_a_fit_reports_the_end_of_every_start(train):
 
 
 def test_who_is_compared_with_whom_does_not_depend_on_the_processes_or_the_number_of_starts():
-    def seen(index, before, progress):
+    def seen(index, before):
         return index, list(before)
 
-    serial = run_restarts(seen, 5, 100, 1, None)
+    serial = run_restarts(seen, 5, 100, 1)
     assert [len(before) for _, before in serial] == [0, 0, 2, 2, 4]
-    assert serial == run_restarts(seen, 5, 100, 2, None)
-    assert serial[:3] == run_restarts(seen, 3, 100, 1, None)
-    assert all(before == [] for _, before in run_restarts(seen, 5, 0, 1, None))
+    assert serial == run_restarts(seen, 5, 100, 2)
+    assert serial[:3] == run_restarts(seen, 3, 100, 1)
+    assert all(before == [] for _, before in run_restarts(seen, 5, 0, 1))
 
 
 @pytest.mark.nightly

@@ -28,6 +28,7 @@ from forcegp.forces import (
     Viscous,
 )
 from forcegp.model import Model
+from forcegp.progress import watched
 from forcegp.robots import Robot
 
 TRUE_FORCES = (
@@ -143,9 +144,11 @@ def test_what_the_log_does_not_show_is_said():
 
 def test_progress_and_a_limit_on_rows():
     seen = []
-    found = identified(recorded(60, 7), given(), *LAWS, rows=20, progress=lambda *told: seen.append(told))
+    with watched(lambda *told: seen.append(told)):
+        found = identified(recorded(60, 7), given(), *LAWS, rows=20)
     assert found.settings["points"] == found.parameters.rows == 20
-    assert [number for _, number, _ in seen] == list(range(1, len(seen) + 1))
+    assert [number for number, *_ in seen] == list(range(1, len(seen) + 1))
+    assert seen[-1][2].startswith(f"all rows, step {len(seen)}: ")
 
 
 def test_models_that_cannot_be_identified_so():

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from forcegp.errors import FitError, InvalidInput, NumericalError
 from forcegp.inference import OptimizerOptions, best_of, minimize_objective
 from forcegp.inference.optimization import _Search
+from forcegp.progress import watched
 
 
 def tensor(*values: float) -> torch.Tensor:
@@ -49,10 +50,9 @@ def test_a_convex_quadratic(seed, size):
 
 def test_rosenbrock():
     calls, told = [], []
-    result = minimize_objective(
-        lambda p: calls.append(1) or rosenbrock(p), start(), progress=lambda *given: told.append(given)
-    )
-    assert told == list(enumerate(result.history))[1:]
+    with watched(lambda *given: told.append(given)):
+        result = minimize_objective(lambda p: calls.append(1) or rosenbrock(p), start())
+    assert [done for done, *_ in told] == list(range(1, len(result.history)))
     assert result.converged
     assert "converged" in result.status
     torch.testing.assert_close(result.parameters["x"], tensor(1.0, 1.0), rtol=0.0, atol=1e-5)

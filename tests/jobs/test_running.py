@@ -7,6 +7,7 @@ import pytest
 
 from forcegp.errors import BackendError, DataWarning, FitError
 from forcegp.jobs import Job, JobStore, digests, run_jobs
+from forcegp.progress import watched
 
 TOY = "tests.jobs.toy_tasks"
 
@@ -27,7 +28,8 @@ def results(tmp_path):
 def test_all_jobs_are_computed_once_and_in_order(results):
     jobs = [next_to(square(3)), square(3), square(4)]
     told = []
-    assert run_jobs(results, jobs, at_once=2, progress=lambda *given: told.append(given)) == 3
+    with watched(lambda *given: told.append(given)):
+        assert run_jobs(results, jobs, at_once=2) == 3
     assert results.result("next/3")["value"] == 10
     assert results.result("square/4")["value"] == 16
     assert (results.place("square/4") / "note.txt").read_text() == "beside the result"

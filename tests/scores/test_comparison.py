@@ -14,6 +14,7 @@ from forcegp.cli.score import Score
 from forcegp.errors import FileFormatError, InvalidInput
 from forcegp.fit import fit as fit_model
 from forcegp.jobs import JobStore
+from forcegp.progress import watched
 from forcegp.scores.models import candidate, learn
 from forcegp.scores.score import KIND
 
@@ -100,7 +101,8 @@ def test_what_was_fitted_before_is_scored_as_it_is(found, data):
 
 def test_a_run_resumes_and_grows(data, tmp_path):
     folder, notes = tmp_path / "out", []
-    scored(["given"], data, folder, progress=lambda *told: notes.append(told))
+    with watched(lambda *told: notes.append(told)):
+        scored(["given"], data, folder)
     assert notes[-1][0] == notes[-1][1]
     kept = changed(folder)
     assert set(kept) == {

@@ -17,6 +17,7 @@ from forcegp.forces import Actuation, RigidBodies, Thrusters
 from forcegp.mechanics import fixed_point
 from forcegp.noise import ACCELERATION
 from forcegp.posterior import load_posterior, save_posterior
+from forcegp.progress import watched
 from forcegp.robots import Robot
 from forcegp.scores import named_model, summands, usual_forces
 from forcegp.scores.models import (
@@ -108,10 +109,8 @@ def test_laws_are_refined_on_motions_and_a_short_log_says_why_intervals_are_not_
     recorded = recording(line, 1, seconds=3.0)
     model = replace(slide(1.0, 1.0), forces=(Actuation(), RigidBodies()))
     told = []
-    posterior, notes = learn(
-        named_model(model, ("viscous", "coulomb")), recorded, [Torques(), Motions(0.5)],
-        report=lambda *words: told.append(words[:2]),
-    )  # fmt: skip
+    with watched(lambda *words: told.append(words[:2])):
+        posterior, notes = learn(named_model(model, ("viscous", "coulomb")), recorded, [Torques(), Motions(0.5)])
     assert posterior.settings["motions"]["seconds"] == 0.5
     assert posterior.parameters["viscous.x"].value == pytest.approx(3.0, rel=0.2)
     assert told

@@ -111,13 +111,13 @@ class Auto(Command):
         named = forcegp.scores.named_model
         expression, _, evidence = identification(model).partition("@")
         laws = forcegp.scores.summands(expression)
-        with terminal.progress("identifying") as progress:
-            how: dict[str, Any] = {"evidence": forcegp.evidence.parse_evidence(evidence), "report": progress}
-            identified: Any = forcegp.scores.learn(named(recording.model, laws), recording, **how)[0]
+        with terminal.progress("identifying"):
+            given = forcegp.evidence.parse_evidence(evidence)
+            identified: Any = forcegp.scores.learn(named(recording.model, laws), recording, given)[0]
         payload: dict[str, Any] = {}
-        with terminal.progress("looking for a payload") as progress:
+        with terminal.progress("looking for a payload"):
             try:
-                found = with_payload(named(recording.model, laws[1:]), recording, self.link, report=progress)
+                found = with_payload(named(recording.model, laws[1:]), recording, self.link)
                 payload, held = payload_dict(found, False), payload_text(found)
             except DatasetError as error:
                 held = f"not estimated: {error}"
@@ -204,17 +204,15 @@ class Auto(Command):
         how: dict[str, Any] = {"model": model, "recording": recording, "identification": identification(model)}
         how |= {"points": min(100, len(rows) // 4), "restarts": 1}
         models = self.models.names() or default_models(model)
-        with terminal.progress("scoring") as report:
-            scores = forcegp.score(
-                models, rows, split="auto", seeds=1, folder=self.out / "validation", overwrite=self.overwrite,
-                progress=report, **how,
-            )  # fmt: skip
+        with terminal.progress("scoring"):
+            folder = self.out / "validation"
+            scores = forcegp.score(models, rows, split="auto", seeds=1, folder=folder, overwrite=self.overwrite, **how)
         for failure in scores.failures:
             terminal.warn(failure)
         with terminal.progress("learning from all rows"):
             posterior = scores.fitted_on_all_rows()
-        with terminal.progress("intervals of motions") as report:
-            posterior, why_not = forcegp.scores.with_intervals_of_motions(posterior, recording, report)
+        with terminal.progress("intervals of motions"):
+            posterior, why_not = forcegp.scores.with_intervals_of_motions(posterior, recording)
         if why_not is not None:
             terminal.note(why_not)
         forcegp.save_posterior(posterior, self.out / "model", overwrite=True)
@@ -234,7 +232,7 @@ class Auto(Command):
         command = dict(answer)["record next"].partition(" (")[0]
         following = [("Record the most informative motion:", command)] if command.startswith("forcegp") else []
         details = {name: content[name] for name in ("import", "mistakes", "preparation", "recommended", "payload")}
-        with terminal.progress("writing the report") as progress:
+        with terminal.progress("writing the report"):
             page = forcegp.report.model_page(
                 posterior,
                 recording,
@@ -246,7 +244,6 @@ class Auto(Command):
                 next_steps=following,
                 details=details,
                 shapes=self.robot.robot,
-                progress=progress,
             )
             forcegp.report.write_page(self.out / "report.html", page)
 

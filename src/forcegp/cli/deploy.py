@@ -254,7 +254,7 @@ class Excite(Command):
             numbers = numbers_of(values, f"--limits {word}: give numbers, for example --limits velocity=1.5.")
             limits[name] = numbers[0] if len(numbers) == 1 else numbers
         given = {name: getattr(self, name) for name in ("seconds", "clearance", "seed")}
-        with terminal.progress(f"choosing a motion of {self.seconds:g} s") as report:
+        with terminal.progress(f"choosing a motion of {self.seconds:g} s"):
             chosen = forcegp.excitation(
                 model or forcegp.load_posterior(str(self.model)),
                 **given,
@@ -262,7 +262,6 @@ class Excite(Command):
                 limits=limits,
                 start=list(self.posture) or None,
                 surfaces=parse_contacts(self.avoid) if self.avoid else None,
-                progress=report,
             )
         chosen.save_csv(self.out)
         usage = {name: values.tolist() for name, values in chosen.usage.items()}

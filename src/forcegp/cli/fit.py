@@ -124,14 +124,13 @@ class Fit(Command):
             words = forcegp.scores.summands(usual)
             notes.append(f"forces: {usual}, the usual ones; forcegp score compares others")
         model = forcegp.scores.named_model(given, words, noise).to(self.device)
-        with terminal.progress("fitting") as report:
+        with terminal.progress("fitting"):
             posterior, found = forcegp.scores.learn(
                 model,
                 dataset,
                 evidence,
                 recording=recording,
                 baseline=None if self.baseline is None else forcegp.Dataset.load(self.baseline),
-                report=report,
                 **vars(self.search),
                 engine=self.engine,
             )
@@ -358,8 +357,8 @@ class Payload(Command):
         notes += forces_of(model)
         words = [word for word in self.forces if word != "none"]
         model = forcegp.scores.named_model(model, words)
-        with terminal.progress("identifying") as report:
-            found = with_payload(model, rows, self.link, baseline, report)
+        with terminal.progress("identifying"):
+            found = with_payload(model, rows, self.link, baseline)
         content = {"data": str(self.log), **payload_dict(found, baseline is not None)}
         if self.out is not None:
             given = {"command": self.words("baseline", "link", "forces", "cutoff", "delay")}
@@ -399,14 +398,13 @@ def with_payload(
     rows: forcegp.Dataset,
     link: str | None,
     baseline: forcegp.Dataset | None = None,
-    report: Any = None,
 ) -> Any:
     """The posterior of a model that carries something; with a baseline the links are estimated, too."""
     bodies = () if baseline is None else (forcegp.RigidBodies("all"),)
     noisy = "u" if model.robot.space.is_vector_space else "both"
     evidence = (forcegp.Torques(noisy, mean=WINDOW),)
     loaded = model.with_forces(*bodies, forcegp.Payload(link))
-    return forcegp.scores.learn(loaded, rows, evidence, baseline=baseline, report=report)[0]
+    return forcegp.scores.learn(loaded, rows, evidence, baseline=baseline)[0]
 
 
 def payload_dict(found: Any, baseline: bool) -> dict[str, Any]:

@@ -74,8 +74,8 @@ class Fleet(Command):
             work.append(Job(name, f"{__name__}:one", spec))
             if store.place(name).exists() and store.result(name)["error"]:
                 shutil.rmtree(store.place(name))  # what was wrong may be mended
-        with terminal.progress("running") as report:
-            run_jobs(store, work, self.jobs, report)
+        with terminal.progress("running"):
+            run_jobs(store, work, self.jobs)
         rows = []
         for name in lines:
             row = store.load(name)

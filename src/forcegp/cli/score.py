@@ -107,7 +107,7 @@ class Score(Command):
             split = forcegp.scores.split_named(rows, self.split or "auto", self.guard)
         elif self.filter.every is not None:
             rows = forcegp.data.Preparation(every=self.filter.every).apply(raw)
-        with terminal.progress(f"scoring {len(rows)} rows") as report:
+        with terminal.progress(f"scoring {len(rows)} rows"):
             scores = forcegp.score(
                 models or None,
                 rows,
@@ -118,7 +118,6 @@ class Score(Command):
                 recording=recording,
                 source={"title": str(data), "data": [f"{data} (SHA-256 {file_digest(data)[:16]}…)"]},
                 overwrite=self.overwrite,
-                progress=report,
                 **vars(self.search),
                 **{name: getattr(self, name) for name in ("seeds", "starts", "integrator", "identification")},
             )
@@ -188,7 +187,7 @@ class Score(Command):
         title = f"{scores.models[name]['summary']}{where}; {len(rows)} rows of {self.paths[-1]}"
         if self.out is not None:
             posterior, rows = forcegp.posterior.observing(posterior, rows)
-            with terminal.progress("writing the report") as progress:
+            with terminal.progress("writing the report"):
                 page = forcegp.report.model_page(
                     posterior,
                     rows,
@@ -197,7 +196,6 @@ class Score(Command):
                     findings=[("warning", each) for each in content["warnings"]],
                     tables=[forcegp.report.scores_table(scores)],
                     details={key: value for key, value in content.items() if key != "runs"},
-                    progress=progress,
                 )
             forcegp.report.write_page(self.out / "report.html", page)
             for picture in page.pictures:

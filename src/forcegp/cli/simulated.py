@@ -114,8 +114,8 @@ def simulate_with_progress(terminal: Terminal, scenario: str, **options: Any) ->
     """Run a scenario with a progress bar. Raises InvalidInput for bad options, MissingExtra without PyBullet."""
     if scenario == "kuka-surface":
         _import_silently("pybullet")
-    with terminal.progress(f"simulating seed {options['seed']}") as report:
-        return forcegp.simulation.simulate(scenario, report, **options)
+    with terminal.progress(f"simulating seed {options['seed']}"):
+        return forcegp.simulation.simulate(scenario, **options)
 
 
 def _import_silently(name: str) -> None:
@@ -174,14 +174,14 @@ class Demo(Command):
             for name, place in MODELS.items():
                 start, model = time.monotonic(), train.model.with_forces(forcegp.JointForces())
                 model = model if name == BEST else model.without_mean()
-                with terminal.progress(f"fitting {name}") as report:
-                    models[name] = forcegp.scores.learn(model, train, report=report, **vars(self.search))[0]
+                with terminal.progress(f"fitting {name}"):
+                    models[name] = forcegp.scores.learn(model, train, **vars(self.search))[0]
                 forcegp.save_posterior(models[name], folder / place)
                 found = fit_summary(models[name], time.monotonic() - start)
                 fits[name] = {"run": str(self.out / place), "fit": found}
                 terminal.note(f"fitted {name}: {found['iterations']} iterations ({found['wall_seconds']:.1f} s)")
-            with terminal.progress("scoring") as report:
-                scores = forcegp.score(models, test, horizons=(), progress=report)
+            with terminal.progress("scoring"):
+                scores = forcegp.score(models, test, horizons=())
             for warning in scores.warnings:
                 terminal.warn(warning)
             results = {
@@ -194,7 +194,7 @@ class Demo(Command):
             }
             write_json(folder / "results.json", results)
             best = forcegp.report.scores_sentence(scores, BEST)
-            with terminal.progress("writing the report") as progress:
+            with terminal.progress("writing the report"):
                 page = forcegp.report.model_page(
                     models[BEST],
                     test,
@@ -204,7 +204,6 @@ class Demo(Command):
                     next_steps=[("For your robot:", "forcegp auto log.csv --robot arm.urdf --out answer")],
                     details=results,
                     shapes=forcegp.simulation.kuka_file(),
-                    progress=progress,
                 )
             forcegp.report.write_page(folder / "report.html", page)
         title = f"{self.search.points} training points, tested on another trajectory (rad/s²; NLPD in nats)"
@@ -250,9 +249,9 @@ class Reproduce(Command):
         experiments = experiments_of(self.preset, self.figure)
         out = Path(f"reproduction-{self.preset}") if self.out is None else self.out
         command = f"{PROGRAM} {self.figure} --preset {self.preset}"
-        with terminal.progress(f"reproducing {self.figure} ({self.preset})") as report:
+        with terminal.progress(f"reproducing {self.figure} ({self.preset})"):
             how: dict[str, Any] = {"command": command, "docs": None, "jobs": checked_jobs(self.jobs)}
-            summaries = reproduce(experiments, self.preset, out, **how, progress=report)
+            summaries = reproduce(experiments, self.preset, out, **how)
         page = out / page_of(experiments)
         terminal.show(f"{page} reports the results; figures, JSON and CSV are in {out / NAME}.")
         return {"out": str(out), "preset": self.preset, "figures": summaries}

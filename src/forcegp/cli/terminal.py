@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
+from forcegp.progress import watched
+
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
     from rich.table import Table
@@ -153,7 +155,9 @@ class Terminal:
         from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
         if not self.err.is_terminal:
-            yield self._lines(what)
+            lines = self._lines(what)
+            with watched(lines):
+                yield lines
             return
         of_a_task = TextColumn("{task.description}"), BarColumn(bar_width=30), TimeElapsedColumn()
         left = TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}")
@@ -163,7 +167,8 @@ class Terminal:
             def report(done: int, total: int, note: str = "") -> None:
                 bars.update(task, completed=done, total=total, note=note)
 
-            yield report
+            with watched(report):
+                yield report
 
     def _lines(self, what: str) -> ProgressCallback:
         """Lines such as `simulating: 40 %`, at most one every few seconds."""

@@ -31,6 +31,7 @@ from forcegp.model import Model
 from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.prediction import inverse_dynamics
 from forcegp.posterior.update import learn_more_rows
+from forcegp.progress import tell
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, whole_number
 from forcegp.summary import Summary, rounded
@@ -269,7 +270,6 @@ def excitation(
     rows: int = 100,
     motions: int = 300,
     seed: int = 0,
-    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Excitation:
     """The motion from rest at `start` and back after which learned forces are surest.
 
@@ -326,7 +326,7 @@ def excitation(
             score = teaches.score(motion)
             size *= (1.3 if score < least else 0.96) if changed else 1.0
             best, least = (motion, score) if score < least else (best, least)
-            progress(k + 1, motions)
+            tell(k + 1, motions)
     if not np.isfinite(least):
         raise InvalidInput(
             f"none of {motions} motions shows all base parameters; give more seconds, limits or motions."

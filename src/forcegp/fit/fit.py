@@ -4,7 +4,6 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -37,11 +36,9 @@ from forcegp.fit.refinement import (
     require_memory_to_learn,
 )
 from forcegp.fit.search import (
-    ALL_ROWS,
     LOG_VARIANCE_SPREAD,
     MOST_POINTS_FOR_RESTARTS,
     FitObjective,
-    FitProgress,
     Search,
     described_rows,
     learns_noise,
@@ -80,7 +77,6 @@ def fit(
     start: Mapping[str, Tensor] | Posterior | None = None,
     engine: Engine | str = "auto",
     learning_points: int | None = None,
-    progress: FitProgress | None = None,
 ) -> Any:
     """Find what a model leaves open, from a log: coefficients of laws, bodies and payloads, and unknown functions.
 
@@ -107,8 +103,8 @@ def fit(
     engine: "exact", "inducing", one of `forcegp.inference.ENGINES` with its settings, or "auto", with the reason in
         `settings["engine_reason"]`.
     learning_points: find the hyper-parameters on this many of the points; None: all up to 1500, and 600 beyond.
-    progress: called as progress(restart, iteration, objective); the restart is `ALL_ROWS` while numbers of laws and
-        bodies are sought.
+
+    How far it is, `forcegp.progress.watched` hears.
 
     Gear friction without a stated `memory` gets the parts that held-out stretches of the log show at each joint
     (`settings["gear_friction"]`). Where friction remembers, rows in which a joint has hardly moved since its episode
@@ -143,21 +139,20 @@ def fit(
                 "torques are evidence for numbers of laws and bodies; functions are learned from accelerations, with "
                 "noise of the forces (Noise(None, force=..., learn=True)), which is the same likelihood."
             )
-        posterior = _of_numbers(model, logs, rest, rows, seed, progress)
+        posterior = _of_numbers(model, logs, rest, rows, seed)
     else:
         if baseline is not None:
             raise InvalidInput(
                 "a baseline is for payloads, without unknown functions; leave these out, or the baseline."
             )
-        search = Search(checked_jobs(jobs), restarts, seed, options, start, progress)
+        search = Search(checked_jobs(jobs), restarts, seed, options, start)
         posterior = _Functions(model, search, engine, learning_points).fitted(dataset, points)
     if choice is not None:
         posterior = posterior.with_settings(gear_friction=choice.to_dict())
     if not known.all():
         posterior = posterior.with_settings(rows_before_a_past=int((~known).sum()))
     if refinement is not None:
-        report = None if progress is None else partial(progress, ALL_ROWS)
-        posterior = refine_on_motions(posterior, dataset, refinement.seconds, refinement.bodies, report, model)
+        posterior = refine_on_motions(posterior, dataset, refinement.seconds, refinement.bodies, model)
     return with_drift(posterior, dataset)
 
 
@@ -210,15 +205,12 @@ def _checked(model: Model, dataset: Dataset, evidence: Any, refinement: Motions 
     return dataset.rows(np.flatnonzero(~again))
 
 
-def _of_numbers(
-    model: Model, logs: Sequence[Dataset], evidence: Any, rows: int | None, seed: int, progress: FitProgress | None
-) -> Posterior:
+def _of_numbers(model: Model, logs: Sequence[Dataset], evidence: Any, rows: int | None, seed: int) -> Posterior:
     """Laws and bodies alone, from all rows."""
-    report = None if progress is None else partial(progress, ALL_ROWS)
     if rows is not None:
         whole_number("rows", rows, 1)
     refuse_what_has_no_answer(model, logs[0])
-    found = fit_physical(model, logs, evidence, rows, report)
+    found = fit_physical(model, logs, evidence, rows)
     trained = replace(found.model, noise=found.noise)
     training = TrainingData.of(found.rows, model.robot.device)
     result = OptimizationResult({}, found.history[-1], found.history, "Gauss-Newton steps", found.estimates.settled,

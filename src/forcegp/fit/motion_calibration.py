@@ -1,7 +1,7 @@
 """Calibration of the intervals of motions on stretches of training time that are left out in turn."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,6 +19,7 @@ from forcegp.posterior.drift import scaled
 from forcegp.posterior.fitted import DEVIATIONS, HORIZONS, MotionIntervals
 from forcegp.posterior.observed_wrench import in_own_air, observing, require_unobserved
 from forcegp.posterior.rollout import Rollout
+from forcegp.progress import part
 
 FOLDS = 4
 SAMPLES = 16
@@ -33,7 +34,6 @@ def calibrated(
     horizons: Sequence[float] = HORIZONS,
     *,
     integrator: str = "rk4",
-    report: Callable[[int, int], None] | None = None,
 ) -> Posterior:
     """The same model with intervals of motions that hold: of records left out in turn, or of stretches of the only one.
 
@@ -42,22 +42,15 @@ def calibrated(
 
     dataset: the recording that the model learned from, in equal steps of time.
     horizons: lengths of the motions in s, at which widths are found; integrator: of these motions.
-    report: called as report(stretch, stretches).
 
     Raises InvalidInput for models without physics, and where fewer than two stretches last for the longest horizon.
     """
     require_type("posterior", posterior, Posterior, ", as in calibrated(posterior, log)")
-    intervals = _intervals(posterior, dataset, horizons, integrator, report)
+    intervals = _intervals(posterior, dataset, horizons, integrator)
     return posterior.with_settings(motion_intervals=intervals.to_dict())
 
 
-def _intervals(
-    posterior: Posterior,
-    dataset: Dataset,
-    horizons: Sequence[float],
-    integrator: str,
-    report: Callable[[int, int], None] | None,
-) -> MotionIntervals:
+def _intervals(posterior: Posterior, dataset: Dataset, horizons: Sequence[float], integrator: str) -> MotionIntervals:
     require_type("dataset", dataset, Dataset)
     require_unobserved(posterior, "intervals of motions")
     dataset = with_memory(dataset, posterior.model)
@@ -68,9 +61,8 @@ def _intervals(
     errors, spreads, shifts, kept, inputs = [], [], [], wanted, posterior.model.inputs
     drift = posterior.settings.get("drift") if _records(dataset, wanted[-1]) == 1 else None
     for number, inside in enumerate(parts):
-        if report is not None:
-            report(number, len(parts))
-        other, rows = observing(_without(posterior, dataset.rows(~inside)), dataset.rows(inside))
+        with part(number, len(parts)):
+            other, rows = observing(_without(posterior, dataset.rows(~inside)), dataset.rows(inside))
         motions = _motions(rows, wanted[-1])
         kept = tuple(h for h in wanted if h >= motions.dt)
         how: dict[str, Any] = {"integrator": integrator, "samples": SAMPLES if len(other.latent_names) else 0}

@@ -7,7 +7,6 @@ residual is worth. Gauss-Newton; initial states are eliminated window by window;
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -28,9 +27,9 @@ from forcegp.model import Model
 from forcegp.posterior import Posterior
 from forcegp.posterior.fitted import Estimates
 from forcegp.posterior.observed_wrench import in_own_air, require_unobserved, unobserved
+from forcegp.progress import tell
 from forcegp.robots.manifold import ConfigurationSpace
 
-Report = Callable[[int, float], None]
 STEP = 0.005
 """Longest step in s: shorter where the recording has shorter ones, of which several make a step."""
 SPEED = 0.02
@@ -184,9 +183,7 @@ class MotionFit:
             free &= ~beyond
         return dx / max(1.0, float((dx.abs() / longest).max())) if len(dx) else dx
 
-    def minimized(
-        self, here: _Point, noise: Tensor, sigma: Tensor, damping: float, report: Callable[[float], None]
-    ) -> tuple[_Point, float]:
+    def minimized(self, here: _Point, noise: Tensor, sigma: Tensor, damping: float) -> tuple[_Point, float]:
         """Levenberg-Marquardt for given noise, from that damping; the last damping as well."""
         here = self.at(here.x, here.states, noise, sigma, here.motions)
         for _ in range(ITERATIONS):
@@ -202,10 +199,9 @@ class MotionFit:
             damping = max(0.2 * damping, 1e-9) if gain > 0.75 else damping if gain > 0.25 else 5.0 * damping
             if gain > 0.0:
                 here = there
-                report(float(self.residual(here.motions).square().mean().sqrt()))
         return here, damping
 
-    def solved(self, report: Callable[[float], None], x: Tensor) -> tuple["MotionFit", _Point, Tensor, Tensor]:
+    def solved(self, x: Tensor) -> tuple["MotionFit", _Point, Tensor, Tensor]:
         """The minimum that is reached from x, the noise and sigma that residuals have there, and the scales of weights.
 
         Raises NumericalError where no motion is found near the recorded one.
@@ -219,8 +215,9 @@ class MotionFit:
             )
         sigma, noise = self.noise(here.motions)
         fit = self
-        for _ in range(ROUNDS):
-            here, damping = fit.minimized(here, noise, sigma, damping, report)
+        for number in range(ROUNDS):
+            tell(number, ROUNDS, f"all rows, rms of q {float(sigma.square().mean().sqrt()):.3g}")
+            here, damping = fit.minimized(here, noise, sigma, damping)
             before, (sigma, noise) = torch.cat([noise, fit.unknowns.scales]), self.noise(here.motions)
             if fit.unknowns.weights.count:
                 N, *_ = fit.curvature(here, noise, sigma)
@@ -234,7 +231,7 @@ class MotionFit:
         if bool(weak.any()):
             scales = torch.where(weak, SCALES[0], fit.unknowns.scales)
             fit = replace(fit, unknowns=replace(fit.unknowns, scales=scales))
-            here, _ = fit.minimized(here, noise, sigma, damping, report)
+            here, _ = fit.minimized(here, noise, sigma, damping)
         return fit, here, noise, sigma
 
     def noise(self, motions: WindowMotions) -> tuple[Tensor, Tensor]:
@@ -252,12 +249,11 @@ def refine_on_motions(
     dataset: Dataset,
     seconds: float,
     bodies: bool,
-    report: Report | None = None,
     stated: Model | None = None,
 ) -> Posterior:
     """Known laws, bodies and latent functions fitted to the recorded positions, beginning from this posterior.
 
-    Numbers that the laws of `stated` know by a standard deviation of 0 stay. `report(step, rms of q)` after each step.
+    Numbers that the laws of `stated` know by a standard deviation of 0 stay.
     Raises InvalidInput for models without physics, windows that no episode has room for and uneven steps,
     NumericalError where no motion is found near the recorded one.
     """
@@ -272,16 +268,7 @@ def refine_on_motions(
         posterior = posterior.with_model(seen.model)
     recorded, stride = all_motions(seen, seconds, STEP)
     unknowns = Unknowns.of(posterior, seen, bodies, stated)
-    done = 0
-
-    def say(rms: float) -> None:
-        nonlocal done
-        done += 1
-        if report is not None:
-            report(done, rms)
-
-    fit = MotionFit(recorded, stride, unknowns)
-    found = _refined(*fit.solved(say, unknowns.first), seconds, bodies)
+    found = _refined(*MotionFit(recorded, stride, unknowns).solved(unknowns.first), seconds, bodies)
     return found if seen is dataset else replace(found, target=unobserved(found.model))
 
 

@@ -16,6 +16,7 @@ from forcegp.evidence import Accelerations, Torques
 from forcegp.evidence.bodies import BaseParameters, parameter_names, thickened
 from forcegp.evidence.least_squares import (
     LEAST,
+    ROUNDS,
     Chained,
     Fit,
     Jacobian,
@@ -31,6 +32,7 @@ from forcegp.forces import Payload
 from forcegp.model import Model
 from forcegp.noise import Noise
 from forcegp.posterior.fitted import STRETCHES, Estimates
+from forcegp.progress import tell
 from forcegp.robots import Robot
 
 
@@ -163,9 +165,6 @@ REACHED = 0.02
 FEWEST = 10 * STRETCHES
 """Rows that a payload needs."""
 
-Progress = Callable[[int, float], None]
-"""Called as progress(round, rms of the residual)."""
-
 
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -185,7 +184,6 @@ def fit_physical(
     logs: Sequence[Dataset],
     evidence: Torques | Accelerations,
     rows: int | None = None,
-    progress: Progress | None = None,
 ) -> Solution:
     """The open numbers of a model without unknown forces; of several logs payloads are in the first alone."""
     bodies = any(getattr(law, "learn", ()) or (isinstance(law, Payload) and not law.known) for law in model.laws)
@@ -205,8 +203,7 @@ def fit_physical(
 
     def note(done: int, rms: float) -> None:
         history.append(rms)
-        if progress is not None:
-            progress(done, rms)
+        tell(min(done, ROUNDS), ROUNDS, f"all rows, step {done}: {rms:.3g}")
 
     options: dict[str, Any] = {"longest": space.longest_steps, "moved": space.moved}
     search = partial(weighted_least_squares, prior=space.prior, bounds=space.bounds, **options)
@@ -243,7 +240,7 @@ def fit_physical(
 
 
 def _with_noise_in_both(
-    equations: Equations, search: Callable[..., Fit], x: np.ndarray, note: Progress
+    equations: Equations, search: Callable[..., Fit], x: np.ndarray, note: Callable[[int, float], None]
 ) -> tuple[Fit, NoiseLevels]:
     """Searches about likely accelerations, whose levels of noise are found along."""
     noise, least, number, evaluations, steps, rough = None, None, 0, 0, STEPS, True

@@ -32,6 +32,7 @@ from forcegp.noise import Noise
 from forcegp.parallel import Jobs, mapped
 from forcegp.posterior import Posterior
 from forcegp.posterior.fitted import DEVIATIONS
+from forcegp.progress import part
 from forcegp.robots.arguments import whole_number
 
 MOST_RESTARTS = 10_000
@@ -116,12 +117,6 @@ ended at an error of .1266, the smoother one at .109."""
 MOST_POINTS_FOR_RESTARTS = 400
 """Training points up to which several starts are the default."""
 
-FitProgress = Callable[[int, int, float], None]
-"""Called as progress(restart, iteration, objective), and with restart `ALL_ROWS` while numbers are sought."""
-
-ALL_ROWS = -1
-"""Instead of a restart: the value is then the root mean square of residuals of all rows."""
-
 Outcome = TypeVar("Outcome")
 
 
@@ -165,10 +160,8 @@ def started(moments: Mapping[str, Tensor], first: Mapping[str, Tensor], seed: in
     return shifted
 
 
-def run_restarts(
-    search: Callable[..., Outcome], restarts: int, patience: int, jobs: Jobs, progress: FitProgress | None
-) -> Sequence[Outcome]:
-    """`search(index, before=outcomes, progress=progress)` from 0 on, so many at once, on which outcomes do not depend.
+def run_restarts(search: Callable[..., Outcome], restarts: int, patience: int, jobs: Jobs) -> Sequence[Outcome]:
+    """`search(index, before=outcomes)` from 0 on, so many at once, on which outcomes do not depend.
 
     Those before are given with `patience` only, and then `AT_ONCE` run at once.
     """
@@ -177,9 +170,9 @@ def run_restarts(
         last = min(restarts, len(outcomes) + AT_ONCE) if patience else restarts
         indices, before = range(len(outcomes), last), tuple(outcomes)
         if jobs == 1 or (restarts == 1 and isinstance(jobs, int)):
-            outcomes += [search(index, before=before, progress=progress) for index in indices]
+            outcomes += [search(index, before=before) for index in indices]
         else:
-            outcomes += mapped(partial(search, before=before, progress=None), indices, jobs)
+            outcomes += mapped(partial(search, before=before), indices, jobs)
     return outcomes
 
 
@@ -239,7 +232,6 @@ class Search:
     seed: int
     options: OptimizerOptions | None
     start: Mapping[str, Tensor] | None
-    progress: FitProgress | None
 
     @usable_arguments("fit")
     def __post_init__(self) -> None:
@@ -261,9 +253,9 @@ class Search:
     def best(self, objective: FitObjective, starts: Starts) -> tuple[OptimizationResult, dict[str, Any]]:
         """The best of all starts with the work of all, and its settings. Raises FitError where none could begin."""
         restarts, options = self.resolved(len(objective.likelihood.training))
-        one = partial(_one_start, objective, starts, options)
+        one = partial(_one_start, objective, starts, options, restarts)
         with blas_threads(objective.likelihood.training.q.numel()):
-            results = run_restarts(one, restarts, options.patience, self.jobs, self.progress)
+            results = run_restarts(one, restarts, options.patience, self.jobs)
         usable = [result for result in results if isinstance(result, OptimizationResult)]
         if not usable:
             causes = "; ".join(f"restart {k}: {error}" for k, error in enumerate(results))
@@ -288,14 +280,15 @@ def _one_start(
     objective: FitObjective,
     starts: Starts,
     options: OptimizerOptions,
+    restarts: int,
     index: int,
     before: Sequence[OptimizationResult | FitError],
-    progress: FitProgress | None,
 ) -> OptimizationResult | FitError:
     """Where the search from start `index` ended, or why it could not begin."""
-    note = None if progress is None else (lambda iteration, value: progress(index, iteration, value))
+    name = f"start {index + 1} of {restarts}, " if restarts > 1 else ""
     try:
-        return minimize_objective(objective, starts(index), options, note, best_value(before))
+        with part(index, restarts, name):
+            return minimize_objective(objective, starts(index), options, best_value(before))
     except FitError as error:
         return error
 

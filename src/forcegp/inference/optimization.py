@@ -12,9 +12,9 @@ from scipy.optimize import OptimizeResult, minimize
 from torch import Tensor
 
 from forcegp.errors import FitError, InvalidInput, NumericalError, NumericalWarning, usable_arguments
+from forcegp.progress import tell
 
 Objective = Callable[[Mapping[str, Tensor]], Tensor]
-ProgressCallback = Callable[[int, float], None]
 
 LINE_SEARCH_FAILED = 2
 """scipy's L-BFGS-B: neither converged (0) nor stopped by a limit (1)."""
@@ -135,14 +135,12 @@ def minimize_objective(
     objective: Objective,
     initial: Mapping[str, Tensor],
     options: OptimizerOptions | None = None,
-    progress: ProgressCallback | None = None,
     rival: float = np.inf,
 ) -> OptimizationResult:
     """Minimise `objective(parameters)` from `initial` (unconstrained float64 tensors, not changed) by L-BFGS-B.
 
     A search that finds no step rolls back to the best point and starts again with an empty memory, twice at most.
-    `progress(iteration, value)` is called after every iteration; `rival` is the best value of earlier starts. Raises
-    FitError where the objective cannot be evaluated at the start.
+    `rival` is the best value of earlier starts. Raises FitError where the objective cannot be evaluated at the start.
     """
     options = options or OptimizerOptions()
     start_time = time.process_time()
@@ -153,8 +151,9 @@ def minimize_objective(
 
     def after_iteration(intermediate_result: OptimizeResult) -> None:
         history.append(float(intermediate_result.fun))
-        if progress is not None:
-            progress(len(history) - 1, history[-1])
+        value = f"{history[-1]:.1f}" if abs(history[-1]) >= 10.0 else f"{history[-1]:.3g}"
+        note = f"iteration {len(history) - 1}, objective {value}"
+        tell(min(len(history) - 1, options.iterations), options.iterations, note)
         hopeless = options.patience and SLOW_ITERATIONS * (history[-1] - rival) > options.patience * pace()
         if len(history) > SLOW_ITERATIONS and (pace() < options.slow or hopeless):
             raise StopIteration  # ends the search at this point

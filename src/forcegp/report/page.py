@@ -2,7 +2,7 @@
 
 import base64
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -88,13 +88,12 @@ def model_page(
     next_steps: Sequence[tuple[str, str]] = (),
     details: Mapping[str, Any] | None = None,
     shapes: str | Path | None = None,
-    progress: Callable[[int, int, str], None] | None = None,
 ) -> Page:
     """A page with the robot in motion, these pictures, and those of the model (`scores.model_pictures`).
 
     What cannot be drawn is named on the page with the reason. `shapes` is a URDF with visual elements.
     """
-    drawn, missing = model_pictures(posterior, dataset, progress)
+    drawn, missing = model_pictures(posterior, dataset)
     try:
         recorded = recorded_scene(dataset, posterior, seconds=SECONDS, shapes=shapes)
         scene, notes = recording(recorded), scene_notes(recorded)

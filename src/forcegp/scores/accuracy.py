@@ -5,7 +5,7 @@ A Dataset holds true forces by name, `Q_U.<name>` and `force.<name>`; one that t
 
 import statistics
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,7 @@ from forcegp.errors import NumericalError
 from forcegp.inference.memory import blas_threads
 from forcegp.model import Model
 from forcegp.posterior.posterior import Posterior
+from forcegp.progress import tell
 from forcegp.summary import listed, plain
 
 Rows = Float[np.ndarray, "rows nv"]
@@ -65,9 +66,7 @@ class PredictedRows:
     carried_force: Rows | None = None
 
 
-def predict_rows(
-    posterior: Posterior, dataset: Dataset, progress: Callable[[int, int], None] | None = None
-) -> PredictedRows:
+def predict_rows(posterior: Posterior, dataset: Dataset) -> PredictedRows:
     """Predict all rows, some at a time. The constraint is that of the Dataset's own system."""
     dataset = with_memory(dataset, posterior.model)
     device, held, done = posterior.model.robot.device, list(posterior.model.held_inputs), 0
@@ -101,8 +100,7 @@ def predict_rows(
         if prediction.unknown_force is not None:
             found["carried_force"] = own.Q_K if posterior.carries_known_forces else torch.zeros_like(own.Q_K)
         names, done = list(found), done + len(q)
-        if progress is not None:
-            progress(done, len(dataset))
+        tell(done, len(dataset))
         return tuple(found.values())
 
     with blas_threads(posterior.training.q.numel()):
@@ -128,10 +126,7 @@ def negative_log_density(
 
 
 def row_scores(
-    posterior: Posterior,
-    test: Dataset,
-    mass: Matrices | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    posterior: Posterior, test: Dataset, mass: Matrices | None = None
 ) -> tuple[Table, dict[str, list[float | None]]]:
     """The table, and errors in about `STRETCHES` stretches of time, over all joints, where lower is better.
 
@@ -143,7 +138,7 @@ def row_scores(
     together have one `nlpd`. `mass` (rows of kg m^2, kg m or kg) turns errors of accelerations into those of forces; it
     is the same for every model that is compared, None takes the model's own.
     """
-    rows = predict_rows(posterior, test, progress)
+    rows = predict_rows(posterior, test)
     mass = rows.mass if mass is None else mass
     pairs = _pairs(rows, test, mass)
     table = {name: metrics(*each) for name, each in pairs.items() if each[0].shape == each[2].shape and each[2].size}

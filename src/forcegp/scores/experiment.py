@@ -7,7 +7,7 @@ import hashlib
 import json
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -255,13 +255,12 @@ def scored(
     mass: Matrices | None = None,
     *,
     fitted_here: bool = False,
-    progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """One model on one log as JSON: table, errors, warnings; also of shared rows unless `fitted_here`."""
     alone, recorded = posterior, test
     if test.time_ordered:
         posterior, test = observing(posterior, test, whole=True)
-    table, stretches = row_scores(posterior, test, mass, progress)
+    table, stretches = row_scores(posterior, test, mass)
     moving, facts = motion_scores(alone, motions, integrator)
     doubts = [] if fitted_here else [*overlaps(alone, recorded), *contact_doubts(test, posterior.model)]
     doubts += [*unfinished_search(posterior), *rows_outside(posterior, test), *poor_scores(posterior, test, table)]

@@ -5,7 +5,7 @@ as `identified`, such as viscous+gp:joint, identified+gp:joint-friction@accelera
 """
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,9 +15,9 @@ import torch
 from forcegp.data import Dataset, thruster_columns
 from forcegp.errors import FitError, InvalidInput
 from forcegp.evidence import Accelerations, Evidence, Motions, Torques, parse_evidence
-from forcegp.evidence.least_squares import ROUNDS, correlation_time
+from forcegp.evidence.least_squares import correlation_time
 from forcegp.evidence.recorded_rows import slides
-from forcegp.fit import ALL_ROWS, calibrated, default_options, default_restarts, fit, held_out_noise
+from forcegp.fit import calibrated, default_options, fit, held_out_noise
 from forcegp.fit.search import MOST_POINTS_FOR_RESTARTS
 from forcegp.forces import (
     IndependentAccelerations,
@@ -32,8 +32,6 @@ from forcegp.noise import Noise
 from forcegp.posterior import Posterior
 from forcegp.scores.scores import Kind
 
-Report = Callable[[int, int, str], None]  # called as report(done, total, what happens)
-
 GIVEN, ONLY, NONE = "given", "only", "none"
 """First words of the forces of a model: those that it has, and none of them; "none" adds nothing."""
 
@@ -41,7 +39,6 @@ POINTS = 200  # rows that functions of many inputs are learned from where nobody
 RESIDUALS = 20_000  # rows whose residuals show how long errors resemble each other
 NOTICEABLE = 1.5  # rows over which they must to count for less
 RESIDUALS_OF_FORCES = 1000  # rows that show where the noise of forces begins
-STEPS = 100  # of a search on motions, for the bar alone
 
 
 def summands(expression: str) -> tuple[str, ...]:
@@ -94,7 +91,6 @@ def learn(
     engine: Any = "auto",
     learning_points: int | None = None,
     iterations: int | None = None,
-    report: Report | None = None,
     **search: Any,
 ) -> tuple[Posterior, list[str]]:
     """`fit` with the number of rows and the noise that a model needs, and notes on what was decided.
@@ -109,7 +105,7 @@ def learn(
     if motions and any(isinstance(force, IndependentAccelerations) for force in model.unknown_forces):
         raise InvalidInput("motions refine physics, and gp:independent has none; leave them out.")
     if not model.unknown_forces and (isinstance(first, Torques) or model.is_open):
-        posterior = fit(model, dataset, others, baseline=baseline, progress=_progress(report, 1, ROUNDS))
+        posterior = fit(model, dataset, others, baseline=baseline)
     else:
         few = bool(model.unknown_forces) and has_few_inputs(model.unknown, model.robot)
         everything = few and points is None and engine in ("auto", "inducing")
@@ -124,44 +120,23 @@ def learn(
             how |= {} if learning_points is None else {"learning_points": learning_points}
         if not model.unknown_forces:
             search = {**search, "restarts": 1}  # its starts are all the same
-        restarts = search.get("restarts") or default_restarts(points)
         how |= {"options": options, **search}
-        progress = _progress(report, restarts, options.iterations)
-        posterior = fit(model, dataset, others, baseline=baseline, points=points, progress=progress, **how)
+        posterior = fit(model, dataset, others, baseline=baseline, points=points, **how)
         if everything:
             posterior, note = allowing_for_correlation(posterior, dataset)
             notes += [] if note is None else [note]
     if motions:
         recording = dataset if recording is None else recording
-        posterior = fit(posterior.model, recording, motions, start=posterior, progress=_progress(report, 1, STEPS))
+        posterior = fit(posterior.model, recording, motions, start=posterior)
         posterior, note = with_intervals_of_motions(posterior, recording)
         notes += [] if note is None else [note]
     return posterior, notes
 
 
-def _progress(report: Report | None, restarts: int, steps: int) -> Any:
-    """What `fit` calls, in terms of steps done and in all."""
-    if report is None:
-        return None
-
-    def progress(restart: int, iteration: int, value: float) -> None:
-        size = f"{value:.1f}" if abs(value) >= 10.0 else f"{value:.3g}"
-        if restart == ALL_ROWS:
-            report(min(iteration, steps), steps, f"all rows, step {iteration}: {size}")
-            return
-        start = f"start {restart + 1} of {restarts}, " if restarts > 1 else ""
-        done = restart * steps + min(iteration, steps)
-        report(done, restarts * steps, f"{start}iteration {iteration}, objective {size}")
-
-    return progress
-
-
-def with_intervals_of_motions(
-    posterior: Posterior, recording: Dataset, report: Callable[[int, int], None] | None = None
-) -> tuple[Posterior, str | None]:
+def with_intervals_of_motions(posterior: Posterior, recording: Dataset) -> tuple[Posterior, str | None]:
     """`calibrated`; the posterior itself, and why, where the recording is too short for it."""
     try:
-        return calibrated(posterior, recording, report=report), None
+        return calibrated(posterior, recording), None
     except InvalidInput as error:
         return posterior, f"intervals of motions are not calibrated: {error}"
 

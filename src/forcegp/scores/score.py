@@ -15,10 +15,11 @@ from forcegp.data import Dataset, with_strokes
 from forcegp.data.dataset import require_rows
 from forcegp.errors import InvalidInput, require_type
 from forcegp.integration import integrator_named
-from forcegp.jobs import JobStore, Progress, machine, run_jobs
+from forcegp.jobs import JobStore, machine, run_jobs
 from forcegp.model import Model
 from forcegp.parallel import checked_jobs
 from forcegp.posterior.posterior import Posterior
+from forcegp.progress import part
 from forcegp.robots.arguments import whole_number
 from forcegp.scores.experiment import Experiment, fingerprint, kept, scored
 from forcegp.scores.held_out import STARTS, HeldOutMotions, Split, held_out_motions, split_named
@@ -56,7 +57,6 @@ def score(
     jobs: int | Executor = 1,
     source: Mapping[str, Any] | None = None,
     overwrite: bool = False,
-    progress: Progress | None = None,
 ) -> Scores:
     """Score models on the same rows: errors, densities, coverage, motions, and paired differences.
 
@@ -109,7 +109,7 @@ def score(
             how = {"rows_sha256": fingerprint(log), "models": digests, "horizons": horizons, "integrator": integrator}
             JobStore.open(Path(folder), KIND, how, overwrite=overwrite)
         motions = held_out_motions(recording or log, np.ones(len(recording or log), dtype=bool), horizons or (), starts)
-        runs = _runs_of(before, log, motions, integrator, progress)
+        runs = _runs_of(before, log, motions, integrator)
         about |= {"splits": [], "seeds": [0], "notes": list(motions.notes)}
         scores = _scores(log, runs, known, about, before.__getitem__)
         if folder is not None:
@@ -125,7 +125,7 @@ def score(
         place = Path(nowhere, "scores") if folder is None else Path(folder)
         store = JobStore.open(place, KIND, experiment.configuration, overwrite=overwrite)
         identifications, fits = experiment.jobs(chosen, seeds)
-        run_jobs(store, [*identifications, *fits], jobs, progress)
+        run_jobs(store, [*identifications, *fits], jobs)
         runs = {name: [kept(store, job.name) for job in fits if job.spec["name"] == name] for name in chosen}
         for name in (name for name, each in chosen.items() if each.all_rows):  # they use no chance
             runs[name] = [{**run, "seed": seed} for seed in range(seeds) for run in runs[name]]
@@ -162,25 +162,17 @@ def write(scores: Scores, folder: Path) -> None:
 
 
 def _runs_of(
-    given: Mapping[str, Posterior],
-    log: Dataset,
-    motions: HeldOutMotions,
-    integrator: str,
-    progress: Progress | None,
+    given: Mapping[str, Posterior], log: Dataset, motions: HeldOutMotions, integrator: str
 ) -> dict[str, list[dict[str, Any]]]:
     """One run of each posterior, on all rows."""
     runs = {}
     for place, (name, posterior) in enumerate(given.items()):
         require_rows("log", log, posterior.joint_names, "the model")
         integrator_named(integrator, posterior.model)
-
-        def report(done: int, total: int, place: int = place, name: str = name) -> None:
-            if progress is not None:
-                progress(done + place * total, len(given) * total, name)
-
         run = {"split": "all rows", "seed": 0, "error": None, "cpu_seconds": None, "mass_matrix": "the model itself"}
         run |= {"training_rows": len(posterior.training)}
-        runs[name] = [run | scored(posterior, log, motions, integrator, progress=report)]
+        with part(place, len(given), name):
+            runs[name] = [run | scored(posterior, log, motions, integrator)]
     return runs
 
 

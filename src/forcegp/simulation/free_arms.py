@@ -1,6 +1,6 @@
 """`ur5-free` and `double-pendulum`: arms that touch nothing; and friction of joints by name, of all plants."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from forcegp.forces.force import JointLaw, Law
 from forcegp.forces.joint_laws import LazyState, Viscous
 from forcegp.forces.registry import parse_forces
 from forcegp.model import Model
+from forcegp.progress import tell
 from forcegp.robots import Robot
 from forcegp.simulation.scenarios import FreeArmConfig
 from forcegp.simulation.trajectory import RATE, recorded
@@ -78,7 +79,7 @@ ARMS = {  # URDF, posture, and inertia of geared rotors in parts of the largest 
 }
 
 
-def simulate_free_arm(config: FreeArmConfig, progress: Callable[[int, int], None] | None = None) -> Dataset:
+def simulate_free_arm(config: FreeArmConfig) -> Dataset:
     """Rows k: q, v, the torque u until row k + 1, and a at the row, so that M a + h = u + Q_U with the true Q_U."""
     file, middle, rotors = ARMS[config.arm]
     robot = Robot.from_urdf(Path(__file__).parent / file)
@@ -113,8 +114,8 @@ def simulate_free_arm(config: FreeArmConfig, progress: Callable[[int, int], None
             for _ in range(FINE):
                 v = v + acceleration(q, v, u, 1.0 / (RATE * FINE)) / (RATE * FINE)
                 q = q + v / (RATE * FINE)
-            if progress is not None and k % RATE == 0:
-                progress(episode * steps + k, config.episodes * steps)
+            if k % RATE == 0:
+                tell(episode * steps + k, config.episodes * steps)
     q, v, u, a, Q_U = map(np.array, zip(*rows, strict=True))
     model = Model(robot, forces=(Actuation(), RigidBodies()))
     truth = {"Q_U": Q_U} | ({"Q_U.joint-friction": Q_U} if friction.laws else {})

@@ -18,6 +18,7 @@ from forcegp.forces import Actuation, RigidBodies
 from forcegp.forces.registry import force_class
 from forcegp.mechanics import Baumgarte, Contact, Surface
 from forcegp.model import Model
+from forcegp.progress import part, tell
 from forcegp.robots import Robot
 from forcegp.robots.urdf import numbers
 from forcegp.simulation.free_arms import LawsOfJoints
@@ -208,10 +209,8 @@ Motion = dict[str, np.ndarray]
 multiplier), and in_contact."""
 
 
-def simulate_episode(
-    config: KukaSurfaceConfig, robot: Robot, urdf: str, episode: int, report: Callable[[int], None]
-) -> Motion:
-    """One continuous motion of the arm. `report(steps done)` is called now and then.
+def simulate_episode(config: KukaSurfaceConfig, robot: Robot, urdf: str, episode: int) -> Motion:
+    """One continuous motion of the arm.
 
     Raises SimulationError if the motion diverges, never touches the surface, or meets a singular posture.
     """
@@ -255,7 +254,7 @@ def simulate_episode(
             for name, value in row.items():
                 columns[name][step] = value
             if (step + 1) % STEPS_PER_REPORT == 0 or step + 1 == steps:
-                report(step + 1)
+                tell(step + 1, steps)
         last_v = arm.state()[1]
         _require_bounded(config, last_v, episode, steps)
 
@@ -295,11 +294,7 @@ def _require_bounded(config: KukaSurfaceConfig, v: Float[np.ndarray, " nv"], epi
         )
 
 
-Progress = Callable[[int, int], None]
-"""Called as `progress(steps done, steps in total)`."""
-
-
-def simulate_kuka_surface(config: KukaSurfaceConfig, progress: Progress | None = None) -> Dataset:
+def simulate_kuka_surface(config: KukaSurfaceConfig) -> Dataset:
     """Simulate the scenario and return what was measured, with the ground truth.
 
     Row k holds the state `(q, v)` before step k, the torque `u` during it (commanded minus joint damping), and the
@@ -312,12 +307,8 @@ def simulate_kuka_surface(config: KukaSurfaceConfig, progress: Progress | None =
     robot = Robot.from_urdf_text(urdf, source="kuka-surface", gravity=(0.0, 0.0, -config.gravity))
     motions = []
     for episode in range(config.episodes):
-
-        def report(step: int, done: int = episode * config.steps // config.episodes) -> None:
-            if progress is not None:
-                progress(done + step, config.steps)
-
-        motions.append(simulate_episode(config, robot, urdf, episode, report))
+        with part(episode, config.episodes):
+            motions.append(simulate_episode(config, robot, urdf, episode))
     return _dataset(config, robot, motions)
 
 

@@ -6,7 +6,6 @@ Corke, IEEE RAM 2012; Faessler et al., RA-L 2018 (drag); Cheeseman & Bennett 195
 """
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from forcegp.errors import NumericalError
 from forcegp.forces import Actuation, RigidBodies, Thrusters
 from forcegp.mechanics import fixed_point
 from forcegp.model import Model
+from forcegp.progress import tell
 from forcegp.robots import Robot
 from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia
 from forcegp.simulation.free_arms import LawsOfJoints
@@ -37,7 +37,7 @@ PLACE = (0.08, -0.04, 0.12)  # of the load in the trunk, m
 NEWTON = 20
 
 
-def simulate_quadruped(config: QuadrupedConfig, progress: Callable[[int, int], None] | None = None) -> Dataset:
+def simulate_quadruped(config: QuadrupedConfig) -> Dataset:
     """Rows of q, v, u and a; truth holds a, the friction Q_U and the foot forces "lambda" in N, world axes."""
     robot = Robot.from_urdf(Path(__file__).parent / "quadruped.urdf", base="floating")
     contacts = tuple(contact for leg in LEGS for contact in fixed_point(f"{leg}_foot", switch=f"{leg}_stands"))
@@ -47,8 +47,7 @@ def simulate_quadruped(config: QuadrupedConfig, progress: Callable[[int, int], N
     parts = []
     for episode in range(config.episodes):
         parts.append(_episode(loaded, model, config, episode, steps))
-        if progress is not None:
-            progress(episode + 1, config.episodes)
+        tell(episode + 1, config.episodes)
     q, v, u, a, Q_U, forces = (torch.cat(part).numpy() for part in zip(*parts, strict=True))
     stands = np.repeat(u[:, -len(LEGS) :], 3, axis=1)
     return recorded(
@@ -189,7 +188,7 @@ POSITION = 4.0, 3.5, 1.0  # gains of the controller: 1/s^2, 1/s, 1/s^3
 TURNING, QUICKEST = 0.5, 12.0  # of attitude: in parts of 1 / lag, and in rad/s
 
 
-def simulate_quadrotor(config: QuadrotorConfig, progress: Callable[[int, int], None] | None = None) -> Dataset:
+def simulate_quadrotor(config: QuadrotorConfig) -> Dataset:
     """Rows of q, v, commanded rotor speeds u and a; truth holds a and "Q_U", metadata the mean wind of each episode.
 
     Q_U is all that the model does not contain: what air does, a thrust that differs from the data sheet,
@@ -201,8 +200,7 @@ def simulate_quadrotor(config: QuadrotorConfig, progress: Callable[[int, int], N
     steps, parts = max(2, round(config.seconds * RATE)), []
     for episode in range(config.episodes):
         parts.append(_flight(robot, config, episode, steps))
-        if progress is not None:
-            progress(episode + 1, config.episodes)
+        tell(episode + 1, config.episodes)
     q, v, u, a, wind = (np.concatenate(part) for part in zip(*parts, strict=True))
     dynamics = model.dynamics(torch.from_numpy(q), torch.from_numpy(v), torch.from_numpy(u))
     Q_U = (dynamics.M @ torch.from_numpy(a)[..., None])[..., 0] - dynamics.Q_K

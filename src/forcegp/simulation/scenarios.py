@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from types import MappingProxyType
@@ -240,11 +240,11 @@ SCENARIOS: Mapping[str, tuple[type, str]] = MappingProxyType(
         "quadrotor": (QuadrotorConfig, "moving_bases:simulate_quadrotor"),
     }
 )
-"""Name -> the frozen dataclass of all its numbers, and "module:name" of a function `(config, progress) -> Dataset`."""
+"""Name -> the frozen dataclass of all its numbers, and "module:name" of a function `(config) -> Dataset`."""
 
 
-def simulate(scenario: str, progress: Callable[[int, int], None] | None = None, **numbers: Any) -> forcegp.data.Dataset:
-    """Run a scenario by name with these fields of its config. `progress(steps, of all)` is called now and then.
+def simulate(scenario: str, **numbers: Any) -> forcegp.data.Dataset:
+    """Run a scenario by name with these fields of its config.
 
     Libraries are imported here, so that listing scenarios is quick. Raises InvalidInput for numbers out of range, and
     MissingExtra without a library of the scenario.
@@ -253,4 +253,4 @@ def simulate(scenario: str, progress: Callable[[int, int], None] | None = None, 
     config, function = SCENARIOS[scenario]
     numbers |= {"arm": scenario} if config is FreeArmConfig else {}
     module, _, name = function.partition(":")
-    return getattr(import_module(f"forcegp.simulation.{module}"), name)(config(**numbers), progress)
+    return getattr(import_module(f"forcegp.simulation.{module}"), name)(config(**numbers))

@@ -27,6 +27,7 @@ from forcegp.forces import (
 from forcegp.mechanics import Contact, Held, LoopClosure
 from forcegp.model import Model
 from forcegp.posterior.posterior import Posterior
+from forcegp.progress import part
 from forcegp.scores.accuracy import ACCELERATION, predict_rows
 from forcegp.scores.figures import style
 from forcegp.scores.page import unit_of
@@ -174,18 +175,15 @@ LARGEST_GRID = 12
 SAMPLES = 24  # functions drawn for an interval where the model has no calibrated ones
 
 
-def model_pictures(
-    posterior: Posterior, dataset: Dataset, progress: Callable[[int, int, str], None] | None = None
-) -> tuple[list[style.Picture], list[str]]:
+def model_pictures(posterior: Posterior, dataset: Dataset) -> tuple[list[style.Picture], list[str]]:
     """Every plot that the model and the recording allow, and why others are missing (uneven time steps, say)."""
     there = {"forces": curve_panels(posterior), "normal_force": posterior.model.contacts}
     wanted, pictures, missing = [name for name in PICTURES if there.get(name, True)], [], []
     for done, name in enumerate(wanted):
-        if progress is not None:
-            progress(done, len(wanted), name)
         draw, caption = PICTURES[name]
         try:
-            pictures.append(style.Picture(name, caption, draw(posterior, dataset)))
+            with part(done, len(wanted), name):
+                pictures.append(style.Picture(name, caption, draw(posterior, dataset)))
         except ForceGPError as error:
             missing.append(f"{name.replace('_', ' ')}: not drawn, because {error}")
     return pictures, missing
