@@ -10,7 +10,7 @@ from forcegp.codegen.c_writer import Program, head, write_entry, write_function
 from forcegp.codegen.graph import Graph, jacobian
 from forcegp.codegen.library import RowFunction, aligned, compile_library
 from forcegp.inference import LatentKernels, Terms
-from forcegp.inference.one_input import LatentCall, OneInputCall
+from forcegp.inference.prepared_kernels import KernelSum
 
 
 def normal(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -73,10 +73,10 @@ def problem(
     )
 
 
-def rows_of_call(part: LatentCall, lanes: int, folder: Path) -> RowFunction:
+def rows_of_call(part: KernelSum, lanes: int, folder: Path) -> RowFunction:
     """A latent as a compiled program from features to values, slopes and prior variances."""
-    graph = Graph(part.summed.features if isinstance(part, OneInputCall) else part.features)
-    values = part.call(graph, part.given(graph, graph.inputs) if isinstance(part, OneInputCall) else graph.inputs, True)
+    graph = Graph(part.features)
+    values = part.call(graph, graph.inputs, True)
     slopes = [node for row in jacobian(graph, values, graph.inputs) for node in row]
     outputs = {"f": values, "J": slopes, "k": part.variance(graph, graph.inputs)}
     program = Program(graph, {"z": len(graph.inputs)}, outputs)

@@ -160,7 +160,7 @@ def test_one_source_serves_all_functions_of_a_structure():
 def test_the_c_code_computes_the_same(expression, lanes, tmp_path):
     given = latents(expression, normal(30, seed=3))
     form = one_input_form(given, 0)
-    function = rows_of_call(OneInputCall(kernel_sums(given)[0], form), lanes, tmp_path)
+    function = rows_of_call(OneInputCall.in_pieces(kernel_sums(given)[0], form), lanes, tmp_path)
     s = torch.cat([torch.linspace(-1.2, 1.2, 170) * float(form.knots.abs().max()), form.knots[:16], torch.zeros(5)])
     outputs = [torch.empty(len(s), size, dtype=torch.float64) for size in function.outputs]
     assert function.rows(len(s), [s.double()[:, None]], outputs) == 0

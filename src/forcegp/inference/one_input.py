@@ -7,13 +7,14 @@ import hashlib
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
 from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
+from typing_extensions import override
 
 from forcegp.codegen.c_writer import c_text, filled
 from forcegp.codegen.graph import Graph
@@ -287,74 +288,58 @@ def _curve(points: PointMap, centers: Float[Tensor, " N"]) -> tuple[float, tuple
     return 0.0, None
 
 
-@dataclass(frozen=True, eq=False)
-class OneInputCall:
-    """One latent by the pieces of its mean; `summed` is the same latent as a sum, of which its prior variance is taken.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OneInputCall(KernelSum):
+    """One latent by the pieces of its mean; `pieces_of_roots` are those of the compressed covariance, whole vectors."""
 
-    `roots` are the functions of the compressed covariance, filled up to whole vectors.
-    """
-
-    summed: KernelSum
     functions: OneInputFunctions
-    roots: OneInputFunctions | None = None
+    pieces_of_roots: OneInputFunctions | None = None
+
+    @classmethod
+    def in_pieces(cls, whole: KernelSum, functions: OneInputFunctions) -> "OneInputCall":
+        """The same latent as a sum, of which its prior variance is taken."""
+        return cls(**{each.name: getattr(whole, each.name) for each in fields(KernelSum)}, functions=functions)
 
     @property
-    def name(self) -> str:
-        """Of the C function."""
-        return self.summed.name
+    @override
+    def width(self) -> int:
+        return 1
 
-    @property
-    def latents(self) -> tuple[int, ...]:
-        """Its number."""
-        return self.summed.latents
-
-    @property
-    def operands(self) -> list[int]:
-        """As many as `given` returns."""
-        return [0]
-
+    @override
     def given(self, graph: Graph, z: Sequence[int]) -> list[int]:
-        """The feature itself."""
         return list(z)
 
-    def variance(self, graph: Graph, z: Sequence[int]) -> list[int]:
-        """Its prior variance at the feature z."""
-        return self.summed.variance(graph, z)
-
+    @override
     def call(self, graph: Graph, z: Sequence[int], slopes: bool) -> list[int]:
-        """The node of E f at the feature z."""
         return graph.call(self.name + ("_slopes" if slopes else ""), z, 1, {(0, 0): 1} if slopes else None)
 
+    @override
     def table(self) -> np.ndarray:
-        """Of the mean."""
         return self.functions.table()
 
+    @override
     def root_table(self) -> np.ndarray:
-        """Of the roots."""
-        assert self.roots is not None, "asked for with a compressed covariance only"
-        return self.roots.table()
+        assert self.pieces_of_roots is not None, "asked for with a compressed covariance only"
+        return self.pieces_of_roots.table()
 
+    @override
     def c_source(self, lanes: int, slopes: bool) -> str:
-        """`NAME(table, live, z, f)`, or NAME_slopes with the derivative after the value."""
         name = self.name + ("_slopes" if slopes else "")
         pieces, called = _once(self.functions, "pieces", 1)
         call = f"(void)live; {called}(t, z[0], f, {'f + 1' if slopes else '0'});"
         return f"{pieces}static APART void {name}(const double *t, long live, const real *z, real *f) {{ {call} }}"
 
+    @override
     def roots_source(self, lanes: int, rank: int) -> str:
-        """`NAME_roots(t, F, z, P)`: P (rank) from the table F, for one state."""
-        assert self.roots is not None, "asked for with a compressed covariance only"
-        pieces, called = _once(self.roots, "roots", lanes)
+        assert self.pieces_of_roots is not None, "asked for with a compressed covariance only"
+        pieces, called = _once(self.pieces_of_roots, "roots", lanes)
         head = f"static void {self.name}_roots(const double *t, const double *F, const double *z, double *P)"
         return f"{pieces}{head} {{ (void)t; {called}(F, z[0], P, 0); }}"
 
 
-LatentCall = KernelSum | OneInputCall
-
-
-def latent_calls(latent: LatentPosterior, compressed: CompressedCovariance | None) -> tuple[LatentCall, ...]:
+def latent_calls(latent: LatentPosterior, compressed: CompressedCovariance | None) -> tuple[KernelSum, ...]:
     """The processes as C functions, in the form that suits each. Raises InvalidInput for an untraceable kernel."""
-    found: list[LatentCall] = []
+    found: list[KernelSum] = []
     sums = kernel_sums(latent)
     factors = [None] * len(sums) if compressed is None else compressed.factors
     for part, F in zip(sums, factors, strict=True):
@@ -365,20 +350,19 @@ def latent_calls(latent: LatentPosterior, compressed: CompressedCovariance | Non
         if functions is None:
             found.append(replace(part, roots=roots))
         else:
-            found.append(
-                OneInputCall(part, functions, None if roots is None else one_input_form(latent, index, roots[0]))
-            )
+            pieces = None if roots is None else one_input_form(latent, index, roots[0])
+            found.append(replace(OneInputCall.in_pieces(part, functions), pieces_of_roots=pieces))
     return tuple(found)
 
 
-def refreshed_calls(calls: Sequence[LatentCall], latent: LatentPosterior) -> tuple[LatentCall, ...]:
+def refreshed_calls(calls: Sequence[KernelSum], latent: LatentPosterior) -> tuple[KernelSum, ...]:
     """The same C functions with the tables of another posterior with the same kernels. Raises InvalidInput if none."""
-    found: list[LatentCall] = []
+    found: list[KernelSum] = []
     for part in calls:
         index = part.latents[0]
         if isinstance(part, OneInputCall) and (form := one_input_form(latent, index)) is not None:
             found.append(replace(part, functions=form))
-        elif isinstance(part, KernelSum) and part.level == (0.0,):  # else its program holds sums of the weights
+        elif not isinstance(part, OneInputCall) and part.level == (0.0,):  # else its program holds sums of the weights
             found.append(replace(part, centers=latent.features[index], weights=latent.weights[index].detach()[None]))
     if [part.c_source(1, True) for part in found] != [part.c_source(1, True) for part in calls]:
         raise InvalidInput(
@@ -389,18 +373,17 @@ def refreshed_calls(calls: Sequence[LatentCall], latent: LatentPosterior) -> tup
 
 
 def drawn_calls(
-    latent: LatentPosterior, calls: Sequence[LatentCall], samples: int, seed: int, widening: float
-) -> list[tuple[LatentCall, ...]] | None:
+    latent: LatentPosterior, calls: Sequence[KernelSum], samples: int, seed: int, widening: float
+) -> list[tuple[KernelSum, ...]] | None:
     """The functions that `draw_functions` draws, in the forms that `calls` have; None where one has no such form."""
     drawn = draw_functions(latent, samples, seed, widening)
-    forms = []
-    for part in calls:
-        index = part.latents[0]
-        form = drawn_form(drawn, latent, index)
-        if form is None:
-            return None
-        forms.append((part.summed if isinstance(part, OneInputCall) else part, form))
-    return [tuple(OneInputCall(summed, form.only(r)) for summed, form in forms) for r in range(samples)]
+    forms = [(part, drawn_form(drawn, latent, part.latents[0])) for part in calls]
+    if any(form is None for _, form in forms):
+        return None
+    return [
+        tuple(OneInputCall.in_pieces(part, form.only(r)) for part, form in forms if form is not None)
+        for r in range(samples)
+    ]
 
 
 def _once(functions: OneInputFunctions, purpose: str, lanes: int) -> tuple[str, str]:

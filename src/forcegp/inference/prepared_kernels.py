@@ -106,6 +106,11 @@ class KernelSum:
         """What a state gives: nodes of the pair."""
         return self._frontier(1)
 
+    @property
+    def width(self) -> int:
+        """How many numbers `given` returns."""
+        return len(self.operands)
+
     def given(self, graph: Graph, z: Sequence[int]) -> list[int]:
         """The operands at features z."""
         return Copier(graph, self.pair, dict(zip(self.pair.inputs, z, strict=False)))(self.operands)

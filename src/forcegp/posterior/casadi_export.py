@@ -19,7 +19,6 @@ from forcegp.atomic_files import write_text
 from forcegp.codegen.graph import ARITHMETIC, COMPARED, FUNCTIONS, Copier, Graph, interpreted
 from forcegp.codegen.tracing import trace
 from forcegp.errors import NumericalError, require_type, required_extra
-from forcegp.inference.one_input import OneInputCall
 from forcegp.inference.prepared_kernels import KernelSum
 from forcegp.integration import integrator_named
 from forcegp.posterior.c_export import identifier, rounding
@@ -165,10 +164,9 @@ def _latents(casadi: Any, code: Programs, x: Sequence[Any]) -> list[Any]:
     at = code.traced
     copied = Copier(graph, at.graph, dict(zip(at.graph.inputs, graph.inputs, strict=False)))
     for part in code.sums:
-        summed = part.summed if isinstance(part, OneInputCall) else part
-        given = summed.given(graph, copied(at.features[summed.latents[0]]))
+        given = KernelSum.given(part, graph, copied(at.features[part.latents[0]]))  # sums also of functions in pieces
         z = _function(casadi, "operands", graph, given, code.sizes)(*x)
-        found |= dict(zip(summed.latents, _sum(casadi, summed, casadi.vertsplit(z)), strict=True))
+        found |= dict(zip(part.latents, _sum(casadi, part, casadi.vertsplit(z)), strict=True))
     return [found[c] for c in sorted(found)]
 
 

@@ -20,9 +20,9 @@ from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput
 from forcegp.evidence.likelihood import Standardization
 from forcegp.forces import Actuation, RigidBodies, UnknownForces
-from forcegp.inference.one_input import LatentCall, drawn_calls, latent_calls, refreshed_calls
+from forcegp.inference.one_input import drawn_calls, latent_calls, refreshed_calls
 from forcegp.inference.posterior import LatentPosterior
-from forcegp.inference.prepared_kernels import PADDING, CompressedCovariance
+from forcegp.inference.prepared_kernels import PADDING, CompressedCovariance, KernelSum
 from forcegp.integration.integrators import SPEED_LIMIT, check_time_step, integrator_named
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.model import Model
@@ -134,7 +134,7 @@ class Programs:
     latent: LatentPosterior
     widening: float
     compressed: CompressedCovariance | None = None
-    given: tuple[Traced, tuple[LatentCall, ...]] | None = None
+    given: tuple[Traced, tuple[KernelSum, ...]] | None = None
     """What was traced of another posterior, and the processes of this one."""
 
     def __post_init__(self) -> None:
@@ -147,7 +147,7 @@ class Programs:
             )
 
     @cached_property
-    def sums(self) -> tuple[LatentCall, ...]:
+    def sums(self) -> tuple[KernelSum, ...]:
         """The processes as C functions."""
         return self.given[1] if self.given else latent_calls(self.latent, self.compressed)
 
@@ -297,7 +297,7 @@ class Programs:
         first, place = 0, self.sizes[1] * C + C
         for k, part in enumerate(self.sums):
             calls.append(f"{part.name}_roots(t[{k}], t[{len(self.sums) + k}], y + {place}, P + {first} * K);")
-            first, place = first + len(part.latents), place + len(part.operands)
+            first, place = first + len(part.latents), place + part.width
         words = {"JOINTS": self.sizes[1], "LATENTS": C, "RANK": self.rank, "WIDENED": (self.widening**2).hex()}
         return filled(c_text(__name__, "covariance.c"), words | {"ROOTS": "\n  ".join(calls)})
 
