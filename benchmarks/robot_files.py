@@ -82,9 +82,6 @@ def measured(path: Path, *, mjcf: bool) -> File:
                 except ForceGPError as second:
                     outcome, message = f"{type(second).__name__} after one round", str(second)
     seconds = time.perf_counter() - started
-    if robot is not None:  # rotors of a free body turn with it here, and not in MuJoCo: a warning says so
-        free = [group for group in robot.layout.groups if group.kind == "floating"]
-        robot = robot.with_armature({name: 0.0 for group in free for name in robot.joint_names[group.rows]})
     wrong = np.nan
     if robot is not None and kind in ("robot", "massless"):
         theirs = compared(robot)

@@ -30,7 +30,7 @@ from forcegp.robots.urdf_file import read_text
 from forcegp.summary import Summary, listed
 
 FORMAT_VERSION = 1
-STORED_PARTS = {"urdf": str, "gravity": list, "armature": list, "locked": dict, "contacts": list, "forces": list}
+STORED_PARTS = {"urdf": str, "gravity": list, "locked": dict, "contacts": list, "forces": list}
 CONSISTENCY_TOLERANCE = 1e-6
 """|A a - b| above this fraction of 1 + |b| means that redundant contacts contradict each other."""
 

@@ -19,7 +19,7 @@ from forcegp.robots.urdf_file import replace_inertial
 from forcegp.simulation import FreeArmConfig
 from forcegp.simulation.free_arms import ARMS, simulate_free_arm
 
-TEXT = simulate_free_arm(FreeArmConfig(arm="ur5-free", seconds=0.1)).model.robot.urdf_text
+TEXT = simulate_free_arm(FreeArmConfig(arm="ur5-free", seconds=0.1)).model.robot.with_armature([0.0] * 6).urdf_text
 ROBOT = Robot.from_urdf_text(TEXT)
 MASS, CENTER, INERTIA = 1.3, np.array([0.03, -0.02, 0.06]), np.diag([2e-3, 3e-3, 1e-3])
 ROTORS = 0.01 * np.array([joint.effort_limit for joint in ROBOT.joints])

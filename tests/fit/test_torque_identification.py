@@ -215,7 +215,7 @@ def test_rotor_inertias_are_whole_in_reports_and_in_files(tmp_path):
     for joint, (start, truth) in zip(model.robot.joint_names, ((0.02, 0.05), (0, 0.04), (0.01, 0.03)), strict=True):
         assert found.parameters[f"rotor.{joint}"].start == pytest.approx(start)
         assert found.parameters[f"rotor.{joint}"].value == pytest.approx(truth, rel=0.03)
-    with pytest.warns(RobotFileWarning, match=r"^found.urdf: URDF has no element for rotor inertias"):
+    with pytest.warns(RobotFileWarning, match="^found.urdf: only forcegp reads rotor inertias from URDF"):
         found.model.to_urdf(tmp_path / "found.urdf")
     written = Robot.from_urdf(tmp_path / "found.urdf")
     np.testing.assert_allclose(written.armature, [0.05, 0.04, 0.03], rtol=0.03)

@@ -17,9 +17,7 @@ from forcegp.cli.command import options_of
 from forcegp.cli.main import parse_arguments
 from forcegp.errors import ForceGPError
 
-FILES = words(
-    "moving.h5 drone.xml arm.armature.json train.h5 test.h5 bare.h5 arm.urdf pair.urdf log.csv log.npz log.mcap"
-)
+FILES = words("moving.h5 drone.xml train.h5 test.h5 bare.h5 arm.urdf pair.urdf log.csv log.npz log.mcap")
 NAMES = words("carried independent nowhere train.h5/x . .. hostile.pkl loop out.h5 out carried/model.json - -x ~")
 AIR = words(
     "gp:aerodynamic gp:aerodynamic:frame=body gp:aerodynamic:observe=0 gp:aerodynamic:observe=-1 gp: "

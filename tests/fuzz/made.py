@@ -82,7 +82,6 @@ def make(folder: Path) -> None:
     INPUTS.moving = simulate_quadrotor(QuadrotorConfig(seconds=0.1))
     INPUTS.moving.save(folder / "moving.h5")
     (folder / "drone.xml").write_text(QUADROTOR)
-    (folder / "arm.armature.json").write_text('{"pan": 0.1}')
     INPUTS.models = (INPUTS.moving.model.to_json(), looped().to_json())
     INPUTS.predictor = plain.predictor(compile=False)
 

@@ -58,7 +58,7 @@ def test_robots_that_walk_drive_or_fly_are_asked(name):
     assert (robot.base, robot.nq - robot.nv) == ("floating", 1)
     bolted = Robot.from_urdf_text(LOOSE[name], base="fixed")
     for each in (robot, bolted):
-        again = each.with_armature([0.1] * each.nv)  # and nobody asks again
+        again = each.with_text(each.urdf_text)  # and nobody asks again
         assert Model.from_json(Model(again).to_json()).robot.base == each.base
 
 

@@ -1,4 +1,4 @@
-"""What lies beside a URDF, and what is expanded to one."""
+"""What is written into a URDF, and what is expanded to one."""
 
 import math
 import sys
@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import CHAIN, MODELS, loaded
+from tests.robots.test_mimic import CHAIN_MIMICS, with_mimics
 from tests.robots.test_urdf_errors import SMALL
 
 from forcegp.errors import (
@@ -27,10 +28,10 @@ from forcegp.robots.inertia import physical_objection
 from forcegp.robots.urdf_file import MARGIN, nearest_inertia, replace_dynamics, replace_inertial
 
 
-def test_rotor_inertias_are_written_beside_the_file_and_read_back(tmp_path):
+def test_rotor_inertias_are_written_and_read_back(tmp_path):
     robot = Robot.from_urdf_text(CHAIN, armature={"spin": 0.1, "tilt": 1 / 3})
     path = tmp_path / "chain.urdf"
-    with pytest.warns(RobotFileWarning, match=r"no element for rotor inertias \(spin, tilt\)"):
+    with pytest.warns(RobotFileWarning, match=r"only forcegp reads rotor inertias from URDF, those of spin, tilt"):
         text = robot.to_urdf(path)
     again = Robot.from_urdf(path)
     assert again.armature.equal(robot.armature)
@@ -41,17 +42,16 @@ def test_rotor_inertias_are_written_beside_the_file_and_read_back(tmp_path):
     assert Robot.from_urdf(path).armature.tolist() == [0.0] * 4
 
 
-def test_without_rotors_nothing_is_beside_the_file_and_nothing_in_it(tmp_path):
+def test_rotors_of_joints_that_follow_count_by_the_square_of_their_ratio():
+    rotors = replace_dynamics(CHAIN, {"slide": {"armature": 5.0}}, source="a test")
+    robot = Robot.from_urdf_text(with_mimics(rotors, CHAIN_MIMICS))  # slide = 0.4 tilt + 0.1
+    assert robot.armature.tolist() == pytest.approx([5 * 0.4**2 if name == "tilt" else 0 for name in robot.joint_names])
+    changed = robot.with_armature({"tilt": 2.0})  # those that follow have none of their own then
+    assert changed.armature.tolist() == [2.0 if name == "tilt" else 0.0 for name in robot.joint_names]
+
+
+def test_without_rotors_nothing_is_in_the_file(tmp_path):
     assert Robot.from_urdf_text(CHAIN).to_urdf(tmp_path / "chain.urdf") == CHAIN
-    assert [file.name for file in tmp_path.iterdir()] == ["chain.urdf"]
-
-
-@pytest.mark.parametrize("text", ["", "[1]", '{"hinge": "heavy"}', '{"hinge": null}', "\ud800", "[" * 10**5])
-def test_another_file_beside_is_refused(tmp_path, text):
-    (tmp_path / "arm.urdf").write_text(SMALL)
-    (tmp_path / "arm.armature.json").write_bytes(text.encode("utf-8", "surrogatepass"))
-    with pytest.raises(RobotModelError, match=r"arm\.armature\.json: holds no rotor inertia per joint"):
-        Robot.from_urdf(tmp_path / "arm.urdf")
 
 
 MACRO = SMALL.replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ').replace(
@@ -101,7 +101,7 @@ TEXT = """<?xml version='1.0'?><!-- Größe --><robot name="r" xmlns:x="x"><link
 
 @pytest.mark.parametrize("before", ["", '<dynamics friction="1"/>', "<dynamics damping = '3' x=\"7\"/>"])
 def test_inertials_and_dynamics_are_replaced_or_added_and_the_rest_stays(before):
-    written = replace_dynamics(TEXT % before, "one", {"damping": 0.1, "friction": 0.25}, source="a test")
+    written = replace_dynamics(TEXT % before, {"one": {"damping": 0.1, "friction": 0.25}}, source="a test")
     element = ElementTree.fromstring(written).find("joint/dynamics")
     assert {**element.attrib, "x": "7"} == {"damping": "0.1", "friction": "0.25", "x": "7"}
     assert all(
@@ -111,7 +111,7 @@ def test_inertials_and_dynamics_are_replaced_or_added_and_the_rest_stays(before)
         written = replace_inertial(written, "b", 2.0, np.zeros(3), np.eye(3), source="a test")
     assert Robot.from_urdf_text(written).mass == 2.0
     with pytest.raises(UnknownName, match="a test: no joint 'two'"):
-        replace_dynamics(TEXT % "", "two", {"damping": 0.1}, source="a test")
+        replace_dynamics(TEXT % "", {"two": {"damping": 0.1}}, source="a test")
 
 
 URDF = """<robot name="one"><link name="base"/>

@@ -160,19 +160,6 @@ def by_joint(given: Any, joints: tuple[str, ...], robot: str) -> Any:
     return [given.get(name, 0.0) for name in joints]
 
 
-def armature_values(
-    given: Vector | Mapping[str, float | int] | None, joints: tuple[str, ...], robot: str
-) -> np.ndarray:
-    """Rotor inertia per joint (kg m^2 or kg), given in joint order or by joint name; 0 where it is not given."""
-    if given is None:
-        return np.zeros(len(joints))
-    values = finite_vector("armature", by_joint(given, joints, robot), len(joints))
-    if (values < 0.0).any():
-        joint = joints[int(np.argmin(values))]
-        raise InvalidInput(f"armature of joint {joint!r} is {values.min():g}; a rotor inertia cannot be negative.")
-    return values
-
-
 def locked_positions(locked: Mapping[str, float | int]) -> dict[str, float]:
     """Positions (rad or m) of locked joints as floats."""
     out = {}

@@ -117,14 +117,14 @@ def _objection(source: str, joint: Joint, at: Joint, found: bool) -> RobotModelE
 def with_followers(
     joints: Mapping[str, Joint], bodies: Sequence[Joint], drives: Mapping[str, tuple[str, float, float]]
 ) -> tuple[Joint, ...]:
-    """The joints with damping and dry friction of those that follow them: factors of multiplier^2 and |multiplier|."""
+    """The joints with rotors and friction of those that follow: by multiplier^2, dry friction by |multiplier|."""
     whole = dict(joints)
     for body in bodies:
         if body.name in drives:
             name, multiplier, _ = drives[body.name]
-            damping = whole[name].damping + multiplier**2 * body.damping
-            friction = whole[name].friction + abs(multiplier) * body.friction
-            whole[name] = replace(whole[name], damping=damping, friction=friction)
+            factors = {"armature": multiplier**2, "damping": multiplier**2, "friction": abs(multiplier)}
+            sums = {key: getattr(whole[name], key) + by * getattr(body, key) for key, by in factors.items()}
+            whole[name] = replace(whole[name], **sums)
     return tuple(whole.values())
 
 

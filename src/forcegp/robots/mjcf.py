@@ -8,7 +8,6 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -17,7 +16,6 @@ from forcegp.errors import RobotModelError, required_extra
 from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import inverse, transform
 from forcegp.robots.layout import BASE, OUTSIDE, followed, joint_motion
-from forcegp.robots.manifold import VELOCITIES
 from forcegp.robots.mjcf_model import CompiledModel, LoopDescription, Translation
 from forcegp.robots.sandbox import read_apart
 from forcegp.robots.structure import RobotStructure
@@ -107,14 +105,6 @@ SMALLEST = 2e-15
 KINDS = {"floating": "free", "prismatic": "slide", "revolute": "hinge", "continuous": "hinge"}
 
 
-class _Axis(NamedTuple):
-    """One <joint> of a body: where it is in the frame of the body."""
-
-    attributes: str
-    pose: np.ndarray
-    axis: tuple[float, float, float] | None  # none: it may turn about every one
-
-
 class MjcfWriter:
     """The text of one robot; `left_out` are frames that it lacks."""
 
@@ -126,7 +116,6 @@ class MjcfWriter:
         self.children: dict[str, list[Joint]] = {link: [] for link in description.links}
         for joint in description.joints:
             self.children[joint.parent].append(joint)
-        self.rotors = dict(zip(robot.joint_names, robot.armature.tolist(), strict=True))
         self.lines: list[str] = []
         self.left_out: list[str] = []
         self.sites: dict[str, list[str]] = {}
@@ -169,13 +158,11 @@ class MjcfWriter:
         inertial = self.robot.description.links[link]
         return inertial.mass if inertial else 0.0
 
-    def _body(self, link: str, pose: np.ndarray, joints: Sequence[_Axis], depth: int) -> None:
-        """One body, and what hangs on it."""
+    def _body(self, link: str, pose: np.ndarray, joints: Sequence[tuple[Joint, np.ndarray]], depth: int) -> None:
+        """One body with its joints, which have poses in its frame, and what hangs on it."""
         space = "  " * depth
         self.lines.append(f"{space}<body name={quoteattr(link)}{_placed(pose)}>")
-        for joint in joints:
-            place = "" if joint.axis is None else _axis(joint)
-            self.lines.append(f"{space}  <joint {joint.attributes}{place}/>")
+        self.lines += [f"{space}  {_jointed(joint, at)}" for joint, at in joints]
         inertial = self.robot.description.links[link]
         if inertial is not None and inertial.mass > 0.0:
             self.lines.append(f"{space}  {_inertial(inertial.mass, inertial.center_of_mass, inertial.inertia)}")
@@ -192,7 +179,7 @@ class MjcfWriter:
         if joint.name not in self.moving:
             self._body(joint.child, pose @ joint_motion(joint, self.held.get(joint.name, 0.0)), [], depth)
             return
-        joints = self._axes(joint)
+        joints = [(joint, np.eye(4))]
         while not any(self._mass(name) > 0.0 for name in self._rigid(joint.child)):
             below = self._next(joint.child)
             if len(below) != 1 or joint.type == "floating":
@@ -202,7 +189,7 @@ class MjcfWriter:
                 )
             self.left_out += self._rigid(joint.child)
             step, joint = below[0]
-            joints = [each._replace(pose=inverse(step) @ each.pose) for each in joints] + self._axes(joint)
+            joints = [*((each, inverse(step) @ at) for each, at in joints), (joint, np.eye(4))]
             pose = pose @ step
         free = joint.type == "floating"
         if free and (depth != 2 or not np.array_equal(pose, np.eye(4))):
@@ -232,22 +219,6 @@ class MjcfWriter:
             if joint.name in self.moving
         ]
 
-    def _axes(self, joint: Joint) -> list[_Axis]:
-        """A joint as MuJoCo's."""
-        free, name = joint.type == "floating", joint.name
-        rotor = f"{name}.{VELOCITIES[-1]}" if free else name
-        return [_Axis(self._attributes(joint, name, KINDS[joint.type], rotor), np.eye(4), None if free else joint.axis)]
-
-    def _attributes(self, joint: Joint, name: str, kind: str, rotor: str | None = None) -> str:
-        given = {"armature": self.rotors.get(rotor or name, 0.0), "damping": joint.damping}
-        given["frictionloss"] = joint.friction
-        parts = [f'{key}="{value!r}"' for key, value in given.items() if value]
-        if joint.lower < joint.upper and not math.isinf(joint.upper - joint.lower):
-            parts.append(f'range="{joint.lower!r} {joint.upper!r}"')
-        if 0.0 < joint.effort_limit < math.inf and kind in ("hinge", "slide"):
-            parts.append(f'actuatorfrcrange="{-joint.effort_limit!r} {joint.effort_limit!r}"')
-        return " ".join([f'name={quoteattr(name)} type="{kind}"', *parts])
-
     def _couplings(self) -> list[str]:
         return [
             f"    <joint joint1={quoteattr(joint.name)} joint2={quoteattr(joint.mimics.joint)} "
@@ -268,10 +239,19 @@ def _inertial(mass: float, center: np.ndarray, inertia: np.ndarray) -> str:
     return f'<inertial{pose} mass="{mass!r}" diaginertia="{numbers(moments)}"/>'
 
 
-def _axis(joint: _Axis) -> str:
-    position = joint.pose[:3, 3]
-    place = f' pos="{numbers(position)}"' if position.any() else ""
-    return f'{place} axis="{numbers(joint.pose[:3, :3] @ np.array(joint.axis))}"'
+def _jointed(joint: Joint, pose: np.ndarray) -> str:
+    """One <joint>, in the frame of its body."""
+    given = {"armature": joint.armature, "damping": joint.damping, "frictionloss": joint.friction}
+    parts = [f'{key}="{value!r}"' for key, value in given.items() if value]
+    if joint.lower < joint.upper and not math.isinf(joint.upper - joint.lower):
+        parts.append(f'range="{joint.lower!r} {joint.upper!r}"')
+    if joint.type != "floating":
+        if 0.0 < joint.effort_limit < math.inf:
+            parts.append(f'actuatorfrcrange="{-joint.effort_limit!r} {joint.effort_limit!r}"')
+        if pose[:3, 3].any():
+            parts.append(f'pos="{numbers(pose[:3, 3])}"')
+        parts.append(f'axis="{numbers(pose[:3, :3] @ np.array(joint.axis))}"')
+    return " ".join([f'<joint name={quoteattr(joint.name)} type="{KINDS[joint.type]}"', *parts]) + "/>"
 
 
 def _placed(pose: np.ndarray) -> str:

@@ -45,7 +45,6 @@ class Translation:
 
     urdf: str
     gravity: np.ndarray
-    armature: dict[str, float]
     locked: dict[str, float]
     loops: tuple[LoopDescription, ...] = ()
     motors: tuple[Motor, ...] = ()
@@ -62,7 +61,6 @@ class CompiledModel:
         self.name = name
         self.elements: list[str] = []
         self.links: set[str] = set()
-        self.armature: dict[str, float] = {}
         self.couplings: dict[int, tuple[int, float, float]] = {}
         self.locked: dict[int, float] = {}
         self.bodies = [self._named(model.body(k).name or f"body_{k}", self.links) for k in range(model.nbody)]
@@ -96,7 +94,7 @@ class CompiledModel:
         model, sprung = self.model, [k for k in range(self.model.njnt) if self.for_system and self._is_sprung(k)]
         rest = {k: float(model.qpos_spring[model.jnt_qposadr[k]]) for k in sprung}
         springs = {self.joints[k]: (float(model.jnt_stiffness[k]), rest[k]) for k in sprung}
-        return Translation(text, gravity, self._rotor_inertias(), locked, loops, motors, springs)
+        return Translation(text, gravity, locked, loops, motors, springs)
 
     @staticmethod
     def _named(name: str, taken: set[str]) -> str:
@@ -161,7 +159,7 @@ class CompiledModel:
         return f"<inertial>{''.join(inertial_parts(model.body_mass[body], pose[:3, 3], inertia))}</inertial>"
 
     def _parts(self, joint: int, kind: str) -> str:
-        """Axis, limits, damping, friction and coupling of one joint."""
+        """Axis, limits, damping, friction, rotor and coupling of one joint."""
         model, dof = self.model, self.model.jnt_dofadr[joint]
         parts = []
         if kind in ("revolute", "prismatic"):
@@ -170,8 +168,12 @@ class CompiledModel:
             limits = {"lower": lower, "upper": upper} if model.jnt_limited[joint] else {}
             limits |= {"effort": effort} if np.isfinite(effort := self._effort(joint)) else {}
             parts.append(_element("limit", limits))
-        losses = {"damping": model.dof_damping[dof], "friction": model.dof_frictionloss[dof]}
-        parts.append(_element("dynamics", {name: value for name, value in losses.items() if value}))
+        dynamics = {"damping": model.dof_damping[dof], "friction": model.dof_frictionloss[dof]}
+        if kind == "floating" and model.dof_armature[dof]:
+            self._lose("rotor inertia of a free body", self.joints[joint])
+        elif kind != "floating":
+            dynamics["armature"] = self._rotor(joint)
+        parts.append(_element("dynamics", dynamics if any(dynamics.values()) else {}))
         if joint in self.couplings:
             driver, multiplier, offset = self.couplings[joint]
             ratio = _element("mimic", {"multiplier": multiplier, "offset": offset})
@@ -305,32 +307,11 @@ class CompiledModel:
         self._fixed(self.bodies[body], frame, pose)
         return frame
 
-    def _rotor_inertias(self) -> dict[str, float]:
-        """Of the joints with a coordinate, by name, with those of the joints that follow them."""
+    def _rotor(self, joint: int) -> float:
+        """The inertia of the rotor of a joint that turns or slides, with those of its actuators, in kg m^2 or kg."""
         model = self.model
-        found = model.dof_armature.tolist()
-        for joint in range(model.njnt):
-            for k in self._actuators_of(joint):
-                if KINDS[model.jnt_type[joint]] in ("revolute", "prismatic"):
-                    found[model.jnt_dofadr[joint]] += float(model.actuator_armature[k] * model.actuator_gear[k][0] ** 2)
-        for joint in self.couplings:
-            ratio, at, passed = 1.0, joint, {joint}
-            while at in self.couplings:
-                at, factor, _ = self.couplings[at]
-                ratio *= factor
-                if at in passed:
-                    break
-                passed.add(at)
-            found[model.jnt_dofadr[at]] += ratio**2 * found[model.jnt_dofadr[joint]] if at != joint else 0.0
-        out = {}
-        for joint in range(model.njnt):
-            kind, dof = KINDS[model.jnt_type[joint]], model.jnt_dofadr[joint]
-            names = [f"{self.joints[joint]}.{each}" for each in VELOCITIES] if kind == "floating" else [""]
-            for step, name in enumerate(names):
-                out[name or self.joints[joint]] = found[dof + step]
-            if kind == "floating" and found[dof]:
-                self._lose("that rotor inertia of a free body moves along axes of the world", self.joints[joint])
-        return {name: value for name, value in out.items() if value}
+        geared = (model.actuator_armature[k] * model.actuator_gear[k][0] ** 2 for k in self._actuators_of(joint))
+        return float(model.dof_armature[model.jnt_dofadr[joint]] + sum(geared))
 
     def _lose(self, what: str, where: str) -> None:
         self.problems.note(f"left out: {what}", where)

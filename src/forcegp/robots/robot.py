@@ -19,7 +19,6 @@ from forcegp.robots.arguments import (
     Positions,
     Problems,
     Vector,
-    armature_values,
     broadcast_batch,
     checked_tensor,
     finite_vector,
@@ -36,15 +35,13 @@ from forcegp.robots.structure import RigidBodyDynamics, RobotStructure, bodies_w
 from forcegp.robots.urdf import parse_urdf
 from forcegp.robots.urdf_file import (
     InertiaChoice,
-    read_armature,
     read_robot_file,
     read_text,
-    replace_dynamics,
     replace_inertial,
-    warn_of_rotors,
+    with_armature,
     with_chosen_inertias,
+    with_joint_values,
     with_note,
-    write_robot_file,
     write_text,
 )
 
@@ -58,23 +55,20 @@ class Robot(RobotStructure, RigidBodyDynamics):
     ``q, v, a, tau`` are float64 tensors (..., nv), batches broadcast, in rad or m, per s, per s^2, and Nm or N, in the
     order of :attr:`joint_names`: depth first, branches in file order. On a base that moves q has `nq` entries,
     :attr:`position_names` (:mod:`forcegp.robots.manifold`). A joint that mimics another has no coordinate: limits are
-    those of the joints with one, whose damping and friction include those that follow.
+    those of the joints with one, whose rotors, damping and friction include those that follow.
 
     InvalidInput for wrong shapes, dtypes and devices; subclasses of UnknownName for unknown names.
     """
 
     @classmethod
     @usable_arguments("Robot.from_urdf")
-    def from_urdf(
-        cls, path: str | Path, *, armature: Vector | Mapping[str, float | int] | None = None, **options: Any
-    ) -> "Robot":
+    def from_urdf(cls, path: str | Path, **options: Any) -> "Robot":
         """Read a URDF file, or a .xacro file where the package xacro is installed. Meshes are not looked for.
 
-        ``options`` are those of :meth:`from_urdf_text`, and so are errors; ``armature`` is by default what
-        :meth:`to_urdf` wrote beside the file. MissingExtra for a .xacro file without the package.
+        ``options`` are those of :meth:`from_urdf_text`, and so are errors. MissingExtra for a .xacro file without the
+        package.
         """
-        text, armature = read_robot_file(path), read_armature(path) if armature is None else armature
-        return cls.from_urdf_text(text, source=str(path), armature=armature, **options)
+        return cls.from_urdf_text(read_robot_file(path), source=str(path), **options)
 
     @classmethod
     @usable_arguments("Robot.from_urdf_text")
@@ -92,9 +86,9 @@ class Robot(RobotStructure, RigidBodyDynamics):
         """Read URDF text; ``source`` is what error messages call it.
 
         ``gravity`` (3,) in m/s^2; ``armature`` (rotor inertia at the joint, kg m^2 or kg), one per joint or by joint
-        name; ``locked`` joints and their positions; ``inertias`` of "nearest" replaces impossible ones; ``base`` says
-        how the root is held, which files of robots that do not look bolted are asked. A RobotFileWarning names what was
-        ignored or repaired.
+        name, by default as in the text; ``locked`` joints and their positions; ``inertias`` of "nearest" replaces
+        impossible ones; ``base`` says how the root is held, which files of robots that do not look bolted are asked. A
+        RobotFileWarning names what was ignored or repaired.
 
         Raises a subclass of RobotModelError with all that is wrong, and the arguments that mend it (its ``remedy``).
         """
@@ -146,7 +140,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         found = translate(text, path, for_system, problems)
         problems.given["locked"] = found.locked | dict(locked or {})
         gravity = found.gravity if gravity is None else gravity
-        return cls._made(found.urdf, problems, gravity, armature, found.armature), found
+        return cls._made(found.urdf, problems, gravity, armature), found
 
     @classmethod
     def _made(
@@ -155,11 +149,10 @@ class Robot(RobotStructure, RigidBodyDynamics):
         problems: Problems,
         gravity: Vector,
         armature: Vector | Mapping[str, float | int] | None,
-        beside: Mapping[str, float] | None = None,
         *,
         quiet: bool = False,
     ) -> "Robot":
-        """The robot of URDF text; `problems` has the arguments and what is wrong already, `beside` what a file adds."""
+        """The robot of URDF text; `problems` has the arguments and what is wrong already."""
         base, inertias = problems.given["base"], problems.given["inertias"]
         check_choice(base)
         locked = locked_positions(problems.given["locked"] or {})
@@ -171,11 +164,12 @@ class Robot(RobotStructure, RigidBodyDynamics):
             problems.raise_all()
         with problems.collected():
             layout = lay_out(description, locked, base, problems)
+            if armature is not None:
+                text = with_armature(text, layout, armature, description.name, source=problems.source)
+                description = parse_urdf(text, Problems(problems.source, problems.given))
+                layout = lay_out(description, locked, base, Problems(problems.source, problems.given))
             text, description = with_chosen_inertias(inertias, text, description, layout, problems)
-            names = tuple(joint.name for joint in layout.joints)
-            if armature is None:  # a file may have those of joints that are locked here
-                armature = {name: value for name, value in (beside or {}).items() if name in names}
-            tree = compile_tree(description, layout, down, armature_values(armature, names, description.name))
+            tree = compile_tree(description, layout, down)
             frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
             robot = cls(description, layout, tree, text, tuple(locked.items()), frames, layout.base)
             without = bodies_without_inertia(description, layout, tree, problems.broken)
@@ -191,20 +185,18 @@ class Robot(RobotStructure, RigidBodyDynamics):
     @classmethod
     def from_stored(cls, stored: Mapping[str, Any]) -> "Robot":
         """The robot that :meth:`to_stored` gave."""
-        return cls._again(
-            stored["urdf"], "stored URDF", *(stored[x] for x in ("gravity", "armature", "locked", "base"))
-        )
+        return cls._again(stored["urdf"], "stored URDF", stored)
 
     @classmethod
-    def _again(cls, text: str, source: str, gravity: Any, armature: Any, locked: Any, base: BaseChoice) -> "Robot":
+    def _again(cls, text: str, source: str, stored: Mapping[str, Any], armature: Any = None) -> "Robot":
         """Of a text that was warned of before."""
-        given = {"locked": locked, "inertias": "strict", "base": base}
-        return cls._made(text.lstrip(), Problems(source, given), gravity, armature, quiet=True)
+        given = {"locked": stored["locked"], "inertias": "strict", "base": stored["base"]}
+        return cls._made(text.lstrip(), Problems(source, given), stored["gravity"], armature, quiet=True)
 
     def to_stored(self) -> dict[str, Any]:
         """The robot as plain JSON values."""
-        numbers = {"gravity": self.gravity.tolist(), "armature": self.armature.tolist(), "locked": self.locked}
-        return {"urdf": self.urdf_text, **numbers, "base": self.base}
+        how = {"gravity": self.gravity.tolist(), "locked": self.locked, "base": self.base}
+        return {"urdf": self.urdf_text, **how}
 
     def _limp(self) -> set[int]:
         """Coordinates that nothing resists at a position without symmetry."""
@@ -243,34 +235,31 @@ class Robot(RobotStructure, RigidBodyDynamics):
         return CompiledRobot(self, folder)
 
     def with_text(self, text: str, armature: Vector | Mapping[str, float | int] | None = None) -> "Robot":
-        """A robot of another URDF text: same gravity, locked joints and device, and armature where none is given."""
-        armature = self.armature if armature is None else armature
-        robot = Robot._again(text, self.source, self.gravity, armature, self.locked, self.base)
+        """A robot of another URDF text, with its rotor inertias if none are given: same gravity, base and device."""
+        robot = Robot._again(text, self.source, self.to_stored(), armature)
         return robot if self.device.type == "cpu" else robot.to(self.device)
 
     def with_joint_dynamics(self, damping: Tensor | None, friction: Tensor | None) -> "Robot":
         """A robot whose URDF has this damping and friction (nv,) of every joint; None: as they are."""
-        text, layout = self.urdf_text, self.layout
-        free = {body for group in layout.groups for body in range(group.bodies.start, group.bodies.stop)}
-        for body, (joint, drive) in enumerate(zip(layout.bodies, layout.drives, strict=True)):
-            if body not in free:
-                own = float(joint.name == self.joint_names[drive.joint])
-                values = {"damping": damping, "friction": friction}
-                given = {name: own * float(value[drive.joint]) for name, value in values.items() if value is not None}
-                text = replace_dynamics(text, joint.name, given, source=self.source) if given else text
-        return self.with_text(text)
+        values = {"damping": damping, "friction": friction}
+        given = {name: value.tolist() for name, value in values.items() if value is not None}
+        return self.with_text(with_joint_values(self.urdf_text, self.layout, given, source=self.source))
 
     def with_note(self, note: str) -> "Robot":
         """The same robot, whose URDF text ends with this comment."""
         return self.with_text(with_note(self.urdf_text, note))
 
     def to_urdf(self, path: str | Path | None = None) -> str:
-        """The URDF text, written to ``path`` if given, and rotor inertias beside it, with a RobotFileWarning."""
-        armature = dict(zip(self.joint_names, self.armature.tolist(), strict=True))
-        source = self.source if path is None else Path(path).name
-        warn_of_rotors(armature, source=source, stacklevel=3)
+        """The URDF text, written to ``path`` if given, with a RobotFileWarning about rotor inertias.
+
+        They are attributes ``armature`` of ``<dynamics>``, which other programs leave out.
+        """
+        if rotors := [joint.name for joint in self.joints if joint.armature]:
+            source, owners = self.source if path is None else Path(path).name, ", ".join(rotors)
+            seen = f"{source}: only forcegp reads rotor inertias from URDF, those of {owners}; give them to others."
+            warnings.warn(seen, RobotFileWarning, stacklevel=2)
         if path is not None:
-            write_robot_file(Path(path), self.urdf_text, armature)
+            write_text(self.urdf_text, Path(path))
         return self.urdf_text
 
     @usable_arguments("Robot.to_mjcf")

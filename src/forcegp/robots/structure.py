@@ -72,7 +72,7 @@ class Tree:
         )
 
 
-def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndarray, armature: np.ndarray) -> Tree:
+def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndarray) -> Tree:
     """Batched constants for :mod:`forcegp.robots.kinematics`, on the CPU."""
     n = len(layout.bodies)
     revolute = np.array([joint.type != "prismatic" for joint in layout.bodies])
@@ -114,6 +114,7 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
     for body, drive in enumerate(layout.drives):
         coupling[body, drive.joint] = drive.multiplier
 
+    armature = np.array([joint.armature for joint in layout.joints])
     constants: dict[str, Any] = {
         "rest": rest[..., None],
         "sine": sine[..., None],

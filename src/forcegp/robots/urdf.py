@@ -109,14 +109,15 @@ class Joint:
     effort_limit: float
     damping: float  # Nms/rad or Ns/m
     friction: float  # Nm or N
+    armature: float  # kg m^2 or kg, inertia of the rotor seen at the joint; an attribute that URDF itself lacks
     origin: np.ndarray = field(compare=False)  # (4, 4), places it in its parent link
     mimics: Mimic | None
 
 
 def free_joint(name: str, parent: str, child: str) -> Joint:
-    """A floating joint without limits and friction, at the origin of its parent."""
+    """A floating joint without limits, friction and rotor, at the origin of its parent."""
     limits = (-math.inf, math.inf, math.inf, math.inf)
-    return Joint(name, "floating", parent, child, (0.0, 0.0, 1.0), *limits, 0.0, 0.0, np.eye(4), None)
+    return Joint(name, "floating", parent, child, (0.0, 0.0, 1.0), *limits, 0.0, 0.0, 0.0, np.eye(4), None)
 
 
 @dataclass(frozen=True)
@@ -322,5 +323,6 @@ def _joint(at: _Part, name: str, links: dict[str, InertialDescription | None]) -
         effort_limit=limit.number("effort", math.inf, "no limit"),
         damping=dynamics.number("damping", 0.0, "none"),
         friction=dynamics.number("friction", 0.0, "none"),
+        armature=dynamics.number("armature", 0.0, "none") if kind in MOVABLE else 0.0,
         mimics=mimics,
     )

@@ -1,8 +1,6 @@
 """URDF files in the encoding that they declare; inertials, friction and impossible inertias replaced in the text."""
 
-import json
-import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -11,16 +9,9 @@ import numpy as np
 from defusedxml import minidom
 from jaxtyping import Float
 
-from forcegp.atomic_files import write_bytes, write_json
-from forcegp.errors import (
-    InvalidInput,
-    NonPhysicalInertia,
-    RobotFileWarning,
-    RobotModelError,
-    UnknownName,
-    required_extra,
-)
-from forcegp.robots.arguments import Problems
+from forcegp.atomic_files import write_bytes
+from forcegp.errors import InvalidInput, NonPhysicalInertia, RobotModelError, UnknownName, required_extra
+from forcegp.robots.arguments import Problems, Vector, by_joint, finite_vector
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import Layout
 from forcegp.robots.sandbox import read_apart
@@ -84,7 +75,8 @@ def replace_inertial(
     text: str, link: str, mass: float, center_of_mass: np.ndarray, inertia: np.ndarray, *, source: str
 ) -> str:
     """URDF text with the ``<inertial>`` (kg, m, kg m^2, link axes) of ``link`` replaced or added, read back exactly."""
-    document, owner = _found(text, "link", link, UnknownName(f"{source}: no link {link!r} in the URDF text."))
+    document = _document(text)
+    owner = _found(document, "link", link, source)
     parts = "".join(inertial_parts(mass, center_of_mass, inertia))
     new = minidom.parseString(f"<inertial>{parts}</inertial>").documentElement
     old = _child(owner, "inertial")
@@ -92,29 +84,63 @@ def replace_inertial(
     return _written(document)
 
 
-def replace_dynamics(text: str, joint: str, values: Mapping[str, float], *, source: str) -> str:
-    """URDF text with attributes ('damping', 'friction') of the ``<dynamics>`` of ``joint`` replaced or added."""
-    document, owner = _found(text, "joint", joint, UnknownName(f"{source}: no joint {joint!r} in the URDF text."))
-    dynamics = _child(owner, "dynamics") or owner.appendChild(document.createElement("dynamics"))
-    for name, value in values.items():
-        dynamics.setAttribute(name, repr(value))
+def replace_dynamics(text: str, joints: Mapping[str, Mapping[str, float]], *, source: str) -> str:
+    """URDF text with these attributes ('damping', 'friction', 'armature') of the ``<dynamics>`` of joints."""
+    document = _document(text)
+    for joint, values in joints.items():
+        owner = _found(document, "joint", joint, source)
+        dynamics = _child(owner, "dynamics")
+        if dynamics is None and any(values.values()):
+            dynamics = owner.appendChild(document.createElement("dynamics"))
+            values = {"damping": 0.0, **values}  # other readers refuse an element without damping and friction
+        for name, value in values.items() if dynamics else ():
+            dynamics.setAttribute(name, repr(value))
     return _written(document)
+
+
+def with_joint_values(text: str, layout: Layout, values: Mapping[str, Sequence[float]], *, source: str) -> str:
+    """URDF text with these attributes (nv,) of all joints of one degree of freedom; those that follow one have 0."""
+    free = {body for group in layout.groups for body in range(group.bodies.start, group.bodies.stop)}
+    given = {}
+    for body, (joint, drive) in enumerate(zip(layout.bodies, layout.drives, strict=True)):
+        own = joint.name == layout.joints[drive.joint].name
+        if body not in free:
+            given[joint.name] = {name: float(each[drive.joint]) if own else 0.0 for name, each in values.items()}
+    return replace_dynamics(text, given, source=source)
+
+
+def with_armature(
+    text: str, layout: Layout, given: Vector | Mapping[str, float | int], robot: str, *, source: str
+) -> str:
+    """URDF text with these rotor inertias (kg m^2 or kg), in joint order or by joint name; 0 where none is given."""
+    joints = tuple(joint.name for joint in layout.joints)
+    values = finite_vector("armature", by_joint(given, joints, robot), len(joints))
+    if (values < 0.0).any():
+        joint = joints[int(np.argmin(values))]
+        raise InvalidInput(f"armature of joint {joint!r} is {values.min():g}; a rotor inertia cannot be negative.")
+    free = [k for group in layout.groups for k in range(group.rows.start, group.rows.stop)]
+    for name, value in ((joints[k], values[k]) for k in free if values[k]):
+        raise InvalidInput(f"armature of joint {name!r} is {value:g}; a base that moves has no rotors, give 0.")
+    return with_joint_values(text, layout, {"armature": values.tolist()}, source=source)
 
 
 def with_note(text: str, note: str) -> str:
     """URDF text with a comment before its last tag."""
-    document: Any = minidom.parseString(with_prefixes(text))
+    document = _document(text)
     document.documentElement.appendChild(document.createComment(f" {note.replace('--', '- -')} "))
     return _written(document)
 
 
-def _found(text: str, kind: str, name: str, unknown: UnknownName) -> tuple[Any, Any]:
-    """The document, and one of the elements directly in its root; raises ``unknown``."""
-    document: Any = minidom.parseString(with_prefixes(text))
+def _document(text: str) -> Any:
+    return minidom.parseString(with_prefixes(text))
+
+
+def _found(document: Any, kind: str, name: str, source: str) -> Any:
+    """One of the elements directly in the root. Raises UnknownName."""
     for element in document.documentElement.childNodes:
         if element.nodeName == kind and element.getAttribute("name") == name:
-            return document, element
-    raise unknown
+            return element
+    raise UnknownName(f"{source}: no {kind} {name!r} in the URDF text.")
 
 
 def _child(owner: Any, tag: str) -> Any:
@@ -233,39 +259,3 @@ def read_robot_file(path: str | Path) -> str:
             "expand it where its packages are: xacro robot.xacro > robot.urdf."
         )
     return answer["text"]
-
-
-def armature_path(path: str | Path) -> Path:
-    """`arm.armature.json` beside `arm.urdf`."""
-    return Path(path).with_suffix(".armature.json")
-
-
-def read_armature(path: str | Path) -> dict[str, float] | None:
-    """The rotor inertias that stand beside a URDF file; None where there are none, RobotModelError for others."""
-    beside = armature_path(path)
-    if not beside.is_file():
-        return None
-    try:
-        given = json.loads(beside.read_text(encoding="utf-8"))
-        return {str(joint): float(value) for joint, value in given.items()}
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
-        raise RobotModelError(f"{beside}: holds no rotor inertia per joint; correct it, or remove it.") from None
-
-
-def warn_of_rotors(armature: Mapping[str, float], *, source: str, stacklevel: int) -> None:
-    """A RobotFileWarning that says which rotor inertias are not zero, and so not in the URDF text."""
-    present = [joint for joint, value in armature.items() if value]
-    if present:
-        warnings.warn(
-            f"{source}: URDF has no element for rotor inertias ({', '.join(present)}): they go into a file beside it "
-            "(.armature.json), which Robot.from_urdf reads back; give them to other programs by hand.",
-            RobotFileWarning,
-            stacklevel=stacklevel,
-        )
-
-
-def write_robot_file(path: Path, text: str, armature: Mapping[str, float]) -> None:
-    """Write URDF text, and rotor inertias beside it where there are some or an older file has others."""
-    if any(armature.values()) or armature_path(path).exists():
-        write_json(armature_path(path), dict(armature))
-    write_text(text, path)
