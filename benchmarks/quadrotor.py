@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from forcegp import AerodynamicForce, Dataset, fit
-from forcegp.data import Lag, estimate_thruster_lag
+from forcegp.data import estimate_thruster_lag, lagged
 from forcegp.posterior import Posterior, observing
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
@@ -28,7 +28,7 @@ HORIZON, STRIDE = 120, 60  # rows: of .5 s, and between starts
 
 
 def acting(dataset: Dataset, lag: float) -> Dataset:
-    late = Lag(lag)(dataset.u, dataset.time)
+    late = lagged(dataset.u, dataset.time, lag)
     keep = np.arange(240, len(dataset))
     return replace(dataset, u=late).rows(keep)
 

@@ -12,10 +12,10 @@ from tests.posterior.arm import arm_model
 
 from forcegp.data import (
     Dataset,
-    Lag,
     Preparation,
     differentiated,
     estimate_delay,
+    lagged,
     low_pass,
     motion_spectrum,
 )
@@ -138,8 +138,8 @@ def test_an_actuator_of_first_order_is_that_of_its_differential_equation():
         t_eval=time,
         max_step=0.002,
     )
-    np.testing.assert_allclose(Lag(0.07)(command, time), exact.y[0], atol=5e-4)
-    assert Lag(0.0)(command, time) is command
+    np.testing.assert_allclose(lagged(command, time, 0.07), exact.y[0], atol=5e-4)
+    assert lagged(command, time, 0.0) is command
 
 
 @pytest.mark.parametrize("lag", [0.01, 0.1])

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from forcegp import AerodynamicForce, fit
-from forcegp.data import Lag, estimate_thruster_lag, recorded_motions
+from forcegp.data import estimate_thruster_lag, lagged, recorded_motions
 from forcegp.errors import InvalidInput
 from forcegp.fit import calibrated
 from forcegp.forces import Actuation, RigidBodies
@@ -29,7 +29,7 @@ def test():
 
 def acting(dataset, lag=0.06):
     """With the rotor speeds that act, from half a second on."""
-    late = Lag(lag)(dataset.u, dataset.time)
+    late = lagged(dataset.u, dataset.time, lag)
     return replace(dataset, u=late).rows(np.arange(120, len(dataset)))
 
 

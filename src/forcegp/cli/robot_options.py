@@ -86,7 +86,7 @@ class RobotOptions(RobotFileOptions):
         if recorded is None or own.robot.joint_names != recorded.robot.joint_names:
             return own
         robot = own.robot
-        if self.robot is None or self.armature or not bool(robot.armature.any()):  # else those beside the file count
+        if self.robot is None or self.armature or not bool(robot.armature.any()):  # else those of the file count
             rotors = dict(zip(robot.joint_names, recorded.robot.armature.tolist(), strict=True))
             robot = robot.with_armature(rotors | changes.get("armature", {}))
         model = recorded.with_robot(robot)

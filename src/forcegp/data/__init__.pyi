@@ -4,9 +4,9 @@ from .contacts import (
 from .dataset import Dataset as Dataset, units_for as units_for
 from .delay import Delay as Delay, estimate_delay as estimate_delay
 from .filters import (
-    Filter as Filter, Lag as Lag, Later as Later, LowPass as LowPass, Mean as Mean, differentiate as differentiate,
-    differentiated as differentiated, episodes_in_order as episodes_in_order, low_pass as low_pass,
-    resample as resample, uniform_step as uniform_step,
+    LowPass as LowPass, differentiate as differentiate, differentiated as differentiated,
+    episodes_in_order as episodes_in_order, lagged as lagged, low_pass as low_pass, resample as resample,
+    uniform_step as uniform_step,
 )
 from .hdf5 import is_dataset as is_dataset
 from .preparation import Preparation as Preparation, preparation_report as preparation_report

@@ -1,15 +1,14 @@
-"""`Filter`: what a linear filter makes of signals, its gain, and for how long the noise behind it remembers itself."""
+"""What linear filters make of signals: a low-pass, delays and lags, derivatives, other rates."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
 from forcegp.data.configurations import actuators, continuous, rates, space_of, through
@@ -22,35 +21,12 @@ Signal = Literal["q", "v", "u", "a"]
 Values = Float[np.ndarray, "rows *columns"]
 
 TRANSIENT = 1e-3  # what is left of a filter's transient at the ends of a recording; sets the length of the padding
-PASSED = 3.0  # rows in a period of a cut-off, of which more repeat their neighbours (`Filter.memory`)
+PASSED = 3.0  # rows in a period of a cut-off, of which more repeat their neighbours (`LowPass.memory`)
 FREQUENCIES = 2**15 + 1
 
 
-class Filter(ABC):
-    """A linear filter of signals in time."""
-
-    @abstractmethod
-    def __call__(self, values: Values, time: Float[np.ndarray, " rows"]) -> Values:
-        """The values behind the filter, at the same times [s]."""
-
-    @abstractmethod
-    def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
-        """Of amplitudes at these frequencies [Hz], for rows at this rate [Hz]."""
-
-    def memory(self, rate: float) -> float:
-        """Time [s] in which the autocorrelation of white noise at this rate [Hz] falls to one half behind the filter.
-
-        Rows that are closer count as one. By the theorem of Wiener and Khinchin, from the gain.
-        """
-        correlation = np.fft.irfft(np.abs(self.gain(np.linspace(0.0, 0.5 * rate, FREQUENCIES), rate)) ** 2)
-        correlation /= correlation[0]
-        after = int(np.argmax(correlation < 0.5))
-        above, below = correlation[[after - 1, after]]
-        return float(after - (0.5 - below) / (above - below)) / rate
-
-
 @dataclass(frozen=True)
-class LowPass(Filter):
+class LowPass:
     """Butterworth low-pass at `cutoff` Hz, run forwards and backwards so that nothing is delayed.
 
     Both ends are continued by point reflection until the transient has died out, so that straight lines pass; two
@@ -81,11 +57,22 @@ class LowPass(Filter):
             )
         return sosfiltfilt(sections, values, axis=0, padlen=padding)
 
-    def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
-        """Real, and 0 at half the rate."""
+    def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Float[np.ndarray, " k"]:
+        """Of amplitudes at these frequencies [Hz], for rows at this rate [Hz]; 0 at half the rate."""
         with np.errstate(over="ignore"):  # infinite at half the sample rate, where nothing passes
             warped = np.tan(np.pi * frequency / rate) / np.tan(np.pi * self.cutoff / rate)
-            return 1.0 / (1.0 + np.abs(warped) ** (2 * self.order)) + 0j
+            return 1.0 / (1.0 + np.abs(warped) ** (2 * self.order))
+
+    def memory(self, rate: float) -> float:
+        """Time [s] in which the autocorrelation of white noise at this rate [Hz] falls to one half behind the filter.
+
+        Rows that are closer count as one. By the theorem of Wiener and Khinchin, from the gain.
+        """
+        correlation = np.fft.irfft(self.gain(np.linspace(0.0, 0.5 * rate, FREQUENCIES), rate) ** 2)
+        correlation /= correlation[0]
+        after = int(np.argmax(correlation < 0.5))
+        above, below = correlation[[after - 1, after]]
+        return float(after - (0.5 - below) / (above - below)) / rate
 
     @property
     def time_constant(self) -> float:
@@ -93,65 +80,18 @@ class LowPass(Filter):
         return 1.0 / (2.0 * np.pi * self.cutoff * np.sin(0.5 * np.pi / self.order))
 
 
-@dataclass(frozen=True)
-class Later(Filter):
-    """The values so many seconds later, by a cubic spline; those at the ends hold beyond them."""
-
-    seconds: float
-
-    def __call__(self, values: Values, time: Float[np.ndarray, " rows"]) -> Values:
-        """At `time + seconds`."""
-        if self.seconds == 0.0:
-            return values
-        return CubicSpline(time, values)(np.clip(time + self.seconds, time[0], time[-1]))
-
-    def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
-        """Of size 1."""
-        return np.exp(2j * np.pi * frequency * self.seconds)
-
-
-@dataclass(frozen=True)
-class Lag(Filter):
-    """What an actuator of first order with that time constant makes of values, at rest with the first of them.
+def lagged(values: Values, time: Float[np.ndarray, " rows"], seconds: float) -> Values:
+    """What an actuator of first order makes of values, at rest with the first of them: T x' + x = values, T in s.
 
     By Tustin's rule (trapezoids), for equal steps of time.
     """
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    if seconds <= 0.25 * step:
+        return values
+    from scipy.signal import lfilter
 
-    seconds: float
-
-    def __call__(self, values: Values, time: Float[np.ndarray, " rows"]) -> Values:
-        """T x' + x = values."""
-        step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-        if self.seconds <= 0.25 * step:
-            return values
-        from scipy.signal import lfilter
-
-        ratio = 2.0 * self.seconds / step
-        return np.asarray(lfilter([1.0, 1.0], [1.0 + ratio, 1.0 - ratio], values - values[0], axis=0)) + values[0]
-
-    def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
-        """Of the differential equation."""
-        return 1.0 / (1.0 + 2j * np.pi * frequency * self.seconds)
-
-
-@dataclass(frozen=True)
-class Mean(Filter):
-    """Means over windows of `rows` rows about each, an odd number; windows are shorter at the ends."""
-
-    rows: int
-
-    def __call__(self, values: Values, time: Float[np.ndarray, " rows"] | None = None) -> Values:
-        """Averaged."""
-        total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-        place = np.arange(len(values))
-        first = np.maximum(place - self.rows // 2, 0)
-        last = np.minimum(place + self.rows // 2 + 1, len(values))
-        return (total[last] - total[first]) / (last - first)[:, None]
-
-    def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Complex[np.ndarray, " k"]:
-        """Dirichlet's kernel."""
-        angles = 2.0 * np.pi * frequency / rate
-        return np.cos(np.outer(np.arange(self.rows) - self.rows // 2, angles)).mean(axis=0) + 0j
+    ratio = 2.0 * seconds / step
+    return np.asarray(lfilter([1.0, 1.0], [1.0 + ratio, 1.0 - ratio], values - values[0], axis=0)) + values[0]
 
 
 def low_pass(dataset: Dataset, cutoff: float, *, signals: Sequence[Signal] = ("q", "v", "u", "a")) -> Dataset:
@@ -185,8 +125,10 @@ def shifted(dataset: Dataset, delay: float, lag: float = 0.0, lagging: Sequence[
 
     def acting(rows: Dataset, label: str) -> dict[str, np.ndarray]:
         u = rows.u.copy()
-        u[:, columns] = Lag(lag)(u[:, columns], rows.time)
-        u[:, :count] = Later(delay)(u[:, :count], rows.time)
+        u[:, columns] = lagged(u[:, columns], rows.time, lag)
+        if delay:  # values at the ends hold beyond them
+            later = np.clip(rows.time + delay, rows.time[0], rows.time[-1])
+            u[:, :count] = CubicSpline(rows.time, u[:, :count])(later)
         return {"u": u}
 
     return replace(dataset, **by_episode(dataset, acting), truth={})

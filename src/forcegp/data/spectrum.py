@@ -12,7 +12,6 @@ from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import Dataset
 from forcegp.data.delay import estimate_delay, torque_columns
 from forcegp.data.filters import (
-    Filter,
     LowPass,
     Signal,
     differentiated,
@@ -66,14 +65,14 @@ class MotionSpectrum:
         noise = np.where(below, np.minimum(self.density, self.floor), self.density)
         return np.where(np.isfinite(self.floor), noise, np.nan)
 
-    def acceleration_noise(self, behind: Filter | None = None) -> Float[np.ndarray, " nv"]:
+    def acceleration_noise(self, behind: LowPass | None = None) -> Float[np.ndarray, " nv"]:
         """Standard deviation of the noise that central differences make of `source` [rad/s^2 or m/s^2]; NaN if unknown.
 
         `behind` is the filter before them. Central differences have the gain `sin(2 pi f h) / h` per derivative.
         """
         response = (np.sin(2.0 * np.pi * self.frequency * self.step) / self.step) ** (2 * _derivatives(self.source))
         if behind is not None:
-            response = response * np.abs(behind.gain(self.frequency, 1.0 / self.step)) ** 2
+            response = response * behind.gain(self.frequency, 1.0 / self.step) ** 2
         return np.sqrt((self.noise_density * response[:, None]).sum(axis=0) * (self.frequency[1] - self.frequency[0]))
 
 

@@ -14,7 +14,6 @@ from torch import Tensor
 
 import forcegp.mechanics
 from forcegp.data.dataset import Dataset
-from forcegp.data.filters import Mean
 from forcegp.data.views import in_blocks
 from forcegp.errors import ContactError, DatasetError, DataWarning
 
@@ -118,8 +117,8 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
     for k, (own, needed) in enumerate(zip(motion, asked, strict=True)):
         smooth = np.empty_like(own)
         for rows, width in zip(episodes, widths, strict=True):
-            smooth[rows] = Mean(width)(own[rows])
-            force[rows, k] = np.linalg.norm(Mean(width)(needed[rows]), axis=1)
+            smooth[rows] = _mean(own[rows], width)
+            force[rows, k] = np.linalg.norm(_mean(needed[rows], width), axis=1)
         speed[:, k] = np.linalg.norm(smooth, axis=1)
         noise[k] = max(_noise(smooth, episodes, [times * width for width in widths]) for times in (1, 2))
     slow = np.maximum(SLOW, DEVIATIONS * noise)
@@ -136,10 +135,18 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
         weight = float(robot.gravity.norm()) * robot.mass
     sure = _noise(whole, episodes, [1] * len(episodes)) < SURE * weight * min(widths) ** 0.5
     for rows, width in zip(episodes, widths, strict=True):
-        falls = np.linalg.norm(Mean(width)(whole[rows]), axis=1) < FALLS * weight
+        falls = np.linalg.norm(_mean(whole[rows], width), axis=1) < FALLS * weight
         stands = (flags[rows] == 1.0).any(axis=1)
         flags[rows[(falls & stands & sure) | (~falls & ~stands & (weight > 0.0))]] = np.nan
     return Stance(names=names, flags=flags, speed=speed, slow=slow, force=force, bearing=bearing)
+
+
+def _mean(values: Float[np.ndarray, "rows k"], width: int) -> Float[np.ndarray, "rows k"]:
+    """Over windows of `width` rows about each, an odd number; windows are shorter at the ends."""
+    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+    place = np.arange(len(values))
+    first, last = np.maximum(place - width // 2, 0), np.minimum(place + width // 2 + 1, len(values))
+    return (total[last] - total[first]) / (last - first)[:, None]
 
 
 def _motion_and_force(

@@ -16,7 +16,7 @@ import forcegp.forces
 import forcegp.mechanics
 from forcegp.data.dataset import Dataset
 from forcegp.data.delay import jackknife, least_squares, lowest
-from forcegp.data.filters import Lag, episodes_in_order, sums_before
+from forcegp.data.filters import episodes_in_order, lagged, sums_before
 from forcegp.data.views import in_blocks
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.robots.manifold import TURN
@@ -275,7 +275,7 @@ def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
         """Sums of log residuals of all rows, and without each block."""
         causes = []
         for each, part in zip(known, episodes, strict=True):
-            late = Lag(seconds)(part.u[:, [*columns]], part.time)
+            late = lagged(part.u[:, [*columns]], part.time, seconds)
             thrust = np.where(np.array([*columns.values()]) == 2, late * np.abs(late), late)
             causes.append(_fast(each.beside_wind(thrust), part.time))
         X = np.concatenate(causes)
@@ -292,7 +292,7 @@ def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
 
 def _fast(values: Float[np.ndarray, "rows k"], time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, "kept k"]:
     """Without what a low pass of first order leaves, where that has settled."""
-    return (values - Lag(FAST)(values, time))[time - time[0] > SETTLED]
+    return (values - lagged(values, time, FAST))[time - time[0] > SETTLED]
 
 
 def thruster_columns(model: forcegp.Model) -> dict[int, int]:
