@@ -32,7 +32,7 @@ from forcegp import KukaSurfaceConfig, Noise, export_c, fit, simulate_kuka_surfa
 from forcegp.data import Dataset, farthest_rows
 from forcegp.evidence import TrainingData
 from forcegp.forces import parse_forces
-from forcegp.integration import INTEGRATORS, integrate
+from forcegp.integration import integrate, integrator_named
 from forcegp.posterior import Posterior, casadi_function
 
 RECOMMENDED = "gp:joint-friction,gp:load-friction"
@@ -93,7 +93,7 @@ def motions(posterior: Posterior, apart: Dataset) -> dict[str, float]:
         drawn = seconds(lambda: predictor.rollouts(q0, v0, u, DT, functions=FUNCTIONS), 10)
     two = seconds(lambda: predictor.rollouts(q0, v0, u, DT, threads=2), 20)
     acceleration = posterior.accelerations(posterior.model.baumgarte)
-    euler = INTEGRATORS["symplectic-euler"](posterior.model)
+    euler = integrator_named("symplectic-euler", posterior.model)
 
     def loop(q: torch.Tensor, v: torch.Tensor, forces: torch.Tensor) -> None:
         for k in range(STEPS):

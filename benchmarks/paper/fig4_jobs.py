@@ -14,7 +14,7 @@ from benchmarks.paper.data import test_trajectory
 from benchmarks.paper.fits import MODEL
 from forcegp.data import Dataset
 from forcegp.data.views import recorded_motions
-from forcegp.integration import Feedback, SymplecticEuler, integrate
+from forcegp.integration import Feedback, integrate, integrator_named
 from forcegp.jobs import JobStore
 from forcegp.mechanics import Baumgarte
 from forcegp.model import Model
@@ -67,13 +67,13 @@ def truth(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str,
         J = dynamics.state.kinematics.frame_jacobian(contact.frame, contact.point)[..., :3, :]
         return dynamics.acceleration(-friction * (J.mT @ (J @ v[..., None]))[..., 0])
 
-    generator = torch.Generator().manual_seed(0)
+    euler, generator = integrator_named("symplectic-euler", model), torch.Generator().manual_seed(0)
     change = torch.randn(recorded.q[:, 0].shape, generator=generator, dtype=torch.float64)
     errors: dict[str, dict[str, list[float | None]]] = {}
     with torch.no_grad():
         for size in (0.0, *PERTURBATIONS):
             start = (recorded.q[:, 0] + size * change, recorded.v[:, 0])
-            motion = integrate(SymplecticEuler(), acceleration, *start, recorded.u.movedim(0, 1), recorded.dt)
+            motion = integrate(euler, acceleration, *start, recorded.u.movedim(0, 1), recorded.dt)
             error = (motion.q.movedim(0, 1) - recorded.q).abs().mean(-1).numpy()
             errors[f"{size:g}"] = {f"{x:g}": _finite(error[:, round(x / recorded.dt)]) for x in spec["seconds"]}
     c = contact.distance(model.robot.kinematics(recorded.q)).abs().numpy()

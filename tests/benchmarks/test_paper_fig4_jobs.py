@@ -10,7 +10,7 @@ from benchmarks.paper.fig4_jobs import BAUMGARTE, FREQUENCY, OFFSET, PERTURBATIO
 from tests.benchmarks.oracle import Tool
 from tests.benchmarks.stored_jobs import DATA
 
-from forcegp.integration import SymplecticEuler, integrate
+from forcegp.integration import integrate, integrator_named
 
 SECONDS, STARTS = 0.2, 3
 
@@ -84,7 +84,8 @@ def test_the_feedback_pulls_a_displaced_motion_back(motion):
 
     def error(feedback):
         forces = recorded.u.movedim(0, 1)
-        end = integrate(SymplecticEuler(), truth, start, recorded.v[:, 0], forces, recorded.dt, feedback=feedback)
+        euler = integrator_named("symplectic-euler", model)
+        end = integrate(euler, truth, start, recorded.v[:, 0], forces, recorded.dt, feedback=feedback)
         return (end.q[-1] - recorded.q[:, -1]).abs().mean(-1)
 
     assert (error(recorded.feedback()) < 0.2 * begin).all()

@@ -1,6 +1,7 @@
 """Integrators against closed forms and fine references, and starts on surfaces."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -9,16 +10,14 @@ from tests.robots.test_moving_bases import LIMBS
 
 from forcegp.errors import InvalidInput, NumericalError, NumericalWarning
 from forcegp.integration import (
+    INTEGRATORS,
     SPEED_LIMIT,
-    ImplicitMidpoint,
-    RungeKutta4,
-    SymplecticEuler,
     integrate,
     integrator_named,
     onto_contacts,
     violation,
 )
-from forcegp.integration.integrators import find_roots
+from forcegp.integration.integrators import VECTORS, find_roots
 from forcegp.mechanics import Contact, ImplicitSurface, Plane, Sphere
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -31,6 +30,10 @@ POINT = """<robot name="point"><link name="base"/>
 <limit lower="-9" upper="9" effort="9" velocity="9"/></joint></robot>"""
 
 
+def of_vectors(name):
+    return partial(INTEGRATORS[name], VECTORS)
+
+
 def observed_order(errors: list[float]) -> float:
     """Slope of log error over log dt, where each dt is half of the one before."""
     return math.log2(errors[0] / errors[-1]) / (len(errors) - 1)
@@ -38,8 +41,7 @@ def observed_order(errors: list[float]) -> float:
 
 @pytest.mark.parametrize(
     ("integrator", "order"),
-    [(SymplecticEuler(), 1), (RungeKutta4(), 4), (ImplicitMidpoint(), 2)],
-    ids=["symplectic-euler", "rk4", "implicit-midpoint"],
+    [("symplectic-euler", 1), ("rk4", 4), ("implicit-midpoint", 2)],
 )
 def test_order_on_a_damped_oscillator_with_its_closed_form(integrator, order):
     damping, q0, v0, end = 0.4, 0.7, -0.3, 2.0
@@ -51,7 +53,7 @@ def test_order_on_a_damped_oscillator_with_its_closed_form(integrator, order):
     for steps in (20, 40, 80):
         begin = [torch.tensor([[x]], dtype=torch.float64) for x in (q0, v0)]
         force = torch.zeros(steps, 1, 1, dtype=torch.float64)
-        motion = integrate(integrator, lambda q, v, u: -q - damping * v + u, *begin, force, end / steps)
+        motion = integrate(of_vectors(integrator), lambda q, v, u: -q - damping * v + u, *begin, force, end / steps)
         errors.append(abs(float(motion.q[-1]) - exact))
     assert observed_order(errors) == pytest.approx(order, abs=0.15)
 
@@ -158,11 +160,11 @@ def explosive(q, v, u):
     return torch.where(v > 0, 40.0 * v, -v) / (q < 1.0)
 
 
-@pytest.mark.parametrize("integrator", [SymplecticEuler(), RungeKutta4()], ids=["euler", "rk4"])
+@pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4"])
 def test_a_diverging_motion_is_nan_from_where_it_says_and_the_others_go_on(integrator):
     q0, v0, force = column(0.0, 0.0, 0.5), column(1.0, -1.0, -2.0), torch.zeros(100, 3, 1, dtype=torch.float64)
     with pytest.warns(NumericalWarning, match=r"1 of 3 motions .*step \d+"):
-        motion = integrate(integrator, explosive, q0, v0, force, 0.01)
+        motion = integrate(of_vectors(integrator), explosive, q0, v0, force, 0.01)
     row = int(motion.diverged_at[0])
     assert 0 < row < 100
     assert motion.diverged_at[1:].tolist() == [-1, -1]
@@ -171,7 +173,7 @@ def test_a_diverging_motion_is_nan_from_where_it_says_and_the_others_go_on(integ
         assert torch.isnan(rows[row:, 0]).all()
     assert torch.isnan(motion.a[row:, 0]).all()
     assert (motion.v[:row, 0].abs() <= SPEED_LIMIT).all()
-    alone = integrate(integrator, explosive, q0[1:], v0[1:], force[:, 1:], 0.01)
+    alone = integrate(of_vectors(integrator), explosive, q0[1:], v0[1:], force[:, 1:], 0.01)
     # vector instructions round a batch of three otherwise than one of two, at each of 100 steps
     torch.testing.assert_close(motion.q[:, 1:], alone.q, rtol=1e-11, atol=1e-11)
     torch.testing.assert_close(motion.a[:, 1:], alone.a, rtol=1e-11, atol=1e-11)
@@ -183,7 +185,7 @@ def test_a_motion_whose_implicit_step_has_no_solution_ends_with_that_reason():
     with pytest.warns(
         NumericalWarning, match=r"1 of 2 .* Newton's method found no solution of the implicit step\. They"
     ):
-        motion = integrate(ImplicitMidpoint(), lambda q, v, u: -10.0 * v.sign(), q0, v0, force, 0.04)
+        motion = integrate(of_vectors("implicit-midpoint"), lambda q, v, u: -10.0 * v.sign(), q0, v0, force, 0.04)
     assert motion.diverged_at.tolist() == [1, -1]
     torch.testing.assert_close(motion.v[:, 1, 0], 5.0 - 0.4 * torch.arange(4, dtype=torch.float64))
 
@@ -191,7 +193,7 @@ def test_a_motion_whose_implicit_step_has_no_solution_ends_with_that_reason():
 def test_a_start_in_other_units_is_refused():
     force = torch.zeros(4, 1, 1, dtype=torch.float64)
     with pytest.raises(InvalidInput, match=r"v0 has a joint velocity of 150; .* check its units"):
-        integrate(SymplecticEuler(), lambda q, v, u: -q, column(1.0), column(150.0), force, 0.1)
+        integrate(of_vectors("symplectic-euler"), lambda q, v, u: -q, column(1.0), column(150.0), force, 0.1)
 
 
 def moved(robot, name, dt, seconds, speed=1.0):

@@ -6,7 +6,7 @@ from tests.posterior import floating_arm
 from tests.posterior.arm import arm_model
 
 from forcegp.integration import midpoint_sensitivities
-from forcegp.integration.integrators import ImplicitMidpoint, rows_jacobian
+from forcegp.integration.integrators import implicit_midpoint, rows_jacobian
 from forcegp.integration.midpoint_sensitivities import Accelerations, Linear, window_motions
 from forcegp.model import Model
 
@@ -62,7 +62,7 @@ def test_motions_are_those_of_the_integrator(given, passes, monkeypatch):
     assert bool(found.found.all())
     q, v = q0, v0
     for k in range(STEPS):
-        step = ImplicitMidpoint(of.space).step(lambda q, v, k=k: of.mean(q, v, u[:, k]), q, v, H)
+        step = implicit_midpoint(of.space, lambda q, v, k=k: of.mean(q, v, u[:, k]), q, v, H)
         q, v = step.q, step.v
         torch.testing.assert_close(found.q[:, k + 1], q, rtol=0.0, atol=1e-9)
         torch.testing.assert_close(found.v[:, k + 1], v, rtol=0.0, atol=1e-7)

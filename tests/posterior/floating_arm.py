@@ -7,8 +7,7 @@ import torch
 
 from forcegp import Dataset, Model, Robot
 from forcegp.forces import Actuation, Coulomb, RigidBodies, Thrusters, Viscous
-from forcegp.integration import integrate
-from forcegp.integration.integrators import RungeKutta4
+from forcegp.integration import integrate, integrator_named
 from forcegp.robots.manifold import pose, quaternion_product
 
 URDF = """<robot name="satellite"><link name="hull"><inertial><origin xyz="0.02 0 0.01"/><mass value="8"/>
@@ -56,7 +55,7 @@ def recording(seed: int, seconds: float, given: Model, bump: float = 1.0) -> Dat
         return true.dynamics(q, v, u).acceleration(unknown(v))
 
     start = true.robot.neutral()[None], torch.tensor(generator.normal(0.0, 0.2, (1, 7)))
-    moved = integrate(RungeKutta4(true.robot.space), acceleration, *start, u[:, None], DT)
+    moved = integrate(integrator_named("rk4", true), acceleration, *start, u[:, None], DT)
     q, v = moved.q[:-1, 0].numpy(), moved.v[:-1, 0].numpy()
     a = moved.a[:, 0].numpy() + 0.05 * generator.standard_normal(v.shape)
     return Dataset(q=q, v=v, u=u.numpy(), a=a, time=time, model=given, noise_std=[0.05] * 7)

@@ -61,7 +61,7 @@ def moving_arm(seconds: float = 2.0, episodes: int = 2, seed: int = 0, stribeck:
 
         for name, values in (("q", q), ("v", v), ("u", u), ("a", acceleration(q, v))):
             found[name].append(values.numpy())
-        step = integrator.step(acceleration, q, v, STEP)
+        step = integrator(acceleration, q, v, STEP)
         q, v = step.q, step.v
     arrays = {name: np.stack(values, axis=1).reshape(-1, 3) for name, values in found.items()}
     given = given_system()

@@ -2,10 +2,10 @@
 
 import math
 import warnings
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -165,7 +165,7 @@ Acceleration = Callable[[Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """The state after one step, the acceleration at its beginning, and whether there is such a state (`failure`)."""
+    """The state after one step, the acceleration at its beginning, and whether there is such a state (`NO_ROOT`)."""
 
     q: Float[Tensor, "n nq"]
     v: Float[Tensor, "n nv"]
@@ -173,95 +173,70 @@ class Step:
     found: Bool[Tensor, " n"]
 
 
-class Integrator(ABC):
-    """A one-step method for v' = a(q, v), where q' = v or, on a manifold, v is the velocity in body axes."""
+Integrator = Callable[[Acceleration, Tensor, Tensor, float], Step]
+"""(acceleration, q, v, dt) -> the state `dt` seconds later, by a one-step method for v' = a(q, v) in some space.
 
-    space: ConfigurationSpace
-    """How positions change; on a manifold steps are those of Lie group methods."""
-    failure: ClassVar[str] = ""
-    """Why a step can have no end, for a warning."""
-
-    @abstractmethod
-    def step(self, acceleration: Acceleration, q: Float[Tensor, "n nq"], v: Float[Tensor, "n nv"], dt: float) -> Step:
-        """The state `dt` seconds later."""
-
-
+There q' = v or, on a manifold, v is the velocity in body axes, and steps are those of Lie group methods.
+"""
 VECTORS = ConfigurationSpace(0)
 """Positions that add up; their number does not matter."""
+NO_ROOT = "Newton's method found no solution of the implicit step"
+"""Why a step can have no end."""
 
 
-@dataclass(frozen=True, eq=False)
-class SymplecticEuler(Integrator):
+def symplectic_euler(space: ConfigurationSpace, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
     """v+ = v + dt a(q, v), q+ = q + dt v+: first order, one evaluation; what PyBullet and Rath et al. (2021) do."""
-
-    space: ConfigurationSpace = VECTORS
-
-    @override
-    def step(self, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
-        a = acceleration(q, v)
-        v = v + dt * a
-        return Step(self.space.integrate(q, dt * v), v, a, _all(q))
+    a = acceleration(q, v)
+    v = v + dt * a
+    return Step(space.integrate(q, dt * v), v, a, _all(q))
 
 
-@dataclass(frozen=True, eq=False)
-class RungeKutta4(Integrator):
+def rk4(space: ConfigurationSpace, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
     """The classical method of fourth order, four evaluations (Hairer, Norsett & Wanner 1993, table II.1.2).
 
     On a manifold in the chart of the exponential (Munthe-Kaas 1999).
     """
 
-    space: ConfigurationSpace = VECTORS
+    def rates(step: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
+        return space.chart_velocity(step, at), acceleration(space.integrate(q, step), at)
 
-    @override
-    def step(self, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
-        def rates(step: Tensor, at: Tensor) -> tuple[Tensor, Tensor]:
-            return self.space.chart_velocity(step, at), acceleration(self.space.integrate(q, step), at)
-
-        a1 = acceleration(q, v)
-        r2, a2 = rates(0.5 * dt * v, v + 0.5 * dt * a1)
-        r3, a3 = rates(0.5 * dt * r2, v + 0.5 * dt * a2)
-        r4, a4 = rates(dt * r3, v + dt * a3)
-        q_next = self.space.integrate(q, dt / 6.0 * (v + 2.0 * r2 + 2.0 * r3 + r4))
-        return Step(q_next, v + dt / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4), a1, _all(q))
+    a1 = acceleration(q, v)
+    r2, a2 = rates(0.5 * dt * v, v + 0.5 * dt * a1)
+    r3, a3 = rates(0.5 * dt * r2, v + 0.5 * dt * a2)
+    r4, a4 = rates(dt * r3, v + dt * a3)
+    q_next = space.integrate(q, dt / 6.0 * (v + 2.0 * r2 + 2.0 * r3 + r4))
+    return Step(q_next, v + dt / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4), a1, _all(q))
 
 
-@dataclass(frozen=True, eq=False)
-class ImplicitMidpoint(Integrator):
+def implicit_midpoint(space: ConfigurationSpace, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
     """v_m = v + dt/2 a(q + dt/2 v_m, v_m), v+ = 2 v_m - v, q+ = q + dt v_m: second order, for stiff friction.
 
     A-stable and symplectic (Hairer, Lubich & Wanner 2006, II.1.3), by Newton's method with derivatives by torch. On a
     manifold q+ = q exp(dt v_m).
     """
 
-    space: ConfigurationSpace = VECTORS
-    failure = "Newton's method found no solution of the implicit step"
+    def moved(at: Tensor, share: float) -> Tensor:
+        return space.integrate(q, share * dt * at)
 
-    @override
-    def step(self, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
-        half = 0.5 * dt
+    def residual(at: Tensor) -> Tensor:
+        return at - v - 0.5 * dt * acceleration(moved(at, 0.5), at)
 
-        def moved(at: Tensor, share: float) -> Tensor:
-            return self.space.integrate(q, share * dt * at)
-
-        def residual(at: Tensor) -> Tensor:
-            return at - v - half * acceleration(moved(at, 0.5), at)
-
-        middle, found = find_roots(residual, v)
-        return Step(moved(middle, 1.0), 2.0 * middle - v, acceleration(q, v), found)
+    middle, found = find_roots(residual, v)
+    return Step(moved(middle, 1.0), 2.0 * middle - v, acceleration(q, v), found)
 
 
-INTEGRATORS: dict[str, Callable[[ConfigurationSpace], Integrator]] = {
-    "symplectic-euler": SymplecticEuler,
-    "rk4": RungeKutta4,
-    "implicit-midpoint": ImplicitMidpoint,
+INTEGRATORS: dict[str, Callable[..., Step]] = {
+    "symplectic-euler": symplectic_euler,
+    "rk4": rk4,
+    "implicit-midpoint": implicit_midpoint,
 }
-"""Integrators by the name that rollouts and the command line use."""
+"""Methods, whose first argument is the space, by the name that rollouts and the command line use."""
 
 
 def integrator_named(name: str, model: Model) -> Integrator:
     """The integrator of that name for motions of `model`. Raises InvalidInput for any other name."""
     require_known("integrator", name, "forcegp", INTEGRATORS, cutoff=0.4)
-    return INTEGRATORS[name](model.robot.space)
+    return partial(INTEGRATORS[name], model.robot.space)
 
 
 def check_time_step(dt: Any) -> None:
@@ -324,7 +299,7 @@ def integrate(
     alive = torch.ones(n, dtype=torch.bool, device=q.device)
     for k in range(steps):
         forces = u[k] if feedback is None else u[k] + feedback(k, q, v)
-        step = integrator.step(_at_finite_states(acceleration, q, v, forces), q, v, dt)
+        step = integrator(_at_finite_states(acceleration, q, v, forces), q, v, dt)
         rows_a.append(torch.where(alive[:, None], step.a, math.nan))
         bounded = (step.v.abs() <= SPEED_LIMIT).all(-1) & torch.isfinite(step.q).all(-1)  # NaN compares as false
         good = alive & bounded & step.found
@@ -341,7 +316,7 @@ def integrate(
             for rows in (rows_q, rows_v, rows_a):
                 rows += [torch.full_like(rows[-1], math.nan)] * (steps - k - 1)
             break
-    warn_of_divergence(diverged_at, not_found, integrator.failure, dt, what)
+    warn_of_divergence(diverged_at, not_found, dt, what)
     return Trajectory(torch.stack(rows_q), torch.stack(rows_v), torch.stack(rows_a), diverged_at, not_found)
 
 
@@ -369,7 +344,7 @@ def _at_finite_states(
     return guarded
 
 
-def warn_of_divergence(diverged_at: Tensor, not_found: Tensor, failure: str, dt: float, what: str) -> None:
+def warn_of_divergence(diverged_at: Tensor, not_found: Tensor, dt: float, what: str) -> None:
     """A NumericalWarning of those that ended."""
     ended = diverged_at >= 0
     if not bool(ended.any()):
@@ -378,7 +353,7 @@ def warn_of_divergence(diverged_at: Tensor, not_found: Tensor, failure: str, dt:
     lost = int(not_found.sum())
     cause = f"a joint faster than {SPEED_LIMIT:g} rad/s or m/s, or a state that is not finite"
     if lost:
-        cause = failure + (f" ({lost} of them), or {cause}" if lost < int(ended.sum()) else "")
+        cause = NO_ROOT + (f" ({lost} of them), or {cause}" if lost < int(ended.sum()) else "")
     warnings.warn(
         f"{int(ended.sum())} of {len(diverged_at)} {what} diverged, the first at step {first} ({first * dt:.4g} s): "
         f"{cause}. They are NaN from there on; a smaller dt, a shorter motion or a model with more physics "

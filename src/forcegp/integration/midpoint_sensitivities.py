@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from forcegp.integration.integrators import VECTORS, ImplicitMidpoint
+from forcegp.integration.integrators import VECTORS, implicit_midpoint
 from forcegp.robots.manifold import ConfigurationSpace
 
 MOST_PASSES = 20
@@ -100,7 +100,7 @@ def _step_by_step(
     positions, velocities, ended = [], [], torch.ones(len(q), dtype=torch.bool, device=q.device)
     space = accelerations.space
     for force in u.unbind(1):
-        moved = ImplicitMidpoint(space).step(lambda q, v, u=force: accelerations.mean(q, v, u), q, v, h)
+        moved = implicit_midpoint(space, lambda q, v, u=force: accelerations.mean(q, v, u), q, v, h)
         ended &= moved.found
         middle = torch.where(ended[:, None], 0.5 * (v + moved.v), v)  # the others only stay finite
         step = h * middle

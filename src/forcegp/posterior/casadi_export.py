@@ -7,6 +7,7 @@ grow with derivatives. CasADi is an extra (LGPL), imported here only.
 import math
 import operator
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +21,7 @@ from forcegp.codegen.graph import ARITHMETIC, COMPARED, FUNCTIONS, Copier, Graph
 from forcegp.codegen.tracing import trace
 from forcegp.errors import NumericalError, require_type, required_extra
 from forcegp.inference.prepared_kernels import KernelSum
-from forcegp.integration import integrator_named
+from forcegp.integration import INTEGRATORS, integrator_named
 from forcegp.posterior.c_export import identifier, rounding
 from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.preparation import rows_for, sample_states
@@ -141,8 +142,8 @@ def _stepped(casadi: Any, code: Programs, acceleration: Any, x: Sequence[Any], d
             nq, nv, _ = code.sizes
             made = {"integrate": (nq, nv), "chart_velocity": (nv, nv)}
             own = {name: _of_space(casadi, getattr(space, name), sizes) for name, sizes in made.items()}
-            method = type(method)(SimpleNamespace(**own))
-        moved = method.step(lambda q, v: acceleration(q, v, u), q, v, dt)
+            method = partial(INTEGRATORS[integrator], SimpleNamespace(**own))
+        moved = method(lambda q, v: acceleration(q, v, u), q, v, dt)
         return [moved.q, moved.v]
     middle, half = casadi.MX.sym("middle", v.numel()), 0.5 * dt
     rest = middle - v - half * acceleration(q + half * middle, middle, u)

@@ -15,8 +15,8 @@ from forcegp.errors import CompilerError, InvalidInput, NumericalError, Numerica
 from forcegp.inference.memory import blas_threads
 from forcegp.inference.pathwise import draw_functions
 from forcegp.integration.integrators import (
+    NO_ROOT,
     Feedback,
-    ImplicitMidpoint,
     Integrator,
     Trajectory,
     check_start,
@@ -144,7 +144,7 @@ def fused(
         for kept, found in ((Q, again.q), (V, again.v), (A, again.a)):
             kept[rows] = found.movedim(0, 1)
         ended[rows], not_found[rows] = again.diverged_at, again.not_found
-    warn_of_divergence(ended, not_found, method.failure, dt, what)
+    warn_of_divergence(ended, not_found, dt, what)
     return Trajectory(Q.movedim(1, 0), V.movedim(1, 0), A.movedim(1, 0), ended, not_found)
 
 
@@ -377,10 +377,10 @@ def stepped(
     """[q, v] one step after the rows x = [q, v, u], as `Predictor.step` documents it."""
     method = _method(model, dt, integrator)
     q, v, u = x.split(model.sizes, dim=-1)
-    step = method.step(lambda q, v: mean(q, v, u), q, v, dt)
+    step = method(lambda q, v: mean(q, v, u), q, v, dt)
     if not bool(step.found.all()):
         row = int((~step.found).nonzero()[0])
-        raise NumericalError(f"{method.failure} from state {row}; give a dt below {dt:g} s, or check that state.")
+        raise NumericalError(f"{NO_ROOT} from state {row}; give a dt below {dt:g} s, or check that state.")
     return torch.cat([step.q, step.v], dim=-1)
 
 
@@ -409,7 +409,7 @@ def linearized_step(
         return joined(a, da_dq @ at_q[..., 1:] + da_dv @ at_v[..., 1:] + da_du @ unit[2 * nv :])
 
     start_q, start_v = joined(q, unit[:nv]), joined(v, unit[nv : 2 * nv])
-    if isinstance(method, ImplicitMidpoint):
+    if integrator == "implicit-midpoint":
         middle = 0.5 * (v + step(x.detach(), dt, integrator)[:, nv:])
         _, da_dq, da_dv, da_du = linearize(q + 0.5 * dt * middle, middle, u)
         J = unit[:nv, :nv] - 0.5 * dt * (da_dv + 0.5 * dt * da_dq)
@@ -417,7 +417,7 @@ def linearized_step(
         at_middle = joined(middle, torch.linalg.solve(J, right))
         end = start_q + dt * at_middle, 2.0 * at_middle - start_v
     else:
-        found = method.step(acceleration, start_q, start_v, dt)
+        found = method(acceleration, start_q, start_v, dt)
         end = found.q, found.v
     there, slopes = torch.cat([part.unflatten(1, (nv, -1)) for part in end], dim=1).split([1, len(unit)], dim=-1)
     c = there[..., 0] - (slopes @ x.detach()[..., None])[..., 0]
