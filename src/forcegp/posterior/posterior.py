@@ -16,8 +16,9 @@ from forcegp.data.dataset import require_rows
 from forcegp.errors import DataWarning, InvalidInput, NumericalError, require_type, usable_arguments
 from forcegp.evidence import Accelerations
 from forcegp.forces import Force
+from forcegp.inference.memory import blas_threads
 from forcegp.inference.prepared_kernels import CompressedCovariance
-from forcegp.integration.integrators import Feedback, check_time_step
+from forcegp.integration.integrators import Feedback, check_time_step, integrator_named
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact
 from forcegp.model import Model
 from forcegp.noise import Noise
@@ -45,9 +46,18 @@ from forcegp.posterior.prediction import (
 from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.preparation import prepared_predictor, rows_for
 from forcegp.posterior.programs import Physics, Programs
-from forcegp.posterior.rollout import AccelerationFunction, Rollout, accelerations, roll_out
+from forcegp.posterior.rollout import (
+    AccelerationFunction,
+    Rollout,
+    accelerations,
+    checked_start,
+    flat_feedback,
+    loops_for,
+    moved,
+)
 from forcegp.posterior.update import learn_and_forget, learn_more_rows
 from forcegp.robots import Robot
+from forcegp.robots.arguments import whole_number
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -218,7 +228,6 @@ class Posterior(Fitted):
         to u, asked at the beginning of step k, with the batch dimensions of the motions. `samples` functions drawn from
         the posterior with `seed` are integrated, too. `grad` keeps the graph in q0, v0, u and what `feedback` adds.
 
-
         A motion that diverges is NaN from then on, `diverged_at` holds the row, and a NumericalWarning is given. Raises
         InvalidInput for arguments that do not fit, and tensors that require a gradient without `grad`.
         """
@@ -228,9 +237,27 @@ class Posterior(Fitted):
         if self.model.held_inputs:
             check_time_step(dt)
             u = self.model.foreseen(state_tensor("u", u, self.model.sizes[2], self.model.robot.device), dt)
-        how: dict[str, Any] = {"feedback": feedback, "samples": samples, "seed": seed}
-        moved = roll_out(self, model, q0, v0, u, dt, integrator=integrator, grad=grad, **how)
-        return replace(moved, intervals=self.motion_intervals)
+        samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
+        method = integrator_named(integrator, model)
+        require_type("grad", grad, bool)
+        remedy = None if grad else "give grad=True"
+        q, v, forces, batch = checked_start(model.sizes, model.robot.device, q0, v0, u, remedy)
+        time = dt * torch.arange(len(forces) + 1, dtype=q.dtype, device=q.device)
+
+        def run(copies: int, what: str) -> Rollout:
+            shape, count = ((copies,) if copies else ()) + batch, max(1, copies)
+            given = q.repeat(count, 1), v.repeat(count, 1), forces.repeat(1, count, 1), dt
+            loops, added = None, None if feedback is None else flat_feedback(feedback, shape, forces.shape[-1])
+            if feedback is None and not grad:
+                loops = loops_for(self, model, integrator, len(forces), copies, seed)
+            work = accelerations(self, model, copies, seed)
+            found = moved(shape, loops, method, work, model, *given, feedback=added, what=what)
+            return Rollout(time, *found, integrator, model)
+
+        with torch.set_grad_enabled(grad), blas_threads(0):
+            mean = run(0, "rollouts")
+            drawn = run(samples, "sampled rollouts") if samples else None
+        return replace(mean, samples=drawn, intervals=self.motion_intervals)
 
     def accelerations(self, baumgarte: Baumgarte | None, samples: int = 0, seed: int = 0) -> AccelerationFunction:
         """(q, v, u) -> a of n rows, as `rollout` integrates it: the mean, or drawn functions, n / samples each."""

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
@@ -11,14 +11,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from forcegp.codegen.library import RowFunction
-from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning, require_type
-from forcegp.inference.memory import blas_threads
+from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
 from forcegp.inference.pathwise import draw_functions
 from forcegp.integration.integrators import (
     NO_ROOT,
     Feedback,
     Integrator,
-    Trajectory,
     check_start,
     check_time_step,
     integrate,
@@ -31,7 +29,7 @@ from forcegp.model import Model
 from forcegp.posterior.fitted import MotionIntervals
 from forcegp.posterior.prediction import state_tensor
 from forcegp.posterior.programs import steps_of
-from forcegp.robots.arguments import broadcast_batch, whole_number
+from forcegp.robots.arguments import broadcast_batch
 from forcegp.robots.manifold import ConfigurationSpace
 
 STEPS_TO_COMPILE = 2000
@@ -95,33 +93,19 @@ def moved(
     threads: int | None = None,
     what: str = "motions",
 ) -> Motions:
-    """`integrate` with these batch dimensions, by compiled loops where there are some; laws of the model remember."""
+    """`integrate` with these batch dimensions, by compiled loops where there are some; laws of the model remember.
+
+    Each loop takes as many motions as the others, one after the other. Those that a loop cannot carry to the end (they
+    diverge, Newton's method fails) are integrated again by torch, with those of the other loops from the same place.
+    """
+
+    def shaped(q: Tensor, v: Tensor, a: Tensor, ended: Tensor) -> Motions:
+        return Motions(*(x.reshape(*batch, *x.shape[1:]) for x in (q, v, a)), ended.reshape(tuple(batch)))
+
     if loops is None:
         u, feedback = remembering(model, u, dt, feedback)
         found = integrate(method, acceleration, q, v, u, dt, feedback=feedback, what=what)
-    else:
-        found = fused(loops, method, acceleration, model, q, v, u, dt, threads=threads, what=what)
-    q, v, a = (x.movedim(0, 1).reshape(*batch, len(x), x.shape[-1]) for x in (found.q, found.v, found.a))
-    return Motions(q, v, a, found.diverged_at.reshape(tuple(batch)))
-
-
-def fused(
-    loops: Sequence[RowFunction],
-    method: Integrator,
-    acceleration: AccelerationFunction,
-    model: Model,
-    q: Float[Tensor, "n nq"],
-    v: Float[Tensor, "n nv"],
-    u: Float[Tensor, "steps n nu"],
-    dt: float,
-    threads: int | None = None,
-    what: str = "motions",
-) -> Trajectory:
-    """`integrate`, by compiled loops; each takes as many motions as the others, one after the other.
-
-    Those that a loop cannot carry to the end (they diverge, Newton's method fails) are integrated again
-    by torch, with those of the other loops from the same place.
-    """
+        return shaped(*(x.movedim(0, 1) for x in (found.q, found.v, found.a)), found.diverged_at)
     check_start(v, dt)
     own, (steps, count, _) = len(q) // len(loops), u.shape
     kept = ((q, steps + 1), (v, steps + 1), (v, steps))
@@ -145,7 +129,7 @@ def fused(
             kept[rows] = found.movedim(0, 1)
         ended[rows], not_found[rows] = again.diverged_at, again.not_found
     warn_of_divergence(ended, not_found, dt, what)
-    return Trajectory(Q.movedim(1, 0), V.movedim(1, 0), A.movedim(1, 0), ended, not_found)
+    return shaped(Q, V, A, ended)
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,46 +219,6 @@ class Rollout:
         return torch.where(torch.isnan(high - low), torch.nan, ((low <= off) & (off <= high)).to(off))
 
 
-def roll_out(
-    posterior: Any,
-    model: Model,
-    q0: Any,
-    v0: Any,
-    u: Any,
-    dt: float,
-    *,
-    integrator: str,
-    feedback: Feedback | None,
-    samples: int,
-    seed: int,
-    grad: bool,
-) -> Rollout:
-    """What `Posterior.rollout` documents, under the stabilisation of `model`."""
-    samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
-    method = integrator_named(integrator, model)
-    require_type("grad", grad, bool)
-    remedy = None if grad else "give grad=True"
-    q, v, forces, batch = checked_start(model.sizes, model.robot.device, q0, v0, u, remedy)
-    steps = len(forces)
-
-    def run(copies: int, what: str) -> Rollout:
-        shape, count = ((copies,) if copies else ()) + batch, max(1, copies)
-        given = q.repeat(count, 1), v.repeat(count, 1), forces.repeat(1, count, 1), dt
-        loops = added = None
-        if feedback is None and not grad:
-            loops = _loops(posterior, model, integrator, steps, copies, seed)
-        if feedback is not None:
-            added = _flat_feedback(feedback, shape, forces.shape[-1])
-        work = accelerations(posterior, model, copies, seed)
-        found = moved(shape, loops, method, work, model, *given, feedback=added, what=what)
-        time = dt * torch.arange(steps + 1, dtype=q.dtype, device=q.device)
-        return Rollout(time, *found, integrator, model)
-
-    with torch.set_grad_enabled(grad), blas_threads(0):
-        mean = run(0, "rollouts")
-        return replace(mean, samples=run(samples, "sampled rollouts")) if samples else mean
-
-
 def remembering(
     model: Model, u: Float[Tensor, "T n nu"], dt: float, feedback: Feedback | None
 ) -> tuple[Float[Tensor, "T n nu"], Feedback | None]:
@@ -301,7 +245,7 @@ def remembering(
     return u, added
 
 
-def _loops(
+def loops_for(
     posterior: Any, model: Model, integrator: str, steps: int, samples: int, seed: int
 ) -> list[RowFunction] | None:
     """Compiled loops, where motions are long enough to be worth compiling them."""
@@ -311,13 +255,13 @@ def _loops(
     try:
         return posterior.programs(model).loops(integrator, samples, seed)
     except CompilerError as error:
-        warnings.warn(f"motions are computed by torch, some 50 times slower: {error}", NumericalWarning, stacklevel=5)
+        warnings.warn(f"motions are computed by torch, some 50 times slower: {error}", NumericalWarning, stacklevel=4)
     except InvalidInput:  # an operation that no program holds, another device
         pass
     return None
 
 
-def _flat_feedback(feedback: Feedback, batch: Sequence[int], size: int) -> Feedback:
+def flat_feedback(feedback: Feedback, batch: Sequence[int], size: int) -> Feedback:
     """Feedback that sees the caller's batch dimensions as one of (n, nv). Raises InvalidInput for other shapes."""
 
     def flat(k: int, q: Tensor, v: Tensor) -> Tensor:

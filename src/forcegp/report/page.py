@@ -80,16 +80,11 @@ def model_page(
     posterior: Posterior,
     dataset: Dataset,
     *,
-    title: str,
-    best: str,
     pictures: Sequence[Picture] = (),
-    findings: Sequence[tuple[str, str]] = (),
-    tables: Sequence[Table] = (),
-    next_steps: Sequence[tuple[str, str]] = (),
-    details: Mapping[str, Any] | None = None,
     shapes: str | Path | None = None,
+    **texts: Any,
 ) -> Page:
-    """A page with the robot in motion, these pictures, and those of the model (`scores.model_pictures`).
+    """A page of `texts`, with the robot in motion, these pictures, and those of the model (`scores.model_pictures`).
 
     What cannot be drawn is named on the page with the reason. `shapes` is a URDF with visual elements.
     """
@@ -99,8 +94,7 @@ def model_page(
         scene, notes = recording(recorded), scene_notes(recorded)
     except MissingExtra as error:
         scene, notes = "", [f"The robot is not shown: {error}."]
-    shown = [*notes, *missing], [*pictures, *drawn]
-    return Page(title, best, findings, scene, *shown, tables, next_steps, details or {})
+    return Page(**texts, scene=scene, scene_notes=[*notes, *missing], pictures=[*pictures, *drawn])
 
 
 def scene_notes(recorded: RecordedScene) -> list[str]:
