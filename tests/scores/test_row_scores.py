@@ -17,6 +17,7 @@ from forcegp.errors import InvalidInput
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction, Rotor, ToolForces
 from forcegp.model import Model
+from forcegp.progress import watched
 from forcegp.scores.accuracy import (
     LEVELS,
     force_errors,
@@ -87,7 +88,8 @@ def test_without_analytical_mean_the_processes_answer_for_the_known_forces_too(w
 def test_blocks_of_rows_join_seamlessly(posterior):
     data = arm_data(BLOCK + 3, seed=2)
     calls = []
-    whole = predict_rows(posterior, data, lambda done, total: calls.append((done, total)))
+    with watched(lambda done, total, _: calls.append((done, total))):
+        whole = predict_rows(posterior, data)
     assert calls == [(BLOCK, len(data)), (len(data), len(data))]
     rows = [0, BLOCK - 1, BLOCK, len(data) - 1]
     ends = predict_rows(posterior, data.rows(rows))
