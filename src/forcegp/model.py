@@ -303,7 +303,7 @@ class Model(Summary):
         for force in self.laws:
             Q_K = Q_K + force.force(state)
         A, b, normals = self.constraint(state)
-        return ConstrainedDynamics.from_constraint(state, self.mass_matrix(state), A, b, normals, Q_K, self.contacts)
+        return ConstrainedDynamics(state, self.mass_matrix(state), A, b, normals, Q_K, self.contacts)
 
     def mass_matrix_at(self, kinematics: Kinematics) -> Float[Tensor, "*batch nv nv"]:
         """M of positions alone, made by `loaded_robot.kinematics(q)`."""

@@ -8,7 +8,7 @@ constraints included: (A M^-1 A^T)^+ = (A~^+)^T A~^+, H = L^-T (I - A~^+ A~) L^-
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -244,29 +244,19 @@ class ConstrainedDynamics:
     A: Float[Tensor, "*batch m nv"]
     b: Float[Tensor, "*batch m"]
     normals: Float[Tensor, "*batch m 3"]
-    H: Float[Tensor, "*batch nv nv"]
     Q_K: Float[Tensor, "*batch nv"]
-    constrained_offset: Float[Tensor, "*batch nv"]  # M^-1 Q_b
-    inverse_lower: Float[Tensor, "*batch nv nv"]  # L^-1
-    pseudo_inverse: Float[Tensor, "*batch nv m"]  # A~^+
     contacts: tuple[Contact, ...] = ()
+    H: Float[Tensor, "*batch nv nv"] = field(init=False)
+    constrained_offset: Float[Tensor, "*batch nv"] = field(init=False)  # M^-1 Q_b
+    inverse_lower: Float[Tensor, "*batch nv nv"] = field(init=False)  # L^-1
+    pseudo_inverse: Float[Tensor, "*batch nv m"] = field(init=False)  # A~^+
 
-    @classmethod
-    def from_constraint(
-        cls,
-        state: State,
-        M: Float[Tensor, "*batch nv nv"],
-        A: Float[Tensor, "*batch m nv"],
-        b: Float[Tensor, "*batch m"],
-        normals: Float[Tensor, "*batch m 3"],
-        Q_K: Float[Tensor, "*batch nv"],
-        contacts: tuple[Contact, ...] = (),
-    ) -> "ConstrainedDynamics":
+    def __post_init__(self) -> None:
         """Gauss' principle for M and A a = b. NumericalError where M is not positive definite or A not finite."""
-        identity = torch.eye(M.shape[-1], dtype=M.dtype, device=M.device)
-        inverse_lower = factors(M)[1]
-        A_white = A @ inverse_lower.mT
-        if A.shape[-2]:
+        identity = torch.eye(self.M.shape[-1], dtype=self.M.dtype, device=self.M.device)
+        inverse_lower = factors(self.M)[1]
+        A_white = self.A @ inverse_lower.mT
+        if self.A.shape[-2]:
             try:
                 pseudo_inverse = torch.linalg.pinv(A_white, rtol=REDUNDANCY_TOLERANCE)
             except torch.linalg.LinAlgError:
@@ -277,9 +267,9 @@ class ConstrainedDynamics:
             pseudo_inverse = A_white.mT
         H = inverse_lower.mT @ (identity - pseudo_inverse @ A_white) @ inverse_lower
         H = 0.5 * (H + H.mT)
-        white_offset = pseudo_inverse @ b[..., None]
-        offset = (inverse_lower.mT @ white_offset)[..., 0]
-        return cls(state, M, A, b, normals, H, Q_K, offset, inverse_lower, pseudo_inverse, contacts)
+        offset = (inverse_lower.mT @ (pseudo_inverse @ self.b[..., None]))[..., 0]
+        made = {"H": H, "constrained_offset": offset, "inverse_lower": inverse_lower, "pseudo_inverse": pseudo_inverse}
+        vars(self).update(made)  # of a frozen value
 
     def acceleration_map(self) -> AffineMap:
         """a = offset + H Q_U with offset = M^-1 Q_b + H Q_K."""
