@@ -28,7 +28,9 @@ from .recordings import import_recordings as import_recordings
 from .simulation import KukaSurfaceConfig as KukaSurfaceConfig, simulate_kuka_surface as simulate_kuka_surface
 
 # learning from it
-from .evidence import Accelerations as Accelerations, Torques as Torques, Motions as Motions
+from .evidence import (
+    Accelerations as Accelerations, ContactForces as ContactForces, Motions as Motions, Torques as Torques,
+)
 from .fit import fit as fit
 from .posterior import (
     Posterior as Posterior, save_posterior as save_posterior, load_posterior as load_posterior,

@@ -96,6 +96,8 @@ class Model(Summary):
         added = tuple(
             each for several in forces for each in (several if isinstance(several, tuple | list) else (several,))
         )
+        how = {"matrix": self.actuation.matrix, "names": self.actuation.names}
+        added = tuple(replace(x, **how) if isinstance(x, Actuation) and x.matrix is None else x for x in added)
         laws = [force for force in added if isinstance(force, Law)]
         kept = tuple(force for force in self.forces if not any(law.takes_the_place_of(force) for law in laws))
         return replace(self, forces=(*kept, *added), noise=self.noise if noise is None else noise)
@@ -280,7 +282,9 @@ class Model(Summary):
     @cached_property
     def _u_is_delivered(self) -> bool:
         """Whether u is the force of every joint, and nothing else."""
-        return self.actuation.matrix is None and len(self.inputs) == len(self.actuation.names)
+        return (
+            self.actuation.is_exact and self.actuation.matrix is None and len(self.inputs) == len(self.actuation.names)
+        )
 
     def _delivered(self, state: State) -> Tensor:
         """Joint forces of all actuators."""

@@ -1,4 +1,4 @@
-"""`Noise`: of measured accelerations, and of forces."""
+"""`Noise`: of measured accelerations, of forces, and of force sensors."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -12,26 +12,33 @@ from forcegp.errors import InvalidInput, require_type, usable_arguments
 
 ACCELERATION = "noise.log_acceleration"
 FORCE = "noise.log_force"
+SENSOR, PUSHES = "noise.log_sensor", "noise.log_pushes"
+STATED = SENSOR, PUSHES
+"""What no search changes."""
 
 
 @dataclass(frozen=True)
 class Noise:
     """Standard deviations: `acceleration` in rad/s^2 or m/s^2, `force` in Nm or N (None: no force-level noise).
 
-    Each is one number or one per joint; None for `acceleration` takes what the dataset states. With `learn` they are
+    Each is one number or one per joint; `sensor` is one number, of force sensors in N. `pushes` are those of forces on
+    joints that something pushes which nobody measured, one per joint. None for `acceleration` takes what the dataset
+    states. With `learn` they are
     start values of the optimisation, else they stay fixed; the hyperprior of a learned one is log-normal around its
-    start value, with a factor of e as one standard deviation. The covariance of one row is
-    diag(acceleration^2) + H diag(force^2) H^T.
+    start value, with a factor of e as one standard deviation. `sensor` and `pushes` stay. The covariance of one row is
+    diag(acceleration^2) + H diag(force^2 + pushes^2) H^T.
     """
 
     acceleration: float | tuple[float, ...] | None = 0.1
     force: float | tuple[float, ...] | None = None
     learn: bool = False
+    sensor: float | None = None
+    pushes: tuple[float, ...] | None = None
 
     @usable_arguments("Noise")
     def __post_init__(self) -> None:
         require_type("learn", self.learn, bool)
-        for name in ("acceleration", "force"):
+        for name in ("acceleration", "force", "sensor", "pushes"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _positive(name, getattr(self, name)))
 
@@ -44,24 +51,35 @@ class Noise:
             raise InvalidInput(
                 "Noise(None) takes the noise of the acceleration from the dataset of a fit; give a number here."
             )
-        named = {ACCELERATION: self.acceleration} | ({} if self.force is None else {FORCE: self.force})
+        named = {ACCELERATION: self.acceleration, FORCE: self.force, PUSHES: self.pushes}
+        named = {name: value for name, value in named.items() if value is not None}
         out = {}
         for name, value in named.items():
             values = torch.as_tensor(value, dtype=torch.float64, device=device)
             if values.dim() and len(values) != nv:
                 raise InvalidInput(f"Noise has {len(values)} values for {nv} joints; give one number or one per joint.")
             out[name] = values.expand(nv).log()
+        if self.sensor is not None:
+            out[SENSOR] = torch.as_tensor(self.sensor, dtype=torch.float64, device=device).reshape(1).log()
         return out
 
     @staticmethod
     def covariance(
-        parameters: Mapping[str, Tensor], H: Float[Tensor, "*batch nv nv"]
-    ) -> Float[Tensor, "1 nv"] | Float[Tensor, "N nv nv"]:
-        """Variances (1, nv) of all rows, or their covariances (N, nv, nv) when there is force-level noise."""
+        parameters: Mapping[str, Tensor], H: Float[Tensor, "*batch D nv"]
+    ) -> Float[Tensor, "1 D"] | Float[Tensor, "N D D"]:
+        """Variances (1, D) of all rows, or their covariances (N, D, D) when there is force-level noise.
+
+        The D entries are nv accelerations and what force sensors measure beside them; H is what joint forces make of
+        them.
+        """
         acceleration = (2.0 * parameters[ACCELERATION]).exp()[None]
-        if FORCE not in parameters:
+        if (sensed := H.shape[-2] - acceleration.shape[-1]) > 0:
+            sensor = (2.0 * parameters[SENSOR]).exp()[None].expand(1, sensed)
+            acceleration = torch.cat([acceleration, sensor], dim=-1)
+        forces = [(2.0 * parameters[name]).exp() for name in (FORCE, PUSHES) if name in parameters]
+        if not forces:
             return acceleration
-        force = (2.0 * parameters[FORCE]).exp()
+        force = torch.stack(forces).sum(0)
         return torch.diag_embed(acceleration) + (H * force) @ H.mT
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
@@ -70,11 +88,12 @@ class Noise:
         Without it, maximum likelihood lets flexible kernels explain the noise of a joint away: measured on a 3-joint
         arm with 60 points, one of three standard deviations collapsed from 0.05 to 1e-4.
         """
-        if ACCELERATION not in parameters:
+        learned = [name for name in (ACCELERATION, FORCE) if name in parameters]
+        if not learned:
             return torch.zeros((), dtype=torch.float64)
-        level = parameters[ACCELERATION]
+        level = parameters[learned[0]]
         starts = self.parameters(len(level), level.device)
-        return -0.5 * torch.stack([(parameters[name] - start).square().sum() for name, start in starts.items()]).sum()
+        return -0.5 * torch.stack([(parameters[name] - starts[name]).square().sum() for name in learned]).sum()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values."""

@@ -33,8 +33,9 @@ def test_an_offset_that_can_carry_the_weight_on_a_contact():
     model = arm_model(1)
     log = log_of(model, 40)
     idle = replace(log, u=log.u * [1.0, 0.0, 1.0])
-    with pytest.raises(InvalidInput, match="nothing drives lift, so an offset there can carry the weight"):
-        fit(model.with_forces(Offset(), JointForces(("q",))), idle, Accelerations(), **QUICK)
+    found = fit(model.with_forces(Offset(), JointForces(("q",)), noise=0.1), idle, Accelerations(), **QUICK)
+    assert "offset.lift" not in found.parameters
+    assert "offset.pan" in found.parameters
 
 
 def test_a_number_that_no_row_shows(log):

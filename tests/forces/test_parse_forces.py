@@ -9,6 +9,7 @@ from tests.posterior.arm import arm_model
 from forcegp.errors import FileFormatError, InvalidInput, UnknownName
 from forcegp.forces import (
     FORCES,
+    Actuation,
     AerodynamicForce,
     BaseWrench,
     ContactFriction,
@@ -48,6 +49,7 @@ NAMES = {
     "gp:load-friction": ContactFriction(load=True),
     "gp:foot-friction:contacts=0": ContactFriction(load=True),
     "rigid-bodies": RigidBodies(),
+    "gain": Actuation(gain=None),
     "payload:hand": Payload("hand"),
     "viscous": Viscous(),
     "direction": DirectionalFriction(),

@@ -30,6 +30,7 @@ def at_once(posterior, data):
     whole = type(first).of(data, torch.device("cpu"))
     whole = dataclasses.replace(whole, reference=first)
     settings = {"widening": posterior.widening}
+    settings |= {name: posterior.settings[name] for name in ("hidden_force",) if name in posterior.settings}
     return posterior.conditioned(posterior.trained, whole, posterior.hyperparameters, posterior.result, settings)
 
 

@@ -18,6 +18,7 @@ import forcegp
 import forcegp.checks
 import forcegp.data
 import forcegp.evidence
+import forcegp.mechanics
 import forcegp.parallel
 import forcegp.posterior
 import forcegp.robots
@@ -85,7 +86,8 @@ class Fit(Command):
     """A second log, of the same robot without the payloads that are estimated."""
     contact: Annotated[tuple[str, ...], listed(goes_on=NUMBERS), unless_given(CONTACTS, "the dataset's")] = ()
     """Points that stay on surfaces, instead of the dataset's contacts; m, in the axes of the link FRAME. SURFACE is
-    plane:nx,ny,nz,offset or sphere:cx,cy,cz,radius. none is no contact at all."""
+    plane:nx,ny,nz,offset or sphere:cx,cy,cz,radius; FRAME@x,y,z:held is bolted down, as a foot on a force sensor. none
+    is no contact at all."""
     noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
     """Noise of the measured acceleration: a standard deviation in rad/s², learned, or as the dataset states it (learned
     where it does not)."""
@@ -172,8 +174,8 @@ class Fit(Command):
 
     def _rows(self, dataset: forcegp.Dataset, model: forcegp.Model) -> tuple[forcegp.Dataset, str | None]:
         """The rows in which all contacts act where the tool leaves a surface at times, and a note for after the fit."""
-        if not model.contacts:
-            return dataset, None
+        if all(isinstance(contact.surface, forcegp.mechanics.Held) for contact in model.contacts):
+            return dataset, None  # what is bolted down never leaves
         try:
             touching = forcegp.data.rows_in_contact(replace(dataset, model=model))
         except ContactError:

@@ -114,6 +114,9 @@ class ColumnOptions:
     """Forces or torques of the actuators, or what motors of the robot take; a constant such as 0 is for all."""
     a: Annotated[str | None, unless_given("COLUMNS", "by the names, else central differences of v", str)] = None
     """Accelerations, one per joint."""
+    force: Annotated[str | None, unless_given("FRAME=COLUMNS,...", "none", str)] = None
+    """Force sensors: at a frame of the robot the force on it, x, y, z in the world's axes; with `--axes force=body` in
+    those of the frame. For instance foot=fx,fy,fz."""
     joints: Annotated[str | None, unless_given("NAMES", "those of --robot", str)] = None
     """Names of the joints in the order of the columns."""
     orientation: Annotated[Literal["xyzw", "wxyz", "angles"] | None, unless_given("xyzw|wxyz|angles", "xyzw")] = None

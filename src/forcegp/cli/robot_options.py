@@ -207,20 +207,24 @@ SYNTAX = {"plane": "nx,ny,nz,offset", "sphere": "cx,cy,cz,radius"}
 CONTACTS = "FRAME@x,y,z:SURFACE,..."
 EXAMPLE = "lbr_iiwa_link_7@0,0,0.1:plane:0,0,1,0.055"
 FEET, FLAT = "FRAME@x,y,z,...", ":flat"  # FLAT stands behind the frame of a foot that does not turn while it stands
+HELD = ":held"  # behind a point that is bolted down
 STANDS = "{}_stands"  # the input that switches the contact of a foot
 
 
 def parse_contacts(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
-    """One contact per text; the single text `none` is no contact. Raises InvalidInput for anything else."""
+    """One contact per text, three of a point that is held; `none` alone is no contact. Raises InvalidInput."""
     if "none" in texts:
         if len(texts) > 1:
             raise InvalidInput("--contact none stands alone; the other contacts contradict it.")
         return ()
-    return tuple(parse_contact(text) for text in texts)
+    return tuple(contact for text in texts for contact in parse_contact(text))
 
 
-def parse_contact(text: str) -> forcegp.Contact:
+def parse_contact(text: str) -> tuple[forcegp.Contact, ...]:
     """`FRAME@x,y,z:SURFACE:numbers`, without `@x,y,z` at the frame's origin. Raises InvalidInput with an example."""
+    if text.endswith(HELD):
+        frame, point = _frame_and_point(text.removesuffix(HELD), f"--contact {text!r} is not FRAME@x,y,z{HELD}")
+        return forcegp.mechanics.fixed_point(frame, point)
     place, kind, numbers = [*text.rsplit(":", 2), "", ""][:3]
     forms = ", ".join(f"{name}:{form}" for name, form in SYNTAX.items())
     needs = f"--contact {text!r} is not FRAME@x,y,z:SURFACE with a SURFACE of {forms} (m); for example {EXAMPLE}"
@@ -232,7 +236,7 @@ def parse_contact(text: str) -> forcegp.Contact:
         raise InvalidInput(needs)
     *vector, size = values
     surface: Any = {"plane": forcegp.Plane, "sphere": forcegp.Sphere}[kind]
-    return forcegp.Contact(frame, point, surface(tuple(vector), size))
+    return (forcegp.Contact(frame, point, surface(tuple(vector), size)),)
 
 
 def parse_feet(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:

@@ -54,6 +54,8 @@ class Dataset(Summary):
     episode: (rows,) integers; rows of equal number are one continuous motion. Default: all 0.
     model: the robot, whose joints the columns are, and what it touches.
     noise_std: standard deviation of the noise on `a`, (nv,), if known.
+    measured: what other sensors say by name: "force.FRAME" (rows, 3) is the force on the robot at that frame [N, world
+        axes], of a force sensor; where a contact is there, at its point.
     truth: what a simulation provides: noise-free "a" (rows, nv), constraint multipliers "lambda" (rows, m) [N],
         the unknown joint forces "Q_U" (rows, nv), their parts "Q_U.<name>" (rows, nv), forces on the robot
         "force.<name>" (rows, 3) [N, world axes], and "in_contact" (rows, m), 1 where a contact acts and 0 elsewhere.
@@ -72,6 +74,7 @@ class Dataset(Summary):
     model: forcegp.model.Model
     episode: Int[np.ndarray, " rows"] = None  # type: ignore[assignment]  # None becomes zeros
     noise_std: Float[np.ndarray, " nv"] | None = None
+    measured: Mapping[str, np.ndarray] = field(default_factory=dict)
     truth: Mapping[str, np.ndarray] = field(default_factory=dict)
     metadata: Mapping[str, Any] = field(default_factory=dict)
     time_ordered: bool = True
@@ -98,6 +101,7 @@ class Dataset(Summary):
             raise DatasetError(f"episode has shape {given.shape}; expected ({rows},).")
         put("episode", _read_only(given.astype(np.int64)))
         put("noise_std", _noise_std(self.noise_std, names))
+        put("measured", _measured(self.measured, rows, robot))
         put("truth", _truth(self.truth, names, rows, self.model))
         try:
             put("metadata", json.loads(json.dumps(self.metadata, allow_nan=False)))
@@ -127,7 +131,8 @@ class Dataset(Summary):
         facts: dict[str, object] = {"rows": len(self), "joints": listed(self.joint_names, most=7)}
         facts |= {"episodes": listed(self.episodes), "robot": robot}
         noise = self.noise_std
-        return facts | {"noise std": "not stated" if noise is None else rounded(noise), "truth": listed(self.truth)}
+        facts |= {"noise std": "not stated" if noise is None else rounded(noise), "truth": listed(self.truth)}
+        return facts | ({"measured": listed(self.measured)} if self.measured else {})
 
     def __reduce__(self) -> tuple[Any, ...]:  # pickling and copying restore writable arrays; the constructor does not
         return partial(Dataset, **self._fields()), ()
@@ -155,11 +160,11 @@ class Dataset(Summary):
         Raises InvalidInput for row numbers that do not exist or repeat, and for an empty selection.
         """
         chosen = _row_numbers(index, len(self))
-        truth = {name: values[chosen] for name, values in self.truth.items()}
+        truth, measured = ({name: values[chosen] for name, values in of.items()} for of in (self.truth, self.measured))
         names = ("q", "v", "u", "a", "time", "episode", "strokes")
         arrays = {name: values[chosen] for name in names if (values := getattr(self, name)) is not None}
         ordered = _first_disorder(arrays["time"], arrays["episode"]) is None
-        return replace(self, **arrays, truth=truth, time_ordered=ordered)
+        return replace(self, **arrays, measured=measured, truth=truth, time_ordered=ordered)
 
     def select_episodes(self, ids: Iterable[int]) -> Dataset:
         """All rows of the given episodes, in their present order. Raises InvalidInput for numbers that do not occur."""
@@ -204,6 +209,18 @@ def _noise_std(given: object, joint_names: tuple[str, ...]) -> np.ndarray | None
             "known or if there is no noise."
         )
     return values
+
+
+FORCE = "force."
+"""Begins the names of measured forces; the frame follows."""
+
+
+def _measured(given: Mapping[str, object], rows: int, robot: forcegp.robots.Robot) -> dict[str, np.ndarray]:
+    for name in given:
+        if not str(name).startswith(FORCE):
+            raise DatasetError(f"measured has {name!r}; allowed: {FORCE}FRAME, the force at a frame of the robot.")
+        robot.frame(name.removeprefix(FORCE))
+    return {name: finite_columns(f"measured[{name!r}]", given[name], ("x", "y", "z"), rows) for name in sorted(given)}
 
 
 def _truth(

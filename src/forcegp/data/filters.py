@@ -97,9 +97,9 @@ def lagged(values: Values, time: Float[np.ndarray, " rows"], seconds: float) -> 
 def low_pass(dataset: Dataset, cutoff: float, *, signals: Sequence[Signal] = ("q", "v", "u", "a")) -> Dataset:
     """The Dataset with the named signals behind a `LowPass` within each episode.
 
-    Filtering `a` makes `noise_std` None, filtering q, v or u drops `truth`. Switches of contacts stay as they are.
-    Raises as `LowPass`, naming the episode; DatasetError for rows that are not in order of time, for positions that
-    jump by a turn, and for a base that turns faster than the filter passes.
+    Filtering `a` makes `noise_std` None, filtering q, v or u filters other sensors as well and drops `truth`. Switches
+    of contacts stay as they are. Raises as `LowPass`, naming the episode; DatasetError for rows out of order, for
+    positions that jump by a turn, and for a base that turns faster than the filter passes.
     """
     if not signals or not set(signals) <= {"q", "v", "u", "a"}:
         raise InvalidInput(f"signals are {tuple(signals)!r}; allowed: one or more of q, v, u, a.")
@@ -113,9 +113,15 @@ def low_pass(dataset: Dataset, cutoff: float, *, signals: Sequence[Signal] = ("q
         forces = actuators(rows) if name == "u" else rows.nv
         return np.concatenate([smooth(values[:, :forces], rows.time), values[:, forces:]], axis=1)
 
-    changed = by_episode(dataset, lambda rows, label: {name: filtered(name, rows, label) for name in signals})
+    def all_of(rows: Dataset, label: str) -> dict[str, np.ndarray]:
+        sensors = rows.measured.items() if set(signals) != {"a"} else ()
+        return {name: filtered(name, rows, label) for name in signals} | {n: smooth(x, rows.time) for n, x in sensors}
+
+    changed = by_episode(dataset, all_of)
+    measured = {name: changed.pop(name, values) for name, values in dataset.measured.items()}
     noise_std = None if "a" in signals else dataset.noise_std
-    return replace(dataset, **changed, truth=dataset.truth if set(signals) == {"a"} else {}, noise_std=noise_std)
+    truth = dataset.truth if set(signals) == {"a"} else {}
+    return replace(dataset, **changed, measured=measured, truth=truth, noise_std=noise_std)
 
 
 def shifted(dataset: Dataset, delay: float, lag: float = 0.0, lagging: Sequence[int] | None = None) -> Dataset:
@@ -213,12 +219,14 @@ def resample(dataset: Dataset, step: float) -> Dataset:
             return CubicSpline(own, values, axis=0)(time)
 
         signals = {name: spline(getattr(rows, name)) for name in ("v", "u", "a")}
+        signals |= {name: spline(values) for name, values in rows.measured.items()}
         signals["q"] = through(space_of(rows), rows.q, spline)
         before = np.searchsorted(rows.time, time * (1 + 1e-12), side="right") - 1
         signals["u"][:, actuators(rows) :] = rows.u[before, actuators(rows) :]
         parts.append({**signals, "time": time, "episode": np.full(count, number)})
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return replace(dataset, **joined, truth={}, noise_std=None)
+    measured = {name: joined.pop(name) for name in dataset.measured}
+    return replace(dataset, **joined, measured=measured, truth={}, noise_std=None)
 
 
 def episodes_in_order(dataset: Dataset) -> list[tuple[int, Dataset, str]]:

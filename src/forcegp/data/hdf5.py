@@ -28,6 +28,8 @@ def write_fields(path: Path, fields: Mapping[str, Any], units: Mapping[str, Any]
     """Write the fields of a Dataset, as `atomic_file` writes and raises."""
     arrays = {name: fields[name] for name in (*COLUMNS, "noise_std") if fields[name] is not None}
     arrays |= {f"truth/{name}": values for name, values in fields["truth"].items()}
+    if names := list(fields["measured"]):  # of frames, which may hold a slash
+        arrays["measured"] = np.stack([fields["measured"][name] for name in names])
     with atomic_file(path) as temporary, new_file(temporary) as file:
         for name, values in arrays.items():
             file.create_dataset(name, data=values, **(COMPRESSION if values.size else {}))
@@ -37,6 +39,8 @@ def write_fields(path: Path, fields: Mapping[str, Any], units: Mapping[str, Any]
         file.attrs["time_ordered"] = fields["time_ordered"]
         for name, unit in units.items():
             file[name].attrs.create("units", unit, dtype=_TEXT)
+        if names:
+            file.create_dataset("measured_names", data=names, dtype=_TEXT)
         file.create_dataset("joint_names", data=list(fields["model"].robot.joint_names), dtype=_TEXT)
         file.create_dataset("metadata", data=json.dumps(fields["metadata"]), dtype=_TEXT)
         file.create_dataset("model", data=fields["model"].to_json(), dtype=_TEXT)
@@ -109,6 +113,10 @@ class _Reader:
         self.require("truth" not in file or isinstance(truth, h5py.Group), ": 'truth' must be a group in this file.")
         names = list(truth) if isinstance(truth, h5py.Group) else []
         values["truth"] = {name: self.array(f"truth/{name}") for name in names}
+        measured = self.texts("measured_names") if "measured_names" in file else []
+        arrays = self.array("measured") if measured else ()
+        self.require(len(arrays) == len(measured), ": 'measured' needs one table for each of 'measured_names'.")
+        values["measured"] = dict(zip(measured, arrays, strict=True))
         values["time_ordered"] = bool(file.attrs.get("time_ordered", True))
         try:
             values["model"] = forcegp.Model.from_json(self.text("model"))

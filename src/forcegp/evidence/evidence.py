@@ -1,11 +1,11 @@
-"""What a fit learns from: accelerations, torques, motions. A new kind is a class and an entry in `EVIDENCE`."""
+"""What a fit learns from: accelerations, torques, motions, sensors. A new kind is a class, an entry in `EVIDENCE`."""
 
 from abc import ABC
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import ClassVar, Literal
 
-from forcegp.data.dataset import Dataset
+from forcegp.data.dataset import FORCE, Dataset
 from forcegp.errors import InvalidInput, require_known, usable_arguments
 from forcegp.forces.registry import called
 
@@ -88,10 +88,38 @@ class Motions(Evidence):
             )
 
 
+@dataclass(frozen=True)
+class ContactForces(Evidence):
+    """What a force sensor measured, beside accelerations or torques: the force on the robot at `frame` ("": at all).
+
+    Where the model has a contact there, its multipliers are seen; elsewhere, beside torques, it is a force that is
+    known. `noise` is the standard deviation of the sensor [N]; None: 2 % of what it measured.
+    """
+
+    name: ClassVar[str] = "contact-forces"
+    frame: str = ""
+    noise: float | None = None
+
+    @usable_arguments("ContactForces")
+    def __post_init__(self) -> None:
+        if self.noise is not None and not 0.0 < self.noise < float("inf"):
+            raise InvalidInput(f"ContactForces noise is {self.noise!r}; give a standard deviation in N, or None.")
+
+    def check(self, dataset: Dataset) -> None:
+        """Raise InvalidInput where the log has no such sensor."""
+        frames = [name.removeprefix(FORCE) for name in dataset.measured]
+        if not frames or self.frame not in ("", *frames):
+            raise InvalidInput(
+                f"the log has no force sensor{f' at {self.frame!r}' * bool(self.frame)}; it has "
+                f"{', '.join(frames) or 'none'}: name its columns, as in `forcegp import --force foot=fx,fy,fz`."
+            )
+
+
 EVIDENCE: dict[str, type[Evidence]] = {
     "accelerations": Accelerations,
     "torques": Torques,
     "motions": Motions,
+    "contact-forces": ContactForces,
 }
 """Kinds by the name that commands and files have for them. Add yours: EVIDENCE["mine"] = Mine."""
 

@@ -1,8 +1,8 @@
 """Where physics and Gaussian processes meet: rows, from states and checked forces to (m, W), features, likelihood."""
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, get_args
 
@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset
+from forcegp.data.dataset import FORCE as OF_SENSOR
 from forcegp.errors import ContactError, DataWarning, InvalidInput
 from forcegp.forces import Scaling, Unknown, UnknownForces
 from forcegp.inference import (
@@ -22,9 +23,9 @@ from forcegp.inference import (
     Terms,
     negative_log_likelihood,
 )
-from forcegp.mechanics import ConstrainedDynamics
+from forcegp.mechanics import AffineMap, ConstrainedDynamics
 from forcegp.model import Model
-from forcegp.noise import ACCELERATION, FORCE, Noise
+from forcegp.noise import ACCELERATION, FORCE, STATED, Noise
 
 CONSTANT = 1e-12
 """Spread of a feature, relative to 1 plus its size, below which it is constant."""
@@ -34,7 +35,7 @@ RESIDUAL_FLOOR = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
-    """States and measured accelerations (N, nv), float64.
+    """States and measured accelerations (N, nv), float64, and by frame the forces (N, 3) that sensors measured.
 
     `reference` holds the rows that features are standardised by, where they are others. Where errors resemble each
     other over `correlated_rows`, as many rows count as one.
@@ -47,19 +48,25 @@ class TrainingData:
     reference: "TrainingData | None" = None
     correlated_rows: float = 1.0
     strokes: Float[Tensor, "N nv strokes"] | None = None
+    sensed: Mapping[str, Float[Tensor, "N 3"]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.q)
 
     @classmethod
-    def of(cls, rows: Dataset, device: torch.device) -> "TrainingData":
-        """Copies of all rows of a Dataset."""
+    def of(cls, rows: Dataset, device: torch.device, frames: Iterable[str] = ()) -> "TrainingData":
+        """Copies of all rows of a Dataset, and of what its force sensors at `frames` measured. Raises InvalidInput."""
+        if lost := [name for name in frames if f"{OF_SENSOR}{name}" not in rows.measured]:
+            raise InvalidInput(f"this model learns from a force sensor at {lost[0]!r}, which these rows do not have.")
+        sensed = {name: torch.tensor(rows.measured[f"{OF_SENSOR}{name}"], device=device) for name in frames}
         q, v, u, a = (torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a))
-        return cls(q, v, u, a, strokes=None if rows.strokes is None else torch.tensor(rows.strokes, device=device))
+        strokes = None if rows.strokes is None else torch.tensor(rows.strokes, device=device)
+        return cls(q, v, u, a, strokes=strokes, sensed=sensed)
 
     def to(self, device: torch.device) -> "TrainingData":
         """The same rows on another device."""
-        return replace(self, **{name: x.to(device) for name, x in vars(self).items() if hasattr(x, "to")})
+        sensed = {name: x.to(device) for name, x in self.sensed.items()}
+        return replace(self, sensed=sensed, **{n: x.to(device) for n, x in vars(self).items() if hasattr(x, "to")})
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +99,19 @@ class Standardization:
     def __call__(self, features: Sequence[Float[Tensor, "*batch _"]]) -> list[Float[Tensor, "*batch _"]]:
         """Standardised features."""
         return [(z - m) / s for z, m, s in zip(features, self.shift, self.scale, strict=True)]
+
+
+def observed(dynamics: ConstrainedDynamics, frames: Iterable[str]) -> AffineMap:
+    """Accelerations, then the forces at contacts of these frames, as functions of the joint forces."""
+    parts = [dynamics.acceleration_map(), *(dynamics.force_at(frame) for frame in frames)]
+    offset, matrix = (torch.cat([part[k] for part in parts], dim=-1 - k) for k in (0, 1))
+    return AffineMap(offset, matrix)
+
+
+def measured(dynamics: ConstrainedDynamics, training: TrainingData) -> Float[Tensor, "N D"]:
+    """What `observed` predicts of these rows."""
+    forces = (dynamics.as_measured(frame, force) for frame, force in training.sensed.items())
+    return torch.cat([training.a, *forces], dim=-1)
 
 
 FAR_FROM_SURFACE = 0.01
@@ -205,18 +225,23 @@ class MarginalLikelihood:
         return self.standardization(self.model.unknown.features(self.dynamics))
 
     @cached_property
-    def mixing(self) -> Float[Tensor, "N nv C"]:
-        """W = H B of the training states."""
-        return self.dynamics.H @ self.model.unknown.direction(self.dynamics)
+    def observed(self) -> AffineMap:
+        """What was measured as a function of the joint forces: accelerations, then what each force sensor saw."""
+        return observed(self.dynamics, self.training.sensed)
 
     @cached_property
-    def residual(self) -> Float[Tensor, "N nv"]:
-        """a - m."""
-        return self.training.a - self.dynamics.acceleration_map().offset
+    def mixing(self) -> Float[Tensor, "N D C"]:
+        """W of the training states: H B, and its like for force sensors."""
+        return self.observed.matrix @ self.model.unknown.direction(self.dynamics)
+
+    @cached_property
+    def residual(self) -> Float[Tensor, "N D"]:
+        """y - m."""
+        return measured(self.dynamics, self.training) - self.observed.offset
 
     def terms(self, parameters: Mapping[str, Tensor]) -> Terms:
-        """Standardised features, W (N, nv, C), residual a - m (N, nv) and the noise, at `parameters`."""
-        noise = Noise.covariance(parameters, self.dynamics.H) * self.training.correlated_rows
+        """Standardised features, W (N, D, C), residual y - m (N, D) and the noise, at `parameters`."""
+        noise = Noise.covariance(parameters, self.observed.matrix) * self.training.correlated_rows
         return Terms(self.features, self.mixing, self.residual, noise)
 
     @cached_property
@@ -254,7 +279,7 @@ class MarginalLikelihood:
         self, kernels: LatentKernels, parameters: Mapping[str, Tensor]
     ) -> tuple[Terms, list[Float[Tensor, "N N"]]]:
         """Terms and kernel matrices at `parameters`. Raises InvalidInput for a name that means nothing here."""
-        known = {*kernels.initial_parameters(), ACCELERATION, FORCE}
+        known = {*kernels.initial_parameters(), ACCELERATION, FORCE, *STATED}
         unknown = next((name for name in parameters if name not in known), None)
         if unknown is not None:
             raise InvalidInput(f"no parameter {unknown!r}; there are {', '.join(sorted(known))}")
@@ -293,7 +318,11 @@ class MarginalLikelihood:
     def split_noise(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Noise parameters that are learned, and those that stay."""
         parameters = self.noise.parameters(self.model.robot.nv, self.model.robot.device)
-        return (parameters, {}) if self.noise.learn else ({}, parameters)
+        # what a model misses of a force sensor is noise of joint forces: learned, that of the sensor would hide it
+        # and where one is, so is noise of joint forces: nobody can state what functions leave of them
+        wanted = {ACCELERATION, FORCE} if self.noise.learn else {FORCE} if self.noise.sensor is not None else set()
+        learned = {name: value for name, value in parameters.items() if name in wanted}
+        return learned, {name: value for name, value in parameters.items() if name not in learned}
 
     @property
     def parameter_shapes(self) -> dict[str, tuple[int, ...]]:

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput
 from forcegp.evidence.bodies import QUANTITIES, Bodies, body_names, body_pseudo_inertias, carrying, with_bodies
-from forcegp.forces import JointLaw, Law, LogNormal, Normal, Parameter, Payload, RigidBodies
-from forcegp.forces.force import Body
+from forcegp.forces import Actuation, Law, LogNormal, Normal, Parameter, Payload, RigidBodies
+from forcegp.forces.force import Body, PerJoint
 from forcegp.forces.registry import force_name
 from forcegp.mechanics import State
 from forcegp.model import Model
@@ -210,7 +210,7 @@ class ParameterSpace:
     def _whole(self, law: Law, name: str) -> Tensor:
         """A coefficient with one value per joint, those that are not estimated as they are."""
         value = law.values[name].to(self.model.robot.device)
-        return value.expand(self.model.robot.nv).clone() if isinstance(law, JointLaw) else value
+        return value.expand(self.model.robot.nv).clone() if isinstance(law, PerJoint) else value
 
     def model_at(self, x: Float[np.ndarray, " k"]) -> Model:
         """The model with the numbers of these coordinates, all of them known. Raises NonPhysicalInertia."""
@@ -274,6 +274,25 @@ class ParameterSpace:
                 column += width
         return total, jacobian
 
+    def delivered(
+        self,
+        x: Float[np.ndarray, " k"],
+        state: State,
+        known: Float[np.ndarray, "rows nv"],
+        slopes: Float[np.ndarray, "rows nv t"],
+    ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv t"]]:
+        """Torques of the actuators and their derivatives, where gains may be estimated; `slopes` are those of `torque`.
+
+        They are `known` where no gain is.
+        """
+        values, of_gain, column = self.values(x), np.zeros(slopes.shape[-1], dtype=bool), 0
+        for term in self.terms:
+            if isinstance(law := self.model.laws[term.law], Actuation):
+                known = law.amplitude(law.features(state), values[term.law]).cpu().numpy()
+                of_gain[column : column + len(term.size)] = True
+            column += len(term.size)
+        return known, -slopes * of_gain
+
     @cached_property
     def _estimated(self) -> dict[int, Law]:
         return {index: self.model.laws[index] for index in dict.fromkeys(term.law for term in self.terms)}
@@ -297,7 +316,7 @@ class ParameterSpace:
 def force_title(law: Law) -> str:
     """What parameters of a law are called by."""
     try:
-        return force_name(law)
+        return law.called or force_name(law)
     except InvalidInput:
         return law.title
 
@@ -347,7 +366,7 @@ def _terms(model: Model, typical: Mapping[str, np.ndarray]) -> list[Term]:
     for index, law in enumerate(model.laws):
         for name in law.learned:
             coefficient, given = law.coefficients[name], getattr(law, name)
-            per_joint = isinstance(law, JointLaw)
+            per_joint = isinstance(law, PerJoint)
             joints = singles if per_joint else np.zeros(1, dtype=int)
             size = coefficient.size(typical)[joints]
 

@@ -7,7 +7,7 @@ Friction g |u| under load makes u = z / (1 - g sign z). Where a and u are both n
 are those of errors in variables (Fuller, "Measurement Error Models", 1987, section 3.2), given the contacts.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -18,15 +18,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset, with_memory
+from forcegp.data.dataset import FORCE
 from forcegp.errors import InvalidInput, NumericalError, require_type
 from forcegp.evidence.bodies import standard_parameters
 from forcegp.evidence.least_squares import NoiseLevels, orthonormal_columns, without
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.forces import Law, RigidBodies
 from forcegp.forces.actuation import OBSERVED
-from forcegp.mechanics import Contact, Held, LoopClosure, State
+from forcegp.mechanics import ConstrainedDynamics, Contact, Held, LoopClosure, State
 from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE
 from forcegp.model import Model
+from forcegp.robots import Kinematics
 
 
 def motion_residuals(
@@ -34,7 +36,8 @@ def motion_residuals(
 ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv"]]:
     """Residuals of joint forces, Q_K - M a (Nm or N), and of accelerations, measured less predicted.
 
-    Forces of feet that stand and of loops are left out; those of contacts that slide are not. Under friction
+    Forces of feet that stand and of loops are left out, where no sensor measured them; those of contacts that slide are
+    not. Under friction
     that grows with |u| the force is what u exceeds the u by that the model needs.
     """
     dataset = with_memory(require_type("dataset", dataset, Dataset), model)
@@ -47,10 +50,30 @@ def motion_residuals(
             idle, loaded = (friction.force(_under_load(dynamics.state, load)) for load in (0.0 * ones, ones))
             without_load = delivered + (loaded - idle) * delivered.abs() - force  # z = u - g |u| - force
             force = dynamics.state.delivered - without_load / (1.0 + (loaded - idle) * without_load.sign())
-    if model.contacts and not any(slides(contact) for contact in model.contacts):
-        held, _ = independent_rows(dynamics.A.cpu().numpy(), dynamics.b.cpu().numpy())
+    for frame, values in sensed_of(dataset).items():
+        force = force + (arm(dynamics.state.kinematics, model, frame) @ torch.tensor(values[..., None]).to(a))[..., 0]
+    open_ = [k for k, contact in enumerate(model.contacts) if f"{FORCE}{contact.frame}" not in dataset.measured]
+    if open_ and not any(slides(model.contacts[k]) for k in open_):
+        held, _ = independent_rows(dynamics.A[:, open_].cpu().numpy(), dynamics.b[:, open_].cpu().numpy())
         return without(force.cpu().numpy(), held.swapaxes(1, 2)), (a - dynamics.acceleration_map().offset).cpu().numpy()
     return force.cpu().numpy(), (a - dynamics.acceleration_map().offset).cpu().numpy()
+
+
+def sensed_of(log: Dataset) -> dict[str, Float[np.ndarray, "rows 3"]]:
+    """What its force sensors measured, by frame."""
+    return {name.removeprefix(FORCE): values for name, values in log.measured.items()}
+
+
+def arm(kinematics: Kinematics, model: Model, frame: str) -> Float[Tensor, "rows nv 3"]:
+    """Joint forces of a force on the robot at a frame, or at the point of its contacts. Raises InvalidInput."""
+    points = {contact.point for contact in model.contacts if contact.frame == frame}
+    if len(points) > 1:
+        raise InvalidInput(
+            f"a force at {frame!r} was measured, which is held at {len(points)} points: only a torque tells how they "
+            "share it; hold one point."
+        )
+    [point] = points or {(0.0, 0.0, 0.0)}
+    return kinematics.frame_jacobian(frame, point)[..., :3, :].mT
 
 
 def _under_load(state: State, load: Tensor) -> State:
@@ -82,6 +105,8 @@ class RecordedRows:
     """States of one log of a model, the given forces there, and the terms of the equation of motion.
 
     `loaded` tells whether payloads that are estimated were there. Contacts that slide are refused unless `any_contact`.
+    `sensed` are forces on the robot at frames, which sensors measured. `pushed` are joints on which something acts that
+    nobody measured: their torques show nothing.
     """
 
     def __init__(
@@ -93,6 +118,8 @@ class RecordedRows:
         loaded: bool = True,
         any_contact: bool = False,
         strokes: Float[np.ndarray, "rows nv strokes"] | None = None,
+        sensed: Mapping[str, Float[np.ndarray, "rows 3"]] | None = None,
+        pushed: Sequence[int] = (),
     ) -> None:
         model, robot = space.model, space.model.loaded_robot
         at_q, at_v, at_u = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, u))
@@ -105,8 +132,15 @@ class RecordedRows:
         A, b, _ = model.constraint(self.state)
         self.held, self.right = independent_rows(A.cpu().numpy(), b.cpu().numpy())
         """Orthonormal rows (rows, m, nv) with ``held a = right``; rows of zeros where nothing holds."""
+        self.sensed, sensed = dict(sensed or {}), sensed or {}
+        arms = {frame: arm(self.kinematics, model, frame).cpu().numpy() for frame in sensed}
+        self.at_contacts = sum((each @ sensed[frame][..., None] for frame, each in arms.items()), np.zeros((1, 1, 1)))
+        self.at_contacts = np.broadcast_to(self.at_contacts[..., 0], self.v.shape)
+        """Joint forces of what sensors measured."""
+        self.open = self._unseen(A.cpu().numpy(), pushed) if sensed or pushed else self.held
+        """Orthonormal rows (rows, m, nv): directions of joint forces that nothing measured, of contacts and pushes."""
         self.force, self.inertia = np.zeros_like(self.v), np.zeros((robot.nv, robot.nv))
-        for force in kept_laws(space, any_contact):
+        for force in kept_laws(space, any_contact, sensed):
             self.force = self.force + force.force(self.state).detach().cpu().numpy()
             added = force.added_inertia(robot)
             self.inertia = self.inertia + (0.0 if added is None else added.detach().cpu().numpy())
@@ -122,16 +156,36 @@ class RecordedRows:
         )
         self._caches: dict[float | None, dict[Any, Any]] = {None: {}, 0.0: {}, 1.0: {}}
 
-    def moving(self, a: Rows) -> Motion:
-        """These rows with these accelerations."""
+    def _unseen(self, A: Float[np.ndarray, "rows m nv"], pushed: Sequence[int]) -> Float[np.ndarray, "rows m nv"]:
+        seen = [contact.frame in self.sensed for contact in self.space.model.contacts]
+        axes = np.broadcast_to(np.eye(A.shape[-1])[list(pushed)], (len(A), len(pushed), A.shape[-1]))
+        rows = np.concatenate([A[:, np.logical_not(seen)], axes], axis=1)
+        return independent_rows(rows, np.zeros(rows.shape[:2]))[0]
+
+    @cached_property
+    def _sensing(self) -> tuple[Float[np.ndarray, "rows k nv"], Float[np.ndarray, "rows k"]]:
+        """What makes sensed forces of A^T lambda, and those that were measured."""
+        model = self.space.model
+        A, b, normals = model.constraint(self.state)
+        M = torch.eye(A.shape[-1]).to(A)
+        parts = ConstrainedDynamics(
+            self.state, M.expand(*A.shape[:1], *M.shape), A, b, normals, torch.zeros_like(A[:, 0]), model.contacts
+        )  # with M = 1 a multiplier is that of the joint force -A^T lambda
+        maps = [-parts.force_at(frame).matrix for frame in self.sensed]
+        forces = (parts.as_measured(frame, torch.tensor(np.array(x)).to(A)) for frame, x in self.sensed.items())
+        return torch.cat(maps, 1).cpu().numpy(), torch.cat([*forces], 1).cpu().numpy()
+
+    def moving(self, a: Rows, given: bool = True) -> Motion:
+        """These rows with these accelerations; `given` takes off what sensors at contacts measured."""
         a = np.array(a)
         Y = self.kinematics.torque_regressor(torch.as_tensor(a, device=self.kinematics.robot.device)).cpu().numpy()
         fixed = Y.reshape(*a.shape, -1) @ self._stated.ravel() + a @ (self.inertia + self._armature) - self.force
+        fixed = fixed - self.at_contacts if given else fixed
         return Motion(a, np.ascontiguousarray(Y[:, :, self._carriers] * self._there[:, None]), fixed)
 
     def without_contacts(self, values: Float[np.ndarray, "rows nv *k"]) -> Float[np.ndarray, "rows nv *k"]:
         """The part of joint forces (first axis after the rows) that no lambda can explain."""
-        return without(values, self.held.swapaxes(1, 2))
+        return without(values, self.open.swapaxes(1, 2))
 
     def _terms(self, x: np.ndarray, a: Rows, load: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Torque of the laws that are estimated and its derivatives, under the measured load or one that is given."""
@@ -147,12 +201,14 @@ class RecordedRows:
             torque, in_x = self._terms(x, motion.a, 0.0)
             return rigid + torque, motion.regressor, in_x, np.ones_like(self.v)
         (torque, in_x), (loaded, loaded_in_x) = (self._terms(x, motion.a, load) for load in (0.0, 1.0))
-        z, g = rigid + torque + self.delivered, loaded - torque
+        delivered, delivered_in_x = self.space.delivered(x, self.state, self.delivered, in_x)
+        z, g = rigid + torque + delivered, loaded - torque
         sign = np.sign(z)
         left = 1.0 - g * sign
         u = z / left
-        in_x = (in_x + (u * sign)[..., None] * (loaded_in_x - in_x)) / left[..., None]
-        return u - self.delivered, motion.regressor / left[..., None, None], in_x, 1.0 / left
+        needed_in_x = in_x + delivered_in_x + (u * sign)[..., None] * (loaded_in_x - in_x)
+        in_x = needed_in_x / left[..., None] - delivered_in_x
+        return u - delivered, motion.regressor / left[..., None, None], in_x, 1.0 / left
 
     def acceleration(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """a^ (rows, nv), the mass matrices and H (rows, nv, nv). Raises NumericalError where a matrix is singular."""
@@ -177,11 +233,25 @@ class RecordedRows:
         return acceleration + (H @ (self.force - bias - torque)[..., None])[..., 0], M, H
 
     def in_acceleration(self, x: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Residual a - a^ and its derivatives, as `in_torque`."""
-        predicted, _, H = self.acceleration(x)
+        """Residual a - a^ and its derivatives, as `in_torque`; then those of what force sensors at contacts measured.
+
+        With the torque t of the motion A^T lambda = M a^ + t, of which D makes the force of a sensor, and
+        dr / dpi = -D (1 - M H) Y.
+        """
+        predicted, M, H = self.acceleration(x)
         Y = self.moving(predicted).regressor
-        _, in_x = self._terms(x, predicted)
-        return a - predicted, (H @ Y.reshape(*predicted.shape, -1)).reshape(Y.shape), H @ in_x
+        torque, in_x = self._terms(x, predicted)
+        r, shape = a - predicted, predicted.shape
+        if not self.sensed:
+            return r, (H @ Y.reshape(*shape, -1)).reshape(Y.shape), H @ in_x
+        rigid = (
+            self.moving(predicted, given=False).fixed
+            + Y.reshape(*shape, -1) @ self.space.standard_parameters(x).ravel()
+        )
+        D, seen = self._sensing
+        by = np.concatenate([H, -D @ (np.eye(shape[1]) - M @ H)], axis=1)
+        r = np.concatenate([r, seen - (D @ (rigid + torque)[..., None])[..., 0]], axis=1)
+        return r, (by @ Y.reshape(*shape, -1)).reshape(*r.shape, *Y.shape[2:]), by @ in_x
 
     def rough_noise(self, x: np.ndarray, a: Rows) -> NoiseLevels:
         """With which all residuals are noise of accelerations.
@@ -210,7 +280,9 @@ class RecordedRows:
         moved = (gain @ (self.right[..., None] - A @ a[..., None]))[..., 0]
         e_a = e_a - gain @ at_contacts
         S = M @ e_a @ M.swapaxes(1, 2) + np.diag(np.where(of_joints, noise.force**2, 0.0))
-        pushed = A * in_z[:, None]  # directions of contact forces; without them S is singular where contacts hold
+        pushed = (
+            self.open * in_z[:, None]
+        )  # directions of contact forces; without them S is singular where contacts hold
         S = S + np.trace(S, axis1=1, axis2=2)[:, None, None] * pushed.swapaxes(1, 2) @ pushed
         whitening = np.linalg.inv(np.linalg.cholesky(S))
         whitening = without(whitening, orthonormal_columns(pushed @ whitening.swapaxes(1, 2)))
@@ -243,13 +315,14 @@ class LikelyAccelerations:
         return (self.whitening @ values.reshape(*self.motion.a.shape, -1)).reshape(values.shape)
 
 
-def kept_laws(space: ParameterSpace, any_contact: bool = False) -> tuple[Law, ...]:
+def kept_laws(space: ParameterSpace, any_contact: bool = False, sensed: Iterable[str] = ()) -> tuple[Law, ...]:
     """Laws not estimated, less the bias and what an observer found.
 
-    Raises InvalidInput for models without a bias, and for contacts that slide.
+    Raises InvalidInput for models without a bias, and for contacts that slide where no force is `sensed`.
     """
     model = space.model
-    sliding = ", ".join(dict.fromkeys(contact.frame for contact in model.contacts if slides(contact)))
+    frames = (contact.frame for contact in model.contacts if slides(contact) and contact.frame not in sensed)
+    sliding = ", ".join(dict.fromkeys(frames))
     if sliding and not any_contact:
         raise InvalidInput(
             f"the robot touches something with {sliding} and slides on it, with friction that is not measured; "

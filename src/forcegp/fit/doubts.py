@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from forcegp.evidence.least_squares import Fit
 from forcegp.evidence.likelihood import CONSTANT, FAR_FROM_SURFACE, MarginalLikelihood, checked_values
 from forcegp.evidence.parameter_space import force_title
 from forcegp.evidence.recorded_rows import RecordedRows
-from forcegp.forces import Offset, RigidBodies
+from forcegp.forces import Force, Normal, Offset, RigidBodies
 from forcegp.model import Model
 from forcegp.summary import listed
 
@@ -37,7 +38,7 @@ def check_forces(likelihood: MarginalLikelihood) -> None:
     if not names:
         return
     doubts = [*_of_features(likelihood, names, features)]
-    effect = dynamics.H @ B
+    effect = likelihood.observed.matrix @ B
     terms = [number for number, which in enumerate(unknown.slices(robot)) for _ in range(which.stop - which.start)]
     doubts += _of_effects(names, terms, dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B), effect)
     Doubts(doubts).warn(stacklevel=5)
@@ -116,24 +117,31 @@ def warn_of_contacts(model: Model, dataset: Dataset) -> None:
     Doubts(each for each in doubts if each.numbers.get("distance", 0.0) <= FAR_FROM_SURFACE).warn(ContactWarning, 3)
 
 
-def refuse_what_has_no_answer(model: Model, dataset: Dataset) -> None:
-    """Before any search: raise InvalidInput for a law that is listed twice, and for offsets of idle joints in contact.
+def refuse_what_has_no_answer(model: Model) -> None:
+    """Before any search: raise InvalidInput for a law that is listed twice.
 
     What else a log does not tell apart, or does not show, its estimates say (`Estimate.why`).
     """
     titles = [force_title(law) for law in model.laws if law.learned]
     if twice := [title for title in dict.fromkeys(titles) if titles.count(title) > 1]:
         raise InvalidInput(f"forces hold {twice[0]!r} twice, which no log tells apart; leave one of them out.")
+
+
+def without_idle_offsets(model: Model, dataset: Dataset) -> Model:
+    """The model without offsets at idle joints in contact: there one can carry the weight, with any sign."""
     if not model.contacts or not any(isinstance(law, Offset) and law.learned for law in model.laws):
-        return
+        return model
     states = [torch.as_tensor(np.array(x), device=model.robot.device) for x in (dataset.q, dataset.v, dataset.u)]
     idle = model.state(*states).delivered.abs().amax(0) == 0.0
-    names = [joint for joint in model.robot.single_joint_names if bool(idle[model.robot.joint_names.index(joint)])]
-    if names and not bool(idle.all()):
-        raise InvalidInput(
-            f"nothing drives {listed(names)}, so an offset there can carry the weight that the contact carries, with "
-            "any sign; leave 'offset' out, or give Offset(Normal(0.0, std)) a std of 0 at it."
-        )
+
+    def kept(law: Force) -> Force:
+        if not isinstance(law, Offset) or not law.learned:
+            return law
+        prior = law.value if isinstance(law.value, Normal) else Normal()
+        std = torch.as_tensor(torch.nan if prior.std is None else prior.std, dtype=torch.float64, device=idle.device)
+        return replace(law, value=Normal(prior.mean, torch.where(idle, 0.0, std.expand(len(idle)))))
+
+    return model if bool(idle.all()) else replace(model, forces=tuple(map(kept, model.forces)))
 
 
 BRAKED = 0.4

@@ -10,13 +10,13 @@ import numpy as np
 from torch import Tensor
 
 from forcegp.data import Dataset, farthest_rows
-from forcegp.data.dataset import require_rows
+from forcegp.data.dataset import FORCE, require_rows
 from forcegp.data.views import past_known, with_memory
 from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
-from forcegp.evidence import Accelerations, Evidence, Motions, Torques, TrainingData
+from forcegp.evidence import Accelerations, ContactForces, Evidence, Motions, Torques, TrainingData
 from forcegp.evidence.likelihood import MarginalLikelihood, check_distance, problem_size
 from forcegp.evidence.parameter_space import ParameterSpace
-from forcegp.fit.doubts import check_forces, refuse_what_has_no_answer, warn_of_contacts
+from forcegp.fit.doubts import check_forces, refuse_what_has_no_answer, warn_of_contacts, without_idle_offsets
 from forcegp.fit.friction_choice import with_friction_chosen
 from forcegp.fit.joint import (
     CHANGE,
@@ -46,10 +46,12 @@ from forcegp.fit.search import (
     widened,
     with_variance_priors,
 )
+from forcegp.fit.unseen import Unseen
 from forcegp.forces import UnknownForces
 from forcegp.forces.registry import described_force
 from forcegp.inference import Engine, OptimizationResult, OptimizerOptions, engine_of
 from forcegp.model import Model
+from forcegp.noise import Noise
 from forcegp.parallel import checked_jobs
 from forcegp.posterior import Posterior
 from forcegp.posterior.drift import with_drift
@@ -57,6 +59,8 @@ from forcegp.posterior.fitted import Estimates
 from forcegp.posterior.observed_wrench import in_air, unobserved
 from forcegp.robots.arguments import whole_number
 
+SENSOR_SHARE = 0.02
+"""Of what a force sensor measures: its standard deviation, where nobody states it."""
 CONTINUE_FROM = (250, 500)
 """Rows of the searches, one after the other, at whose end one on more than `MOST_POINTS_FOR_RESTARTS` rows begins."""
 
@@ -123,8 +127,10 @@ def fit(
     NumericalError: the engine failed.
     """
     require_type("model", model, Model, ", for example dataset.model")
-    rest, refinement = _chosen(evidence, model, start)
+    rest, refinement, sensors = _chosen(evidence, model, start)
+    dataset = with_sensors(dataset, model, rest, sensors, chosen=bool(evidence))
     dataset = _checked(model, dataset, rest, refinement)
+    model = without_idle_offsets(model, dataset)
     how = Torques() if model.robot.space.is_vector_space else Torques(noisy="both")
     model, choice = (model, None) if isinstance(start, Posterior) else with_friction_chosen(model, dataset, how)
     dataset = dataset if choice is None else with_memory(dataset, model)
@@ -133,7 +139,7 @@ def fit(
     logs = [dataset] if baseline is None else [dataset, _checked(model, baseline, rest, None)]
     if isinstance(start, Posterior):
         posterior: Any = start
-    elif isinstance(rest, Torques) or (model.is_open and not model.unknown_forces):
+    elif (isinstance(rest, Torques) or not model.unknown_forces) and (model.is_open or model.unknown_forces):
         if model.unknown_forces:
             raise InvalidInput(
                 "torques are evidence for numbers of laws and bodies; functions are learned from accelerations, with "
@@ -145,22 +151,31 @@ def fit(
             raise InvalidInput(
                 "a baseline is for payloads, without unknown functions; leave these out, or the baseline."
             )
+        sensor = next((each.noise for each in sensors if each.noise is not None), None)
         search = Search(checked_jobs(jobs), restarts, seed, options, start)
-        posterior = _Functions(model, search, engine, learning_points).fitted(dataset, points)
+        posterior = _Functions(model, search, engine, learning_points, sensor).fitted(dataset, points)
     if choice is not None:
         posterior = posterior.with_settings(gear_friction=choice.to_dict())
     if not known.all():
         posterior = posterior.with_settings(rows_before_a_past=int((~known).sum()))
+    if model.contacts and not posterior.is_black_box:
+        posterior = posterior.with_settings(
+            **Unseen.of(model, dataset, typical_sizes(model, [dataset])["force"]).stated
+        )
     if refinement is not None:
         posterior = refine_on_motions(posterior, dataset, refinement.seconds, refinement.bodies, model)
     return with_drift(posterior, dataset)
 
 
-def _chosen(evidence: Evidence | Sequence[Evidence] | None, model: Model, start: Any) -> tuple[Any, Motions | None]:
-    """The evidence to begin with, and the motions that refine what it found."""
+def _chosen(
+    evidence: Evidence | Sequence[Evidence] | None, model: Model, start: Any
+) -> tuple[Any, Motions | None, tuple[ContactForces, ...]]:
+    """The evidence to begin with, the motions that refine what it found, and force sensors beside it."""
     given = () if evidence is None else (evidence,) if isinstance(evidence, Evidence) else tuple(evidence)
     if not all(isinstance(each, Evidence) for each in given):
-        raise InvalidInput(f"evidence is {evidence!r}; give Accelerations(), Torques() or Motions(S).")
+        raise InvalidInput(f"evidence is {evidence!r}; give Accelerations(), Torques(), ContactForces() or Motions(S).")
+    sensors = tuple(each for each in given if isinstance(each, ContactForces))
+    given = tuple(each for each in given if not isinstance(each, ContactForces))
     motions = [each for each in given if isinstance(each, Motions)]
     others = [each for each in given if not isinstance(each, Motions)]
     if len(motions) > 1 or len(others) > 1:
@@ -172,11 +187,47 @@ def _chosen(evidence: Evidence | Sequence[Evidence] | None, model: Model, start:
     if isinstance(start, Posterior) and (refinement is None or others):
         raise InvalidInput("start is a posterior; it is refined by Motions() alone: give that as the evidence.")
     if others:
-        return others[0], refinement
+        return others[0], refinement, sensors
     if model.unknown_forces or not model.is_open:
-        return Accelerations(), refinement
+        return Accelerations(), refinement, sensors
     fixed = model.robot.space.is_vector_space
-    return Torques() if fixed else Torques(noisy="both"), refinement
+    return Torques() if fixed else Torques(noisy="both"), refinement, sensors
+
+
+def frames_of(dataset: Dataset) -> list[str]:
+    """Where its force sensors are."""
+    return [name.removeprefix(FORCE) for name in dataset.measured]
+
+
+def with_sensor(noise: Noise, rows: Dataset, stated: float | None) -> Noise:
+    """The noise with that of force sensors, where the log has them."""
+    if not rows.measured or noise.sensor is not None:
+        return noise
+    size = float(np.sqrt(np.mean([np.square(values).mean() for values in rows.measured.values()])))
+    return replace(noise, sensor=stated or max(SENSOR_SHARE * size, 1e-9))
+
+
+def with_sensors(
+    dataset: Dataset, model: Model, rest: Evidence, sensors: Sequence[ContactForces], chosen: bool
+) -> Dataset:
+    """The log with the force sensors that are evidence: of the default all that functions or laws can learn from."""
+    require_type("dataset", dataset, Dataset)
+    for each in sensors:
+        each.check(dataset)
+    at_contacts = {contact.frame for contact in model.contacts}
+    frames = frames_of(dataset)
+    if sensors and all(each.frame for each in sensors):
+        frames = [each.frame for each in sensors]
+    elif not sensors:
+        frames = [] if chosen else [name for name in frames if name in at_contacts]
+    if frames and isinstance(rest, Accelerations) and model.is_open and not model.unknown_forces:
+        raise InvalidInput("force sensors teach numbers beside torques, not beside accelerations; give Torques().")
+    if model.unknown_forces and (lost := [name for name in frames if name not in at_contacts]):
+        raise InvalidInput(
+            f"a force was measured at {lost[0]!r}, where the model has no contact; give it one (--contact), or leave "
+            "gp: forces out, so that it is a known force."
+        )
+    return replace(dataset, measured={f"{FORCE}{name}": dataset.measured[f"{FORCE}{name}"] for name in frames})
 
 
 def _checked(model: Model, dataset: Dataset, evidence: Any, refinement: Motions | None) -> Dataset:
@@ -209,7 +260,7 @@ def _of_numbers(model: Model, logs: Sequence[Dataset], evidence: Any, rows: int 
     """Laws and bodies alone, from all rows."""
     if rows is not None:
         whole_number("rows", rows, 1)
-    refuse_what_has_no_answer(model, logs[0])
+    refuse_what_has_no_answer(model)
     found = fit_physical(model, logs, evidence, rows)
     trained = replace(found.model, noise=found.noise)
     training = TrainingData.of(found.rows, model.robot.device)
@@ -233,6 +284,8 @@ class _Functions:
     search: Search
     engine: Engine | str
     learning_points: int | None
+    sensor: float | None = None
+    """Standard deviation of force sensors [N], where it is stated."""
 
     def fitted(self, dataset: Dataset, points: int | None) -> Posterior:
         """In the air of the log, where that moves."""
@@ -287,7 +340,7 @@ class _Functions:
         """Searches for functions with numbers of laws and bodies free, where these are open."""
         if not self.model.is_open:
             return self._with_loads(rows, dataset)
-        refuse_what_has_no_answer(self.model, rows)
+        refuse_what_has_no_answer(self.model)
         typical = typical_sizes(self.model, [rows])
         model = with_payloads_placed(self.model, [dataset])
         space = ParameterSpace(model, typical)
@@ -336,9 +389,12 @@ class _Functions:
 
         `beside` gives the likelihood in which numbers are free.
         """
-        noise = resolved_noise(self.model.noise, rows)
+        noise = with_sensor(resolved_noise(self.model.noise, rows), rows, self.sensor)
+        if self.model.contacts:
+            typical = typical_sizes(self.model, [rows])["force"]
+            noise = Unseen.of(self.model, rows, typical).with_pushes(noise, typical, len(rows))
         model = replace(self.model, noise=noise)
-        training = TrainingData.of(rows, model.robot.device)
+        training = TrainingData.of(rows, model.robot.device, frames_of(rows))
         likelihood = MarginalLikelihood(model, training)
         model.check_states(training.q, training.v, training.u)
         check_distance(model, training)

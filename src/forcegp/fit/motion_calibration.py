@@ -148,6 +148,6 @@ def _without(posterior: Posterior, rest: Dataset) -> Posterior:
     own = posterior.training
     rest = in_own_air(posterior, rest)
     rows = farthest_rows(rest, len(own)) if len(own) < len(rest) else rest
-    given = replace(TrainingData.of(rows, own.q.device), reference=own.reference or own)
+    given = replace(TrainingData.of(rows, own.q.device, own.sensed), reference=own.reference or own)
     how = posterior.hyperparameters, posterior.result, posterior.settings, posterior.engine
     return replace(posterior.conditioned(posterior.trained, given, *how), target=posterior.target)

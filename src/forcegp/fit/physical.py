@@ -26,8 +26,9 @@ from forcegp.evidence.least_squares import (
     without,
 )
 from forcegp.evidence.parameter_space import ParameterSpace
-from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, RecordedRows
+from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, RecordedRows, sensed_of
 from forcegp.fit.doubts import doubts_of_base, doubts_of_no_body, doubts_of_offsets
+from forcegp.fit.unseen import Unseen
 from forcegp.forces import Payload
 from forcegp.model import Model
 from forcegp.noise import Noise
@@ -39,15 +40,24 @@ from forcegp.robots import Robot
 class Equations:
     """Rows of one log or several as one array each, and the equations that they give at x."""
 
-    def __init__(self, space: ParameterSpace, logs: Sequence[Dataset], evidence: Torques | Accelerations) -> None:
+    def __init__(
+        self,
+        space: ParameterSpace,
+        logs: Sequence[Dataset],
+        evidence: Torques | Accelerations,
+        pushed: Sequence[int] = (),
+    ) -> None:
         self.space, self.evidence, self.logs = space, evidence, logs
         self.parts = [
-            RecordedRows(space, log.q, log.v, log.u, loaded=not k, strokes=log.strokes) for k, log in enumerate(logs)
+            RecordedRows(
+                space, log.q, log.v, log.u, loaded=not k, strokes=log.strokes, sensed=sensed_of(log), pushed=pushed
+            )
+            for k, log in enumerate(logs)
         ]
         self.a = np.concatenate([log.a for log in logs])
         self.ends = np.cumsum([len(log) for log in logs])[:-1]
         self.measured = [part.moving(a) for part, a in zip(self.parts, self.each(self.a), strict=True)]
-        self.held = _stacked([part.held for part in self.parts])
+        self.held = _stacked([part.open if evidence.of_torque else part.held for part in self.parts])
         seconds = evidence.mean if isinstance(evidence, Torques) else None
         self.windows = None if seconds is None else WindowMeans(logs, seconds)
         self._stays: tuple[np.ndarray, ...] = ()
@@ -195,9 +205,10 @@ def fit_physical(
     typical = typical_sizes(model, logs)
     model = with_payloads_placed(model, logs)
     space = ParameterSpace(model, typical)
-    equations = Equations(space, logs, evidence)
+    unseen = Unseen.of(model, logs[0], typical["force"])
+    equations = Equations(space, logs, evidence, unseen.pushed)
     held = equations.held if evidence.of_torque and equations.held.shape[1] and equations.windows is None else None
-    if held is not None and held.any(-1).sum(1).min() == robot.nv:
+    if held is not None and not unseen.pushed and held.any(-1).sum(1).min() == robot.nv:
         raise InvalidInput("contacts hold every degree of freedom in every row, so no equation is left to learn from.")
     history: list[float] = []
 
@@ -231,11 +242,15 @@ def fit_physical(
     estimates = _estimates(space, fit, equations, evidence, thick)
     if not robot.space.is_vector_space:
         doubts += doubts_of_base(model, found, equations.parts[0], residual[: len(logs[0])])
+    doubts += unseen.doubts(model)
     Doubts(doubts).warn(stacklevel=4)
     level = model.noise
+    if evidence.of_torque and model.contacts and noise is None:
+        noise = unseen.levels(equations.a, equations.accelerations(fit.x), equations.held, fit.noise)
     if level is None or level.learn or level.acceleration is None:
         found_levels = Noise(tuple(np.sqrt((residual**2).mean(0)).clip(1e-12)))
         level = found_levels if noise is None else Noise(tuple(noise.acceleration), tuple(noise.force))
+        level = unseen.with_pushes(level, typical["force"])
     return Solution(found, estimates, level, with_memory(logs[0], found), tuple(history) or (0.0,), fit.x)
 
 

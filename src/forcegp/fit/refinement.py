@@ -25,7 +25,7 @@ from forcegp.inference import (
 )
 from forcegp.inference.engines import ENOUGH, MOST_EXACT_ROWS
 from forcegp.inference.memory import blas_threads, require_memory
-from forcegp.noise import ACCELERATION
+from forcegp.noise import ACCELERATION, SENSOR
 from forcegp.posterior import Posterior
 from forcegp.robots.arguments import whole_number
 
@@ -79,7 +79,8 @@ def independent_rows(rows: Dataset) -> Dataset:
 def require_memory_to_learn(likelihood: MarginalLikelihood) -> None:
     """Raise NotEnoughMemory where the exact likelihood of these rows does not fit into memory."""
     with torch.no_grad():
-        size = ProblemSize.of(likelihood.terms({ACCELERATION: torch.zeros_like(likelihood.training.a[0])}))
+        one = torch.zeros_like(likelihood.training.a[0])
+        size = ProblemSize.of(likelihood.terms({ACCELERATION: one, SENSOR: one[:1]}))
     remedy = "find hyper-parameters on fewer rows: `learning_points=600`, or give fewer points"
     what = f"the likelihood of N={size.rows} rows with its gradients"
     require_memory(Exact().bytes_to_learn(size), what, remedy, likelihood.training.q.device)
@@ -98,7 +99,7 @@ def on_all_rows(
     reference = training = fitted.training
     likelihood, latent = fitted.likelihood, fitted.latent
     if len(rows) != len(reference.q):
-        training = replace(TrainingData.of(rows, reference.q.device), reference=reference)
+        training = replace(TrainingData.of(rows, reference.q.device, reference.sensed), reference=reference)
         likelihood = replace(likelihood, training=training)
         fitted.trained.check_states(training.q, training.v, training.u)
         check_distance(fitted.trained, training)

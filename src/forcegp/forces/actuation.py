@@ -2,16 +2,16 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, require_type
-from forcegp.forces.force import Force, Law, as_numbers
+from forcegp.forces.force import Coefficient, Force, Law, Number, PerJoint, as_numbers
 from forcegp.forces.joint_laws import Coulomb, Spring, Viscous
 from forcegp.forces.rigid_bodies import RigidBodies
 from forcegp.mechanics.gauss_principle import State
@@ -22,16 +22,23 @@ FADES = 0.25  # s
 
 
 @dataclass(frozen=True, eq=False)
-class Actuation(Law):
-    """What the actuators deliver: `matrix` u with `matrix` (nv, nu), one column per actuator, called `names`.
+class Actuation(PerJoint):
+    """What the actuators deliver: gain (`matrix` u) with `matrix` (nv, nu), one column per actuator, called `names`.
 
     Without a matrix there is one actuator per joint of one degree of freedom, u = its force; bases that move have none.
-    With `known` False what they do is left to the unknown forces.
+    `gain` is a factor per joint: 1 where u is what arrives there; a prior, such as LogNormal(1, .2), where drives are
+    calibrated badly; None where u is a current, a percentage or ticks, whose constants nobody knows. With `known` False
+    what they do is left to the unknown forces.
     """
 
     matrix: Sequence[Sequence[float]] | np.ndarray | Tensor | None = None
     names: tuple[str, ...] = ()
     known: bool = True
+    gain: Number = 1.0
+    coefficients: ClassVar[Mapping[str, Coefficient]] = {
+        "gain": Coefficient("1", 1.0, factor=1.0, lowest=1e-6, highest=1e6, logarithm=True)
+    }
+    called: ClassVar[str] = "gain"
 
     def __post_init__(self) -> None:
         require_type("Actuation known", self.known, bool)
@@ -41,10 +48,10 @@ class Actuation(Law):
         if self.matrix is None:
             free = {row for group in robot.layout.groups for row in range(*group.rows.indices(robot.nv))}
             if not free:
-                return Actuation(None, robot.joint_names, self.known)
+                return self._of(robot, None, robot.joint_names)
             driven = [row for row in range(robot.nv) if row not in free]
             matrix = torch.eye(robot.nv, dtype=torch.float64, device=robot.device)[:, driven]
-            return Actuation(matrix, tuple(robot.joint_names[row] for row in driven), self.known)
+            return self._of(robot, matrix, tuple(robot.joint_names[row] for row in driven))
         matrix = as_numbers("Actuation matrix", self.matrix, robot, f"{robot.nv} rows of numbers")
         names = tuple(self.names) or tuple(f"actuator_{k + 1}" for k in range(matrix.shape[-1] if matrix.dim() else 0))
         if matrix.dim() != 2 or len(matrix) != robot.nv or not bool(torch.isfinite(matrix).all()):
@@ -54,20 +61,41 @@ class Actuation(Law):
             )
         if len(names) != matrix.shape[1] or len(set(names)) != len(names):
             raise InvalidInput(f"Actuation names are {names}; give {matrix.shape[1]} different ones, one per column.")
-        return Actuation(matrix, names, self.known)
+        return self._of(robot, matrix, names)
 
-    def delivered(self, state: State) -> Tensor:
-        """Joint forces (..., nv) of the actuators."""
+    def _of(self, robot: Robot, matrix: Tensor | None, names: tuple[str, ...]) -> "Actuation":
+        gain = self.gain if self.is_exact else self._bound("gain", robot)
+        return Actuation(matrix, names, self.known, gain)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether u is taken as what arrives at the joints."""
+        return isinstance(self.gain, int | float) and self.gain == 1
+
+    def stated(self, state: State) -> Tensor:
+        """Joint forces (..., nv) as u states them, before gains."""
         u = state.u[..., : len(self.names)]
         return u if self.matrix is None else u @ torch.as_tensor(self.matrix).mT
 
+    def delivered(self, state: State) -> Tensor:
+        """Joint forces (..., nv) of the actuators."""
+        return self.stated(state) if self.is_exact else self.values["gain"].to(state.u.device) * self.stated(state)
+
     @override
     def features(self, state: State) -> tuple[Tensor, ...]:
-        return (self.delivered(state),)
+        return (self.stated(state),)
 
     @override
     def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
-        return features[0] if self.known else torch.zeros_like(features[0])
+        if not self.known:
+            return torch.zeros_like(features[0])
+        return features[0] if self.is_exact else parameters["gain"] * features[0]
+
+    @override
+    def acts_on(self, name: str, robot: Robot) -> Bool[np.ndarray, " nv"]:
+        if self.matrix is None:
+            return np.full(robot.nv, self.known)
+        return self.known & (torch.as_tensor(self.matrix) != 0.0).any(1).cpu().numpy()
 
 
 class LinkForce(Law):

@@ -159,11 +159,13 @@ def plain(value: Any) -> Any:
     if isinstance(value, Normal | LogNormal):
         return {type(value).__name__: {f.name: plain(getattr(value, f.name)) for f in fields(value)}}
     if isinstance(value, Tensor | np.ndarray):
-        return torch.as_tensor(value).detach().tolist()
+        return plain(torch.as_tensor(value).detach().tolist())
     if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, float) and value != value:  # the weak prior of a joint; JSON has no nan
+        return None
     return [plain(entry) for entry in value] if isinstance(value, tuple | list) else value
 
 
@@ -178,6 +180,8 @@ class Law(Force):
     """Its numbers by the names of their fields."""
     under_load: ClassVar[bool] = False
     """Whether it depends on the torque of the actuators, `State.delivered`, and grows in proportion to its size."""
+    called: ClassVar[str] = ""
+    """What its numbers are called; "" where that is the name of the law."""
     part: ClassVar[str] = ""
     """What of the robot it is a law of: those of one part take the place of each other, "" is that of its class."""
 
@@ -309,17 +313,11 @@ def slides(joint: str, robot: Robot) -> bool:
     return any(each.name == joint and each.type == "prismatic" for each in robot.joints)
 
 
-class JointLaw(Law):
-    """A law that acts in every joint of one degree of freedom by itself: all coefficients have one value per joint.
+class PerJoint(Law):
+    """A law whose coefficients have one value per joint; the amplitude of a joint depends on those of that joint alone.
 
-    The amplitude of a joint depends on the coefficients of that joint alone. `features` are (..., nv) each; joints of
-    several degrees of freedom, such as a base that moves, have coefficients 0.
+    `features` are (..., nv) each.
     """
-
-    @override
-    def features(self, state: State) -> tuple[Tensor, ...]:
-        """The velocities."""
-        return (state.v,)
 
     @override
     def bound_to(self: AnyLaw, robot: Robot) -> AnyLaw:
@@ -341,6 +339,8 @@ class JointLaw(Law):
     def _numbers(self, name: str, given: Any, robot: Robot, coefficient: Coefficient, weak: bool = False) -> Tensor:
         """One per joint, checked; those of weak priors may be nan."""
         what = f"{type(self).__name__} {name}"
+        if weak and isinstance(given, tuple | list):
+            given = [np.nan if entry is None else entry for entry in given]
         remedy = "a number, one per joint, or a mapping from joint names"
         values = as_numbers(what, by_joint(given, robot.joint_names, robot.name), robot, remedy)
         if values.dim() == 0:  # one number for every joint, but not for bases that move
@@ -362,6 +362,18 @@ class JointLaw(Law):
         if not bool(good.all()):
             raise InvalidInput(f"{what} is {values.tolist()}; every joint needs {least}.")
         return values
+
+
+class JointLaw(PerJoint):
+    """A law that acts in every joint of one degree of freedom by itself, such as friction.
+
+    Joints of several degrees of freedom, such as a base that moves, have coefficients 0.
+    """
+
+    @override
+    def features(self, state: State) -> tuple[Tensor, ...]:
+        """The velocities."""
+        return (state.v,)
 
 
 def as_numbers(name: str, given: Any, robot: Robot, remedy: str) -> Tensor:

@@ -45,6 +45,7 @@ FORCES: dict[str, str | type[Force]] = {
 UNKNOWN, MEMORY = "gp:", "memory"
 SHORT: dict[str, tuple[str, Mapping[str, Any]]] = {
     "bodies": ("rigid-bodies", {"learn": "all"}),
+    "gain": ("actuation", {"gain": None}),
     "joint": ("joint-forces", {}),
     "joint-ripple": ("joint-position", {"period": 2.0 * math.pi}),
     "tool-friction": ("tool-forces", {}),

@@ -289,6 +289,29 @@ class ConstrainedDynamics:
         matrix = (self.normals[..., None] * multiplier.matrix[..., None, :]).flatten(-3, -2)
         return AffineMap(offset, matrix)
 
+    def force_at(self, frame: str) -> AffineMap:
+        """World force on the robot (..., 3) at the contacts of a frame together, in N.
+
+        Of a surface it is the part along the normal, (..., 1): friction along it is another force. Raises ContactError
+        where no contact is.
+        """
+        places = [k for k, contact in enumerate(self.contacts) if contact.frame == frame]
+        if not places:
+            raise ContactError(f"the model has no contact at {frame!r}, where a force was measured; give it one.")
+        multiplier, normals = self.multiplier_map(), self.normals[..., places, :].mT
+        if any(not isinstance(self.contacts[k].surface, Held) for k in places):
+            normals = torch.linalg.vector_norm(normals, dim=-2, keepdim=True)
+        offset = (normals @ multiplier.offset[..., places, None])[..., 0]
+        return AffineMap(offset, normals @ multiplier.matrix[..., places, :])
+
+    def as_measured(self, frame: str, force: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch k"]:
+        """Of a measured force what `force_at` predicts."""
+        places = [k for k, contact in enumerate(self.contacts) if contact.frame == frame]
+        if all(isinstance(self.contacts[k].surface, Held) for k in places):
+            return force
+        normals = self.normals[..., places, :].sum(-2)
+        return (normals * force).sum(-1, keepdim=True) / torch.linalg.vector_norm(normals, dim=-1, keepdim=True)
+
     def acceleration(self, Q_U: Float[Tensor, "*#batch nv"]) -> Float[Tensor, "*batch nv"]:
         """a = M^-1 Q_b + H (Q_K + Q_U) in rad/s^2 or m/s^2."""
         return self.acceleration_map()(Q_U)

@@ -14,16 +14,17 @@ from torch import Tensor
 from forcegp.data import Dataset, with_memory
 from forcegp.data.dataset import require_rows
 from forcegp.errors import DataWarning, InvalidInput, NumericalError, require_type, usable_arguments
-from forcegp.evidence import Accelerations
+from forcegp.evidence import Accelerations, ContactForces
 from forcegp.forces import Force
 from forcegp.inference.memory import blas_threads
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.integration.integrators import Feedback, check_time_step, integrator_named
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact
 from forcegp.model import Model
-from forcegp.noise import Noise
+from forcegp.noise import ACCELERATION, FORCE, PUSHES, Noise
 from forcegp.posterior.drift import followed
 from forcegp.posterior.fitted import Fitted
+from forcegp.posterior.joint_forces import hidden_forces, joint_forces_given
 from forcegp.posterior.observed_wrench import rows_of_own_system
 from forcegp.posterior.prediction import (
     ROWS_PER_BLOCK,
@@ -75,11 +76,20 @@ class Posterior(Fitted):
         return self.model.dynamics(q, v, u)
 
     @overload
-    def predict(self, q: Array, v: Array, u: Array, *, covariance: bool = ..., of: None = ...) -> Prediction: ...
+    def predict(
+        self, q: Array, v: Array, u: Array, *, a: Array | None = ..., covariance: bool = ..., of: None = ...
+    ) -> Prediction: ...
 
     @overload
     def predict(
-        self, q: Array, v: Array, u: Array, *, covariance: bool = ..., of: Sequence[Accelerations | Contact | Force]
+        self,
+        q: Array,
+        v: Array,
+        u: Array,
+        *,
+        a: Array | None = ...,
+        covariance: bool = ...,
+        of: Sequence[Accelerations | ContactForces | Contact | Force],
     ) -> tuple[Gaussian, ...]: ...
 
     def predict(
@@ -88,13 +98,16 @@ class Posterior(Fitted):
         v: Array,
         u: Array,
         *,
+        a: Array | None = None,
         covariance: bool = True,
-        of: Sequence[Accelerations | Contact | Force] | None = None,
+        of: Sequence[Accelerations | ContactForces | Contact | Force] | None = None,
     ) -> Prediction | tuple[Gaussian, ...]:
         """Distribution of the acceleration and, where the model predicts them, of the forces behind it.
 
-        A `Prediction`, or with `of` one `Gaussian` for each of `Accelerations()`, contacts of the model (the force on
-        the robot there, (..., 3) in N) and its unknown forces (joint forces). States (..., nv) are in rad, rad/s and Nm
+        A `Prediction`, or with `of` one `Gaussian` for each of `Accelerations()`, contacts of the model or
+        `ContactForces(frame)` (the force on the robot there, (..., 3) in N) and its unknown forces (joint forces).
+        With `a`, accelerations that were measured in these states (..., nv), all is given these: what an estimator of
+        contact forces without a force sensor needs. States (..., nv) are in rad, rad/s and Nm
         (m, m/s and N), arrays, lists or tensors; `covariance=False` is much faster. Differentiable in q, v and u. Where
         laws remember, u has columns for that (`forcegp.data.with_memory` makes them of a log); without these the past
         counts as unknown, in the mean and in the covariance, and a DataWarning says so.
@@ -109,8 +122,15 @@ class Posterior(Fitted):
             what = f"u has no columns {', '.join(memory)}, so that the past of friction counts as unknown"
             warnings.warn(f"{what}; forcegp.data.with_memory adds them to a log.", DataWarning, stacklevel=2)
         states, batch = state_rows(self.model, q, v, u, past)
-        parts = zip(*(x.split(ROWS_PER_BLOCK) for x in states), strict=True)
-        blocks = [predict(q, v, u, covariance) for q, v, u in parts]
+        if a is not None:
+            if self.is_black_box:
+                raise InvalidInput(f"a {self.description} predicts no forces, which a could tell about; leave a out.")
+            rows = state_tensor("a", a, self.model.robot.nv, self.model.robot.device)
+            states = [*states, rows.expand(*batch, -1).reshape(batch.numel(), -1)]
+        blocks = [
+            predict(q, v, u, covariance, *seen)
+            for q, v, u, *seen in zip(*(x.split(ROWS_PER_BLOCK) for x in states), strict=True)
+        ]
         predicted = join_predictions(blocks, batch)
         # lost where a state is so large, or a system so singular, that nothing is left of the numbers
         variance = predicted.mean if predicted.covariance is None else predicted.variance
@@ -123,16 +143,21 @@ class Posterior(Fitted):
             )
         return predicted if of is None else tuple(quantity_of(self, each, predicted, (q, v, u)) for each in of)
 
-    def predict_rows(self, q: Positions, v: Rows, u: Inputs, covariance: bool) -> Prediction:
+    def predict_rows(self, q: Positions, v: Rows, u: Inputs, covariance: bool, a: Rows | None = None) -> Prediction:
         """`predict` for one block of checked states."""
-        dynamics = self.dynamics(q, v, u)
-        B = self.trained.unknown.direction(dynamics)
-        latents = self.latents(dynamics, covariance)
+        dynamics, given = self.dynamics(q, v, u), self.hyperparameters
+        B, motion = self.trained.unknown.direction(dynamics), dynamics.acceleration_map()
+        latents = self.latents(dynamics, covariance or a is not None)
+        seen = None if a is None else (a, given[ACCELERATION].exp())
+        whole, learned = joint_forces_given(latents, B, self._unlearned(dynamics), motion, seen)
+        moving = (learned if seen is None else whole).through(motion.matrix, motion.offset)
+        if not covariance:
+            whole, learned, moving = (Gaussian(each.mean, None) for each in (whole, learned, moving))
 
         def through(affine: AffineMap) -> Gaussian:
-            return latents.through(affine.matrix @ B, affine.offset)
+            return whole.through(affine.matrix, affine.offset)
 
-        predicted, noise = through(dynamics.acceleration_map()), _noise_covariance(self.hyperparameters, dynamics)
+        predicted, noise = moving, _noise_covariance(given, dynamics)
         if self.is_black_box:  # its functions hold what contacts do, so forces are not those of anything
             return Prediction(predicted.mean, predicted.covariance, None, None, None, noise)
         return Prediction(
@@ -140,9 +165,20 @@ class Posterior(Fitted):
             predicted.covariance,
             multiplier=through(dynamics.multiplier_map()),
             contact_force=through(dynamics.contact_force_map()),
-            unknown_force=latents.through(B),
+            unknown_force=learned,
             noise_covariance=noise,
         )
+
+    def _unlearned(self, dynamics: ConstrainedDynamics) -> Tensor | None:
+        """The covariance of joint forces beside what was learned: noise, what pushed, and what contacts hid."""
+        given, hidden = self.hyperparameters, self.settings.get("hidden_force")
+        levels = [given[name].exp().square() for name in (FORCE, PUSHES) if name in given]
+        found = torch.diag_embed(torch.stack(levels).sum(0)) if levels else None
+        if hidden is None or not dynamics.A.shape[-2]:
+            return found
+        frames = [name for name in self.training.sensed if any(x.frame == name for x in dynamics.contacts)]
+        left = hidden_forces(torch.tensor(hidden, dtype=torch.float64).to(dynamics.H), dynamics, frames)
+        return left if found is None else left + found
 
     def latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Gaussian:
         """All processes at a batch of states: mean (..., C), and their joint covariance (..., C, C) where asked for."""

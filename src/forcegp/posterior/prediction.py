@@ -11,7 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, NumericalError, UnknownName, require_known
-from forcegp.evidence import Accelerations
+from forcegp.evidence import Accelerations, ContactForces
 from forcegp.forces import Actuation, UnknownForces
 from forcegp.integration.integrators import find_roots, rows_jacobian
 from forcegp.mechanics import ConstrainedDynamics
@@ -80,7 +80,8 @@ class Prediction(Gaussian):
 
     `multiplier` is lambda (..., m); `contact_force` the world force on the robot at each contact in turn (..., 3 m) in
     N; `unknown_force` Q_U (..., nv) in Nm or N, without a mean with Q_K in it; None where a model predicts no forces.
-    Along contact normals accelerations show nothing: there all three rest on the prior alone. `noise_covariance` (...,
+    Along contact normals accelerations show nothing: where no force sensor was learned from all three rest on the prior
+    alone there. Forces of contacts hold the noise of joint forces. `noise_covariance` (...,
     nv, nv) is that of a measurement, at the root-mean-square level where that differed between rows.
     """
 
@@ -106,7 +107,9 @@ class Prediction(Gaussian):
         return Gaussian(self.mean, None if self.covariance is None else self.covariance + self.noise_covariance)
 
 
-def without_past(posterior: Any, q: Positions, v: Rows, u: Inputs, covariance: bool) -> Prediction:
+def without_past(
+    posterior: Any, q: Positions, v: Rows, u: Inputs, covariance: bool, a: Rows | None = None
+) -> Prediction:
     """The prediction for one block of rows whose u lacks what laws remember, which then counts as unknown.
 
     Its mean and variance are those of the training rows that moved the same way; a force is linear in it.
@@ -117,7 +120,9 @@ def without_past(posterior: Any, q: Positions, v: Rows, u: Inputs, covariance: b
     mean, variance = memory.likely(v, training.u[:, columns], training.v)
 
     def at(z: Float[Tensor, "rows m"], covariance: bool) -> Prediction:
-        given: Prediction = posterior.predict_rows(q, v, torch.cat([u[:, :first], z, u[:, first:]], dim=1), covariance)
+        given: Prediction = posterior.predict_rows(
+            q, v, torch.cat([u[:, :first], z, u[:, first:]], dim=1), covariance, a
+        )
         return given
 
     found = at(mean, covariance)
@@ -367,11 +372,19 @@ def quantity_of(posterior: Any, of: Any, predicted: Any, states: Sequence[Any]) 
         return predicted.acceleration
     if of in contacts:
         return predicted.contact_force.entries(slice(3 * contacts.index(of), 3 * contacts.index(of) + 3))
+    if isinstance(of, ContactForces):
+        own = [k for k, contact in enumerate(contacts) if of.frame in ("", contact.frame)]
+        if not own:
+            raise InvalidInput(f"of holds {of!r}; the model has no contact there.")
+        together = torch.zeros(3, 3 * len(contacts), dtype=torch.float64, device=posterior.model.robot.device)
+        for k in own:
+            together[:, 3 * k : 3 * k + 3] = torch.eye(3)
+        return predicted.contact_force.through(together)
     if of in forces:
         components = posterior.components(*states, covariance=predicted.covariance is not None)
         return list(components.values())[forces.index(of)].joint_force
     raise InvalidInput(
-        f"of holds {of!r}; give Accelerations(), or a contact or an unknown force of the model that predicts."
+        f"of holds {of!r}; give Accelerations(), ContactForces(frame), or a contact or an unknown force of the model."
     )
 
 

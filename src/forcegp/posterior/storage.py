@@ -17,6 +17,7 @@ from safetensors.torch import load_file, save
 from forcegp import __version__
 from forcegp.atomic_files import atomic_folder, require_replaceable, require_unchanged, write_digests
 from forcegp.data import units_for
+from forcegp.data.dataset import FORCE
 from forcegp.errors import FileFormatError, ForceGPError, require_type, usable_arguments
 from forcegp.evidence.likelihood import TrainingData
 from forcegp.inference import OptimizationResult, engine_from_dict
@@ -32,13 +33,14 @@ ROWS = ("q", "v", "u", "a")
 SETTINGS: dict[str, tuple[int | str, ...]] = {
     **dict.fromkeys(("widening", "correlated_rows", "rows_added", "learned_until"), ()),
     "data.episodes": ("episodes",),
+    "hidden_force": ("nv",),
     "motion_intervals.horizons": ("horizons",),
     "motion_intervals.rms": ("horizons", 2, "nv"),
     "motion_intervals.factors": (2, "horizons", 2, "nv"),
     **{"air.coefficients": (6, 20), "air.deviations": (6,), "air.wind": (3,)},
 }
 """Shapes of the numbers in the settings of a model that are read after loading."""
-POSITIVE = ("widening", "correlated_rows", "horizons", "deviations")
+POSITIVE = ("widening", "hidden_force", "correlated_rows", "horizons", "deviations")
 UNUSABLE = (ArithmeticError, AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError)
 UNUSABLE += (SafetensorError, ForceGPError)
 SOLUTION = "latent.solution"
@@ -75,6 +77,7 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     tensors = {f"{PARAMETERS}{name}": value for name, value in posterior.hyperparameters.items()}
     for prefix, rows in ((TRAINING, posterior.training), (REFERENCE, posterior.training.reference)):
         tensors |= {prefix + name: value for name in ROWS if (value := getattr(rows, name, None)) is not None}
+        tensors |= {f"{prefix}{FORCE}{name}": value for name, value in (rows.sensed if rows else {}).items()}
     if (solution := posterior.solution) is not None:
         tensors[SOLUTION] = solution
     with atomic_folder(path, overwrite=overwrite) as folder:
@@ -140,7 +143,11 @@ def _rows(prefix: str, tensors: Mapping[str, torch.Tensor], model: Model) -> Tra
     for name, value in given.items():
         if value.shape != (count, columns.get(name, model.robot.nv)):
             raise ValueError(f"{prefix}{name} has shape {tuple(value.shape)}, which is not that of {count} rows")
-    return TrainingData(**given)
+    own = f"{prefix}{FORCE}"
+    sensed = {name.removeprefix(own): value for name, value in tensors.items() if name.startswith(own)}
+    if any(value.shape != (count, 3) for value in sensed.values()):
+        raise ValueError(f"{own} has other shapes than ({count}, 3)")
+    return TrainingData(**given, sensed=sensed)
 
 
 def _require_numbers(settings: Mapping[str, Any], nv: int) -> None:
@@ -148,7 +155,7 @@ def _require_numbers(settings: Mapping[str, Any], nv: int) -> None:
     sizes = {"nv": nv}
     for name, shape in SETTINGS.items():
         group, _, key = name.rpartition(".")
-        if (holder := settings.get(group) if group else {key: settings.get(key, 1.0)}) is None:
+        if (holder := settings.get(group) if group else {key: settings.get(key)}) is None or holder == {key: None}:
             continue
         given = np.asarray(value := holder.get(key) if isinstance(holder, Mapping) else holder)
         same = given.ndim == len(shape) and given.dtype.kind in "if" and np.isfinite(given).all()

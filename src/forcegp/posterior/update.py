@@ -30,9 +30,11 @@ def learn_more_rows(posterior: Structured, rows: Dataset) -> Structured:
         terms = more.terms(posterior.hyperparameters)
         variance = terms.noise.expand(len(terms.W), *terms.noise.shape[1:])
         latent = with_rows(latent, terms._replace(noise=variance))
-    pairs = {name: [getattr(x, name) for x in (training, more.training)] for name in (*"qvua", "strokes")}
+    both = training, more.training
+    sensed = {frame: torch.cat([x.sensed[frame] for x in both]) for frame in training.sensed}
+    pairs = {name: [getattr(x, name) for x in both] for name in (*"qvua", "strokes")}
     joined = {name: None if any(x is None for x in pair) else torch.cat(pair) for name, pair in pairs.items()}
-    likelihood = replace(more, training=replace(training, **joined, reference=more.training.reference))
+    likelihood = replace(more, training=replace(training, **joined, sensed=sensed, reference=more.training.reference))
     changes = {"points": len(latent.system.alpha), "rows_added": posterior.settings.get("rows_added", 0) + len(rows)}
     return replace(posterior, likelihood=likelihood, latent=latent).with_settings(**changes)
 
@@ -80,7 +82,9 @@ def _on_rows(posterior: Structured, rows: Dataset) -> MarginalLikelihood:
     training = likelihood.training
     reference = training if training.reference is None else training.reference
     alike = training.correlated_rows
-    added = replace(TrainingData.of(rows, training.q.device), reference=reference, correlated_rows=alike)
+    added = replace(
+        TrainingData.of(rows, training.q.device, training.sensed), reference=reference, correlated_rows=alike
+    )
     likelihood.model.check_states(added.q, added.v, added.u)
     check_distance(likelihood.model, added)
     return replace(likelihood, training=added, fixed_standardization=likelihood.standardization)

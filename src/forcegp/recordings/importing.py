@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from typing_extensions import override
 
 import forcegp
 from forcegp.atomic_files import file_digest
 from forcegp.data import Dataset, is_dataset
+from forcegp.data.dataset import FORCE
 from forcegp.data.filters import JITTER
 from forcegp.errors import DatasetError, DataWarning, FileFormatError, InvalidInput, usable_arguments
 from forcegp.recordings.arrays import ARRAYS, ArrayFile
@@ -117,7 +119,13 @@ def import_recordings(
     columns: dict[str, Any] = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
     columns.setdefault("u", np.zeros((len(columns["time"]), 0)))
     done["rows"] = len(columns["time"])
-    return Dataset(**columns, model=model, metadata={"import": done})
+    measured = {name: columns.pop(name) for name in [*columns] if name.startswith(FORCE)}
+    if mapping.axes.get("force", ("world",)) == ("body",):
+        at = model.robot.kinematics(torch.tensor(columns["q"]))
+        for name, values in measured.items():
+            axes = at.frame_pose(name.removeprefix(FORCE))[:, :3, :3].numpy()
+            measured[name] = (axes @ values[..., None])[..., 0]
+    return Dataset(**columns, measured=measured, model=model, metadata={"import": done})
 
 
 def _sources(paths: Sequence[Path], mapping: ColumnMapping) -> list[tuple[str, Source]]:

@@ -52,6 +52,7 @@ UNITS: dict[str, dict[str, LogUnit]] = {
     | {"1": ONE}
     | _units("rad/s", {"rad/s": 1, "rev/s": _TURNS, "rpm": 60 * _TURNS}),
     "a": _units("rad/s^2", {"rad/s^2": 1, "deg/s^2": _DEGREES}) | _units("m/s^2", {"m/s^2": 1, "mm/s^2": 1e3}),
+    "force": _units("N", {"N": 1, "mN": 1e3, "kN": 1e-3}),
 }
 """By quantity and name: what `ColumnMapping.unit` accepts."""
 
@@ -68,7 +69,7 @@ def log_unit(quantity: str, name: str) -> LogUnit:
 SIGNALS = ("q", "v", "u", "a")
 ORIENTATIONS = ("xyzw", "wxyz", "angles")
 """Quaternions with w last or first; roll, pitch and yaw with R = Rz(yaw) Ry(pitch) Rx(roll), or the yaw of a plane."""
-AXES = {"v": ("body", "world"), "a": ("body", "world", "imu")}
+AXES = {"v": ("body", "world"), "a": ("body", "world", "imu"), "force": ("world", "body")}
 """What linear and angular velocities and accelerations may be measured in."""
 
 
@@ -81,10 +82,11 @@ class ColumnMapping:
     time, step: a column or combination that is the time, or the time in s between two rows; one of both.
     q, v, u, a: per signal, its columns: patterns (`pos{1..7}`), names of vectors, combinations (`theta2 - theta1`), or
         one constant. None: v and a are differentiated, the others are looked for by the names of the joints.
+    force: by frame of the robot, three columns of a force sensor there: the force on the robot, x, y, z in world axes.
     joints: their names, in the order of the columns; columns of a base that moves stand where its robot has them.
     orientation: of a base that moves: quaternions "xyzw" (default) or "wxyz", or "angles" roll, pitch and yaw.
     axes: of its v and a, of the linear and the angular part: "body" (default), "world", or "imu" for what an
-        accelerometer at its origin measures.
+        accelerometer at its origin measures; of `force` "world" (default), or "body", those of its frame.
     ned: the log's world is north, east, down and its base forward, right, down; both are turned about x by half a turn.
     unit: by signal and "time", one unit for all joints or one for each. Default: SI. With a base that moves, each unit
         is for the columns of its kind.
@@ -104,6 +106,7 @@ class ColumnMapping:
     v: tuple[str, ...] | None = None
     u: tuple[str, ...] | None = None
     a: tuple[str, ...] | None = None
+    force: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     joints: tuple[str, ...] = ()
     orientation: str | None = None
     axes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -204,7 +207,7 @@ class ColumnMapping:
         return {name: value for name, value in found.items() if value not in (None, (), {}, False)}
 
 
-EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body"}
+EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body", "force": "foot=fx,fy,fz"}
 
 
 def by_quantity(flag: str, text: str) -> dict[str, tuple[str, ...]]:

@@ -13,7 +13,7 @@ from jaxtyping import Float
 import forcegp
 from forcegp.data import differentiate
 from forcegp.data.configurations import in_base
-from forcegp.data.dataset import ROTATION, TRANSLATION
+from forcegp.data.dataset import FORCE, ROTATION, TRANSLATION
 from forcegp.errors import FileFormatError, InvalidInput, require_known
 from forcegp.recordings.mapping import (
     ORIENTATIONS,
@@ -200,6 +200,7 @@ def signal_plan(
         for name, expressions in found.items()
         for item in _signals(mapping, name, expressions, log[name], order[name], joints, turned)
     )
+    signals += tuple(item for frame in mapping.force for item in _sensor(mapping, frame, source, model))
     lacking = {name: [x.expression is LACKING for x in signals if x.signal == name != "u"] for name in found}
     episode = mapping.episode or (EPISODE if EPISODE in source.columns() else None)
     if episode is not None:
@@ -222,7 +223,10 @@ def signal_plan(
 
 def _joints(mapping: ColumnMapping, robot: Robot) -> tuple[str, ...]:
     """Joints of one degree of freedom, in the order of the log."""
-    stated = [name for name in ("orientation", "axes", "ned") if getattr(mapping, name)]
+    own_axes = mapping.axes.keys() - {"force"}
+    stated = [
+        name for name in ("orientation", "axes", "ned") if (own_axes if name == "axes" else getattr(mapping, name))
+    ]
     if stated and robot.space.is_vector_space:
         raise InvalidInput(f"{stated[0]} is about a base that moves; give a robot with one, by base='floating'.")
     own = robot.single_joint_names
@@ -232,6 +236,18 @@ def _joints(mapping: ColumnMapping, robot: Robot) -> tuple[str, ...]:
             "Give the columns of exactly these, or another `model`."
         )
     return mapping.joints or own
+
+
+def _sensor(mapping: ColumnMapping, frame: str, source: Source, model: forcegp.Model) -> Iterator[JointSignal]:
+    """The force at a frame."""
+    model.robot.frame(frame)
+    expressions = _expressions(mapping.force[frame], (), source, may_lack=False)
+    if len(expressions) != 3:
+        raise InvalidInput(
+            f"force of {frame} has {len(expressions)} columns; give x, y and z, with 0 for what was not measured."
+        )
+    unit = log_unit("force", mapping.unit.get("force", ("N",))[0])
+    yield from (JointSignal(f"{FORCE}{frame}", axis, x, unit, 1.0) for axis, x in zip("xyz", expressions, strict=True))
 
 
 def _expressions(patterns: Sequence[str], joints: Sequence[str], source: Source, may_lack: bool) -> list[Expression]:
@@ -378,11 +394,11 @@ def layout_of(mapping: ColumnMapping, model: forcegp.Model, lacking: Mapping[str
     groups = bases(model.robot)
     derived = {name: [row for row, lacks in enumerate(own) if lacks] for name, own in lacking.items()}
     axes = {name: (own[0], own[-1] if own[-1] != "imu" else "body") for name, own in mapping.axes.items()}
-    for name in axes.keys() - lacking.keys():
+    for name in axes.keys() - lacking.keys() - ({"force"} if mapping.force else set()):
         raise InvalidInput(
             f"axes of {name} are stated, but the log has no {name}; name its columns, or leave axes out."
         )
-    for name, group in ((name, group) for name in axes for group in groups):
+    for name, group in ((name, group) for name in axes if name != "force" for group in groups):
         for part, words in (((0, 1, 2), "linear"), ((3, 4, 5), "angular")):
             rows = {group.row + k for k in part}
             if axes[name][words == "angular"] == "world" and 0 < len(rows & {*derived.get(name, ())}) < len(rows):

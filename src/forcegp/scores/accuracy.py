@@ -21,6 +21,8 @@ from forcegp.data import Dataset, repeated_rows, time_blocks, with_memory
 from forcegp.data.views import in_blocks
 from forcegp.doubts import Doubt, look
 from forcegp.errors import NumericalError
+from forcegp.evidence import ContactForces
+from forcegp.evidence.recorded_rows import sensed_of
 from forcegp.inference.memory import blas_threads
 from forcegp.model import Model
 from forcegp.posterior.posterior import Posterior
@@ -34,7 +36,7 @@ Table = dict[str, dict[str, list[float | None]]]
 
 ACCELERATION, TRUE_ACCELERATION, ALL_JOINTS = "acceleration", "true acceleration", "all joints"
 FORCE, TRUE_FORCE, UNKNOWN_FORCE = "force", "true force", "unknown force"
-CONTACT_FORCE, CONSTRAINT = "contact force", "constraint"
+CONTACT_FORCE, CONSTRAINT, AT_SENSOR = "contact force", "constraint", "force at"
 
 LEVELS = (0.5, 0.95)  # of the central intervals whose coverage is scored, as `coverage_95`
 STRETCHES = 20  # parts of the time in which models are compared by themselves
@@ -50,6 +52,7 @@ class PredictedRows:
     Dataset where that is larger; `negative_log_density` of the measured rows [nats]; `known_physics`, the acceleration
     of the known forces alone; `residual` |A a - b| of the mean; the mass matrix `mass`. Of models with forces Q_U
     (`unknown_force`), what of it is known (`carried_force`, Q_K without an analytical mean, else 0), and lambda.
+    `sensed` are forces at frames with a force sensor, x, y and z of each, given the accelerations that were measured.
     """
 
     mean: Rows
@@ -64,6 +67,8 @@ class PredictedRows:
     multiplier: Float[np.ndarray, "rows m"] | None = None
     multiplier_variance: Float[np.ndarray, "rows m"] | None = None
     carried_force: Rows | None = None
+    sensed: Float[np.ndarray, "rows axes"] | None = None
+    sensed_variance: Float[np.ndarray, "rows axes"] | None = None
 
 
 def predict_rows(posterior: Posterior, dataset: Dataset) -> PredictedRows:
@@ -71,6 +76,7 @@ def predict_rows(posterior: Posterior, dataset: Dataset) -> PredictedRows:
     dataset = with_memory(dataset, posterior.model)
     device, held, done = posterior.model.robot.device, list(posterior.model.held_inputs), 0
     names: list[str] = []
+    frames = sensed_frames(posterior, dataset)
 
     def predicted(q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, ...]:
         nonlocal done, names
@@ -99,6 +105,10 @@ def predict_rows(posterior: Posterior, dataset: Dataset) -> PredictedRows:
             found |= {} if force is None else {name: force.mean, f"{name}_variance": force.variance}
         if prediction.unknown_force is not None:
             found["carried_force"] = own.Q_K if posterior.carries_known_forces else torch.zeros_like(own.Q_K)
+        if frames:
+            forces = posterior.predict(q, v, u, a=a, of=[ContactForces(frame) for frame in frames])
+            found |= {"sensed": torch.cat([x.mean for x in forces], -1)}
+            found |= {"sensed_variance": torch.cat([x.variance for x in forces], -1)}
         names, done = list(found), done + len(q)
         tell(done, len(dataset))
         return tuple(found.values())
@@ -140,7 +150,7 @@ def row_scores(
     """
     rows = predict_rows(posterior, test)
     mass = rows.mass if mass is None else mass
-    pairs = _pairs(rows, test, mass)
+    pairs = _pairs(rows, test, mass) | _of_sensors(rows, test, sensed_frames(posterior, test))
     table = {name: metrics(*each) for name, each in pairs.items() if each[0].shape == each[2].shape and each[2].size}
     table[ALL_JOINTS] = {"nlpd": [float(rows.negative_log_density.mean())]}
     measured = table[ACCELERATION]
@@ -157,6 +167,26 @@ def row_scores(
 
 Pair = tuple[np.ndarray, np.ndarray | None, np.ndarray]
 """Mean and variance of a prediction, and what was there; all (rows, columns)."""
+
+
+def sensed_frames(posterior: Posterior, dataset: Dataset) -> list[str]:
+    """Frames of contacts at which a force was measured, of a model that predicts forces."""
+    own = {contact.frame for contact in posterior.model.contacts}
+    return [] if posterior.is_black_box else [name for name in sensed_of(dataset) if name in own]
+
+
+def _of_sensors(rows: PredictedRows, test: Dataset, frames: Sequence[str]) -> dict[str, Pair]:
+    """Forces at each frame by axis, which sensors measured."""
+    if rows.sensed is None or rows.sensed_variance is None:
+        return {}
+    names = [f"{AT_SENSOR} {frame}, {axis}" for frame in frames for axis in "xyz"]
+    there = np.concatenate([sensed_of(test)[frame] for frame in frames], axis=1)
+    return {
+        name: (rows.sensed[:, [k]], rows.sensed_variance[:, [k]], there[:, [k]])
+        for k, name in enumerate(names)
+        if rows.sensed_variance[:, k].max()
+        > CONSTANT**2 * np.square(there[:, k]).mean()  # no motion of the robot pushes along the others
+    }
 
 
 def _pairs(rows: PredictedRows, test: Dataset, mass: Matrices) -> dict[str, Pair]:

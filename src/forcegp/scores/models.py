@@ -14,9 +14,9 @@ import torch
 
 from forcegp.data import Dataset, thruster_columns
 from forcegp.errors import FitError, InvalidInput
-from forcegp.evidence import Accelerations, Evidence, Motions, Torques, parse_evidence
+from forcegp.evidence import Accelerations, ContactForces, Evidence, Motions, Torques, parse_evidence
 from forcegp.evidence.least_squares import correlation_time
-from forcegp.evidence.recorded_rows import slides
+from forcegp.evidence.recorded_rows import sensed_of, slides
 from forcegp.fit import calibrated, default_options, fit, held_out_noise
 from forcegp.fit.search import MOST_POINTS_FOR_RESTARTS
 from forcegp.forces import (
@@ -31,6 +31,7 @@ from forcegp.model import Model
 from forcegp.noise import Noise
 from forcegp.posterior import Posterior
 from forcegp.scores.scores import Kind
+from forcegp.summary import listed
 
 GIVEN, ONLY, NONE = "given", "only", "none"
 """First words of the forces of a model: those that it has, and none of them; "none" adds nothing."""
@@ -100,8 +101,17 @@ def learn(
     have more rows, and intervals of motions are calibrated then. `search` is restarts, seed, jobs.
     """
     motions = [each for each in evidence if isinstance(each, Motions)]
-    others = [each for each in evidence if not isinstance(each, Motions)] or [usual_evidence(model)]
+    sensors = [each for each in evidence if isinstance(each, ContactForces)]
+    others = [each for each in evidence if each not in (*motions, *sensors)] or [usual_evidence(model)]
     first, notes = others[0], []
+    if not evidence:
+        touched = {contact.frame for contact in model.contacts}
+        sensors = [ContactForces(frame) for frame in sensed_of(dataset) if frame in touched]
+    others += sensors
+    if sensors:
+        notes.append(
+            f"evidence: {first.name}, and forces measured at {listed([x.frame or 'all frames' for x in sensors])}"
+        )
     if motions and any(isinstance(force, IndependentAccelerations) for force in model.unknown_forces):
         raise InvalidInput("motions refine physics, and gp:independent has none; leave them out.")
     if not model.unknown_forces and (isinstance(first, Torques) or model.is_open):

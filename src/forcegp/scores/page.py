@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from forcegp.data import Preparation, preparation_report
-from forcegp.scores.accuracy import ACCELERATION, ALL_JOINTS, FORCE
+from forcegp.scores.accuracy import ACCELERATION, ALL_JOINTS, AT_SENSOR, FORCE
 from forcegp.scores.scores import CRITERIA, MARGIN, Scores
 
 
@@ -117,6 +117,8 @@ def columns_of(scores: Scores) -> list[Column]:
         *((f"q after {h:g} s [{q}]", f"position after {h:g} s", "rmse", 4) for h in scores.horizons),
     ]
     held = [scores.quantities(name) for name in scores.models if scores.finished(name)]
+    sensed = [name for name in (held[0] if held else ()) if name.startswith(AT_SENSOR)]
+    wanted += [(f"{name} [N]", name, "rmse", 2) for name in sensed]
     return [each for each in wanted if all(each[2] in other.get(each[1], ()) for other in held)]
 
 
