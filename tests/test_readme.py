@@ -72,6 +72,15 @@ def test_the_results_of_real_robots_are_those_of_their_page(repository: Path):
             assert cell.strip(" *") == rows[model][column].split(",")[2].strip(" *"), (robot, model)
 
 
+def test_torques_of_real_robots_are_those_of_their_page(repository: Path):
+    readme = (repository / "README.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "benchmarks" / "real-robots.md").read_text(encoding="utf-8")
+    (least, learned) = re.findall(r"^\| Stäubli TX40 .*\| ([\d.]+) \| \*\*([\d.]+)\*\* \|$", readme, re.MULTILINE)[0]
+    (of_page, ratio) = re.findall(r"^\| Stäubli TX40 \| ([\d.]+) Nm \|[^|]*\| \*\*([\d.]+)", page, re.MULTILINE)[0]
+    assert least == of_page
+    assert abs(float(learned) - float(ratio) * float(least)) < 0.01
+
+
 def test_errors_of_tracking_are_those_of_the_benchmark(repository: Path):
     page = (repository / "docs" / "benchmarks" / "control.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| computed torque, ([^|]*)\| \**([\d.]+)", page, re.MULTILINE)

@@ -1,15 +1,17 @@
 """The recordings of real robots in the optional folder ../shared/realdata, prepared by the protocols of its README."""
 
 import gzip
+import re
 import warnings
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
 import scipy.io
 
-from forcegp.data import Dataset, Preparation, resample
+from forcegp.data import Dataset, Preparation, resample, with_strokes
 from forcegp.errors import DataWarning
-from forcegp.forces import Actuation, CoupledRotors, Law, RigidBodies
+from forcegp.forces import Actuation, Law, RigidBodies, Rotor
 from forcegp.model import Model
 from forcegp.robots import Robot
 
@@ -53,7 +55,7 @@ def multiarm(folder: Path, model: Model) -> Dataset:
 def dfki_system(folder: Path) -> Model:
     """The double pendulum of DFKI with rotors at a ratio of 6 on the first link."""
     robot = Robot.from_urdf(folder / "dfki_double_pendulum/model/double_pendulum_C1.urdf")
-    return Model(robot, (), (Actuation(), RigidBodies(), CoupledRotors(1e-5, [[6.0, 0.0], [-1.0, 6.0]])))
+    return Model(robot, (), (Actuation(), RigidBodies(), Rotor(1e-5, transmission=[[6.0, 0.0], [-1.0, 6.0]])))
 
 
 def dfki(folder: Path, model: Model, *runs: int) -> Dataset:
@@ -104,3 +106,65 @@ def emps(folder: Path) -> tuple[Dataset, Dataset]:
     log = Preparation(cutoff=20.0, trim=0.1).apply(dataset(Model(robot), time, q, u, np.zeros(len(time), dtype=int)))
     middle = 0.5 * float(log.time[-1])
     return log.rows(log.time < middle - 0.25), log.rows(log.time >= middle)
+
+
+def table(path: Path) -> np.ndarray:
+    return np.genfromtxt(path, delimiter=",", skip_header=1)  # gzip or not
+
+
+def log_of(robot: Robot, t: np.ndarray, q: np.ndarray, u: np.ndarray, step: float, every: int = 1, **how) -> Dataset:
+    raw = dataset(Model(robot), t - t[0], q, u, np.zeros(len(t), int))
+    return Preparation(every=every, **how).apply(resample(raw, step))
+
+
+def tx40(folder: Path) -> Dataset:
+    p, c = (table(folder / f"tx40/{name}.csv.gz").T for name in ("pos", "curr"))
+    q = [p[0] / 32, p[1] / 32 - np.pi / 2, p[2] / 45 + np.pi / 2, -p[3] / 48, p[4] / 45, p[5] / 32 - p[4] / 45]
+    u = [32 * c[0], 32 * c[1], 45 * c[2], -48 * c[3], 45 * c[4] + 32 * c[5], 32 * c[5]]
+    robot = Robot.from_file(folder / "tx40/tx40.urdf", inertias="nearest", armature={"joint_6": 0.05})
+    return log_of(robot, 2e-4 * np.arange(len(p[0])), np.stack(q, 1), np.stack(u, 1), 2e-4, 25, cutoff=60.0, trim=0.1)
+
+
+def tiago(folder: Path) -> Dataset:
+    text = gzip.decompress((folder / "tiago/tiago_48_schunk.urdf.gz").read_bytes()).decode()
+    own = ["torso_lift_joint", *(f"arm_{k}_joint" for k in range(1, 8))]
+    moving = [each for each in ET.fromstring(text).iter("joint") if each.get("type", "fixed") != "fixed"]
+    names = [str(each.get("name")) for each in moving if each.find("mimic") is None]
+    locked = {name: 0.0 for name in names if name not in own}
+    robot = Robot.from_urdf_text(text, locked=locked, inertias="nearest", base="fixed")
+    position, effort = (table(folder / f"tiago/tiago_{name}.csv.gz") for name in ("position", "effort"))
+    gain = np.array([1, 13.6, 13.6, -8.7, -8.7, -20.5968, -20.5968, -20.5968])
+    fresh = np.r_[True, np.diff(position[:, 0]) > 0.0]
+    t, q, u = position[fresh, 0], position[fresh, 1:], effort[fresh, 1:] * gain
+    return log_of(robot, t, q, u, float(np.median(np.diff(t))), cutoff=10.0, trim=0.25)
+
+
+def go2(folder: Path) -> Dataset:
+    text = re.sub(r"<freejoint[^>]*/>|<mesh [^>]*/>|<geom[^>]*mesh=[^>]*/>", "", (folder / "go2/go2.xml").read_text())
+    robot, data = Robot.from_mjcf_text(text), table(folder / "go2/go2_traj0.csv.gz")
+    return log_of(robot, data[:, 0], data[:, 1:13], data[:, 13:25], 0.005, cutoff=15.0, trim=0.2)
+
+
+def lbr(folder: Path) -> Dataset:
+    data = table(folder / "lbr_med7/measurements.csv.gz")
+    robot = Robot.from_file(folder / "lbr_med7/med7dock.urdf", inertias="nearest")
+    return log_of(robot, 0.01 * np.arange(len(data)), data[:, :7], -data[:, 7:14], 0.01, cutoff=5.0, trim=0.2)
+
+
+def triple(folder: Path) -> tuple[Dataset, Dataset]:
+    pieces = [x for _, x in sorted(np.load(folder / "triple_pendulum/triple_id.npz").items()) if x.ndim == 2]
+    q = np.concatenate([np.stack([x[:, 0] + np.pi, x[:, 1] - x[:, 0], x[:, 2] - x[:, 1]], 1) for x in pieces])
+    episode, steps = np.repeat(np.arange(len(pieces)), [len(x) for x in pieces]), [np.arange(len(x)) for x in pieces]
+    model = Model(Robot.from_file(folder / "triple_pendulum/published.urdf"))
+    raw = dataset(model, 1e-3 * np.concatenate(steps), q, np.zeros_like(q), episode)
+    rows = Preparation(cutoff=25.0, trim=0.1, every=5).apply(raw)
+    return rows.rows(rows.episode % 3 > 0), rows.rows(rows.episode % 3 == 0)
+
+
+def blocks(log: Dataset, guard: float = 0.25) -> tuple[Dataset, Dataset]:
+    """Of five blocks of time the third and the fifth are unseen."""
+    log, ends = with_strokes(log), np.linspace(log.time[0], log.time[-1] + 1e-9, 6)
+    block = np.searchsorted(ends, log.time, side="right") - 1
+    near = (abs(log.time[:, None] - ends[2:5]) <= guard).any(1)
+    test = np.isin(block, (2, 4))
+    return log.rows(~test & ~near), log.rows(test)

@@ -11,7 +11,6 @@ from forcegp.evidence.recorded_rows import RecordedRows
 from forcegp.fit.physical import typical_sizes
 from forcegp.forces import (
     Coulomb,
-    CoupledRotors,
     DirectionalFriction,
     LoadFriction,
     Offset,
@@ -24,6 +23,7 @@ from forcegp.forces import (
 )
 from forcegp.model import Model
 
+COUPLED = [[3.0, 0.0, 0.0], [-1.0, 4.0, 0.0], [0.0, 1.0, 2.0]]
 LAWS = {
     "viscous": Viscous([0.1, 0.2, 0.3]),
     "coulomb": Coulomb([0.5, 0.4, 0.3], [0.2, 0.3, 0.4]),
@@ -33,13 +33,16 @@ LAWS = {
     "direction": DirectionalFriction([0.2, -0.1, 0.05]),
     "spring": Spring([2.0, 1.0, 3.0], [0.1, -0.2, 0.3]),
     "rotor": Rotor([0.01, 0.02, 0.03]),
-    "coupled": CoupledRotors([1e-3, 2e-3, 3e-3], [[3.0, 0.0, 0.0], [-1.0, 4.0, 0.0], [0.0, 1.0, 2.0]]),
+    "coupled": Rotor([1e-3, 2e-3, 3e-3], transmission=COUPLED),
+    "load of motors": LoadFriction([0.1, 0.05, 0.2], 0.3, [0.2, 0.3, 0.4], transmission=COUPLED),
+    "damped motors": Viscous([0.1, 0.2, 0.3], transmission=COUPLED),
 }
 CHOICES = [
     ("viscous", "coulomb", "offset", "rotor"),
     ("stribeck", "coupled"),
     ("load", "offset", "rotor"),
     ("viscous", "direction", "spring"),
+    ("load of motors", "damped motors", "coupled"),
 ]
 
 

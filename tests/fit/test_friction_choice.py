@@ -1,6 +1,7 @@
 """Parts of gear friction by evidence: what is there is found, what is not is left out, few reversals show nothing."""
 
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -10,8 +11,17 @@ from tests.posterior.arm import arm_model
 
 from forcegp import Torques, fit
 from forcegp.data import Dataset
-from forcegp.fit.friction_choice import _Regression, choose_friction
-from forcegp.forces import DirectionalFriction, GearFriction, Viscous
+from forcegp.evidence import motion_residuals
+from forcegp.fit.friction_choice import (
+    WIDTHS,
+    _precision,
+    _Regression,
+    choose_friction,
+    friction_in_words,
+)
+from forcegp.fit.transmission_choice import SHARE, _clearly
+from forcegp.forces import Actuation, Coulomb, DirectionalFriction, GearFriction, Rotor, Viscous
+from forcegp.noise import Noise
 
 LEVEL = np.array([0.8, 0.5, 0.3])
 
@@ -53,6 +63,43 @@ def test_what_is_there_is_found_and_memory_is_not(friction, expected):
         assert sum(map(bool, names)) <= 1
 
 
+COUPLED = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 1.0]])
+
+
+@pytest.mark.parametrize("T", [np.eye(3), COUPLED], ids=["joints", "motors"])
+def test_motors_that_turn_with_two_joints_are_found(T):
+    log = log_with(lambda v, rigid: (LEVEL * sign(v @ T.T) + 0.2 * (v @ T.T)) @ T)
+    posterior, found = parts_of(log, Rotor())
+    assert found.get("transmission") == (None if T is not COUPLED else T.tolist())
+    laws = {type(law): law for law in posterior.model.laws}
+    for kind in (Viscous, GearFriction, Rotor):
+        given = laws[kind].transmission
+        np.testing.assert_array_equal(np.eye(3) if given is None else given, T)
+    np.testing.assert_allclose(laws[GearFriction].values["level"], LEVEL, rtol=0.1)
+    np.testing.assert_allclose(laws[Viscous].values["damping"], 0.2, rtol=0.2)
+    words = friction_in_words(posterior.model, log, "Nm")
+    assert ("the motor of bend turns with -1 lift +1 bend" in words) == (T is COUPLED)
+    assert words.count("the motor of") == (T is COUPLED)
+
+
+def test_a_transmission_that_is_stated_or_that_of_the_actuators_is_taken():
+    third = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.5, 1.0]])
+    log = log_with(lambda v, rigid: (LEVEL * sign(v @ third.T)) @ third, rows=1500)
+    stated = arm_model(0).with_forces(Viscous(), GearFriction(transmission="bend+0.5*lift"))
+    assert fit(stated, log, Torques(), rows=500).settings["gear_friction"]["transmission"] == third.tolist()
+    motors = Actuation((2.0 * third).T.tolist(), names=("one", "two", "three"))
+    driven = arm_model(0).with_forces(motors, Viscous(), GearFriction())
+    rows = replace(log, u=log.u @ np.linalg.inv(2.0 * third), model=replace(driven, forces=driven.laws[:2]))
+    assert fit(driven, rows, Torques(), rows=500).settings["gear_friction"]["transmission"] == third.tolist()
+
+
+@pytest.mark.parametrize(("share", "errors", "expected"), [(0.3, 4.0, True), (0.15, 9.0, False), (0.3, 2.0, False)])
+def test_a_transmission_needs_more_evidence_than_parts(share, errors, expected):
+    without, best = (each[:, None] * [1.0, 0.0, 1.0] for each in gains(share, errors))
+    assert _clearly(without, best, [0, 2]) is expected
+    assert _clearly(without, best, [0, 1]) is (expected or share < SHARE)  # relative to the joints that change
+
+
 def test_bristles_are_memory_in_every_joint(lugre_log):  # noqa: F811  # the fixture
     posterior, found = parts_of(lugre_log)
     assert all("memory" in parts for parts in found["parts"].values())
@@ -86,11 +133,59 @@ def test_few_reversals_show_no_memory(rows, enough, lugre_log):  # noqa: F811  #
     assert all("memory" not in choice.parts[JOINTS.index(name)] for name in choice.few_reversals)
 
 
+def test_long_logs_are_thinned(monkeypatch):
+    """To 10,000 rows, and to 2,000 for the first fit and for transmissions."""
+    rows, module = [], import_module("forcegp.fit.friction_choice")
+    log = log_with(lambda v, rigid: LEVEL * sign(v), rows=12_000)
+
+    def seen(name, place):
+        given = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *args: rows.append(len(args[place])) or given(*args))
+
+    seen("_Regression", 0)
+    seen("choose_transmission", 2)
+    _, found = parts_of(log)
+    assert rows == [2000, 10_000]
+    assert set(found["parts"]) == set(JOINTS)
+
+
 def test_stated_numbers_are_left_as_they_are():
     model = arm_model(0).with_forces(GearFriction(memory=False))
     posterior = fit(model, log_with(lambda v, rigid: LEVEL * sign(v)), Torques(), rows=500)
     assert "gear_friction" not in posterior.settings
     assert {name.split(".")[1] for name in posterior.parameters} >= {"level", "factor", "root", "breakaway"}
+
+
+@pytest.mark.parametrize("noise", [None, Noise((0.3, 0.2, 0.5), (0.05, 0.1, 0.02))], ids=["forces", "both"])
+def test_normal_equations_are_those_of_weighted_least_squares(noise):
+    log, model = (
+        log_with(lambda v, rigid: LEVEL * (1.0 + np.sqrt(np.abs(v))) * sign(v)).rows(slice(None, None, 5)),
+        arm_model(0).with_forces(Viscous(0.0), Coulomb(0.0)),
+    )
+    P, torque = _precision(model, log, noise), motion_residuals(log, model)[0]
+    state = model.state(*(torch.tensor(np.array(x)) for x in (log.q, log.v, log.u)))
+    regression = _Regression(P, Coulomb(), log, state, torque)
+    regression.beside, regression.across = regression._beside(0), {}
+    at, parts = (-WIDTHS[3], 5), ("root", "direction")
+    L = np.linalg.cholesky(P).swapaxes(1, 2)
+    columns = [np.linalg.solve(P, regression.bodies)]
+    for j in range(3):
+        chosen, sign_of = (parts, at[0]) if j == 0 else ((), regression.at[j])
+        s = np.tanh(log.v[:, j] / (-sign_of * regression.speed[j]))
+        more = [np.sqrt(np.abs(log.v[:, j])) * s, np.abs(log.v[:, j])] if chosen else []
+        own = [log.v[:, j], s, np.ones(600), *more]
+        columns.append(np.stack(own, axis=-1)[:, None] * np.eye(3)[j][:, None])
+    X, y = L @ np.concatenate(columns, axis=-1), L @ torque[..., None]
+    rows, left = np.arange(600) * 10 // 600, {}
+    for k in range(-1, 10):  # all rows, then without a stretch
+        kept = rows != k
+        x = np.linalg.lstsq(X[kept].reshape(-1, X.shape[-1]), y[kept].ravel(), rcond=None)[0]
+        left[k] = (y[..., 0] - X @ x) ** 2
+    joints = slice(None) if noise else 0
+    for held_out in (False, True):
+        expected = [left[k if held_out else -1][rows == k][:, joints].sum() for k in range(10)]
+        found = regression._residuals(0, parts, at, held_out)
+        np.testing.assert_allclose(found, expected, rtol=1e-3)
 
 
 def gains(share: float, errors: float) -> tuple[np.ndarray, np.ndarray]:
@@ -113,7 +208,7 @@ def gains(share: float, errors: float) -> tuple[np.ndarray, np.ndarray]:
 )
 def test_memory_needs_less_evidence_than_other_parts(share, errors, memory, expected):
     regression = object.__new__(_Regression)
-    regression.count = 10
+    regression.count, regression.coupled = 10, False
     without, best = gains(share, errors)
     gain = without - best
     assert gain.sum() / without.sum() == pytest.approx(share)

@@ -9,16 +9,7 @@ from tests.evidence.realdata import dfki, dfki_system, emps, multiarm, multiarm_
 
 from forcegp.evidence import Accelerations, Motions, motion_residuals
 from forcegp.fit import calibrated, fit
-from forcegp.forces import (
-    Coulomb,
-    CoupledRotors,
-    DirectionalFriction,
-    LoadFriction,
-    Offset,
-    RigidBodies,
-    Rotor,
-    Viscous,
-)
+from forcegp.forces import Coulomb, DirectionalFriction, LoadFriction, Offset, RigidBodies, Rotor, Viscous
 from forcegp.mechanics import Contact, Sphere
 from forcegp.scores.held_out import held_out_motions, motion_scores
 
@@ -85,7 +76,7 @@ def test_an_elbow_that_stuck_is_a_holonomic_constraint(shared):
 
 def open_rotors(model):
     """The coupled rotors that the model lists, to be estimated."""
-    (rotors,) = (law for law in model.laws if isinstance(law, CoupledRotors))
+    (rotors,) = (law for law in model.laws if isinstance(law, Rotor))
     return rotors.open()
 
 

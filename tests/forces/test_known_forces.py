@@ -14,7 +14,6 @@ from forcegp.forces import (
     Actuation,
     Body,
     Coulomb,
-    CoupledRotors,
     DirectionalFriction,
     GearFriction,
     Law,
@@ -26,7 +25,7 @@ from forcegp.forces import (
     Stribeck,
     Viscous,
 )
-from forcegp.forces.force import JointLaw
+from forcegp.forces.joint_law import JointLaw
 from forcegp.forces.registry import FORCES, force_class
 from forcegp.mechanics import State
 from forcegp.model import Model
@@ -37,6 +36,7 @@ TENSOR = torch.tensor(NUMBERS, dtype=torch.float64)
 TENTHS = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
 ROOTS = torch.tensor([0.2, -0.1, 0.3, 0.0], dtype=torch.float64)
 TRANSMISSION = ((6.0, 0.0, 0.0, 0.0), (-1.0, 6.0, 0.0, 0.0), (0.0, 0.0, 1.0, 1.0), (0.0, 0.0, 1.0, -1.0))
+COUPLED = torch.tensor(TRANSMISSION, dtype=torch.float64)
 
 FORMULAS = {
     "actuation": (lambda: Actuation(), lambda q, v, u: u),
@@ -61,8 +61,31 @@ FORMULAS = {
     "constant": (lambda: Offset(-TENSOR), lambda q, v, u: -TENSOR.expand_as(v)),
     "direction": (lambda: DirectionalFriction(-TENSOR), lambda q, v, u: TENSOR * v.abs()),
     "armature": (lambda: Rotor(NUMBERS), lambda q, v, u: torch.zeros_like(u)),
-    "rotors": (lambda: CoupledRotors(NUMBERS, TRANSMISSION), lambda q, v, u: torch.zeros_like(u)),
+    "rotors": (lambda: Rotor(NUMBERS, transmission=TRANSMISSION), lambda q, v, u: torch.zeros_like(u)),
+    "damped motors": (
+        lambda: Viscous(NUMBERS, transmission=TRANSMISSION),
+        lambda q, v, u: -torch.einsum("kj,k,ki,ni->nj", COUPLED, TENSOR, COUPLED, v),
+    ),
+    "sprung motors": (
+        lambda: Spring(NUMBERS, 0.3, transmission=TRANSMISSION),
+        lambda q, v, u: -(TENSOR * (q @ COUPLED.mT - 0.3)) @ COUPLED,
+    ),
+    "gears of motors": (
+        lambda: GearFriction(0.7, 0.5, 0.02, 0.2, transmission=TRANSMISSION),
+        lambda q, v, u: (
+            -(
+                (0.7 + 0.5 * torch.linalg.solve(COUPLED.mT, u.mT).mT.abs() + 0.2 * (v @ COUPLED.mT).abs().sqrt())
+                * ((v @ COUPLED.mT) / 0.02).tanh()
+            )
+            @ COUPLED
+        ),
+    ),
 }
+
+
+def at_motors(transmission):
+    """Makes rotors with this transmission."""
+    return lambda inertia: Rotor(inertia, transmission=transmission)
 
 
 def chain():
@@ -142,9 +165,11 @@ def test_armature_adds_to_the_diagonal_and_to_that_of_the_robot():
         (Viscous, ([1.0, -2.0, 0.0, 0.0],), InvalidInput, "every joint needs a finite number >= 0"),
         (Viscous, (math.nan,), InvalidInput, "every joint needs a finite number"),
         (Stribeck, (1.0, 2.0, 0.0), InvalidInput, "stribeck_velocity is .* a finite number > 0"),
-        (CoupledRotors, (-1.0,), InvalidInput, "CoupledRotors inertia"),
-        (CoupledRotors, (1.0, [[1.0, 0.0]]), InvalidInput, r"has shape \(1, 2\); chain needs a finite matrix \(4, 4\)"),
-        (CoupledRotors, (1.0, "gears"), InvalidInput, "CoupledRotors transmission is 'gears'"),
+        (Rotor, (-1.0,), InvalidInput, "Rotor inertia"),
+        (at_motors([[1.0, 0.0]]), (1.0,), InvalidInput, r"has shape \(1, 2\); chain needs a finite regular matrix"),
+        (at_motors([[1.0] * 4] * 4), (1.0,), InvalidInput, "needs a finite regular matrix"),
+        (at_motors("gears"), (1.0,), InvalidInput, "Rotor transmission is 'gears'; write the joints that a motor"),
+        (at_motors("spin+"), (1.0,), InvalidInput, "Rotor transmission is 'spin[+]'"),
         (Viscous, ({"elbow": 1.0},), UnknownName, "no joint 'elbow' in chain"),
         (Viscous, ({"tilt": None},), InvalidInput, "give a number, one per joint, or a mapping"),
         (Viscous, ("strong",), InvalidInput, "Viscous damping is 'strong'"),

@@ -13,6 +13,7 @@ from forcegp.forces import (
     DirectionalFriction,
     GearFriction,
     JointLaw,
+    LoadFriction,
     Offset,
     Spring,
     Stribeck,
@@ -24,6 +25,16 @@ THREE = [0.5, 0.4, 0.3]
 
 class TestViscous(LawConformance):
     law = Viscous(THREE)
+
+
+class TestSprungMotors(LawConformance):
+    law = Spring([2.0, 1.0, 3.0], [0.5, 0.2, 0.3], transmission="bend+lift")
+    given = ("transmission",)
+
+
+class TestGearsOfMotors(LawConformance):
+    law = LoadFriction(THREE, 0.1, 0.2, transmission="bend+lift")
+    given = ("velocity_scale", "transmission")
 
 
 class TestDirectionalFriction(LawConformance):

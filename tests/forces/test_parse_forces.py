@@ -14,7 +14,6 @@ from forcegp.forces import (
     BaseWrench,
     ContactFriction,
     Coulomb,
-    CoupledRotors,
     DirectionalFriction,
     GearFriction,
     IndependentAccelerations,
@@ -60,7 +59,6 @@ NAMES = {
     "offset": Offset(),
     "spring": Spring(),
     "rotor": Rotor(),
-    "coupled-rotors": CoupledRotors(),
     "gp:joint-forces": JointForces(),
     "gp:joint-accelerations": JointAccelerations(),
     "gp:independent": IndependentAccelerations(),
@@ -72,6 +70,7 @@ NAMES = {
 EXPRESSIONS = {
     "gp:joint:inputs=v/q,kernel=matern-3/2": JointForces(("v", "q"), "matern-3/2"),
     "gp:joint:v": JointForces(("v",)),
+    "viscous:transmission=lift+pan/pan-0.5*lift": Viscous(transmission="lift+pan/pan-0.5*lift"),
     "gp: joint-friction : joints = lift / pan ": JointFriction(("lift", "pan")),
     "gp:joint-ripple:period=0.5:joints=pan": JointPositionForces(("pan",), period=0.5),
     "gp:tool-forces:frame=hand:point=0/-0.1/2e-1:axes=world": ToolForces(

@@ -16,10 +16,11 @@ from forcegp.control import ComputedTorque, ContactMonitor
 from forcegp.control.tracking import Past
 from forcegp.data import estimate_delay, with_memory, with_strokes
 from forcegp.data.strokes import encoder_step, strokes, turning_points
-from forcegp.data.views import FORGOTTEN, FORGOTTEN_SOON, past_known, recorded_motions
+from forcegp.data.views import FORGOTTEN, past_known, recorded_motions
 from forcegp.errors import DataWarning, InvalidInput
 from forcegp.evidence import motion_residuals
 from forcegp.fit import calibrated
+from forcegp.fit.doubts import doubts_of_past
 from forcegp.forces import Coulomb, GearFriction, LoadFriction, Stribeck, Viscous
 from forcegp.forces.presliding import after_step, after_strokes
 from forcegp.noise import Noise
@@ -110,6 +111,28 @@ def test_a_thinned_log_has_the_same_past():
     assert np.median(abs(gaps - whole.u[some, 3:])) < 1e-6
     with pytest.raises(InvalidInput, match="remembers, and the rows are not in order of time"):
         with_memory(log.rows(some[::-1]), model)
+
+
+def test_motors_that_turn_with_two_joints_have_strokes_of_their_own():
+    time, q, v, a = motion(1500, 3)
+    law = Coulomb(1.0, sigma=SIGMA.tolist(), memory=True, transmission="bend+lift/pan-0.5*bend")
+    T = np.array([[1.0, 0.0, -0.5], [0.0, 1.0, 0.0], [0.0, 1.0, 1.0]])
+    np.testing.assert_array_equal(law.bound_to(arm_model(0).robot).transmission, T)
+    log, model = log_of(q, v, a, a, time), arm_model(0).with_forces(law)
+    whole = with_memory(log, model)
+    expected = np.stack([dahl(time, q @ T[j], v @ T[j], float(SIGMA[j])) for j in range(3)], axis=1)
+    np.testing.assert_allclose(whole.u[:, 3:], expected, atol=0.01)
+    force = whole.model.laws[-1].force(whole.model.state(*(torch.tensor(x) for x in (whole.q, whole.v, whole.u))))
+    np.testing.assert_allclose(force, -whole.u[:, 3:] @ T, atol=1e-12)
+    some = whole.rows(np.random.default_rng(1).permutation(1500)[:300])
+    np.testing.assert_array_equal(with_memory(some, model).u, some.u)
+    with pytest.raises(InvalidInput, match="not in order of time"):
+        with_memory(with_strokes(log).rows(slice(None, None, -1)), model)
+    step = 1e-3
+    coarse = log_of(np.round(q / step) * step, v, a, a, time)
+    z = after_strokes(torch.tensor(strokes(coarse, transmission=T)), torch.tensor(0.1 / step))
+    smooth = after_strokes(torch.tensor(strokes(log, transmission=T)), torch.tensor(0.1 / step))
+    assert float((z - smooth).abs().mean()) < 0.05
 
 
 def test_steps_of_an_encoder_are_no_reversals():
@@ -203,11 +226,13 @@ def test_scores_and_motions_know_the_past(lugre_log):
         assert ratio.max() < most, quantity
 
 
-@pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", "implicit-midpoint"])
-def test_compiled_motions_carry_the_state_along(integrator, lugre_log):
-    model = arm_model(0).with_forces(
-        Coulomb([0.8, 0.5, 0.3], 0.1, sigma=300.0, memory=("pan", "bend")), noise=Noise(0.1)
-    )  # fmt: skip
+@pytest.mark.parametrize(
+    ("integrator", "transmission"),
+    [("symplectic-euler", None), ("rk4", None), ("implicit-midpoint", None), ("rk4", "bend+lift")],
+)
+def test_compiled_motions_carry_the_state_along(integrator, transmission, lugre_log):
+    law = Coulomb([0.8, 0.5, 0.3], 0.1, sigma=300.0, memory=("pan", "bend"), transmission=transmission)
+    model = arm_model(0).with_forces(law, noise=Noise(0.1))
     posterior = fit(model, lugre_log.rows(slice(0, 200)))
     u = np.zeros((4, 60, 5))
     u[..., :3] = lugre_log.u[None, :60] * np.array([1.0, 0.5, -0.5, 0.2])[:, None, None]
@@ -227,9 +252,10 @@ def test_compiled_motions_carry_the_state_along(integrator, lugre_log):
 
 
 @pytest.mark.usefixtures("unchecked")  # explicit steps add and scale CasADi's expressions as they do tensors
-def test_programs_carry_the_state_along(lugre_log, tmp_path):
+@pytest.mark.parametrize("transmission", [None, "bend-0.5*lift"])
+def test_programs_carry_the_state_along(transmission, lugre_log, tmp_path):
     casadi = pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
-    law = Coulomb([0.8, 0.5, 0.3], 0.1, sigma=300.0, memory=("pan", "bend"))
+    law = Coulomb([0.8, 0.5, 0.3], 0.1, sigma=300.0, memory=("pan", "bend"), transmission=transmission)
     model = arm_model(0).with_forces(law, noise=Noise(0.1))
     posterior = fit(model, lugre_log.rows(slice(0, 200)))
     q, v = lugre_log.q[0], 0.3 * lugre_log.v[0]
@@ -327,8 +353,8 @@ def test_noise_of_an_encoder_does_not_wear_the_state_down():
 
 
 def test_rows_before_a_joint_has_moved_are_left_out():
-    _, q, v, a = motion(1500, 2)
-    rest = np.zeros((15, 3))
+    _, q, v, a = motion(6000, 2)
+    rest = 1e-9 * np.random.default_rng(0).standard_normal((15, 3))
     q, v, a = np.vstack([q[0] + rest, q]), np.vstack([rest, v]), np.vstack([rest, a])
     log = with_strokes(log_of(q, v, a, a, DT * np.arange(len(q))))
     model = arm_model(0).with_forces(Coulomb(sigma=500.0, memory=("lift",)))
@@ -336,13 +362,57 @@ def test_rows_before_a_joint_has_moved_are_left_out():
     first = int(np.argmax(known))
     assert known[first:].all()
     assert first >= 15
-    many = log.rows(np.r_[:first, first : 30 * first])  # a share that is too large is left as it is
-    assert past_known(many, model).all() == (first > FORGOTTEN_SOON * len(many))
+    for share, said in ((0.09, False), (0.11, True)):
+        many = np.arange(1000) >= 1000 * share
+        assert bool(list(doubts_of_past(model, log, many))) is said
+    for rows, left_out in ((60 * first, True), (30 * first, False)):
+        found = fit(model, log.rows(slice(0, rows)), Torques(), rows=500)
+        assert ("rows_before_a_past" in found.settings) is left_out
     way = np.abs(np.diff(q[: first + 1, 1])).sum()
     assert FORGOTTEN / 500.0 - 0.005 < way < FORGOTTEN / 500.0 + 0.005
     q[:, 1] = q[0, 1]  # a joint that never moves keeps its rows
     assert past_known(with_strokes(log_of(q, v, a, a, log.time)), model).all()
     assert past_known(log, arm_model(0)).all()
+
+
+@pytest.mark.parametrize("kind", ["short", "coarse", "sharp"])
+def test_what_a_log_does_not_tell_of_memory_is_said(kind, lugre_log):  # the fixture
+    log, few = lugre_log.rows(slice(0, 3000)), 1000
+    if kind == "short":
+        log, said = (
+            replace(log, episode=np.arange(3000) // 10),
+            r"counts as 0 before the first row .* in \d\d% of the rows",
+        )
+    elif kind == "coarse":
+        log, said = replace(log, q=np.round(log.q / 2e-3) * 2e-3), r"larger than the ways .*: pan \(2\), lift \(2\)"
+    else:
+        u = arm_model(0).robot.inverse_dynamics(*map(torch.tensor, (log.q, log.v, log.a))).numpy()
+        log, said = (
+            replace(log, u=u + 0.5 * np.sign(log.v)),
+            "sigma of pan, lift, bend is at its bound: it turns sooner",
+        )
+    with pytest.warns(DataWarning, match=said):
+        fit(arm_model(0).with_forces(Viscous(), Coulomb(memory=True)), log, Torques(), rows=few)
+
+
+def test_joints_that_stand_and_pauses_and_gaps_are_no_harm(lugre_log):  # the fixture
+    q, v, a = (np.array(x) for x in (lugre_log.q, lugre_log.v, lugre_log.a))
+    model = arm_model(0).with_forces(Viscous(), Coulomb(memory=True))
+    whole = {name: each.value for name, each in fit(model, lugre_log, Torques(), rows=1500).parameters.items()}
+    at = np.r_[0:3000, np.full(1000, 3000), 3000:6000]  # all joints wait for 2 s
+    moves = np.repeat([1.0, 0.0, 1.0], [3000, 1000, 3000])[:, None]
+    paused = log_of(q[at], moves * v[at], moves * a[at], lugre_log.u[at], DT * np.arange(7000))
+    gaps = lugre_log.rows(np.r_[0:1000, 1600:3000, 3700:6000])
+    for log in (paused, gaps):
+        found = fit(model, log, Torques(), rows=1500).parameters
+        for name, value in whole.items():
+            if not name.startswith("viscous"):
+                assert found[name].value == pytest.approx(value, rel=0.1), name
+    q[:, 1], v[:, 1], a[:, 1] = q[0, 1], 0.0, 0.0
+    still = log_of(q, v, a, lugre_log.u, lugre_log.time)
+    found = fit(model, still, Torques(), rows=1000).parameters
+    for name in ("coulomb.level.lift", "coulomb.sigma.lift"):
+        assert (found[name].decided_by, found[name].why) == ("prior", "no row shows it")
 
 
 def test_intervals_of_motions_under_gears_hold(lugre_log):

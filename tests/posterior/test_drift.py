@@ -6,17 +6,20 @@ import numpy as np
 import pytest
 import torch
 from scipy.linalg import null_space
+from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 from tests.fit.test_motion_fit import slide
-from tests.posterior.arm import arm_data
+from tests.forces.test_presliding import log_of, motion
+from tests.posterior.arm import arm_data, arm_model
 
-from forcegp import Coulomb, Dataset, Viscous, fit, load_posterior, save_posterior
+from forcegp import Coulomb, Dataset, Torques, Viscous, fit, load_posterior, save_posterior
 from forcegp.data.views import recorded_motions
 from forcegp.evidence import Accelerations
 from forcegp.fit import calibrated
 from forcegp.forces import GearFriction, JointFriction, Offset
 from forcegp.noise import Noise
-from forcegp.posterior.drift import BETWEEN, ROWS, Drift, random_walk, restricted_likelihood, scaled
+from forcegp.posterior.drift import BETWEEN, Drift, in_its_record, random_walk, restricted_likelihood, scaled
+from forcegp.scores.held_out import held_out_motions
 
 DT, NOISE = 0.01, 0.3
 
@@ -82,6 +85,10 @@ def test_where_nothing_drifts_none_is_found(steady):
         y = np.convolve(generator.standard_normal(41), [1.0, 1.0], "valid")
         lasting += random_walk(y, 10.0 * np.ones(40), np.arange(40.0), np.zeros(40, dtype=int), 1.0)[0] > 0.0
     assert lasting <= 2
+    for _ in range(20):  # what lasts for six is no error of a posture
+        y = lfilter([0.53], [1.0, -np.exp(-1.0 / 6.0)], generator.standard_normal(80))
+        lasting += random_walk(y, 100.0 * np.ones(80), np.arange(80.0), np.zeros(80, dtype=int), 1.0)[0] > 0.0
+    assert lasting >= 7
     drifting = 0
     for _ in range(40):  # a threshold twice as high would miss most
         y = generator.standard_normal(40) + 0.7 * np.cumsum(generator.standard_normal(40))
@@ -137,6 +144,20 @@ def test_update_is_conditioning_on_all_rows(steady):
     assert updated.parameters["viscous.x"] == posterior.parameters["viscous.x"]
 
 
+def test_the_level_is_that_of_motors():
+    time, q, v, a = motion(3000, 1)
+    T, level = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 1.0]]), np.array([0.8, 0.5, 0.3])
+    rigid = arm_model(0).robot.inverse_dynamics(*map(torch.tensor, (q, v, a))).numpy()
+    noise = 0.01 * np.random.default_rng(0).standard_normal((2, *q.shape))
+    first, second = (
+        log_of(q, v, a, rigid + (by * level * np.tanh(v @ T.T / 0.05)) @ T + each, time)
+        for by, each in zip((1.0, [1.0, 1.0, 1.1]), noise, strict=True)
+    )
+    posterior = fit(arm_model(0).with_forces(Coulomb(transmission="bend+lift")), first, Torques(), rows=1500)
+    moved = posterior.update(replace(second, time=time + 1e4)).settings["drift"]["level"]
+    np.testing.assert_allclose(moved, [0.0, 0.0, 0.1], atol=0.01)
+
+
 def test_another_record_is_predicted_better(steady, tmp_path):
     _, posterior = steady
     other = recording(5, level=0.15, seconds=24.0)
@@ -166,6 +187,22 @@ def test_where_the_same_record_goes_on_nothing_changes(steady):
     assert drift_of(updated).level == [0.0]
     state = log.q[:5], log.v[:5], log.u[:5]
     assert torch.equal(updated.predict(*state).mean, posterior.predict(*state).mean)
+
+
+def test_motions_that_go_on_in_the_record_have_its_level(steady):
+    _, posterior = steady
+    drift = posterior.settings["drift"]
+    until, seconds = drift["until"], drift["seconds"]
+    soon = in_its_record(posterior, [until + 0.5, until + 0.9 * seconds]).settings["drift"]
+    assert soon == {**drift, "here": "fit", "std": [0.0]}
+    for begins in ([until + 1.1 * seconds], [0.5 * until], [until + 0.5, 0.0]):
+        assert in_its_record(posterior, begins) is posterior
+    walking = posterior.with_settings(drift={**drift, "rate": [0.02]})
+    assert in_its_record(walking, [until + 4.0]).settings["drift"]["std"] == [pytest.approx(0.04)]
+    rows = recording(7, seconds=20.0)
+    later = replace(rows, time=rows.time + until + 0.1)
+    motions = held_out_motions(later, np.ones(len(rows), dtype=bool), (0.5,), 5)
+    assert motions.of(posterior)[0].settings["drift"]["here"] == "fit"
 
 
 def test_intervals_count_another_level_until_it_is_seen(steady):
@@ -213,7 +250,7 @@ def test_a_joint_that_hardly_moves_has_no_level():
 
 
 def test_many_rows_are_thinned():
-    log = recording(2, seconds=1.5 * ROWS * DT)
+    log = recording(2, seconds=150.0)
     noise = drift_of(fitted(log)).noise[0][0]
     assert noise == pytest.approx((5.0 * NOISE) ** 2 * 2.0 * DT, rel=0.3), "white noise of every second row"
 

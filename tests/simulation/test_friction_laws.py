@@ -10,7 +10,8 @@ from scipy.optimize import brentq
 
 from forcegp import Robot
 from forcegp.errors import InvalidInput, SimulationError
-from forcegp.forces.force import Coefficient, JointLaw
+from forcegp.forces.force import Coefficient
+from forcegp.forces.joint_law import JointLaw
 from forcegp.forces.registry import FORCES
 from forcegp.simulation import KukaSurfaceConfig
 from forcegp.simulation.free_arms import LawsOfJoints

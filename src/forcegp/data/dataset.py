@@ -61,6 +61,7 @@ class Dataset(Summary):
         "force.<name>" (rows, 3) [N, world axes], and "in_contact" (rows, m), 1 where a contact acts and 0 elsewhere.
     metadata: a copy of anything that JSON can hold.
     strokes: what rows know of the motion before them (`forcegp.data.strokes`), for friction that remembers; not stored.
+    transmission: of the motors whose strokes these are, (nv, nv); None: those of the joints.
     time_ordered: False for rows drawn in another order (`rows`): times are then only required to differ.
 
     Raises DatasetError naming the array, row and column that break this, and what to do.
@@ -79,6 +80,7 @@ class Dataset(Summary):
     metadata: Mapping[str, Any] = field(default_factory=dict)
     time_ordered: bool = True
     strokes: Float[np.ndarray, "rows nv strokes"] | None = None
+    transmission: Float[np.ndarray, "nv nv"] | None = None
 
     @usable_arguments("Dataset")
     def __post_init__(self) -> None:
@@ -165,6 +167,11 @@ class Dataset(Summary):
         arrays = {name: values[chosen] for name in names if (values := getattr(self, name)) is not None}
         ordered = _first_disorder(arrays["time"], arrays["episode"]) is None
         return replace(self, **arrays, measured=measured, truth=truth, time_ordered=ordered)
+
+    def knows_strokes(self, transmission: Float[np.ndarray, "nv nv"] | torch.Tensor | None = None) -> bool:
+        """Whether rows know the strokes of joints, or those of motors with this transmission."""
+        T = None if transmission is None else np.asarray(torch.as_tensor(transmission).cpu())
+        return self.strokes is not None and np.array_equal(self.transmission, T)  # type: ignore[arg-type]  # None is None
 
     def select_episodes(self, ids: Iterable[int]) -> Dataset:
         """All rows of the given episodes, in their present order. Raises InvalidInput for numbers that do not occur."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from torch import Tensor
 
 from forcegp.data.dataset import Dataset
 
@@ -16,23 +17,30 @@ ON_GRID, MOSTLY = 0.1, 0.9
 """Positions lie on a grid where so many of their differences are within this share of a whole number of steps."""
 
 
-def with_strokes(dataset: Dataset) -> Dataset:
-    """The log whose rows know the motion before them, whichever of them are chosen; as it is where it has no order."""
-    if dataset.strokes is not None or not dataset.time_ordered:
+def with_strokes(dataset: Dataset, transmission: Float[np.ndarray, "nv nv"] | Tensor | None = None) -> Dataset:
+    """The log whose rows know the motion before them, whichever of them are chosen; as it is where it has no order.
+
+    Strokes are those of joints, or of motors with this `transmission`.
+    """
+    if dataset.knows_strokes(transmission) or not dataset.time_ordered:
         return dataset
-    return replace(dataset, strokes=strokes(dataset))
+    T = None if transmission is None else np.asarray(torch.as_tensor(transmission).cpu())
+    return replace(dataset, strokes=strokes(dataset, transmission=T), transmission=T)
 
 
-def strokes(dataset: Dataset, count: int = COUNT) -> Float[np.ndarray, "rows nv count"]:
+def strokes(
+    dataset: Dataset, count: int = COUNT, transmission: Float[np.ndarray, "nv nv"] | None = None
+) -> Float[np.ndarray, "rows nv count"]:
     """Displacements (rad or m) of each joint up to every row: since the last reversal, of the stroke before, and so on.
 
     They alternate in sign; those before the first row of an episode are 0. Of joints of several degrees of freedom all
-    are. Only positions count, so pauses and thinned rows do no harm while no reversal is lost.
+    are. Only positions count, so pauses and thinned rows do no harm while no reversal is lost. With a `transmission`
+    they are those of its motors.
     """
     out = np.zeros((len(dataset), dataset.nv, count))
-    positions = joint_positions(dataset)
+    positions, steps = motor_positions(dataset, transmission)
     for joint in range(dataset.nv):
-        least = STEPS * encoder_step(dataset, positions[:, joint])
+        least = STEPS * steps[joint]
         for episode in dataset.episodes:
             rows = np.flatnonzero(dataset.episode == episode)
             q = positions[rows, joint]
@@ -46,6 +54,15 @@ def strokes(dataset: Dataset, count: int = COUNT) -> Float[np.ndarray, "rows nv 
                 place = last - k + 1
                 out[rows, joint, k] = np.where(place > 0, between[np.maximum(place, 0)], 0.0)
     return out
+
+
+def motor_positions(
+    dataset: Dataset, transmission: Float[np.ndarray, "nv nv"] | None = None
+) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, " nv"]]:
+    """Positions of motors with this transmission, None: of joints; and the steps of their encoders."""
+    positions = joint_positions(dataset)
+    steps = np.array([encoder_step(dataset, q) for q in positions.T])
+    return (positions, steps) if transmission is None else (positions @ transmission.T, abs(transmission) @ steps)
 
 
 def joint_positions(dataset: Dataset) -> Float[np.ndarray, "rows nv"]:

@@ -81,43 +81,39 @@ def with_memory(dataset: Dataset, model: Model) -> Dataset:
     Rows before the first reversal depend on where the episode began, which no log tells. Raises InvalidInput for rows
     that are not in order of time and do not carry their past, since a sample has none.
     """
-    from forcegp.data.strokes import strokes  # of views
+    from forcegp.data.strokes import with_strokes  # of views
 
     memory, own = model.memory, dataset.model.memory.names
     if not memory.names or (own == memory.names and dataset.strokes is None):
         return dataset
-    if dataset.strokes is None and not dataset.time_ordered:
+    if not (dataset := with_strokes(dataset, memory.transmission)).knows_strokes(memory.transmission):
         raise InvalidInput(
             f"{', '.join(memory.titles)} remembers, and the rows are not in order of time; give the whole log."
         )
-    past = strokes(dataset) if dataset.strokes is None else dataset.strokes
+    assert dataset.strokes is not None, "it knows them"
     remembered = np.isin(dataset.model.inputs, own)
     bare, stated = (dataset.u[:, ~remembered], dataset.u[:, remembered]) if own else (dataset.u, None)
     stated = stated if own == memory.names else None
     columns = np.zeros((len(dataset), len(memory.names)))
     for episode in dataset.episodes:
         rows = np.flatnonzero(dataset.episode == episode)
-        q, time, own_past = (
-            torch.as_tensor(np.array(x[rows]), device=model.robot.device) for x in (dataset.q, dataset.time, past)
-        )  # fmt: skip
+        each = (dataset.q, dataset.time, dataset.strokes)
+        q, time, own_past = (torch.as_tensor(np.array(x[rows]), device=model.robot.device) for x in each)
         known = None if stated is None else torch.as_tensor(np.array(stated[rows]), device=model.robot.device)
         columns[rows] = memory.along(q, time, own_past, known).cpu().numpy()
     first = model.memory_column
     u = np.concatenate([bare[:, :first], columns, bare[:, first:]], axis=1)
-    return replace(dataset, u=u, model=replace(dataset.model, forces=model.laws), strokes=past)
+    return replace(dataset, u=u, model=replace(dataset.model, forces=model.laws))
 
 
 FORGOTTEN = 3.0
 """Way times sigma after which what a joint remembered before an episode counts for less than a twentieth."""
-FORGOTTEN_SOON = 0.02
-"""Share of a log that may be left out for that: a joint that waits for long says less of itself than others move."""
 
 
 def past_known(dataset: Dataset, model: Model) -> Bool[np.ndarray, " rows"]:
     """Rows in which what joints remember does not depend on what was before their episode.
 
-    A joint that never goes so far in an episode does not count: what sticks there is in its offset. All rows do where
-    more than `FORGOTTEN_SOON` of them would not: the memory begins at 0 there.
+    A joint that never goes so far in an episode does not count: what sticks there is in its offset.
     """
     known = np.ones(len(dataset), dtype=bool)
     for law in model.laws:
@@ -128,7 +124,7 @@ def past_known(dataset: Dataset, model: Model) -> Bool[np.ndarray, " rows"]:
         for episode in dataset.episodes:
             rows = dataset.episode == episode
             known[rows] &= ~(near[rows] & ~near[rows].all(0)).any(1)
-    return known | (known.mean() < 1.0 - FORGOTTEN_SOON)
+    return known
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,8 @@ from torch import Tensor
 from forcegp.errors import InvalidInput
 from forcegp.evidence.bodies import QUANTITIES, Bodies, body_names, body_pseudo_inertias, carrying, with_bodies
 from forcegp.forces import Actuation, Law, LogNormal, Normal, Parameter, Payload, RigidBodies
-from forcegp.forces.force import Body, PerJoint
+from forcegp.forces.force import Body
+from forcegp.forces.joint_law import PerJointLaw
 from forcegp.forces.registry import force_name
 from forcegp.mechanics import State
 from forcegp.model import Model
@@ -210,7 +211,7 @@ class ParameterSpace:
     def _whole(self, law: Law, name: str) -> Tensor:
         """A coefficient with one value per joint, those that are not estimated as they are."""
         value = law.values[name].to(self.model.robot.device)
-        return value.expand(self.model.robot.nv).clone() if isinstance(law, PerJoint) else value
+        return value.expand(self.model.robot.nv).clone() if isinstance(law, PerJointLaw) else value
 
     def model_at(self, x: Float[np.ndarray, " k"]) -> Model:
         """The model with the numbers of these coordinates, all of them known. Raises NonPhysicalInertia."""
@@ -239,9 +240,9 @@ class ParameterSpace:
     # --- what they do
 
     @property
-    def under_load(self) -> bool:
-        """Whether a law that is estimated depends on the torque of the actuators."""
-        return any(self.model.laws[term.law].under_load for term in self.terms)
+    def under_load(self) -> Law | None:
+        """The law that is estimated and depends on the torque of the actuators."""
+        return next((law for law in self._estimated.values() if law.under_load), None)
 
     def torque(
         self, x: Float[np.ndarray, " k"], state: State, a: Float[np.ndarray, "rows nv"], cache: dict[Any, Any]
@@ -262,7 +263,7 @@ class ParameterSpace:
                 derivatives = [moved[:, :, list(term.joints or ())] for _, term in terms]
             else:
                 if index not in cache:
-                    cache[index] = law.features(state), law.direction(state)
+                    cache[index] = law.features(law.seen(state)), law.direction(state)
                 force, derivatives = _derivatives(law, values[index], [term for _, term in terms], *cache[index])
                 total -= force
             for (own, term), derivative in zip(terms, derivatives, strict=True):
@@ -360,15 +361,25 @@ def _derivatives(
     return force.cpu().numpy(), out
 
 
+def _at_motors(law: Law, typical: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+    """Typical sizes at the motors of a law."""
+    if law.transmission is None:
+        return typical
+    T = np.asarray(torch.as_tensor(law.transmission).cpu())
+    sizes = {name: abs(T) @ typical[name] for name in ("position", "velocity")}
+    force, inertia = abs(np.linalg.inv(T)).T @ typical["force"], typical["inertia"] / (T**2).sum(1)
+    return {**sizes, "force": force, "inertia": inertia}
+
+
 def _terms(model: Model, typical: Mapping[str, np.ndarray]) -> list[Term]:
     robot, out = model.robot, []
     singles = np.flatnonzero(np.isin(robot.joint_names, robot.single_joint_names))
     for index, law in enumerate(model.laws):
         for name in law.learned:
             coefficient, given = law.coefficients[name], getattr(law, name)
-            per_joint = isinstance(law, PerJoint)
+            per_joint = isinstance(law, PerJointLaw)
             joints = singles if per_joint else np.zeros(1, dtype=int)
-            size = coefficient.size(typical)[joints]
+            size = coefficient.size(_at_motors(law, typical))[joints]
 
             def of(value: Any, joints: np.ndarray = joints, per_joint: bool = per_joint) -> np.ndarray:
                 array = np.asarray(torch.as_tensor(value).detach().cpu(), dtype=np.float64)

@@ -7,9 +7,9 @@ Friction g |u| under load makes u = z / (1 - g sign z). Where a and u are both n
 are those of errors in variables (Fuller, "Measurement Error Models", 1987, section 3.2), given the contacts.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -46,10 +46,11 @@ def motion_residuals(
     force = dynamics.Q_K - (dynamics.M @ a[..., None])[..., 0]
     for friction in model.laws:
         if friction.under_load:
-            ones, delivered = torch.ones_like(a), dynamics.state.delivered
+            ones, motor = friction.at_joints(torch.ones_like(a)), friction.at_motors
             idle, loaded = (friction.force(_under_load(dynamics.state, load)) for load in (0.0 * ones, ones))
-            without_load = delivered + (loaded - idle) * delivered.abs() - force  # z = u - g |u| - force
-            force = dynamics.state.delivered - without_load / (1.0 + (loaded - idle) * without_load.sign())
+            delivered, slope = motor(dynamics.state.delivered), motor(loaded - idle)
+            without_load = delivered + slope * delivered.abs() - motor(force)  # z = u - g |u| - force
+            force = dynamics.state.delivered - friction.at_joints(without_load / (1.0 + slope * without_load.sign()))
     for frame, values in sensed_of(dataset).items():
         force = force + (arm(dynamics.state.kinematics, model, frame) @ torch.tensor(values[..., None]).to(a))[..., 0]
     open_ = [k for k, contact in enumerate(model.contacts) if f"{FORCE}{contact.frame}" not in dataset.measured]
@@ -74,6 +75,15 @@ def arm(kinematics: Kinematics, model: Model, frame: str) -> Float[Tensor, "rows
         )
     [point] = points or {(0.0, 0.0, 0.0)}
     return kinematics.frame_jacobian(frame, point)[..., :3, :].mT
+
+
+Response = Callable[[Float[np.ndarray, "rows nv *k"]], Float[np.ndarray, "rows nv *k"]]
+"""What joint forces without friction in proportion to the load become with it, to first order."""
+
+
+def _turned(T: Float[np.ndarray, "nv nv"] | None, values: Float[np.ndarray, "rows nv *k"]) -> np.ndarray:
+    """T^T times every row."""
+    return values if T is None else np.einsum("kj,nk...->nj...", T, values)
 
 
 def _under_load(state: State, load: Tensor) -> State:
@@ -128,7 +138,6 @@ class RecordedRows:
         self.state = replace(model.state(at_q, at_v, at_u), strokes=past)
         self.kinematics = self.state.kinematics
         self.delivered = self.state.delivered.cpu().numpy()
-        self.load = abs(self.delivered)
         A, b, _ = model.constraint(self.state)
         self.held, self.right = independent_rows(A.cpu().numpy(), b.cpu().numpy())
         """Orthonormal rows (rows, m, nv) with ``held a = right``; rows of zeros where nothing holds."""
@@ -188,27 +197,35 @@ class RecordedRows:
         return without(values, self.open.swapaxes(1, 2))
 
     def _terms(self, x: np.ndarray, a: Rows, load: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Torque of the laws that are estimated and its derivatives, under the measured load or one that is given."""
-        measured = self.load if load is None else np.full_like(self.load, load)
-        state = _under_load(self.state, torch.as_tensor(measured, device=self.state.q.device))
+        """Torque of the laws that are estimated and its derivatives, under the measured load or one of all motors."""
+        state = self.state
+        if load is not None:
+            given, law = torch.full_like(state.v, load), self.space.under_load
+            state = _under_load(state, given if law is None else law.at_joints(given))
         return self.space.torque(x, state, a, self._caches[load])
 
-    def in_torque(self, x: np.ndarray, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Residual (rows, nv), derivatives in standard parameters and in x of the laws, and du/dz (rows, nv)."""
+    def in_torque(self, x: np.ndarray, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray, Response]:
+        """Residual (rows, nv), derivatives in standard parameters and in x of the laws, and du/dz of forces."""
         parameters = self.space.standard_parameters(x)
         rigid = motion.fixed + motion.regressor.reshape(*motion.a.shape, -1) @ parameters.ravel()
-        if not self.space.under_load:
+        law = self.space.under_load
+        if law is None:
             torque, in_x = self._terms(x, motion.a, 0.0)
-            return rigid + torque, motion.regressor, in_x, np.ones_like(self.v)
+            return rigid + torque, motion.regressor, in_x, lambda values: values
         (torque, in_x), (loaded, loaded_in_x) = (self._terms(x, motion.a, load) for load in (0.0, 1.0))
+        T = None if law.transmission is None else np.asarray(torch.as_tensor(law.transmission).cpu())
+        motor, joint = (partial(_turned, each) for each in (None if T is None else np.linalg.inv(T), T))
         delivered, delivered_in_x = self.space.delivered(x, self.state, self.delivered, in_x)
-        z, g = rigid + torque + delivered, loaded - torque
+        z, g = motor(rigid + torque + delivered), motor(loaded - torque)
         sign = np.sign(z)
         left = 1.0 - g * sign
         u = z / left
-        needed_in_x = in_x + delivered_in_x + (u * sign)[..., None] * (loaded_in_x - in_x)
-        in_x = needed_in_x / left[..., None] - delivered_in_x
-        return u - delivered, motion.regressor / left[..., None, None], in_x, 1.0 / left
+
+        def response(values: np.ndarray) -> np.ndarray:
+            return joint(motor(values) / left.reshape(*left.shape, *(1,) * (values.ndim - 2)))
+
+        in_x = response(in_x + delivered_in_x + joint((u * sign)[..., None] * motor(loaded_in_x - in_x)))
+        return joint(u) - delivered, response(motion.regressor), in_x - delivered_in_x, response
 
     def acceleration(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """a^ (rows, nv), the mass matrices and H (rows, nv, nv). Raises NumericalError where a matrix is singular."""
@@ -269,8 +286,8 @@ class RecordedRows:
         Forces of joints that nothing measures, as those of a base, belong to a*, since they move the robot.
         """
         _, M, H = self.acceleration(x)
-        needed, _, _, in_z = self.in_torque(x, measured)
-        M, a, robot = in_z[..., None] * M, measured.a, self.space.model.robot
+        needed, _, _, response = self.in_torque(x, measured)
+        M, a, robot = response(M), measured.a, self.space.model.robot
         of_joints = np.isin(robot.joint_names, robot.single_joint_names)
         e_a = np.diag(noise.acceleration**2) + (H * np.where(of_joints, 0.0, noise.force**2)) @ H
         A, idle = self.held, np.logical_not(self.held.any(axis=-1))
@@ -280,9 +297,8 @@ class RecordedRows:
         moved = (gain @ (self.right[..., None] - A @ a[..., None]))[..., 0]
         e_a = e_a - gain @ at_contacts
         S = M @ e_a @ M.swapaxes(1, 2) + np.diag(np.where(of_joints, noise.force**2, 0.0))
-        pushed = (
-            self.open * in_z[:, None]
-        )  # directions of contact forces; without them S is singular where contacts hold
+        # directions of contact forces; without them S is singular where contacts hold
+        pushed = response(self.open.swapaxes(1, 2)).swapaxes(1, 2)
         S = S + np.trace(S, axis1=1, axis2=2)[:, None, None] * pushed.swapaxes(1, 2) @ pushed
         whitening = np.linalg.inv(np.linalg.cholesky(S))
         whitening = without(whitening, orthonormal_columns(pushed @ whitening.swapaxes(1, 2)))

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from forcegp.data import Dataset, contact_doubts, thruster_columns
+from forcegp.data.strokes import motor_positions
 from forcegp.doubts import Doubt, Doubts, look
 from forcegp.errors import ContactWarning, InvalidInput
 from forcegp.evidence.bodies import carrying
@@ -22,6 +23,7 @@ from forcegp.model import Model
 from forcegp.summary import listed
 
 CLEARLY_MORE = 10.0  # nats
+MISLEADING = 0.1  # share of the rows in which the past of friction is not known
 INVISIBLE = 1e-9  # |H B_c| over |M^-1 B_c| below which accelerations show nothing of a latent: rounding, measured 1e-15
 ROUNDING = 1e-12  # |M^-1 B_c| relative to the largest of them below which a latent moves nothing
 
@@ -184,6 +186,33 @@ def doubts_of_base(
 ALIKE = 5.0  # times the error of a mass without offsets
 RIGHT = 0.01  # residuals over a payload's torques below which it is right as it is
 LEAST = 0.05  # share of the squares that a payload leaves, which only numbers of no body explain
+
+
+def doubts_of_past(model: Model, log: Dataset, known: Bool[np.ndarray, " rows"]) -> Iterator[Doubt]:
+    """That many rows do not know the past of friction that is estimated."""
+    share, estimated = 1.0 - known.mean(), any(law.learned and law.memory_names(model.robot) for law in model.laws)
+    if estimated and share > MISLEADING:
+        yield look(
+            about="friction that remembers",
+            what=f"it counts as 0 before the first row of each episode, which shows in {share:.0%} of the rows: its "
+            "levels are too small.",
+            do="Give longer episodes, or leave memory out.",
+        )
+
+
+def doubts_of_reversals(model: Model, log: Dataset) -> Iterator[Doubt]:
+    """That friction turns over less than the step of an encoder, so that this is what is learned."""
+    for law in model.laws:
+        if (joints := law.memory_joints(model.robot)) and log.time_ordered:
+            steps = motor_positions(log, log.transmission)[1]
+            turns = steps * law.values["sigma"].expand(model.robot.nv).cpu().numpy()
+            if names := [f"{log.joint_names[j]} ({1e3 * steps[j]:.2g})" for j in joints if turns[j] > 1.0]:
+                yield look(
+                    about="friction that remembers",
+                    what="steps of encoders [mrad or mm] are larger than the ways over which it turns: "
+                    f"{', '.join(names)}.",
+                    do="Do not rely on sigma there, or record finer positions.",
+                )
 
 
 def doubts_of_offsets(

@@ -12,11 +12,19 @@ from torch import Tensor
 from forcegp.data import Dataset, farthest_rows
 from forcegp.data.dataset import FORCE, require_rows
 from forcegp.data.views import past_known, with_memory
+from forcegp.doubts import Doubts
 from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
 from forcegp.evidence import Accelerations, ContactForces, Evidence, Motions, Torques, TrainingData
 from forcegp.evidence.likelihood import MarginalLikelihood, check_distance, problem_size
 from forcegp.evidence.parameter_space import ParameterSpace
-from forcegp.fit.doubts import check_forces, refuse_what_has_no_answer, warn_of_contacts, without_idle_offsets
+from forcegp.fit.doubts import (
+    check_forces,
+    doubts_of_past,
+    doubts_of_reversals,
+    refuse_what_has_no_answer,
+    warn_of_contacts,
+    without_idle_offsets,
+)
 from forcegp.fit.friction_choice import with_friction_chosen
 from forcegp.fit.joint import (
     CHANGE,
@@ -63,6 +71,9 @@ SENSOR_SHARE = 0.02
 """Of what a force sensor measures: its standard deviation, where nobody states it."""
 CONTINUE_FROM = (250, 500)
 """Rows of the searches, one after the other, at whose end one on more than `MOST_POINTS_FOR_RESTARTS` rows begins."""
+
+LEFT_OUT = 0.02
+"""Largest share of the rows that is left out since they do not know the past of friction: waiting joints have more."""
 
 
 @usable_arguments("fit")
@@ -112,7 +123,8 @@ def fit(
 
     Gear friction without a stated `memory` gets the parts that held-out stretches of the log show at each joint
     (`settings["gear_friction"]`). Where friction remembers, rows in which a joint has hardly moved since its episode
-    began are left out (`settings["rows_before_a_past"]`): what it remembers there, no log tells.
+    began are left out (`settings["rows_before_a_past"]`): what it remembers there, no log tells. Warns (DataWarning)
+    where these are too many, and where the friction turns over less than the step of an encoder, or at a bound.
 
     Friction in proportion to the normal force, with no `expected` friction, is fitted again under the normal force that
     was found, until it settles.
@@ -131,10 +143,13 @@ def fit(
     dataset = with_sensors(dataset, model, rest, sensors, chosen=bool(evidence))
     dataset = _checked(model, dataset, rest, refinement)
     model = without_idle_offsets(model, dataset)
-    how = Torques() if model.robot.space.is_vector_space else Torques(noisy="both")
+    usual = Torques() if model.robot.space.is_vector_space else Torques(noisy="both")
+    how = rest if isinstance(rest, Accelerations) and not model.unknown_forces else usual
     model, choice = (model, None) if isinstance(start, Posterior) else with_friction_chosen(model, dataset, how)
     dataset = dataset if choice is None else with_memory(dataset, model)
     known = past_known(dataset, model)
+    doubts = list(doubts_of_past(model, dataset, known))
+    known = known | (known.mean() < 1.0 - LEFT_OUT)
     dataset = dataset if known.all() else dataset.rows(np.flatnonzero(known))
     logs = [dataset] if baseline is None else [dataset, _checked(model, baseline, rest, None)]
     if isinstance(start, Posterior):
@@ -164,6 +179,7 @@ def fit(
         )
     if refinement is not None:
         posterior = refine_on_motions(posterior, dataset, refinement.seconds, refinement.bodies, model)
+    Doubts([*doubts, *doubts_of_reversals(posterior.model, dataset)]).warn(stacklevel=3)
     return with_drift(posterior, dataset)
 
 

@@ -2,21 +2,26 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from forcegp.data import Dataset, evenly, with_memory, with_strokes
 from forcegp.data.views import tensors
-from forcegp.evidence import Torques, motion_residuals
-from forcegp.fit.physical import fit_physical
-from forcegp.forces import Coulomb, DirectionalFriction, DryFriction, GearFriction, LogNormal, Normal, Viscous
+from forcegp.evidence import Accelerations, Torques, motion_residuals
+from forcegp.fit.physical import Solution, fit_physical
+from forcegp.fit.transmission_choice import choose_transmission
+from forcegp.forces import Coulomb, DirectionalFriction, DryFriction, GearFriction, LogNormal, Normal, Rotor, Viscous
+from forcegp.forces.force import Force
+from forcegp.forces.joint_law import JointLaw
 from forcegp.forces.presliding import after_strokes
 from forcegp.mechanics import State
 from forcegp.model import Model
+from forcegp.noise import Noise
 
 PARTS = "memory", "factor", "root", "direction", "breakaway"
 """Of `GearFriction`, and of the law beside it."""
@@ -28,8 +33,8 @@ LEAST, LITTLE = 0.05, 0.007
 """Share of it by which a part must do so, and memory."""
 FALLS = tuple(np.geomspace(0.04, 0.6, 7).tolist())
 """Of the root mean square velocity, what a breakaway may fall over here; a fit finds the rest."""
-COLUMNS = 6 + len(FALLS)
-"""Of each joint: viscous, dry, load, root of speed, direction, a constant, and breakaways."""
+SIGNED = np.array([0, 1, 1, 1, 0, 0] + [1] * len(FALLS), dtype=bool)
+"""Of each joint's columns: viscous, dry, load, root of speed, direction, a constant, and breakaways."""
 HIGHEST = 0.5
 """Largest share of the load that friction takes: beyond it something else is explained."""
 REVERSALS = 6
@@ -38,10 +43,6 @@ WIDTHS = tuple(np.geomspace(0.003, 1.0, 11).tolist())
 """Of the smooth sign, over the root mean square velocity."""
 SEEN, RIDGE = 0.003, 1e-7
 """Of the torque of bodies, the least that counts over the largest; and what is added to the normal equations."""
-FINER = 3
-"""Times that the distance of widths, and of stiffnesses, is halved around the best one."""
-PASSES = 2
-"""Over the joints."""
 MOST_ROWS = 10_000
 """Of the log that are asked, evenly spread: each knows its past."""
 FIRST_ROWS = 2000
@@ -57,54 +58,75 @@ class FrictionChoice:
     joints: tuple[str, ...]
     parts: tuple[tuple[str, ...], ...]
     ratios: tuple[float, ...]
-    """Root mean square of what is left at a joint, over that without any of these parts."""
+    """Root mean square of what is left, over that without any of these parts at a joint."""
     few_reversals: tuple[str, ...]
     sigma: tuple[float, ...]
     """Stiffness of the memory of each joint in 1/rad or 1/m, roughly; 0 without."""
     falls: tuple[float, ...]
     """Velocity that a breakaway would fall over, roughly."""
+    transmission: Float[np.ndarray, "nv nv"] | None = None
+    """Of the motors whose friction it is; None: the joints."""
 
     def to_dict(self) -> dict[str, Any]:
         """For the settings of a fit."""
         found = {name: list(parts) for name, parts in zip(self.joints, self.parts, strict=True)}
-        return {"parts": found, "left": list(self.ratios), "few_reversals": list(self.few_reversals)}
+        coupled = {} if self.transmission is None else {"transmission": self.transmission.tolist()}
+        return {"parts": found, "left": list(self.ratios), "few_reversals": list(self.few_reversals)} | coupled
 
     def has(self, part: str) -> Bool[np.ndarray, " nv"]:
         """By joint."""
         return np.array([part in each for each in self.parts])
 
 
-def choose_friction(model: Model, log: Dataset, parts: Sequence[str] = PARTS) -> FrictionChoice:
+def choose_friction(
+    model: Model, log: Dataset, parts: Sequence[str] = PARTS, noise: Noise | None = None
+) -> FrictionChoice:
     """The parts of friction by which held-out stretches of the log are predicted better, joint by joint.
 
     `model` is one whose other numbers are known; its friction is left out. The torque that is left is regressed on
     viscous and dry friction of all joints, on parameters of bodies, which may be off, and on the parts. At each joint
-    the part that helps most is added while it helps by more than `CLEARLY` standard errors over the stretches.
+    the part that helps most is added while it helps by more than `CLEARLY` standard errors over the stretches. All this
+    is at the motors where its dry friction has a `transmission`. Residuals are weighted by the `noise` of accelerations
+    and forces, None: by that of the forces of each joint.
     """
-    log = with_strokes(log)
+    law = next((law for law in model.laws if isinstance(law, DryFriction)), Coulomb())
+    log = with_strokes(log, law.transmission)  # type: ignore[arg-type]  # a model binds it
     log = log.rows(evenly(log, MOST_ROWS))
-    friction = (Viscous, Coulomb, GearFriction, DirectionalFriction)
-    bare = replace(model, forces=tuple(force for force in model.forces if not isinstance(force, friction)))
+    bare = _without(model, Viscous, DryFriction, DirectionalFriction)
     torque = motion_residuals(replace(log, strokes=None), bare)[0]
     state = bare.state(*(torch.as_tensor(np.array(x), device=bare.robot.device) for x in (log.q, log.v, log.u)))
     strokes = log.strokes
-    regression = _Regression(model, log, state, torque)
+    regression = _Regression(_precision(model, log, noise), law, log, state, torque)
     single, few = np.isin(log.joint_names, bare.robot.single_joint_names), []
-    moving = [j for j in np.flatnonzero(single).tolist() if log.v[:, j].any()]
+    moving = [j for j in np.flatnonzero(single).tolist() if regression.v[:, j].any()]
     for j in moving:
         turns = 0 if strokes is None else int((np.diff(np.sign(strokes[:, j, 0])) != 0).sum())
         if strokes is not None and turns >= REVERSALS:
-            spread = max(float(state.positions[:, j].std()), 1e-9)
+            spread = max(float(law.turning(state.positions)[:, j].std()), 1e-9)
             regression.remember(j, strokes[:, j], [each / spread for each in STIFFNESS])
         else:
             few.append(log.joint_names[j])
-    for _ in range(PASSES):
-        for j in moving:
-            regression.choose(j, parts)
+    for j in 2 * moving:  # again, beside what the others have now
+        regression.choose(j, parts)
     chosen = [regression.parts.get(j, ()) for j in range(len(log.joint_names))]
     parts_found, ratios = tuple(chosen), tuple(regression.ratios)
     sigma, falls = regression.sigma, tuple((regression.speed * np.array(FALLS)[regression.fall]).tolist())
-    return FrictionChoice(tuple(log.joint_names), parts_found, ratios, tuple(few), sigma, falls)
+    return FrictionChoice(tuple(log.joint_names), parts_found, ratios, tuple(few), sigma, falls, log.transmission)
+
+
+def _precision(model: Model, log: Dataset, noise: Noise | None) -> Float[np.ndarray, "rows nv nv"]:
+    """Inverse covariances of residual forces: M N_a M + N_f."""
+    if noise is None or noise.force is None or noise.acceleration is None:
+        left = np.sqrt((motion_residuals(log, model)[0] ** 2).mean(0))
+        weight = np.maximum(left, 1e-6 * max(float(left.max()), 1e-12)) ** -2.0
+        return np.tile(np.diag(weight), (len(log), 1, 1))
+    q, v, u, *_ = tensors(with_memory(log, model), model.robot.device)
+    M = model.dynamics(q, v, u).M.cpu().numpy()
+    return np.linalg.inv(M * np.square(noise.acceleration) @ M + np.diag(np.square(noise.force)))
+
+
+def _without(model: Model, *laws: type[Force]) -> Model:
+    return replace(model, forces=tuple(force for force in model.forces if not isinstance(force, laws)))
 
 
 def _folds(log: Dataset) -> np.ndarray:
@@ -126,30 +148,45 @@ Sums = tuple[np.ndarray, np.ndarray, np.ndarray]
 class _Regression:
     """Weighted normal equations of all joints by stretch: bodies together, friction of each joint by itself."""
 
-    def __init__(self, model: Model, log: Dataset, state: State, torque: Float[np.ndarray, "rows nv"]) -> None:
-        self.nv, self.fold = torque.shape[1], _folds(log)
-        self.count = int(self.fold.max()) + 1
-        noise = np.sqrt((motion_residuals(log, model)[0] ** 2).mean(0))
-        self.weight = 1.0 / np.maximum(noise, 1e-6 * max(float(noise.max()), 1e-12))
-        self.v, self.load = np.asarray(log.v), np.abs(state.delivered.cpu().numpy() - torque)  # of the model
+    def __init__(
+        self, precision: np.ndarray, law: JointLaw, log: Dataset, state: State, torque: Float[np.ndarray, "rows nv"]
+    ) -> None:
+        def motors(forces: Tensor | np.ndarray) -> np.ndarray:
+            return law.at_motors(torch.as_tensor(forces, device=state.q.device)).cpu().numpy()
+
+        self.nv, fold = torque.shape[1], _folds(log)
+        self.count = int(fold.max()) + 1
+        self.rows = [fold == k for k in range(self.count)]
+        torque, given = motors(torque), motors(state.delivered)
+        v = law.turning(state.v).cpu().numpy()
+        turned = law.turning(torch.as_tensor(precision, device=state.q.device))
+        self.precision = P = law.turning(turned.mT).cpu().numpy()
+        self.coupled = bool((P * (1.0 - np.eye(self.nv))).any())
+        load = np.abs(given if self.coupled else given - torque)  # by what has less noise: u, or the model
         a = torch.as_tensor(np.array(log.a), device=state.q.device)
-        Y = state.kinematics.torque_regressor(a).flatten(2).cpu().numpy() * self.weight[:, None]
-        sizes, vectors = np.linalg.eigh(np.tensordot(Y, Y, ((0, 1), (0, 1))))
+        Y = motors(state.kinematics.torque_regressor(a).flatten(2).mT).swapaxes(1, 2)
+        sizes, vectors = np.linalg.eigh(np.tensordot(Y, P @ Y, ((0, 1), (0, 1))))
         kept = sizes > SEEN**2 * sizes.max()
-        self.bodies = Y @ (vectors[:, kept] / np.sqrt(sizes[kept] / len(Y)))
-        self.torque = torque * self.weight
-        rows = [self.fold == k for k in range(self.count)]
-        self.inner = np.stack([np.einsum("nji,njk->jik", self.bodies[k], self.bodies[k]) for k in rows])
-        self.target = np.stack([np.einsum("nji,nj->ji", self.bodies[k], self.torque[k]) for k in rows])
-        self.squares = np.stack([(self.torque[k] ** 2).sum(0) for k in rows])
-        self.rows = rows
-        self.speed = np.maximum(np.sqrt((self.v**2).mean(0)), 1e-12)
+        Y = Y @ (vectors[:, kept] / np.sqrt(sizes[kept] / len(Y)))
+        self.bodies, self.torque = P @ Y, P @ torque[..., None]
+        each = [slice(None)] if self.coupled else range(self.nv)  # rows of joints, where these stand for themselves
+        self.inner = np.stack([self._by(Y[:, j], self.bodies[:, j]) for j in each], axis=1)
+        self.target = np.stack([self._by(Y[:, j], self.torque[:, j])[..., 0] for j in each], axis=1)
+        self.squares = np.stack([self._by(torque[:, j, None], self.torque[:, j])[:, 0, 0] for j in each], axis=1)
+        self.speed = np.maximum(np.sqrt((v**2).mean(0)), 1e-12)
+        one, falls = np.ones_like(v), (np.exp(-((v / (fall * self.speed)) ** 2)) for fall in FALLS)
+        self.v, self.shapes = v, np.stack([v, one, load, np.sqrt(np.abs(v)), np.abs(v), one, *falls], axis=-1)
         self.past: dict[int, torch.Tensor] = {}
         self.signs = [{-width: self._sums(j, -width) for width in WIDTHS} for j in range(self.nv)]
         self.at, self.fall = [-WIDTHS[1]] * self.nv, [len(FALLS) // 2] * self.nv
         """The sign of each joint: minus a width, or the stiffness of a memory; and which of `FALLS` it has."""
         self.parts: dict[int, tuple[str, ...]] = {}
         self.ratios = [1.0] * self.nv
+
+    def _by(self, left: Float[np.ndarray, "rows *j n"], right: Float[np.ndarray, "rows *j m"]) -> np.ndarray:
+        """Products of columns, summed in every stretch: (stretches, n, m)."""
+        flat = [x.reshape(len(x), -1, x.shape[-1]) for x in (left, right)]
+        return np.stack([np.tensordot(flat[0][k], flat[1][k], ((0, 1), (0, 1))) for k in self.rows])
 
     @property
     def sigma(self) -> tuple[float, ...]:
@@ -161,21 +198,20 @@ class _Regression:
         self.past[j] = torch.as_tensor(np.array(strokes))
         self.signs[j] |= {sigma: self._sums(j, sigma) for sigma in stiffness}
 
-    def _sums(self, j: int, at: float) -> Sums:
+    def _columns(self, j: int, at: float) -> Float[np.ndarray, "rows k"]:
+        """Of a joint, under a sign."""
         v = self.v[:, j]
         s = after_strokes(self.past[j], torch.tensor(at)).numpy() if at > 0.0 else np.tanh(v / (-at * self.speed[j]))
-        slow = (np.exp(-((v / (fall * self.speed[j])) ** 2)) * s for fall in FALLS)
-        columns = [v, s, self.load[:, j] * s, np.sqrt(np.abs(v)) * s, np.abs(v), np.ones_like(v), *slow]
-        F, Z, y = np.stack(columns, axis=1) * self.weight[j], self.bodies[:, j], self.torque[:, j]
-        return (
-            np.stack([Z[k].T @ F[k] for k in self.rows]),
-            np.stack([F[k].T @ F[k] for k in self.rows]),
-            np.stack([F[k].T @ y[k] for k in self.rows]),
-        )
+        return self.shapes[:, j] * np.where(SIGNED, s[:, None], 1.0)
+
+    def _sums(self, j: int, at: float) -> Sums:
+        F = self._columns(j, at)
+        weighted = self.precision[:, j, j, None] * F
+        return self._by(self.bodies[:, j], F), self._by(weighted, F), self._by(F, self.torque[:, j])[..., 0]
 
     def choose(self, j: int, parts: Sequence[str]) -> None:
         """Parts of one joint, those of the others being as they are."""
-        self.beside = self._beside(j)
+        self.beside, self.across = self._beside(j), {}
         best, here = self._refined(j, ()), ()
         first = best
         both = [("memory", part) for part in ("root", "breakaway")]  # a level that changes with speed hides reversals
@@ -187,7 +223,8 @@ class _Regression:
                 break
             tried = {each: self._fitted(j, each) for each in left}
             there = min(left, key=lambda each: tried[each][1].sum())
-            if not self._clearly(best[1], tried[there][1], "memory" in {*there} - {*here}):
+            more = {*there} - {*here}  # noise of accelerations in other joints may look like two parts, not like memory
+            if not self._clearly(best[1], tried[there][1], more == {"memory"} if self.coupled else "memory" in more):
                 break
             best, here = self._refined(j, there) if "memory" in {*there} - {*here} else tried[there], there
         rest = tuple(part for part in here if part != "root")  # which stands in for a breakaway that came later
@@ -203,14 +240,12 @@ class _Regression:
             return bool(np.isfinite(best).all())
         errors, share = (LIKELY, LITTLE) if memory else (CLEARLY, LEAST)
         noise = errors * np.sqrt(self.count) * gain.std(ddof=1) if self.count > 1 else 0.0
-        return bool(gain.sum() > max(noise, share * without.sum()))
+        return bool(gain.sum() > max(noise, share * without.sum() / (self.nv if self.coupled else 1)))
 
     def _refined(self, j: int, parts: tuple[str, ...]) -> tuple[tuple[float, int], Float[np.ndarray, " stretches"]]:
         """`_fitted`, with signs between those of the grid."""
-        step = WIDTHS[1] / WIDTHS[0]
-        for _ in range(FINER):
-            step **= 0.5
-            at = self._fitted(j, parts)[0][0]
+        for part in (0.5, 0.25, 0.125):
+            at, step = self._fitted(j, parts)[0][0], (WIDTHS[1] / WIDTHS[0]) ** part
             self.signs[j] |= {each: self._sums(j, each) for each in (at * step, at / step)}
         return self._fitted(j, parts)
 
@@ -226,58 +261,74 @@ class _Regression:
         return best, self._residuals(j, parts, best, True)
 
     def _residuals(self, j: int, parts: tuple[str, ...], sign: tuple[float, int], held_out: bool) -> np.ndarray:
-        """Squared residuals of a joint in every stretch, by numbers from all rows or from the other stretches."""
-        across, inner, right = self._open(j, parts, sign)
-        (A, b), first = self.beside, across.shape[1]
-        n, m = b.shape[1], b.shape[1] + right.shape[1]
-        own, own_b = np.r_[0:first, n:m], np.concatenate([self.target[:, j], right], axis=1)
-        own_A = np.block([[self.inner[:, j], across], [across.swapaxes(1, 2), inner]])
+        """Squared residuals in every stretch, by numbers from all rows or from the other stretches.
 
-        def joined(rows: slice | list[int]) -> tuple[np.ndarray, np.ndarray]:
-            normal, target = np.zeros((m, m)), np.zeros(m)
-            normal[:n, :n], target[:n] = A[rows].sum(0), b[rows].sum(0)
-            normal[np.ix_(own, own)] += own_A[rows].sum(0)
-            target[own] += own_b[rows].sum(0)
-            return normal, target
-
-        whole, given = joined(slice(None))
+        Those of the joint, or of all joints where the noise of accelerations makes their forces resemble each other.
+        """
+        (A, b, others), (across, inner, right) = self.beside, self._open(j, parts, sign)
+        if sign[0] not in self.across:
+            nothing = np.zeros((self.count, others.shape[-1], len(SIGNED)))
+            self.across[sign[0]] = self._by(others, self._columns(j, sign[0])) if self.coupled else nothing
+        across = np.concatenate([across, self.across[sign[0]][..., self._places(parts, sign[1])]], axis=1)
+        A = np.block([[A, across], [across.swapaxes(1, 2), inner]])
+        b, n = np.concatenate([b, right], axis=1), b.shape[1]
+        own, own_A, own_b, squares = slice(None), A, b, self.squares[:, 0]
+        if not self.coupled:
+            first = self.inner.shape[-1]
+            own, across, squares = np.r_[0:first, n : b.shape[1]], across[:, :first], self.squares[:, j]
+            own_A = np.block([[self.inner[:, j], across], [across.swapaxes(1, 2), inner]])
+            own_b = np.concatenate([self.target[:, j], right], axis=1)
+        whole, given = A.sum(0), b.sum(0)
         scale = np.sqrt(whole.diagonal().clip(1e-300))
-        out, numbers = np.zeros(self.count), np.zeros(m)
+        out, x = np.zeros(self.count), np.zeros(len(whole))
         for k in range(self.count):
             if k == 0 or held_out:
-                without = joined([k]) if held_out else (0.0, 0.0)
+                without = (A[k], b[k]) if held_out else (0.0, 0.0)
                 normal = (whole - without[0]) / np.outer(scale, scale)
-                numbers = np.linalg.solve(normal + RIDGE * np.eye(m), (given - without[1]) / scale) / scale
-                loads = "factor" not in parts or 0.0 <= numbers[n + 2] <= HIGHEST
-                if not loads or ("breakaway" in parts and numbers[-1] < 0.0):
+                x = np.linalg.solve(normal + RIDGE * np.eye(len(x)), (given - without[1]) / scale) / scale
+                loads = "factor" not in parts or 0.0 <= x[n + 2] <= HIGHEST
+                if not loads or ("breakaway" in parts and not 0.0 <= x[-1] <= x[n + 1]):  # it falls by half at most
                     return np.full(self.count, np.inf)
-            x = numbers[own]
-            out[k] = self.squares[k, j] - 2.0 * x @ own_b[k] + x @ own_A[k] @ x
+            out[k] = squares[k] - 2.0 * x[own] @ own_b[k] + x[own] @ own_A[k] @ x[own]
         return out
+
+    def _places(self, parts: tuple[str, ...], fall: int) -> Int[np.ndarray, " k"]:
+        """Columns that these parts need."""
+        breaks = ("breakaway" in parts and each == fall for each in range(len(FALLS)))
+        return np.flatnonzero([True, True, *(part in parts for part in PARTS[1:-1]), True, *breaks])
 
     def _open(self, j: int, parts: tuple[str, ...], sign: tuple[float, int]) -> Sums:
         """Of the columns of a joint that these parts need."""
-        across, inner, right = self.signs[j][sign[0]]
-        breaks = ("breakaway" in parts and fall == sign[1] for fall in range(len(FALLS)))
-        open_ = np.flatnonzero([True, True, *(part in parts for part in PARTS[1:-1]), True, *breaks])
+        (across, inner, right), open_ = self.signs[j][sign[0]], self._places(parts, sign[1])
         return across[..., open_], inner[:, open_][..., open_], right[:, open_]
 
-    def _beside(self, j: int) -> tuple[np.ndarray, np.ndarray]:
-        """Normal equations of all other joints by stretch, in bodies and the columns that they need."""
+    def _beside(self, j: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Normal equations of all other joints by stretch, in bodies and the columns that they need; and these.
+
+        The latter are weighted as errors of joint j resemble theirs.
+        """
         joints = [i for i in range(self.nv) if i != j]
-        sums = [self._open(i, self.parts.get(i, ()), (self.at[i], self.fall[i])) for i in joints]
-        first = self.inner.shape[-1]
-        size = first + sum(right.shape[1] for *_, right in sums)
-        A, b, end = np.zeros((self.count, size, size)), np.zeros((self.count, size)), first
-        A[:, :first, :first], b[:, :first] = self.inner[:, joints].sum(1), self.target[:, joints].sum(1)
-        for across, inner, right in sums:
-            place = slice(end, end + right.shape[1])
+        chosen = [(i, self.parts.get(i, ()), (self.at[i], self.fall[i])) for i in joints]
+        sums, first = [self._open(*each) for each in chosen], self.inner.shape[-1]
+        columns = [self._columns(i, at)[:, self._places(parts, fall)] for i, parts, (at, fall) in chosen]
+        ends = np.cumsum([first, *(each.shape[1] for each in columns)])
+        A, b = np.zeros((self.count, ends[-1], ends[-1])), np.zeros((self.count, ends[-1]))
+        A[:, :first, :first], b[:, :first] = self.inner.sum(1), self.target.sum(1)
+        places = [slice(*pair) for pair in pairwise(ends)]
+        for k, (place, (across, inner, right)) in enumerate(zip(places, sums, strict=True)):
             A[:, :first, place], A[:, place, place], b[:, place] = across, inner, right
-            A[:, place, :first], end = across.swapaxes(1, 2), place.stop
-        return A, b
+            A[:, place, :first] = across.swapaxes(1, 2)
+            for m in range(k) if self.coupled else ():
+                weighted = self.precision[:, joints[k], joints[m], None] * columns[k]
+                A[:, place, places[m]] = self._by(weighted, columns[m])
+                A[:, places[m], place] = A[:, place, places[m]].swapaxes(1, 2)
+        weighted = [self.precision[:, j, i, None] * each for i, each in zip(joints, columns, strict=True)]
+        return A, b, np.concatenate(weighted, axis=1) if weighted else np.zeros((len(self.v), 0))
 
 
-def with_friction_chosen(model: Model, log: Dataset, evidence: Torques) -> tuple[Model, FrictionChoice | None]:
+def with_friction_chosen(
+    model: Model, log: Dataset, evidence: Torques | Accelerations
+) -> tuple[Model, FrictionChoice | None]:
     """The model whose gear friction without a stated `memory` has the parts that the log shows; None for no such law.
 
     Loads and what friction has to explain are those of a first fit with dry friction alone.
@@ -285,10 +336,23 @@ def with_friction_chosen(model: Model, log: Dataset, evidence: Torques) -> tuple
     gears = [force for force in model.laws if isinstance(force, GearFriction)]
     if not any(force.memory is None and force.level is None for force in gears):
         return model, None
-    plain = tuple(Coulomb().bound_to(model.robot) if force in gears else force for force in model.laws)
-    found = fit_physical(replace(model, forces=plain), [log], evidence, rows=FIRST_ROWS).model
+    [gear] = gears
+
+    def first(transmission: Any) -> Solution:
+        """The model with dry friction alone."""
+        plain = tuple(Coulomb().bound_to(model.robot) if force is gear else force for force in model.laws)
+        at_motors = _with_transmission(replace(model, forces=plain), transmission)
+        return fit_physical(at_motors, [log], evidence, rows=FIRST_ROWS)
+
+    found = first(gear.transmission)
+    if gear.transmission is None:
+        bare = _without(found.model, Viscous, DryFriction, DirectionalFriction, Rotor)
+        some = log.rows(evenly(log, FIRST_ROWS))
+        transmission = choose_transmission(found.model, bare, some, _folds(some))
+        found = found if transmission is None else first(transmission)
     beside = any(isinstance(law, DirectionalFriction) and law.learned for law in model.laws)
-    choice = choose_friction(found, log, [part for part in PARTS if beside or part != "direction"])
+    parts = [part for part in PARTS if beside or part != "direction"]
+    choice = choose_friction(found.model, log, parts, found.noise)
     return with_choice(model, choice), choice
 
 
@@ -312,18 +376,33 @@ def with_choice(model: Model, choice: FrictionChoice) -> Model:
         elif isinstance(force, DirectionalFriction) and force.difference is None:
             force = replace(force, difference=only("direction", 0.0))
         made.append(force)
-    return replace(model, forces=tuple(made))
+    return _with_transmission(replace(model, forces=tuple(made)), choice.transmission)
+
+
+def _with_transmission(model: Model, transmission: Any) -> Model:
+    """With friction and rotors that are estimated, and state no other, at these motors."""
+    kinds = (Viscous, DryFriction, DirectionalFriction, Rotor)
+    forces = (
+        replace(force, transmission=transmission)
+        if isinstance(force, kinds) and force.learned and force.transmission is None
+        else force
+        for force in model.forces
+    )
+    return model if transmission is None else replace(model, forces=tuple(forces))
 
 
 def friction_in_words(model: Model, log: Dataset, unit: str) -> str:
     """Dry friction of the joints at the speed and load of the log (root mean squares), near rest, and its memory."""
     [law] = [law for law in model.laws if isinstance(law, DryFriction)]
-    state = model.state(*tensors(with_memory(log, model), model.robot.device)[:3])
+    state = law.seen(model.state(*tensors(with_memory(log, model), model.robot.device)[:3]))
     v, load = (x.square().mean(0).sqrt() for x in (state.v, state.delivered))
     numbers = (law.level_at((speed, load), law.values).expand(v.shape) for speed in (v, 0.0 * v))
     joints = [log.joint_names.index(name) for name in model.robot.single_joint_names]
     moving, rest = (each[joints] for each in numbers)
     text = f"{_listed(moving)} {unit}, near rest {_listed(rest - moving)} more"
+    for name, row in zip(log.joint_names, law.turning(torch.eye(log.nv).to(v)).mT.tolist(), strict=True):
+        terms = [f"{x:+.3g} {other}" for other, x in zip(log.joint_names, row, strict=True) if x]
+        text += f"; the motor of {name} turns with {' '.join(terms)}" if len(terms) > 1 else ""
     if not (remember := law.memory_joints(model.robot)):
         return text
     ways = 1e3 / law.values["sigma"].expand(v.shape)[remember]

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 
 from forcegp.data import Dataset, evenly, with_memory
-from forcegp.doubts import Doubt, Doubts
+from forcegp.doubts import Doubt, Doubts, look
 from forcegp.errors import DatasetError, InvalidInput, require_type
 from forcegp.evidence import Accelerations, Torques
 from forcegp.evidence.bodies import BaseParameters, parameter_names, thickened
@@ -35,6 +35,7 @@ from forcegp.noise import Noise
 from forcegp.posterior.fitted import STRETCHES, Estimates
 from forcegp.progress import tell
 from forcegp.robots import Robot
+from forcegp.summary import listed
 
 
 class Equations:
@@ -238,7 +239,7 @@ def fit_physical(
             fit = search(white, start=fit.x, progress=note)
     found = space.model_at(fit.x)
     residual = equations.a - equations.accelerations(fit.x)[0]
-    doubts = list(_doubts_of_payloads(space, fit, equations.windows is not None))
+    doubts = [*_doubts_of_payloads(space, fit, equations.windows is not None), *_doubts_of_memory(space, fit.x)]
     estimates = _estimates(space, fit, equations, evidence, thick)
     if not robot.space.is_vector_space:
         doubts += doubts_of_base(model, found, equations.parts[0], residual[: len(logs[0])])
@@ -339,10 +340,6 @@ def typical_sizes(model: Model, logs: Sequence[Dataset]) -> dict[str, Float[np.n
     mass = np.maximum(mass, torque / np.maximum(np.sqrt((a**2).mean(0)), 1e-12)) if a.any() else mass
     position = state.positions.cpu().numpy()
     position = np.maximum(np.sqrt((position**2).mean(0)), 1e-3)
-    bases = (law.inertia_basis(model.robot) for law in model.laws if law.learned)
-    basis = next((found for found in bases if found is not None), None)
-    if basis is not None:
-        mass = mass / np.maximum(basis.cpu().numpy().diagonal(axis1=1, axis2=2).sum(1), 1e-12)
     return {"force": torque, "velocity": velocity, "inertia": mass, "position": position}
 
 
@@ -400,6 +397,18 @@ def _doubts_of_payloads(space: ParameterSpace, fit: Fit, averaged: bool) -> Iter
             slopes = space.bodies.chained(fit.x[: space.bodies.size], one)[:, 0, own]
             link = getattr(space.model.laws[each.payload], "link", "")
             yield from doubts_of_no_body(fit, space.standard_parameters(fit.x)[body], slopes, own, link)
+
+
+def _doubts_of_memory(space: ParameterSpace, x: np.ndarray) -> Iterator[Doubt]:
+    for own, term in zip(space.split(x)[1], space.terms, strict=True):
+        joints = np.array(space.model.robot.joint_names)[list(term.joints or ())]
+        for ends, when in ((term.high, "sooner"), (term.low, "later")) if term.name == "sigma" else ():
+            if (own == ends).any():
+                yield look(
+                    about="friction that remembers",
+                    what=f"sigma of {listed(joints[own == ends])} is at its bound: it turns {when} than the log tells.",
+                    do="Leave it out of memory, or give a log of slower reversals.",
+                )
 
 
 STRETCHES_LEFT_OUT = 4

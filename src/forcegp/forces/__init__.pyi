@@ -3,7 +3,8 @@ from .actuation import (
     Thrusters as Thrusters,
 )
 from .contact_friction import ContactFriction as ContactFriction, foot_friction as foot_friction
-from .force import Force as Force, JointLaw as JointLaw, Law as Law
+from .force import Force as Force, Law as Law
+from .joint_law import JointLaw as JointLaw
 from .joint_forces import (
     IndependentAccelerations as IndependentAccelerations, JointAccelerations as JointAccelerations,
     JointForces as JointForces, JointFriction as JointFriction,
@@ -11,7 +12,7 @@ from .joint_forces import (
 )
 from .kernels import KERNELS as KERNELS, kernel_of as kernel_of
 from .joint_laws import (
-    Coulomb as Coulomb, CoupledRotors as CoupledRotors, DirectionalFriction as DirectionalFriction,
+    Coulomb as Coulomb, DirectionalFriction as DirectionalFriction,
     DryFriction as DryFriction, GearFriction as GearFriction, LoadFriction as LoadFriction, Offset as Offset,
     Rotor as Rotor, Spring as Spring, Stribeck as Stribeck, Viscous as Viscous,
 )

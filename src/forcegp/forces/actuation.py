@@ -11,7 +11,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, require_type
-from forcegp.forces.force import Coefficient, Force, Law, Number, PerJoint, as_numbers
+from forcegp.forces.force import Coefficient, Force, Law, Number, as_numbers
+from forcegp.forces.joint_law import PerJointLaw
 from forcegp.forces.joint_laws import Coulomb, Spring, Viscous
 from forcegp.forces.rigid_bodies import RigidBodies
 from forcegp.mechanics.gauss_principle import State
@@ -22,7 +23,7 @@ FADES = 0.25  # s
 
 
 @dataclass(frozen=True, eq=False)
-class Actuation(PerJoint):
+class Actuation(PerJointLaw):
     """What the actuators deliver: gain (`matrix` u) with `matrix` (nv, nu), one column per actuator, called `names`.
 
     Without a matrix there is one actuator per joint of one degree of freedom, u = its force; bases that move have none.

@@ -14,12 +14,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from typing_extensions import override
 
 from forcegp.errors import InvalidInput, usable_arguments
 from forcegp.mechanics.gauss_principle import Contact, State
 from forcegp.robots import Robot
-from forcegp.robots.arguments import by_joint
 
 UNITS = {
     "force": ("Nm", "N"),
@@ -122,6 +120,10 @@ def per_joint(name: str, joints: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{name}.{joint}" for joint in joints)
 
 
+def _times(T: Float[Tensor, "nv nv"], x: Float[Tensor, "*batch nv"]) -> Float[Tensor, "*batch nv"]:
+    return (T @ x[..., None])[..., 0]
+
+
 PerJoint = float | Sequence[float] | Mapping[str, float] | np.ndarray | Tensor
 Number = PerJoint | Normal | LogNormal | None
 """A number of a law: given (one, one per joint, or by joint name), or estimated under a prior; None: a weak one."""
@@ -184,6 +186,8 @@ class Law(Force):
     """What its numbers are called; "" where that is the name of the law."""
     part: ClassVar[str] = ""
     """What of the robot it is a law of: those of one part take the place of each other, "" is that of its class."""
+    transmission: Any = None
+    """Of motors in which it acts; None: it acts at the joints."""
 
     @classmethod
     def takes_the_place_of(cls, other: Force) -> bool:
@@ -208,8 +212,26 @@ class Law(Force):
 
     def force_at(self, state: State, values: Mapping[str, Tensor]) -> Float[Tensor, "*#batch nv"]:
         """`force` at other coefficients."""
-        amplitude, B = self.amplitude(self.features(state), values), self.direction(state)
+        amplitude, B = self.amplitude(self.features(self.seen(state)), values), self.direction(state)
         return amplitude if B is None else (B @ amplitude[..., None])[..., 0]
+
+    def seen(self, state: State) -> State:
+        """The state as `features` are to see it."""
+        return state
+
+    def turning(self, motion: Float[Tensor, "*batch nv"]) -> Float[Tensor, "*batch nv"]:
+        """Velocities or displacements of the motors, where joints have these."""
+        return motion if self.transmission is None else _times(torch.as_tensor(self.transmission), motion)
+
+    def at_motors(self, forces: Float[Tensor, "*batch nv"]) -> Float[Tensor, "*batch nv"]:
+        """What motors deliver that make these joint forces."""
+        if self.transmission is None:
+            return forces
+        return _times(torch.linalg.inv(torch.as_tensor(self.transmission)).mT, forces)
+
+    def at_joints(self, forces: Float[Tensor, "*batch nv"]) -> Float[Tensor, "*batch nv"]:
+        """Joint forces of motors that deliver these."""
+        return forces if self.transmission is None else _times(torch.as_tensor(self.transmission).mT, forces)
 
     def inertia_basis(self, robot: Robot) -> Float[Tensor, "k nv nv"] | None:
         """What one unit of each entry of the first coefficient adds to the mass matrix; None for laws without inertia.
@@ -313,69 +335,6 @@ def slides(joint: str, robot: Robot) -> bool:
     return any(each.name == joint and each.type == "prismatic" for each in robot.joints)
 
 
-class PerJoint(Law):
-    """A law whose coefficients have one value per joint; the amplitude of a joint depends on those of that joint alone.
-
-    `features` are (..., nv) each.
-    """
-
-    @override
-    def bound_to(self: AnyLaw, robot: Robot) -> AnyLaw:
-        return replace(self, **{name: self._bound(name, robot) for name in self.coefficients})  # type: ignore[type-var]  # laws are dataclasses
-
-    def _bound(self, name: str, robot: Robot) -> Any:
-        given, coefficient = getattr(self, name), self.coefficients[name]
-        if isinstance(given, Normal | LogNormal):
-            first, second = (f.name for f in fields(given))
-            spread = getattr(given, second)
-            parts = {first: self._numbers(name, getattr(given, first), robot, coefficient)}
-            if spread is not None:
-                parts[second] = self._numbers(name, spread, robot, Coefficient("1"), weak=True)
-            return replace(given, **parts)
-        if given is None and name in self.learned:
-            return None
-        return self._numbers(name, coefficient.default if given is None else given, robot, coefficient)
-
-    def _numbers(self, name: str, given: Any, robot: Robot, coefficient: Coefficient, weak: bool = False) -> Tensor:
-        """One per joint, checked; those of weak priors may be nan."""
-        what = f"{type(self).__name__} {name}"
-        if weak and isinstance(given, tuple | list):
-            given = [np.nan if entry is None else entry for entry in given]
-        remedy = "a number, one per joint, or a mapping from joint names"
-        values = as_numbers(what, by_joint(given, robot.joint_names, robot.name), robot, remedy)
-        if values.dim() == 0:  # one number for every joint, but not for bases that move
-            driven = [joint in robot.single_joint_names or coefficient.logarithm for joint in robot.joint_names]
-            values = values * torch.tensor(driven, dtype=values.dtype, device=values.device)
-        values = values.clone()  # which keeps the graph
-        if values.shape != (robot.nv,):
-            raise InvalidInput(
-                f"{what} has {tuple(values.shape)} values; {robot.name} has {robot.nv} joints: "
-                f"{', '.join(robot.joint_names)}"
-            )
-        least = "a finite number"
-        checked = torch.where(values.isnan(), 1.0, values) if weak else values
-        good = torch.isfinite(checked)
-        if coefficient.logarithm:
-            good, least = good & (checked > 0), "a finite number > 0"
-        elif coefficient.lowest == 0.0:
-            good, least = good & (checked >= 0), "a finite number >= 0"
-        if not bool(good.all()):
-            raise InvalidInput(f"{what} is {values.tolist()}; every joint needs {least}.")
-        return values
-
-
-class JointLaw(PerJoint):
-    """A law that acts in every joint of one degree of freedom by itself, such as friction.
-
-    Joints of several degrees of freedom, such as a base that moves, have coefficients 0.
-    """
-
-    @override
-    def features(self, state: State) -> tuple[Tensor, ...]:
-        """The velocities."""
-        return (state.v,)
-
-
 def as_numbers(name: str, given: Any, robot: Robot, remedy: str) -> Tensor:
     """A tensor in float64 on the robot's device. Raises InvalidInput, with what to give, for what has no numbers."""
     try:
@@ -399,6 +358,11 @@ class Memory:
         return tuple(law.title for law, _ in self._laws)
 
     @property
+    def transmission(self) -> Tensor | None:
+        """Of the motors whose strokes they remember; None: joints."""
+        return next((law.transmission for law, _ in self._laws), None)
+
+    @property
     def start(self) -> Float[Tensor, " m"]:
         """Before anything has moved."""
         return torch.cat([law.memory_start(self.robot) for law, _ in self._laws])
@@ -412,7 +376,8 @@ class Memory:
         for law, size in self._laws:
             if (joints := law.memory_joints(self.robot)) is not None:
                 own = slice(first, first + size)
-                signs[:, own], seen_signs[:, own] = v[:, list(joints)].sign(), seen_v[:, list(joints)].sign()
+                here, there = (law.turning(each)[:, list(joints)].sign() for each in (v, seen_v))
+                signs[:, own], seen_signs[:, own] = here, there
             first += size
         mean = (seen * seen_signs).mean(0)
         at_rest = signs == 0.0

@@ -1,7 +1,7 @@
 """Laws that act in every joint by itself: friction, offsets, springs, rotors; and what each needs of the torque."""
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
@@ -13,7 +13,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
-from forcegp.forces.force import Coefficient, JointLaw, Law, Number, as_numbers
+from forcegp.forces.force import Coefficient, Law, Number
+from forcegp.forces.joint_law import JointLaw
 from forcegp.forces.presliding import after_step, after_strokes
 from forcegp.mechanics.gauss_principle import State
 from forcegp.robots import Kinematics, Robot
@@ -129,7 +130,7 @@ class DryFriction(JointLaw):
 
     @override
     def remember(self, memory: Tensor, step: Tensor, dt: float | Tensor) -> Tensor:
-        return after_step(memory, step[..., self._places], self._sigma(step)[self._places])
+        return after_step(memory, self.turning(step)[..., self._places], self._sigma(step)[self._places])
 
     @override
     def past_of(self, strokes: Tensor) -> Tensor:
@@ -269,7 +270,12 @@ class Spring(JointLaw):
 
 @dataclass(frozen=True, eq=False)
 class Rotor(JointLaw):
-    """Rotor inertia seen at the joint (kg m^2 or kg), added to the mass matrix on top of the robot's own `armature`."""
+    """Rotor inertia seen at the joint (kg m^2 or kg), added to the mass matrix on top of the robot's own `armature`.
+
+    With a `transmission` T it adds T^T diag(I) T: its rows say how fast each rotor turns about its axis, in a frame
+    that does not, per joint velocity, so that a motor on a moving link also turns with that link. Gyroscopic forces are
+    left out. Source: Murphy, Wen & Saridis, ICRA 1990.
+    """
 
     inertia: Number = None
     coefficients: ClassVar[Mapping[str, Coefficient]] = {"inertia": Coefficient("inertia")}
@@ -280,38 +286,8 @@ class Rotor(JointLaw):
 
     @override
     def inertia_basis(self, robot: Robot) -> Tensor:
-        T = self._turning(robot)
+        T = self.turning(torch.eye(robot.nv, dtype=torch.float64, device=robot.device)).mT
         return T[:, :, None] * T[:, None, :]
-
-    def _turning(self, robot: Robot) -> Tensor:
-        return torch.eye(robot.nv, dtype=torch.float64, device=robot.device)
-
-
-@dataclass(frozen=True, eq=False)
-class CoupledRotors(Rotor):
-    """Rotors that turn with several joints: T^T diag(I) T added to the mass matrix, for rotor speeds T v.
-
-    `inertia` I: one rotor per joint (kg m^2); `transmission` T (nv, nv): how fast each turns about its axis, in a frame
-    that does not, per joint velocity; None: the identity. A motor on a moving link also turns with that link.
-    Gyroscopic forces are left out. Source: Murphy, Wen & Saridis, ICRA 1990.
-    """
-
-    transmission: Sequence[Sequence[float]] | Tensor | None = None
-
-    @override
-    def bound_to(self, robot: Robot) -> "CoupledRotors":
-        given = torch.eye(robot.nv).tolist() if self.transmission is None else self.transmission
-        matrix = as_numbers("CoupledRotors transmission", given, robot, f"{robot.nv} rows of numbers")
-        if matrix.shape != (robot.nv, robot.nv) or not bool(torch.isfinite(matrix).all()):
-            raise InvalidInput(
-                f"CoupledRotors transmission has shape {tuple(matrix.shape)}; {robot.name} needs a finite matrix "
-                f"({robot.nv}, {robot.nv}): a row per rotor, a column per joint {', '.join(robot.joint_names)}."
-            )
-        return replace(super().bound_to(robot), transmission=matrix)
-
-    @override
-    def _turning(self, robot: Robot) -> Tensor:
-        return torch.as_tensor(self.transmission)
 
 
 Values = Float[np.ndarray, "rows nv"]

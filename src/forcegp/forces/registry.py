@@ -29,7 +29,6 @@ FORCES: dict[str, str | type[Force]] = {
     "offset": "joint_laws.Offset",
     "spring": "joint_laws.Spring",
     "rotor": "joint_laws.Rotor",
-    "coupled-rotors": "joint_laws.CoupledRotors",
     "joint-forces": "joint_forces.JointForces",
     "joint-accelerations": "joint_forces.JointAccelerations",
     "independent": "joint_forces.IndependentAccelerations",

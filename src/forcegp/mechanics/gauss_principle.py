@@ -150,7 +150,8 @@ class State:
     """Positions, velocities and inputs of equal batch, and the standard parameters of `bodies` (None: the robot's).
 
     `inputs` names the columns of u, `delivered` are the joint forces (..., nv) of its actuators, `strokes` the
-    displacements of each joint from reversal to reversal before the state, the last one first, where they are known.
+    displacements of each joint (or motor, for laws at motors) from reversal to reversal before the state, the last one
+    first, where they are known.
     """
 
     q: Float[Tensor, "*batch nq"]
@@ -163,7 +164,7 @@ class State:
     delivered_by: "Callable[[State], Tensor] | None" = None
     strokes: Float[Tensor, "*batch nv strokes"] | None = None
 
-    @property
+    @cached_property
     def positions(self) -> Float[Tensor, "*batch nv"]:
         """Positions of the joints; 0 in the places of joints of several degrees of freedom."""
         if self.robot.space.is_vector_space:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset, with_memory
 from forcegp.data.views import consecutive, in_blocks
-from forcegp.forces.force import JointLaw
+from forcegp.forces.joint_law import JointLaw
 from forcegp.forces.joint_laws import DryFriction
 from forcegp.forces.registry import force_name
 from forcegp.model import Model
@@ -76,6 +76,10 @@ class Drift:
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values."""
         return asdict(self)
+
+    def goes_on(self, begins: float) -> bool:
+        """Whether rows that begin at this time are of the record of the last row."""
+        return self.until < begins < self.until + self.seconds
 
     @property
     def shares(self) -> Float[np.ndarray, "2 1 1 1"]:
@@ -202,6 +206,15 @@ def random_walk(
     return rate * noise, between * noise, noise * (1.0 + 2.0 * lasting * seconds / (size * width))
 
 
+def in_its_record(posterior: Posterior, begins: Sequence[float]) -> Posterior:
+    """The posterior of motions in the record of the fit, whose level is known, if all begin soon after it."""
+    stored: Mapping[str, Any] | None = posterior.settings.get("drift")
+    if stored is None or stored["here"] != "unknown" or not all(map(Drift(**stored).goes_on, begins)):
+        return posterior
+    std = (max(begins) - stored["until"]) ** 0.5 * np.array(stored["rate"])
+    return posterior.with_settings(drift={**stored, "here": "fit", "std": std.tolist()})
+
+
 def followed(posterior: Posterior, rows: Dataset) -> Posterior:
     """What `Posterior.update` says of laws without unknown forces beside them."""
     stored: Mapping[str, Any] | None = posterior.settings.get("drift")
@@ -218,7 +231,7 @@ def followed(posterior: Posterior, rows: Dataset) -> Posterior:
         record = np.flatnonzero(rows.episode == number)
         begins = float(rows.time[record][0])
         ages = np.diff(rows.time[record], prepend=begins)
-        if number == rows.episodes[0] and drift.until < begins < drift.until + drift.seconds:  # the same record goes on
+        if number == rows.episodes[0] and drift.goes_on(begins):
             here, ages[0] = ("fit" if here == "unknown" else here), begins - drift.until
             P = P if drift.here == "another" else 0.0 * P
         else:  # its level is about that of the fit
@@ -253,15 +266,16 @@ def _moved(posterior: Posterior, d: np.ndarray, std: np.ndarray) -> Any:
 
 
 def _missed(posterior: Posterior, rows: Dataset) -> tuple[np.ndarray, np.ndarray, float]:
-    """Joint forces that the mean lacks, those of dry friction (rows, nv), and the step of time in s."""
+    """Forces that the mean lacks, and of dry friction, at its motors or joints (rows, nv); the step of time in s."""
     model = posterior.model
     rows = with_memory(rows, model)
 
     def of(q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, ...]:
         away = a - posterior.predict_rows(q, v, u, False).mean
         state, M = model.state(q, v, u), posterior.dynamics(q, v, u).M
-        dry = [law.force(state) for law in model.laws if isinstance(law, DryFriction)]
-        return (M @ away[..., None])[..., 0], torch.stack(dry).sum(0)
+        laws = [law for law in model.laws if isinstance(law, DryFriction)]
+        dry = torch.stack([law.force(state) for law in laws]).sum(0)
+        return laws[0].at_motors((M @ away[..., None])[..., 0]), laws[0].at_motors(dry)
 
     missed, friction = in_blocks(rows, of, model.robot.device)
     steps = np.diff(rows.time)[consecutive(rows)[:-1]]

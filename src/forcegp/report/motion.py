@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from forcegp.data import Dataset
 from forcegp.errors import required_extra
-from forcegp.forces import Actuation, BaseWrench, CoupledRotors, ObservedWrench, RigidBodies, Rotor, Thrusters, Unknown
+from forcegp.forces import Actuation, BaseWrench, ObservedWrench, RigidBodies, Rotor, Thrusters, Unknown
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.posterior.posterior import Posterior
 from forcegp.report.shapes import LinkShape, link_shapes, poses_of_links, reach
@@ -27,7 +27,7 @@ LONGEST_ARROW = 0.4
 """Of the reach of the robot, for a force that is large in its group."""
 LARGE = 98.0
 """Percentile of the largest force of each row: peaks do not make all other arrows short."""
-NOT_SHOWN = (Actuation, Thrusters, ObservedWrench, RigidBodies, Rotor, CoupledRotors)
+NOT_SHOWN = (Actuation, Thrusters, ObservedWrench, RigidBodies, Rotor)
 """Known forces that are no finding at a joint: what motors do, wind on a base, and inertia."""
 
 

@@ -17,6 +17,7 @@ from forcegp.data import Dataset, require_disjoint
 from forcegp.data.views import EVEN_STEPS, RecordedMotions, recorded_motions
 from forcegp.errors import InvalidInput, require_type, usable_arguments
 from forcegp.posterior import Posterior, observing
+from forcegp.posterior.drift import in_its_record
 from forcegp.robots.arguments import whole_number
 from forcegp.scores.accuracy import Table
 from forcegp.summary import plain
@@ -179,8 +180,12 @@ class HeldOutMotions:
     stretches: tuple[tuple[Dataset, tuple[int, ...]], ...] = ()
 
     def of(self, posterior: Posterior) -> tuple[Posterior, RecordedMotions]:
-        """The posterior, and the motions with what its observers have seen before each of them."""
+        """The posterior, and the motions with what its observers have seen before each of them.
+
+        Its friction is known where these go on in the record that it was fitted to.
+        """
         assert self.motions is not None, "there are motions"
+        posterior = in_its_record(posterior, [float(rows.time.min()) for rows, _ in self.stretches])
         pairs = [observing(posterior, rows, whole=True) for rows, _ in self.stretches]
         if all(seen is rows for (_, seen), (rows, _) in zip(pairs, self.stretches, strict=True)):
             return posterior, self.motions

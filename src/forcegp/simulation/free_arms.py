@@ -11,7 +11,8 @@ from jaxtyping import Float
 
 from forcegp.data import Dataset
 from forcegp.forces import Actuation, RigidBodies
-from forcegp.forces.force import JointLaw, Law
+from forcegp.forces.force import Law
+from forcegp.forces.joint_law import JointLaw
 from forcegp.forces.joint_laws import LazyState, Viscous
 from forcegp.forces.registry import parse_forces
 from forcegp.model import Model

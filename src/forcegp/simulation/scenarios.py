@@ -26,7 +26,7 @@ def require_joint_friction(name: Any, more: Sequence[str] = ()) -> None:
     """Raise InvalidInput for what is neither none, nor one of these, nor laws of joints."""
     if name in ("none", *more):
         return
-    from forcegp.forces.force import JointLaw  # torch, which lists of options do without
+    from forcegp.forces.joint_law import JointLaw  # torch, which lists of options do without
     from forcegp.forces.registry import FORCES, force_class, parse_forces
 
     laws = [each for each in FORCES if issubclass(force_class(each), JointLaw)]

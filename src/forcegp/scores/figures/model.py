@@ -16,7 +16,6 @@ from forcegp.data import Dataset, evenly, recorded_motions
 from forcegp.errors import ForceGPError, InvalidInput
 from forcegp.forces import (
     Actuation,
-    CoupledRotors,
     JointFriction,
     LoadFriction,
     Offset,
@@ -36,7 +35,7 @@ from forcegp.scores.scores import Scores
 LARGEST_GRID = 12
 BEYOND = 0.18  # part of the visited range that is drawn on either side of it
 POINTS = 241
-NOT_OF_VELOCITY = (Actuation, RigidBodies, Rotor, CoupledRotors, Offset, LoadFriction)
+NOT_OF_VELOCITY = (Actuation, RigidBodies, Rotor, Offset, LoadFriction)
 """Known forces that are no curve over the velocity of one joint."""
 LAWS = "friction laws"  # the component of a joint that has laws alone
 TRUE_POINTS = 200
