@@ -1,7 +1,7 @@
 """Where a robot goes according to a fitted model: `Rollout`, and one step x+ = f(x, u) with its derivatives."""
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -99,13 +99,14 @@ def moved(
     diverge, Newton's method fails) are integrated again by torch, with those of the other loops from the same place.
     """
 
-    def shaped(q: Tensor, v: Tensor, a: Tensor, ended: Tensor) -> Motions:
-        return Motions(*(x.reshape(*batch, *x.shape[1:]) for x in (q, v, a)), ended.reshape(tuple(batch)))
+    def shaped(rows: Iterable[Tensor], ended: Tensor) -> Motions:
+        q, v, a = (x.reshape(*batch, *x.shape[1:]) for x in rows)
+        return Motions(q, v, a, ended.reshape(tuple(batch)))
 
     if loops is None:
         u, feedback = remembering(model, u, dt, feedback)
         found = integrate(method, acceleration, q, v, u, dt, feedback=feedback, what=what)
-        return shaped(*(x.movedim(0, 1) for x in (found.q, found.v, found.a)), found.diverged_at)
+        return shaped((x.movedim(0, 1) for x in (found.q, found.v, found.a)), found.diverged_at)
     check_start(v, dt)
     own, (steps, count, _) = len(q) // len(loops), u.shape
     kept = ((q, steps + 1), (v, steps + 1), (v, steps))
@@ -129,7 +130,7 @@ def moved(
             kept[rows] = found.movedim(0, 1)
         ended[rows], not_found[rows] = again.diverged_at, again.not_found
     warn_of_divergence(ended, not_found, dt, what)
-    return shaped(Q, V, A, ended)
+    return shaped((Q, V, A), ended)
 
 
 @dataclass(frozen=True, eq=False)

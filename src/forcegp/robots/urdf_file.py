@@ -90,10 +90,12 @@ def replace_dynamics(text: str, joints: Mapping[str, Mapping[str, float]], *, so
     for joint, values in joints.items():
         owner = _found(document, "joint", joint, source)
         dynamics = _child(owner, "dynamics")
-        if dynamics is None and any(values.values()):
+        if dynamics is None:
+            if not any(values.values()):
+                continue
             dynamics = owner.appendChild(document.createElement("dynamics"))
             values = {"damping": 0.0, **values}  # other readers refuse an element without damping and friction
-        for name, value in values.items() if dynamics else ():
+        for name, value in values.items():
             dynamics.setAttribute(name, repr(value))
     return _written(document)
 
