@@ -352,7 +352,8 @@ def with_friction_chosen(
         found = found if transmission is None else first(transmission)
     beside = any(isinstance(law, DirectionalFriction) and law.learned for law in model.laws)
     parts = [part for part in PARTS if beside or part != "direction"]
-    choice = choose_friction(found.model, log, parts, found.noise)
+    noise = found.noise if isinstance(evidence, Accelerations) else None
+    choice = choose_friction(found.model, log, parts, noise)
     return with_choice(model, choice), choice
 
 
