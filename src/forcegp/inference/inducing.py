@@ -1,6 +1,6 @@
 """Variational inducing points: all data through a few points per latent, with a bound on what that costs.
 
-Weights w with k_c ~ phi_c . phi_c', phi_c(z) = L_c^-1 k_c(p_c, z), of precision B = I + Phi^T D^-1 Phi: Titsias
+Weights w with k_c ~ phi_c . phi_c', phi_c(z) = L_c^-1 k_c(p_c, z), of precision B = I + Phi^T Phi: Titsias
 (2009). N times `left_out` bounds, in nats, what it costs (Burt, Rasmussen & van der Wilk 2020, theorem 4).
 """
 
@@ -76,20 +76,14 @@ class WeightSpace:
         points: Sequence[Float[Tensor, "_ _"]],
         C: Float[Tensor, "N r C"],
         t: Float[Tensor, "N r"],
-        noise_precision: Float[Tensor, "N r r"] | None = None,
-        earlier: tuple[Float[Tensor, "P P"], Float[Tensor, " P"]] | None = None,
     ) -> "WeightSpace":
-        """Condition on all rows; None for the noise precision D^-1 is white noise. Time O(N P^2).
-
-        `earlier`: precision (overwritten) and precision times mean of the weights before, None for those of the prior.
-        Raises NumericalError where the kernel matrix of the points cannot be factorised.
-        """
+        """Condition on all rows; time O(N P^2). Raises NumericalError where the points cannot be factorised."""
         prior = cls.at(kernels, points, CholeskyFactor(C.new_zeros(0, 0)), C.new_zeros(0))
-        white, slices = C if noise_precision is None else noise_precision @ C, prior.slices
-        pairs = (C[..., :, None] * white[..., None, :]).sum(1)  # C_i^T D_i^-1 C_i
-        target = (white * t[..., None]).sum(1)  # C_i^T D_i^-1 t_i
+        slices = prior.slices
+        pairs = (C[..., :, None] * C[..., None, :]).sum(1)  # C_i^T C_i
+        target = (C * t[..., None]).sum(1)  # C_i^T t_i
         relevance = C.square().sum(1)
-        B, right = earlier or (torch.eye(prior.count, dtype=C.dtype, device=C.device), C.new_zeros(prior.count))
+        B, right = torch.eye(prior.count, dtype=C.dtype, device=C.device), C.new_zeros(prior.count)
         left_out = C.new_zeros(())
         height = max(1, BLOCK_BYTES // (8 * max(1, prior.count)))
         for start in range(0, len(C), height):
@@ -116,26 +110,6 @@ class WeightSpace:
             factorize(partial(kernel.cross, z, z)).lower.tril() for kernel, z in zip(kernels.dense, points, strict=True)
         )
         return cls(kernels, points, lowers, precision, mean, 0.0)
-
-    def learned(self, kept: Sequence[float], terms: Terms) -> "WeightSpace":
-        """After forgetting all but a part `kept` of each latent, and conditioning on more rows; time O(P^3 + N P^2).
-
-        f <- kept f + sqrt(1 - kept^2) g, g a new draw from the prior: kernels k_c exp(-|t - t'| / horizon_c), which are
-        Markov (Van Vaerenbergh, Lazaro-Gredilla & Santamaria 2012). What the weights leave out is noise of a row.
-        """
-        deflation, phis = terms.deflated(), self.columns(terms.features)
-        d = torch.cat([self.mean.new_full((len(z),), part) for z, part in zip(self.points, kept, strict=True)])
-        covariance = CholeskyFactor(self.precision.lower.clone()).into_inverse().mul_(d).mul_(d[:, None])
-        covariance.diagonal().add_(1.0 - d.square())
-        factor = factorize(covariance.clone)
-        right = factor.solve((d * self.mean)[:, None])[:, 0].contiguous()
-        parts = zip(self.kernels.dense, terms.features, phis, strict=True)
-        left_out = torch.stack([kernel.diagonal(z) - phi.square().sum(0) for kernel, z, phi in parts], dim=-1)
-        C = deflation.C
-        D = (C * left_out.clamp_min(0.0)[:, None, :]) @ C.mT + torch.eye(C.shape[1], dtype=C.dtype, device=C.device)
-        precision = torch.cholesky_inverse(torch.linalg.cholesky(D))
-        given = self.kernels, terms.features, self.points, deflation.C, deflation.t, precision
-        return WeightSpace.of(*given, (factor.into_inverse(), right))
 
     @property
     def count(self) -> int:

@@ -17,14 +17,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.linalg import lapack
 from torch import Tensor
 
 from forcegp.errors import NumericalError, NumericalWarning
-from forcegp.inference.memory import return_freed_memory
 
 JITTER_LADDER = (0.0, 1e-12, 1e-10, 1e-8)
 """Multiples of the mean diagonal that are added in turn; beyond the last one the factorisation fails."""
@@ -63,21 +61,10 @@ class CholeskyFactor:
         """L^-1 in the lower triangle, written over the factor's own memory: the factor is used up."""
         if not _is_for_lapack(self.lower):
             return torch.linalg.inv(self.lower.tril_())
-        return self._in_place(lapack.dtrtri, "dtrtri")
-
-    def into_inverse(self) -> Float[Tensor, "n n"]:
-        """T^-1 in the lower triangle, written over the factor's own memory: the factor is used up."""
-        if not _is_for_lapack(self.lower):
-            return torch.cholesky_inverse(self.lower.tril_(), out=self.lower)
-        return self._in_place(lapack.dpotri, "dpotri")
-
-    def _in_place(self, function: Callable[..., tuple[np.ndarray, int]], name: str) -> Float[Tensor, "n n"]:
         # The row-major lower triangle is the column-major upper one: LAPACK takes the transposed view without a copy.
-        inverse, info = function(self.lower.numpy().T, lower=0, overwrite_c=1)
+        inverse, info = lapack.dtrtri(self.lower.numpy().T, lower=0, overwrite_c=1)
         if info != 0:
-            raise NumericalError(
-                f"inverting the covariance from its Cholesky factor failed (LAPACK {name} info={info})"
-            )
+            raise NumericalError(f"inverting the Cholesky factor of the covariance failed (LAPACK dtrtri info={info})")
         return torch.from_numpy(inverse.T)
 
 
@@ -232,9 +219,6 @@ PANEL_BYTES = 4 * 2**20
 INNER = 256
 """Rows of L^-1 that are multiplied at once, the inner dimension of products of N x N matrices."""
 
-LARGE = 2000
-"""Rows of a covariance from which on it matters what else is held beside it (32 MB)."""
-
 
 def negative_log_likelihood(
     W: Float[Tensor, "N D C"],
@@ -284,8 +268,6 @@ class DeflatedSystem:
 def solve_deflated(deflation: Deflation, kernel_matrices: Sequence[Float[Tensor, "N N"]]) -> DeflatedSystem:
     """Build and factorise T, then alpha = T^-1 t and beta_ic = sum_a C_iac alpha_ia."""
     count, rank, _ = deflation.C.shape
-    if count * rank >= LARGE:
-        return_freed_memory()
     factor = factorize(lambda: deflated_covariance(deflation.C, kernel_matrices))
     alpha = factor.solve(deflation.t.reshape(-1, 1)).reshape(count, rank)
     beta = torch.einsum("irc,ir->ic", deflation.C, alpha)

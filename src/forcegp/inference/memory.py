@@ -1,7 +1,5 @@
 """How much memory there is, the error that names what a computation would need, and threads of linear algebra."""
 
-import ctypes
-import sys
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -32,13 +30,6 @@ def require_memory(needed: int, what: str, remedy: str, device: torch.device) ->
     free = free_memory(device)
     if needed > USABLE * free:
         raise NotEnoughMemory(f"{what} needs {gib(needed)}, {gib(free)} are free: {remedy}")
-
-
-def return_freed_memory() -> None:
-    """Give freed memory back to the system, where it can (malloc_trim): 90 of 410 MiB in a fit to 1000 rows."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
-    if trim is not None:
-        trim(0)
 
 
 def gib(size: int) -> str:

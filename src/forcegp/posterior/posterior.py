@@ -56,7 +56,7 @@ from forcegp.posterior.rollout import (
     loops_for,
     moved,
 )
-from forcegp.posterior.update import learn_and_forget, learn_more_rows
+from forcegp.posterior.update import learn_more_rows
 from forcegp.robots import Robot
 from forcegp.robots.arguments import whole_number
 
@@ -299,25 +299,19 @@ class Posterior(Fitted):
         """(q, v, u) -> a of n rows, as `rollout` integrates it: the mean, or drawn functions, n / samples each."""
         return accelerations(self, replace(self.model, baumgarte=baumgarte), samples, seed)
 
-    def update(
-        self,
-        rows: Dataset,
-        *,
-        horizon: float | Mapping[str, float] | None = None,
-    ) -> "Posterior":
+    def update(self, rows: Dataset) -> "Posterior":
         """A new posterior that has learned from more rows, too; this one stays as it is.
 
         Parameters, noise level and standardization stay, so it is that of conditioning on all rows at once, in O(N^2).
-        With a `horizon` in s, for all terms or by name, it forgets. Without unknown forces the level of dry friction
-        follows rows in order of time, as far as `settings["drift"]` lets it: give the last seconds of a record, whose
-        coming motions are to be predicted. Raises InvalidInput for rows that do not fit and models that would have to
-        be trained again, ContactError for rows at which the contacts cannot hold.
+        Without unknown forces the level of dry friction follows rows in order of time, as far as `settings["drift"]`
+        lets it: give the last seconds of a record, whose coming motions are to be predicted. Raises InvalidInput for
+        rows that do not fit and models that would have to be trained again, ContactError for rows at which the contacts
+        cannot hold.
         """
         example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, model=posterior.model)"
         require_rows("rows", rows, self.model.robot.joint_names, "the model", example)
         own, rows = replace(self, target=None), rows_of_own_system(self, with_memory(rows, self.model))
-        learned = learn_more_rows(own, rows) if horizon is None else learn_and_forget(own, rows, horizon)
-        return followed(replace(learned, target=self.target), rows)
+        return followed(replace(learn_more_rows(own, rows), target=self.target), rows)
 
     def with_model(self, model: Model) -> "Posterior":
         """The same unknown forces in another model (robot, contacts, laws, stabilisation) with the same joints.
