@@ -134,8 +134,7 @@ def _import_silently(name: str) -> None:
 NOISE = 0.1  # rad/s^2, as in the paper
 SEED = 21  # not 1 to 6: those trajectories served to choose the hyperprior, so they would flatter the model
 
-BEST = "S-GP + analytical mean"
-MODELS = {"S-GP": "s-gp", BEST: "s-gp-analytical-mean"}  # name in the paper -> folder
+BEST = "S-GP + analytical mean"  # its name in the paper
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,52 +162,42 @@ class Demo(Command):
             raise InvalidInput(f"--points is {self.search.points}; at least 2 are needed.")
         self.require_free(self.out)
         options = {name: value for name, value in values_of(self).items() if name != "out"}
-        begin, data, models, fits = time.monotonic(), [], {}, {}
+        begin, models, fits = time.monotonic(), {}, {}
         with self.folder(self.out, {"options": options}) as folder:
-            for name, seed in (("train", self.seed), ("test", self.seed + 1)):
-                how: dict[str, Any] = {"seconds": self.seconds, "seed": seed, "noise": NOISE}
-                data.append(simulate_with_progress(terminal, "kuka-surface", **how))
-                data[-1].save(folder / f"{name}.h5")
-                terminal.note(f"simulated {name}: {len(data[-1])} rows, seed {seed}")
-            train, test = data
-            for name, place in MODELS.items():
-                start, model = time.monotonic(), train.model.with_forces(forcegp.JointForces())
-                model = model if name == BEST else model.without_mean()
+            seeds = {"train": self.seed, "test": self.seed + 1}
+            how: dict[str, Any] = {"seconds": self.seconds, "noise": NOISE}
+            data = {name: simulate_with_progress(terminal, "kuka-surface", seed=k, **how) for name, k in seeds.items()}
+            for name, log in data.items():
+                log.save(folder / f"{name}.h5")
+            unknown = data["train"].model.with_forces(forcegp.JointForces())
+            for name, model in (("S-GP", unknown.without_mean()), (BEST, unknown)):
+                start, place = time.monotonic(), name.lower().replace(" + ", "-").replace(" ", "-")
                 with terminal.progress(f"fitting {name}"):
-                    models[name] = forcegp.scores.learn(model, train, **vars(self.search))[0]
+                    models[name] = forcegp.scores.learn(model, data["train"], **vars(self.search))[0]
                 forcegp.save_posterior(models[name], folder / place)
                 found = fit_summary(models[name], time.monotonic() - start)
                 fits[name] = {"run": str(self.out / place), "fit": found}
-                terminal.note(f"fitted {name}: {found['iterations']} iterations ({found['wall_seconds']:.1f} s)")
-            with terminal.progress("scoring"):
-                scores = forcegp.score(models, test, horizons=())
-            for warning in scores.warnings:
-                terminal.warn(warning)
-            results = {
-                "out": str(self.out),
-                "seeds": {"train": self.seed, "test": self.seed + 1},
-                "points": self.search.points,
-                "models": fits,
-                "scores": scores.to_dict(),
-                "wall_seconds": time.monotonic() - begin,
-            }
-            write_json(folder / "results.json", results)
-            best = forcegp.report.scores_sentence(scores, BEST)
-            with terminal.progress("writing the report"):
+            with terminal.progress("scoring and writing the report"):
+                scores = forcegp.score(models, data["test"], horizons=())
+                results = {"out": str(self.out), "seeds": seeds, "points": self.search.points, "models": fits}
+                results |= {"scores": scores.to_dict(), "wall_seconds": time.monotonic() - begin}
+                write_json(folder / "results.json", results)
                 page = forcegp.report.model_page(
                     models[BEST],
-                    test,
+                    data["test"],
                     title=f"forcegp demo: friction of a tool on a surface, from {self.search.points} points",
-                    best=best,
+                    best=forcegp.report.scores_sentence(scores, BEST),
                     tables=[forcegp.report.scores_table(scores)],
                     next_steps=[("For your robot:", "forcegp auto log.csv --robot arm.urdf --out answer")],
                     details=results,
                     shapes=forcegp.simulation.kuka_file(),
                 )
-            forcegp.report.write_page(folder / "report.html", page)
+                forcegp.report.write_page(folder / "report.html", page)
+            for warning in scores.warnings:
+                terminal.warn(warning)
         title = f"{self.search.points} training points, tested on another trajectory (rad/s²; NLPD in nats)"
         kept = f"Models, data and results.json are in {self.out}. Open the report:"
-        terminal.show(*comparison(scores, title), kept, f"  {self.out}/report.html", best)
+        terminal.show(*comparison(scores, title), kept, f"  {self.out}/report.html", page.best)
         return results
 
 
