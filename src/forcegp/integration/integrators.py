@@ -5,10 +5,10 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import override
 
@@ -258,19 +258,18 @@ Feedback = Callable[[int, Tensor, Tensor], Tensor]
 """(k, q, v) -> what a controller adds to u[k], of the shape of u; asked once per step, at the state where it begins."""
 
 
-@dataclass(frozen=True, eq=False)
-class Trajectory:
-    """n motions of T steps: q, v (T+1, n, nv), a (T, n, nv) at the beginning of each step.
+class Trajectory(NamedTuple):
+    """Motions of T steps: q, v (..., T+1, nv), a (..., T, nv) at the beginning of each step, in rad (m) and s.
 
-    `diverged_at` (n,) is the first row of q and v that is NaN, else -1; `not_found` those the integrator could not
-    carry on.
+    `diverged_at` (...) is the row from which on a motion is NaN because it diverged, -1 if it lasted to the end;
+    `not_found` those the integrator could not carry on. `integrate` has the steps first: (T+1, n, nv).
     """
 
-    q: Float[Tensor, "rows n nq"]
-    v: Float[Tensor, "rows n nv"]
-    a: Float[Tensor, "steps n nv"]
-    diverged_at: Int[Tensor, " n"]
-    not_found: Bool[Tensor, " n"]
+    q: Tensor
+    v: Tensor
+    a: Tensor
+    diverged_at: Tensor
+    not_found: Tensor
 
 
 def integrate(

@@ -288,7 +288,7 @@ class Posterior(Fitted):
                 loops = loops_for(self, model, integrator, len(forces), copies, seed)
             work = accelerations(self, model, copies, seed)
             found = moved(shape, loops, method, work, model, *given, feedback=added, what=what)
-            return Rollout(time, *found, integrator, model)
+            return Rollout(time, *found[:4], integrator, model)
 
         with torch.set_grad_enabled(grad), blas_threads(0):
             mean = run(0, "rollouts")

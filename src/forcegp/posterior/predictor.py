@@ -16,12 +16,11 @@ from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, as_plain
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance
-from forcegp.integration.integrators import check_time_step, integrator_named, rows_jacobian
+from forcegp.integration.integrators import Trajectory, check_time_step, integrator_named, rows_jacobian
 from forcegp.posterior.prediction import Gaussian, JointForces, Linearization, forces_around, inverse_dynamics
 from forcegp.posterior.programs import Programs, steps_of
 from forcegp.posterior.rollout import (
     AccelerationFunction,
-    Motions,
     StepLinearization,
     checked_start,
     linearized_on_manifold,
@@ -209,7 +208,7 @@ class Predictor(Summary):
         divided: bool = False,
         seed: int = 0,
         threads: int | None = None,
-    ) -> Motions:
+    ) -> Trajectory:
         """Motions from q0 (..., nq), v0 (..., nv) under u (..., T, nu), with batches that broadcast, without a graph.
 
         As `posterior.rollout`, where of what laws remember the first row of u counts, under the mean, or with

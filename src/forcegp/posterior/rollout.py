@@ -1,7 +1,7 @@
 """Where a robot goes according to a fitted model: `Rollout`, and one step x+ = f(x, u) with its derivatives."""
 
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -17,6 +17,7 @@ from forcegp.integration.integrators import (
     NO_ROOT,
     Feedback,
     Integrator,
+    Trajectory,
     check_start,
     check_time_step,
     integrate,
@@ -66,18 +67,6 @@ def accelerations(posterior: Any, model: Model, samples: int = 0, seed: int = 0)
     return acceleration
 
 
-class Motions(NamedTuple):
-    """q, v (..., T+1, nv) in rad and rad/s (m and m/s), a (..., T, nv) in rad/s^2 (m/s^2), as in a `Rollout`.
-
-    `diverged_at` (...) is the row from which on a motion is NaN because it diverged, -1 if it lasted to the end.
-    """
-
-    q: Tensor
-    v: Tensor
-    a: Tensor
-    diverged_at: Tensor
-
-
 def moved(
     batch: Sequence[int],
     loops: Sequence[RowFunction] | None,
@@ -92,21 +81,20 @@ def moved(
     feedback: Feedback | None = None,
     threads: int | None = None,
     what: str = "motions",
-) -> Motions:
+) -> Trajectory:
     """`integrate` with these batch dimensions, by compiled loops where there are some; laws of the model remember.
 
     Each loop takes as many motions as the others, one after the other. Those that a loop cannot carry to the end (they
     diverge, Newton's method fails) are integrated again by torch, with those of the other loops from the same place.
     """
 
-    def shaped(rows: Iterable[Tensor], ended: Tensor) -> Motions:
-        q, v, a = (x.reshape(*batch, *x.shape[1:]) for x in rows)
-        return Motions(q, v, a, ended.reshape(tuple(batch)))
+    def shaped(q: Tensor, v: Tensor, a: Tensor, *ended: Tensor) -> Trajectory:
+        return Trajectory(*(x.reshape([*batch, *x.shape[1:]]) for x in (q, v, a, *ended)))
 
     if loops is None:
         u, feedback = remembering(model, u, dt, feedback)
         found = integrate(method, acceleration, q, v, u, dt, feedback=feedback, what=what)
-        return shaped((x.movedim(0, 1) for x in (found.q, found.v, found.a)), found.diverged_at)
+        return shaped(*(x.movedim(0, 1) for x in found[:3]), *found[3:])
     check_start(v, dt)
     own, (steps, count, _) = len(q) // len(loops), u.shape
     kept = ((q, steps + 1), (v, steps + 1), (v, steps))
@@ -130,7 +118,7 @@ def moved(
             kept[rows] = found.movedim(0, 1)
         ended[rows], not_found[rows] = again.diverged_at, again.not_found
     warn_of_divergence(ended, not_found, dt, what)
-    return shaped((Q, V, A), ended)
+    return shaped(Q, V, A, ended, not_found)
 
 
 @dataclass(frozen=True, eq=False)

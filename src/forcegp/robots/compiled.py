@@ -1,6 +1,5 @@
 """The dynamics of one robot as machine code: what torch computes, traced into scalars, and `CompiledRobot`."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -95,8 +94,11 @@ class CompiledRobot(RigidBodyDynamics):
 
     @override
     def _dynamics(self, function: str, *arguments: Tensor) -> Any:
-        nv, given, names = self._nv, list(arguments), ARGUMENTS[function]
-        plain = self._are_possible(given) if self._space.groups else are_plain(given, nv)
+        nv, space, given, names = self._nv, self._space, list(arguments), ARGUMENTS[function]
+        plain = not space.groups and are_plain(given, nv)
+        if space.groups and are_plain(given[:1], space.nq) and are_plain(given[1:], nv):  # q has entries of its own
+            plain = all(x.shape[:-1] == given[0].shape[:-1] for x in given)
+            space.check(given[0])
         if not plain:
             given = [self.robot.checked_input(name, value) for name, value in zip(names, given, strict=True)]
             if torch.is_grad_enabled() and any(value.requires_grad for value in given):
@@ -108,9 +110,7 @@ class CompiledRobot(RigidBodyDynamics):
         else:
             if not plain:
                 batch = broadcast_batch({name: value.shape[:-1] for name, value in zip(names, given, strict=True)})
-                given = [value.expand(*batch, value.shape[-1]) for value in given]
-            if not plain or len(batch) != 1:
-                given = [value.reshape(batch.numel(), value.shape[-1]).contiguous() for value in given]
+                given = [x.expand(*batch, -1).reshape(batch.numel(), x.shape[-1]).contiguous() for x in given]
             results = [torch.empty(batch.numel(), size, dtype=torch.float64) for size in program.outputs]
             bits = program.rows(batch.numel(), given, results)
         if bits & NOT_POSITIVE:
@@ -118,12 +118,3 @@ class CompiledRobot(RigidBodyDynamics):
         made = zip(results, DIMENSIONS.get(function, (1,)), strict=True)
         found = [x if d == len(batch) == 1 else x.view(*batch, *(nv,) * d) for x, d in made]
         return found[0] if len(found) == 1 else tuple(found)
-
-    def _are_possible(self, given: Sequence[Tensor]) -> bool:
-        """`are_plain` where q has more entries than v and a length to check."""
-        q, *others = given
-        plain = are_plain([q], self._space.nq) and are_plain(others, self._nv)
-        if plain and all(x.shape[:-1] == q.shape[:-1] for x in others):
-            self._space.check(q)
-            return True
-        return False
