@@ -23,10 +23,9 @@ class Noise:
 
     Each is one number or one per joint; `sensor` is one number, of force sensors in N. `pushes` are those of forces on
     joints that something pushes which nobody measured, one per joint. None for `acceleration` takes what the dataset
-    states. With `learn` they are
-    start values of the optimisation, else they stay fixed; the hyperprior of a learned one is log-normal around its
-    start value, with a factor of e as one standard deviation. `sensor` and `pushes` stay. The covariance of one row is
-    diag(acceleration^2) + H diag(force^2 + pushes^2) H^T.
+    states. With `learn` they are start values of the optimisation, else they stay fixed; the hyperprior of a learned
+    one is log-normal around its start value, with a factor of e as one standard deviation. `sensor` and `pushes` stay.
+    The covariance of one row is diag(acceleration^2) + H diag(force^2 + pushes^2) H^T.
     """
 
     acceleration: float | tuple[float, ...] | None = 0.1

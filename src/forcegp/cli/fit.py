@@ -396,10 +396,7 @@ class Payload(Command):
 
 
 def with_payload(
-    model: forcegp.Model,
-    rows: forcegp.Dataset,
-    link: str | None,
-    baseline: forcegp.Dataset | None = None,
+    model: forcegp.Model, rows: forcegp.Dataset, link: str | None, baseline: forcegp.Dataset | None = None
 ) -> Any:
     """The posterior of a model that carries something; with a baseline the links are estimated, too."""
     bodies = () if baseline is None else (forcegp.RigidBodies("all"),)

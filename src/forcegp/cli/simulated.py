@@ -36,11 +36,10 @@ OF_THE_TOOL = ("tool_friction", "surface")  # options of the scenario that has a
 class Simulate(Command):
     """Simulate a robot and write what it measured, with the ground truth, to one file.
 
-    kuka-surface: a KUKA iiwa slides its tool on a surface with unmodelled friction, as in Rath, Geist,
-    Trimpe (2021). ur5-free, double-pendulum: arms that touch nothing, with dry
-    friction in every joint, without PyBullet. quadruped: a robot on a floating base that shifts its weight and lifts
-    its feet, with an unknown load of 2 kg. quadrotor: a drone on a path in wind, with late rotors.
-    Equal seeds give equal motions; train and test need different ones.
+    kuka-surface: a KUKA iiwa slides its tool on a surface with unmodelled friction, as in Rath, Geist, Trimpe (2021).
+    ur5-free, double-pendulum: arms that touch nothing, with dry friction in every joint, without PyBullet. quadruped: a
+    robot on a floating base that shifts its weight and lifts its feet, with an unknown load of 2 kg. quadrotor: a drone
+    on a path in wind, with late rotors. Equal seeds give equal motions; train and test need different ones.
 
     For example:
       forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5

@@ -26,9 +26,7 @@ _ARGUMENT = re.compile(r"`([a-z_.]+)(?:=([^`]*))?`")
 OTHERWISE = {"contacts": "contact", "folder": "out", "locked": "lock", "model": "robot"}
 """Options whose argument has another name in Python."""
 
-ELSEWHERE = {
-    "`posterior.with_model(dataset.model)`": "--system data",
-}
+ELSEWHERE = {"`posterior.with_model(dataset.model)`": "--system data"}
 """Calls of Python that an option stands for."""
 
 

@@ -11,15 +11,7 @@ from jaxtyping import Float
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import Dataset
 from forcegp.data.delay import estimate_delay, torque_columns
-from forcegp.data.filters import (
-    LowPass,
-    Signal,
-    differentiated,
-    episodes_in_order,
-    low_pass,
-    shifted,
-    uniform_step,
-)
+from forcegp.data.filters import LowPass, Signal, differentiated, episodes_in_order, low_pass, shifted, uniform_step
 from forcegp.errors import DatasetError
 
 SEGMENT = 4.0  # s

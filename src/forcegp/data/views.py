@@ -149,9 +149,8 @@ class RecordedMotions:
 def recorded_motions(dataset: Dataset, starts: int | Sequence[int], seconds: float) -> RecordedMotions:
     """The motions of that length that begin at the given rows, or at so many rows spread evenly over the recording.
 
-    A number of starts takes motions without a gap, where there are any.
-    Raises InvalidInput for rows at which no motion of that length begins, for steps of time that are not equal, and for
-    a length of less than one step.
+    A number of starts takes motions without a gap, where there are any. Raises InvalidInput for rows at which no motion
+    of that length begins, for steps of time that are not equal, and for a length of less than one step.
     """
     if not dataset.time_ordered:
         raise InvalidInput("the rows of the dataset are not in the order of time; give a whole recording.")

@@ -14,15 +14,7 @@ from forcegp.data import Dataset
 from forcegp.data.dataset import FORCE as OF_SENSOR
 from forcegp.errors import ContactError, DataWarning, InvalidInput
 from forcegp.forces import Scaling, Unknown, UnknownForces
-from forcegp.inference import (
-    Engine,
-    Exact,
-    LatentKernels,
-    LatentPosterior,
-    ProblemSize,
-    Terms,
-    negative_log_likelihood,
-)
+from forcegp.inference import Engine, Exact, LatentKernels, LatentPosterior, ProblemSize, Terms, negative_log_likelihood
 from forcegp.mechanics import AffineMap, ConstrainedDynamics
 from forcegp.model import Model
 from forcegp.noise import ACCELERATION, FORCE, STATED, Noise

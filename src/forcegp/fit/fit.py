@@ -26,14 +26,7 @@ from forcegp.fit.doubts import (
     without_idle_offsets,
 )
 from forcegp.fit.friction_choice import with_friction_chosen
-from forcegp.fit.joint import (
-    CHANGE,
-    MOST_ROUNDS,
-    FreeNumbers,
-    estimates_beside,
-    numbers_beside,
-    with_free_numbers,
-)
+from forcegp.fit.joint import CHANGE, MOST_ROUNDS, FreeNumbers, estimates_beside, numbers_beside, with_free_numbers
 from forcegp.fit.motion_fit import refine_on_motions
 from forcegp.fit.physical import fit_physical, typical_sizes, with_payloads_placed
 from forcegp.fit.refinement import (
@@ -396,10 +389,7 @@ class _Functions:
         return fit_with_refined_loads(first, again)
 
     def _search(
-        self,
-        rows: Dataset,
-        dataset: Dataset,
-        beside: Callable[[MarginalLikelihood], FreeNumbers] | None = None,
+        self, rows: Dataset, dataset: Dataset, beside: Callable[[MarginalLikelihood], FreeNumbers] | None = None
     ) -> Posterior:
         """One search on these rows of the log with the model as it is, and the exact posterior there.
 

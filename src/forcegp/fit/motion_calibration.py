@@ -29,11 +29,7 @@ LEVEL = 0.95
 
 
 def calibrated(
-    posterior: Posterior,
-    dataset: Dataset,
-    horizons: Sequence[float] = HORIZONS,
-    *,
-    integrator: str = "rk4",
+    posterior: Posterior, dataset: Dataset, horizons: Sequence[float] = HORIZONS, *, integrator: str = "rk4"
 ) -> Posterior:
     """The same model with intervals of motions that hold: of records left out in turn, or of stretches of the only one.
 

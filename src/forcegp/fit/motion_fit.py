@@ -245,11 +245,7 @@ class MotionFit:
 
 @torch.no_grad()
 def refine_on_motions(
-    posterior: Posterior,
-    dataset: Dataset,
-    seconds: float,
-    bodies: bool,
-    stated: Model | None = None,
+    posterior: Posterior, dataset: Dataset, seconds: float, bodies: bool, stated: Model | None = None
 ) -> Posterior:
     """Known laws, bodies and latent functions fitted to the recorded positions, beginning from this posterior.
 

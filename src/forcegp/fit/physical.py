@@ -191,10 +191,7 @@ class Solution:
 
 
 def fit_physical(
-    model: Model,
-    logs: Sequence[Dataset],
-    evidence: Torques | Accelerations,
-    rows: int | None = None,
+    model: Model, logs: Sequence[Dataset], evidence: Torques | Accelerations, rows: int | None = None
 ) -> Solution:
     """The open numbers of a model without unknown forces; of several logs payloads are in the first alone."""
     bodies = any(getattr(law, "learn", ()) or (isinstance(law, Payload) and not law.known) for law in model.laws)

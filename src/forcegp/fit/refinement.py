@@ -14,15 +14,7 @@ from forcegp.errors import DataWarning, InvalidInput, NumericalWarning
 from forcegp.evidence.likelihood import MarginalLikelihood, TrainingData, check_distance
 from forcegp.forces import UnknownForces
 from forcegp.forces.contact_friction import JAMMING, TabulatedCurve, refined_loads
-from forcegp.inference import (
-    Choice,
-    Engine,
-    Exact,
-    Inducing,
-    InducingPosterior,
-    ProblemSize,
-    choose_engine,
-)
+from forcegp.inference import Choice, Engine, Exact, Inducing, InducingPosterior, ProblemSize, choose_engine
 from forcegp.inference.engines import ENOUGH, MOST_EXACT_ROWS
 from forcegp.inference.memory import blas_threads, require_memory
 from forcegp.noise import ACCELERATION, SENSOR
@@ -86,12 +78,7 @@ def require_memory_to_learn(likelihood: MarginalLikelihood) -> None:
     require_memory(Exact().bytes_to_learn(size), what, remedy, likelihood.training.q.device)
 
 
-def on_all_rows(
-    fitted: Posterior,
-    rows: Dataset,
-    engine: Engine | None,
-    described: Mapping[str, Any],
-) -> Posterior:
+def on_all_rows(fitted: Posterior, rows: Dataset, engine: Engine | None, described: Mapping[str, Any]) -> Posterior:
     """`fitted`, conditioned on all `rows` by the engine, or by one that is chosen for their number where it is None.
 
     `described` replaces what the settings hold of the rows. Raises NotEnoughMemory, NumericalError.
@@ -148,9 +135,7 @@ of `PLACES`, whose difference is noise, it would soon be far from the curve itse
 
 
 def fit_with_refined_loads(
-    first: Posterior,
-    again: Callable[[UnknownForces, Posterior], Posterior],
-    rounds: int = ROUNDS,
+    first: Posterior, again: Callable[[UnknownForces, Posterior], Posterior], rounds: int = ROUNDS
 ) -> Posterior:
     """`first`, or the last of the fits that follow it under the normal forces of the one before, or the most likely.
 

@@ -59,11 +59,7 @@ class JointForces(SharedInputs):
     @override
     def columns(self, dynamics: ConstrainedDynamics) -> dict[str, Callable[[], Tensor]]:
         state = dynamics.state
-        return {
-            "q": lambda: state.robot.posture(state.q),
-            "v": lambda: state.v,
-            "u": lambda: _driven(state),
-        }
+        return {"q": lambda: state.robot.posture(state.q), "v": lambda: state.v, "u": lambda: _driven(state)}
 
     @override
     def labels(self, robot: Robot) -> dict[str, tuple[str, ...]]:

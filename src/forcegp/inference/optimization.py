@@ -132,10 +132,7 @@ class _Search:
 
 
 def minimize_objective(
-    objective: Objective,
-    initial: Mapping[str, Tensor],
-    options: OptimizerOptions | None = None,
-    rival: float = np.inf,
+    objective: Objective, initial: Mapping[str, Tensor], options: OptimizerOptions | None = None, rival: float = np.inf
 ) -> OptimizationResult:
     """Minimise `objective(parameters)` from `initial` (unconstrained float64 tensors, not changed) by L-BFGS-B.
 

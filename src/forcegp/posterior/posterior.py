@@ -105,14 +105,13 @@ class Posterior(Fitted):
         """Distribution of the acceleration and, where the model predicts them, of the forces behind it.
 
         A `Prediction`, or with `of` one `Gaussian` for each of `Accelerations()`, contacts of the model or
-        `ContactForces(frame)` (the force on the robot there, (..., 3) in N) and its unknown forces (joint forces).
-        With `a`, accelerations that were measured in these states (..., nv), all is given these: what an estimator of
-        contact forces without a force sensor needs. States (..., nv) are in rad, rad/s and Nm
-        (m, m/s and N), arrays, lists or tensors; `covariance=False` is much faster. Differentiable in q, v and u. Where
-        laws remember, u has columns for that (`forcegp.data.with_memory` makes them of a log); without these the past
-        counts as unknown, in the mean and in the covariance, and a DataWarning says so.
-        InvalidInput for wrong shapes, values that are not finite, and inside `vmap`; NumericalError where the result is
-        not finite.
+        `ContactForces(frame)` (the force on the robot there, (..., 3) in N) and its unknown forces (joint forces). With
+        `a`, accelerations that were measured in these states (..., nv), all is given these: what an estimator of
+        contact forces without a force sensor needs. States (..., nv) are in rad, rad/s and Nm (m, m/s and N), arrays,
+        lists or tensors; `covariance=False` is much faster. Differentiable in q, v and u. Where laws remember, u has
+        columns for that (`forcegp.data.with_memory` makes them of a log); without these the past counts as unknown, in
+        the mean and in the covariance, and a DataWarning says so. InvalidInput for wrong shapes, values that are not
+        finite, and inside `vmap`; NumericalError where the result is not finite.
         """
         require_type("covariance", covariance, bool)
         memory, width = self.model.memory.names, np.shape(u)[-1:]

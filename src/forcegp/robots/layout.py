@@ -11,12 +11,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from forcegp.errors import (
-    InvalidInput,
-    RobotModelError,
-    UnknownName,
-    require_known,
-)
+from forcegp.errors import InvalidInput, RobotModelError, UnknownName, require_known
 from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import inverse, rotation_about, rotation_of_z_onto, transform
 from forcegp.robots.manifold import POSITIONS, VELOCITIES, Group

@@ -11,13 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import (
-    InvalidInput,
-    NonPhysicalInertia,
-    RobotModelError,
-    UnknownName,
-    require_known,
-)
+from forcegp.errors import InvalidInput, NonPhysicalInertia, RobotModelError, UnknownName, require_known
 from forcegp.robots.arguments import JointValues, Positions, checked_tensor, usable_device
 from forcegp.robots.inertia import axis_inertia_vanishes, pseudo_inertia, skew, turns_with_inertia
 from forcegp.robots.layout import BASE, WORLD, BaseChoice, Layout

@@ -14,15 +14,7 @@ from matplotlib.figure import Figure
 
 from forcegp.data import Dataset, evenly, recorded_motions
 from forcegp.errors import ForceGPError, InvalidInput
-from forcegp.forces import (
-    Actuation,
-    JointFriction,
-    LoadFriction,
-    Offset,
-    RigidBodies,
-    Rotor,
-    Unknown,
-)
+from forcegp.forces import Actuation, JointFriction, LoadFriction, Offset, RigidBodies, Rotor, Unknown
 from forcegp.mechanics import Contact, Held, LoopClosure
 from forcegp.model import Model
 from forcegp.posterior.posterior import Posterior
