@@ -3,6 +3,7 @@
 import contextlib
 import difflib
 import importlib
+import math
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, TypeVar
 
@@ -119,6 +120,12 @@ def require_type(name: str, given: object, kind: type[Kind], example: str = "") 
     if not isinstance(given, kind):
         raise InvalidInput(f"{name} is a {type(given).__name__}; give a {kind.__name__}{example}")
     return given
+
+
+def require_number(name: str, given: object, words: str, least: float = math.ulp(0.0), below: float = math.inf) -> None:
+    """Raise `NAME is GIVEN; WORDS` for what is no number of at least `least` (above 0) and less than `below`."""
+    if isinstance(given, bool) or not isinstance(given, int | float) or not least <= given < below:
+        raise InvalidInput(f"{name} is {given!r}; {words}.")
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ from scipy.stats import chi2, gumbel_r
 from torch import Tensor
 
 from forcegp.control.tracking import Moving, Past, joint_forces, model_of
-from forcegp.errors import DatasetError, InvalidInput
+from forcegp.errors import DatasetError, InvalidInput, require_number
 from forcegp.evidence.least_squares import NoiseLevels
 from forcegp.integration.integrators import check_time_step
 from forcegp.posterior.predictor import Predictor
@@ -75,8 +75,8 @@ class ContactMonitor:
             )
         self.open = isinstance(model, Predictor) and model.kind != "none"
         check_time_step(dt)
-        if not (isinstance(bandwidth, int | float) and 0.0 < bandwidth < 0.5 / dt):
-            raise InvalidInput(f"bandwidth is {bandwidth!r}; give Hz above 0 and below {0.5 / dt:g}, half the rate.")
+        words = f"give Hz above 0 and below {0.5 / dt:g}, half the rate"
+        require_number("bandwidth", bandwidth, words, below=0.5 / dt)
         self.robot: Robot = plain.robot
         self.dt, self.bandwidth = float(dt), float(bandwidth)
         self._keep = math.exp(-2.0 * math.pi * bandwidth * dt)
@@ -96,9 +96,8 @@ class ContactMonitor:
         The largest distances of stretches of 2 s follow a Gumbel distribution (Fisher, Tippett 1928), whose quantile is
         the threshold. Take another motion than the model learned from, as varied as those to come.
         """
-        rate = false_alarms_per_hour
-        if not (isinstance(rate, int | float) and 0.0 < rate < 3600.0 / BLOCK):
-            raise InvalidInput(f"false_alarms_per_hour is {rate!r}; give a number above 0 and below {3600 / BLOCK:g}.")
+        rate, words = false_alarms_per_hour, f"give a number above 0 and below {3600 / BLOCK:g}"
+        require_number("false_alarms_per_hour", rate, words, below=3600 / BLOCK)
         settle, block = round(1.0 / (self.bandwidth * self.dt)), round(BLOCK / self.dt)
         found = [self._residuals(*motion, settle) for motion in free]
         if sum(len(tau) // block for tau, *_ in found) < LEAST_BLOCKS:

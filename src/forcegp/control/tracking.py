@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, require_known, require_type
+from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, require_known, require_number, require_type
 from forcegp.integration.integrators import check_time_step
 from forcegp.model import Model
 from forcegp.posterior.prediction import JointForces, require_actuated
@@ -170,8 +170,7 @@ class ComputedTorque(TrackingController):
 
     def __init__(self, model: Moving, *, position_noise: float = 0.0, **settings: Any) -> None:
         known = model_of(model)
-        if not (isinstance(position_noise, int | float) and 0.0 <= position_noise < float("inf")):
-            raise InvalidInput(f"position_noise is {position_noise!r}; give rad (m) of at least 0.")
+        require_number("position_noise", position_noise, "give rad (m) of at least 0", 0.0)
         if known.contacts:
             raise InvalidInput(
                 "ComputedTorque moves a robot without contacts, and this model has one; use HybridForce, or "

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 from typing import ClassVar, Literal
 
 from forcegp.data.dataset import FORCE, Dataset
-from forcegp.errors import InvalidInput, require_known, usable_arguments
+from forcegp.errors import InvalidInput, require_known, require_number, usable_arguments
 from forcegp.forces.registry import called
 
 
@@ -82,10 +82,7 @@ class Motions(Evidence):
 
     @usable_arguments("Motions")
     def __post_init__(self) -> None:
-        if not isinstance(self.seconds, int | float) or self.seconds is True or not 0.0 < self.seconds < float("inf"):
-            raise InvalidInput(
-                f"Motions seconds is {self.seconds!r}; give the length of windows in s, a positive number."
-            )
+        require_number("Motions seconds", self.seconds, "give the length of windows in s, a positive number")
 
 
 @dataclass(frozen=True)
@@ -102,8 +99,8 @@ class ContactForces(Evidence):
 
     @usable_arguments("ContactForces")
     def __post_init__(self) -> None:
-        if self.noise is not None and not 0.0 < self.noise < float("inf"):
-            raise InvalidInput(f"ContactForces noise is {self.noise!r}; give a standard deviation in N, or None.")
+        if self.noise is not None:
+            require_number("ContactForces noise", self.noise, "give a standard deviation in N, or None")
 
     def check(self, dataset: Dataset) -> None:
         """Raise InvalidInput where the log has no such sensor."""

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from forcegp.errors import InvalidInput, usable_arguments
+from forcegp.errors import InvalidInput, require_number, usable_arguments
 from forcegp.mechanics.gauss_principle import Contact, State
 from forcegp.robots import Robot
 
@@ -99,10 +99,7 @@ class Body:
 
     @usable_arguments("Body")
     def __post_init__(self) -> None:
-        if not (isinstance(self.strength, int | float) and 0.0 < self.strength < np.inf):
-            raise InvalidInput(
-                f"Body strength is {self.strength!r}; it must be > 0, since data never determine all of a body."
-            )
+        require_number("Body strength", self.strength, "it must be > 0, since data never determine all of a body")
 
 
 @dataclass(frozen=True)

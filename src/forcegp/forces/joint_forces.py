@@ -1,6 +1,5 @@
 """Priors at the joints: on all of (q, v, u), of forces or accelerations, and one function per joint."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
@@ -11,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, UnknownName, require_known, usable_arguments
+from forcegp.errors import InvalidInput, UnknownName, require_known, require_number, usable_arguments
 from forcegp.forces.force import joint_unit, slides
 from forcegp.forces.kernels import checked_kernel, periodic
 from forcegp.forces.unknown import ExpressedKernels, Scaling, SharedInputs, as_names
@@ -214,8 +213,7 @@ class JointPositionForces(PerJoint):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.period is not None:
-            if not isinstance(self.period, int | float) or not 0.0 < self.period < math.inf:
-                raise InvalidInput(f"JointPositionForces period is {self.period!r}; give a positive number in rad.")
+            require_number("JointPositionForces period", self.period, "give a positive number in rad")
             object.__setattr__(self, "period", float(self.period))
 
     @property

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, require_known, usable_arguments
+from forcegp.errors import InvalidInput, require_known, require_number, usable_arguments
 from forcegp.inference.dense_kernels import LatentKernels
 from forcegp.inference.inducing import InducingPosterior, WeightSpace
 from forcegp.inference.likelihood import CholeskyFactor, Terms
@@ -122,9 +122,7 @@ class Inducing(Engine):
     def __post_init__(self) -> None:
         if isinstance(self.points, bool) or not isinstance(self.points, int) or self.points < 1:
             raise InvalidInput(f"Inducing points is {self.points!r}; it must be a whole number >= 1")
-        tolerance = self.tolerance
-        if isinstance(tolerance, bool) or not isinstance(tolerance, int | float) or not tolerance >= 0.0:
-            raise InvalidInput(f"Inducing tolerance is {tolerance!r}; it must be at least 0")
+        require_number("Inducing tolerance", self.tolerance, "it must be at least 0", 0.0)
 
     @override
     def required_bytes(self, size: ProblemSize) -> int:

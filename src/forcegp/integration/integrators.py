@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, require_known
+from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, require_known, require_number
 from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE, factors
 from forcegp.model import Model
 from forcegp.robots.manifold import ConfigurationSpace
@@ -241,8 +241,7 @@ def integrator_named(name: str, model: Model) -> Integrator:
 
 def check_time_step(dt: Any) -> None:
     """Raise InvalidInput for what is no positive number."""
-    if isinstance(dt, bool) or not (isinstance(dt, int | float) and math.isfinite(dt) and dt > 0):
-        raise InvalidInput(f"dt is {dt!r}; give the time step as a positive number of seconds.")
+    require_number("dt", dt, "give the time step as a positive number of seconds")
 
 
 def _all(q: Tensor) -> Tensor:

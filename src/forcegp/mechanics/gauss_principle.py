@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from forcegp.errors import ContactError, InvalidInput, NumericalError
+from forcegp.errors import ContactError, InvalidInput, NumericalError, require_number
 from forcegp.mechanics.surfaces import Held, Surface
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import broadcast_batch, checked_tensor, finite_vector
@@ -31,9 +31,8 @@ class Baumgarte:
 
     def __post_init__(self) -> None:
         for name in ("omega", "zeta"):
-            value = getattr(self, name)
-            if not (isinstance(value, int | float) and 0 <= value < 1e15):  # its square must not overflow
-                raise InvalidInput(f"Baumgarte {name} is {value!r}; it must be a finite number >= 0 (and < 1e15).")
+            words = "it must be a finite number >= 0 (and < 1e15)"  # its square must not overflow
+            require_number(f"Baumgarte {name}", getattr(self, name), words, 0.0, 1e15)
 
 
 class Row(NamedTuple):

@@ -155,7 +155,7 @@ def _require_numbers(settings: Mapping[str, Any], nv: int) -> None:
     sizes = {"nv": nv}
     for name, shape in SETTINGS.items():
         group, _, key = name.rpartition(".")
-        if (holder := settings.get(group) if group else {key: settings.get(key)}) is None or holder == {key: None}:
+        if (holder := settings.get(group) if group else settings) is None or not (group or key in settings):
             continue
         given = np.asarray(value := holder.get(key) if isinstance(holder, Mapping) else holder)
         same = given.ndim == len(shape) and given.dtype.kind in "if" and np.isfinite(given).all()

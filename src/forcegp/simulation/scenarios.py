@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any, ClassVar, Literal, get_args
 
 import forcegp.data
-from forcegp.errors import InvalidInput, require_known, usable_arguments
+from forcegp.errors import InvalidInput, require_known, require_number, usable_arguments
 
 Range = tuple[str, float, float]
 """What is allowed in words, the least and the largest value."""
@@ -56,10 +56,9 @@ class CommonConfig:
     def _check(self, **ranges: Range) -> None:
         """Raise InvalidInput for these numbers, and those that have one of the ranges."""
         for name, (words, lower, upper) in {"seconds": SECONDS, "noise": NOT_NEGATIVE, **ranges}.items():
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | float) or not lower <= value <= upper:
-                raise InvalidInput(f"{name} is {value!r}; it must be one number, {words}.")
-            object.__setattr__(self, name, float(value))
+            most = math.nextafter(upper, math.inf)
+            require_number(name, getattr(self, name), f"it must be one number, {words}", lower, most)
+            object.__setattr__(self, name, float(getattr(self, name)))
         for name, least, most in (("seed", 0, 2**63 - 1), ("episodes", 1, 10_000)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
