@@ -42,7 +42,7 @@ def motion_residuals(
     dataset = with_memory(require_type("dataset", dataset, Dataset), model)
     q, v, u, a = (torch.tensor(np.array(getattr(dataset, x)), device=model.robot.device) for x in ("q", "v", "u", "a"))
     dynamics = model.dynamics(q, v, u)
-    force = dynamics.Q_K - (dynamics.M @ a[..., None])[..., 0]
+    force, missed = dynamics.Q_K - (dynamics.M @ a[..., None])[..., 0], a - dynamics.acceleration_map().offset
     for friction in model.laws:
         if friction.under_load:
             ones, motor = friction.at_joints(torch.ones_like(a)), friction.at_motors
@@ -55,8 +55,8 @@ def motion_residuals(
     open_ = [k for k, contact in enumerate(model.contacts) if f"{FORCE}{contact.frame}" not in dataset.measured]
     if open_ and not any(slides(model.contacts[k]) for k in open_):
         held, _ = independent_rows(dynamics.A[:, open_].cpu().numpy(), dynamics.b[:, open_].cpu().numpy())
-        return without(force.cpu().numpy(), held.swapaxes(1, 2)), (a - dynamics.acceleration_map().offset).cpu().numpy()
-    return force.cpu().numpy(), (a - dynamics.acceleration_map().offset).cpu().numpy()
+        return without(force.cpu().numpy(), held.swapaxes(1, 2)), missed.cpu().numpy()
+    return force.cpu().numpy(), missed.cpu().numpy()
 
 
 def sensed_of(log: Dataset) -> dict[str, Float[np.ndarray, "rows 3"]]:
@@ -142,8 +142,8 @@ class RecordedRows:
         """Orthonormal rows (rows, m, nv) with ``held a = right``; rows of zeros where nothing holds."""
         self.sensed, sensed = dict(sensed or {}), sensed or {}
         arms = {frame: arm(self.kinematics, model, frame).cpu().numpy() for frame in sensed}
-        self.at_contacts = sum((each @ sensed[frame][..., None] for frame, each in arms.items()), np.zeros((1, 1, 1)))
-        self.at_contacts = np.broadcast_to(self.at_contacts[..., 0], self.v.shape)
+        forces = (each @ sensed[frame][..., None] for frame, each in arms.items())
+        self.at_contacts = sum(forces, np.zeros((*self.v.shape, 1)))[..., 0]
         """Joint forces of what sensors measured."""
         self.open = self._unseen(A.cpu().numpy(), pushed) if sensed or pushed else self.held
         """Orthonormal rows (rows, m, nv): directions of joint forces that nothing measured, of contacts and pushes."""
@@ -241,9 +241,8 @@ class RecordedRows:
             among = through @ A.swapaxes(1, 2) + idle[:, :, None] * np.eye(A.shape[1])
             lifted = np.linalg.solve(among, np.concatenate([through, self.right[..., None]], axis=-1))
         except np.linalg.LinAlgError:
-            raise NumericalError(
-                "the mass matrix of the estimates is singular at a row; check the robot's file."
-            ) from None
+            singular = "the mass matrix of the estimates is singular at a row; check the robot's file."
+            raise NumericalError(singular) from None
         acceleration = (through.swapaxes(1, 2) @ lifted[..., -1:])[..., 0]
         H = H - through.swapaxes(1, 2) @ lifted[..., :-1]
         return acceleration + (H @ (self.force - bias - torque)[..., None])[..., 0], M, H
@@ -260,11 +259,8 @@ class RecordedRows:
         r, shape = a - predicted, predicted.shape
         if not self.sensed:
             return r, (H @ Y.reshape(*shape, -1)).reshape(Y.shape), H @ in_x
-        rigid = (
-            self.moving(predicted, given=False).fixed
-            + Y.reshape(*shape, -1) @ self.space.standard_parameters(x).ravel()
-        )
-        D, seen = self._sensing
+        fixed, (D, seen) = self.moving(predicted, given=False).fixed, self._sensing
+        rigid = fixed + Y.reshape(*shape, -1) @ self.space.standard_parameters(x).ravel()
         by = np.concatenate([H, -D @ (np.eye(shape[1]) - M @ H)], axis=1)
         r = np.concatenate([r, seen - (D @ (rigid + torque)[..., None])[..., 0]], axis=1)
         return r, (by @ Y.reshape(*shape, -1)).reshape(*r.shape, *Y.shape[2:]), by @ in_x

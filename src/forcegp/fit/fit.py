@@ -133,8 +133,8 @@ def fit(
     """
     require_type("model", model, Model, ", for example dataset.model")
     rest, refinement, sensors = _chosen(evidence, model, start)
-    dataset = with_sensors(dataset, model, rest, sensors, chosen=bool(evidence))
     dataset = _checked(model, dataset, rest, refinement)
+    dataset = with_sensors(dataset, model, rest, sensors, chosen=bool(evidence))
     model = without_idle_offsets(model, dataset)
     usual = Torques() if model.robot.space.is_vector_space else Torques(noisy="both")
     how = rest if isinstance(rest, Accelerations) and not model.unknown_forces else usual
@@ -220,7 +220,6 @@ def with_sensors(
     dataset: Dataset, model: Model, rest: Evidence, sensors: Sequence[ContactForces], chosen: bool
 ) -> Dataset:
     """The log with the force sensors that are evidence: of the default all that functions or laws can learn from."""
-    require_type("dataset", dataset, Dataset)
     for each in sensors:
         each.check(dataset)
     at_contacts = {contact.frame for contact in model.contacts}
