@@ -41,11 +41,11 @@ def unseen(folder: Path, name: str) -> tuple[Dataset, Dataset]:
 def gaussian_process(x: np.ndarray, y: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Of every column of y, from evenly spread rows."""
     some, found = np.linspace(0, len(x) - 1, min(POINTS, len(x))).astype(int), []
-    X, at = torch.tensor(x[some]), torch.tensor(at)
+    X, there = torch.tensor(x[some]), torch.tensor(at)
     for target in torch.tensor(y[some].T):
         kernel = gpytorch.kernels.ScaleKernel(gpytorch.kernels.RBFKernel(ard_num_dims=x.shape[1])).double()
         raw = [*kernel.parameters(), noise := torch.zeros((), dtype=torch.float64, requires_grad=True)]
-        search = torch.optim.Adam(raw, lr=0.1)
+        search, weights = torch.optim.Adam(raw, lr=0.1), target[:, None]
         for step in range(61):
             K = kernel(X).to_dense() + noise.exp() * torch.eye(len(X))
             lower = torch.linalg.cholesky(K)
@@ -54,7 +54,7 @@ def gaussian_process(x: np.ndarray, y: np.ndarray, at: np.ndarray) -> np.ndarray
                 search.zero_grad()
                 (0.5 * target @ weights[:, 0] + lower.diagonal().log().sum()).backward()
                 search.step()
-        found.append((kernel(at, X).to_dense() @ weights)[:, 0].detach().numpy())
+        found.append((kernel(there, X).to_dense() @ weights)[:, 0].detach().numpy())
     return np.stack(found, 1)
 
 

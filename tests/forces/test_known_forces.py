@@ -1,6 +1,7 @@
 """Each known force against its formula, with its sign, through files, and from the numbers of the URDF."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -85,7 +86,7 @@ FORMULAS = {
 
 def at_motors(transmission):
     """Makes rotors with this transmission."""
-    return lambda inertia: Rotor(inertia, transmission=transmission)
+    return partial(Rotor, transmission=transmission)
 
 
 def chain():

@@ -62,7 +62,7 @@ class Unseen:
         residual = rows.in_torque(np.zeros(0), rows.moving(a))[0]
         needed = rows.kinematics.inverse_dynamics(torch.as_tensor(a, device=robot.device)).cpu().numpy()
         single, pushing = np.isin(robot.joint_names, robot.single_joint_names), np.zeros_like(typical)
-        for j in np.flatnonzero(single & ~rows.delivered.any(0)):
+        for j in np.flatnonzero(single & ~rows.delivered.any(0)).tolist():
             force = push(residual, rows.open, typical, j)
             if _size(force) > PUSHED * _size(needed[:, j]):
                 pushing[j] = _size(force)

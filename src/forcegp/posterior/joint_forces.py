@@ -40,6 +40,7 @@ def joint_forces_given(
         covariance: Tensor = prior.covariance - gain @ across.mT  # type: ignore[operator]  # `predict` computes it
         return Gaussian(prior.mean + (gain @ missed[..., None])[..., 0], 0.5 * (covariance + covariance.mT))
 
+    assert learned.covariance is not None, "as above"
     return given(whole, whole.covariance @ H.mT), given(learned, learned.covariance @ H.mT)
 
 
