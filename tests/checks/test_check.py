@@ -10,6 +10,7 @@ from tests.checks.logs import arm, clean, column, pendulum
 from forcegp.checks import CheckReport, check
 from forcegp.data import Preparation
 from forcegp.errors import InvalidInput
+from forcegp.mechanics import fixed_point
 
 SYSTEMS = {"arm": arm, "pendulum": pendulum}
 
@@ -55,6 +56,20 @@ def test_a_prepared_log_is_told_with_the_price_that_was_paid():
     paid = prepared.metadata["preparation"]["acceleration_noise"]["after"]
     assert [each["noise_after"] for each in report.per_joint()] == pytest.approx(paid)
     assert "when this dataset was prepared" in report.doubts.of("noise")[0].what
+
+
+def test_switches_of_a_foot_that_lifts_are_no_lost_rows():
+    log = clean(5)
+    flags = np.ones((len(log), 1))
+    for row in range(50, len(log), 100):
+        flags[row : row + 3] = 0.0
+    model = log.model.with_contacts(fixed_point("hand", switch="hand_stands")[:1])
+    lifted = replace(log, u=np.hstack([log.u, flags]), model=model, noise_std=None)
+    assert not check(lifted).doubts.of("drop-outs")
+    lost = np.array(lifted.u)
+    lost[25::100, 1] = 0.0
+    (found,) = check(replace(lifted, u=lost)).doubts.of("drop-outs")
+    assert found.joints == ("lift",)
 
 
 def test_repeated_rows_are_told():

@@ -167,7 +167,9 @@ def _mended(dataset: Dataset) -> dict[str, Any]:
 def _drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
     """Where a signal is exactly 0 between values far from 0: it was not measured, or lost on its way."""
     values = getattr(dataset, name)
-    lost = np.zeros(values.shape, dtype=bool)
+    if name == "u":  # the last columns may be switches of contacts, which are 0 by right
+        values = values[:, : min(dataset.nv, len(dataset.model.actuators))]
+    lost = np.zeros(values.shape if name == "q" else dataset.v.shape, dtype=bool)
     follows = consecutive(dataset)[:-1]
     for joint in np.flatnonzero(((values == 0.0).sum(axis=0) >= FEWEST_DROPS) & (np.ptp(values, axis=0) > 0.0)):
         x = values[:, joint]
