@@ -242,8 +242,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "update": _call(
         Posterior.update,
         _of_posterior("update", lambda made: made.predict(*STATE)),
-        "horizon",
-        lambda: {"rows": INPUTS.data.rows([9])},
+        given=lambda: {"rows": INPUTS.data.rows([9])},
     ),
     "predictor().refreshed": (lambda **k: INPUTS.predictor.refreshed(**k), lambda: {"posterior": INPUTS.posterior}),
     "curve": _call(Posterior.curve, _of_posterior("curve"), "features", lambda: {"latent": "pan", "points": 5}),
