@@ -144,6 +144,8 @@ def fit(
     doubts = list(doubts_of_past(model, dataset, known))
     known = known | (known.mean() < 1.0 - LEFT_OUT)
     dataset = dataset if known.all() else dataset.rows(np.flatnonzero(known))
+    touches = model.contacts and not model.carries_known_forces
+    unseen = Unseen.of(model, dataset, typical_sizes(model, [dataset])["force"]) if touches else None
     logs = [dataset] if baseline is None else [dataset, _checked(model, baseline, rest, None)]
     if isinstance(start, Posterior):
         posterior: Any = start
@@ -161,15 +163,13 @@ def fit(
             )
         sensor = next((each.noise for each in sensors if each.noise is not None), None)
         search = Search(checked_jobs(jobs), restarts, seed, options, start)
-        posterior = _Functions(model, search, engine, learning_points, sensor).fitted(dataset, points)
+        posterior = _Functions(model, search, engine, learning_points, sensor, unseen).fitted(dataset, points)
     if choice is not None:
         posterior = posterior.with_settings(gear_friction=choice.to_dict())
     if not known.all():
         posterior = posterior.with_settings(rows_before_a_past=int((~known).sum()))
-    if model.contacts and not posterior.is_black_box:
-        posterior = posterior.with_settings(
-            **Unseen.of(model, dataset, typical_sizes(model, [dataset])["force"]).stated
-        )
+    if unseen is not None and not posterior.is_black_box:
+        posterior = posterior.with_settings(**unseen.stated)
     if refinement is not None:
         posterior = refine_on_motions(posterior, dataset, refinement.seconds, refinement.bodies, model)
     Doubts([*doubts, *doubts_of_reversals(posterior.model, dataset)]).warn(stacklevel=3)
@@ -232,8 +232,8 @@ def with_sensors(
         raise InvalidInput("force sensors teach numbers beside torques, not beside accelerations; give Torques().")
     if model.unknown_forces and (lost := [name for name in frames if name not in at_contacts]):
         raise InvalidInput(
-            f"a force was measured at {lost[0]!r}, where the model has no contact; give it one (--contact), or leave "
-            "gp: forces out, so that it is a known force."
+            f"a force was measured at {lost[0]!r}, where the model has no contact; give it one, or leave unknown "
+            "forces out, so that it is a force that is known."
         )
     return replace(dataset, measured={f"{FORCE}{name}": dataset.measured[f"{FORCE}{name}"] for name in frames})
 
@@ -294,6 +294,8 @@ class _Functions:
     learning_points: int | None
     sensor: float | None = None
     """Standard deviation of force sensors [N], where it is stated."""
+    unseen: Unseen | None = None
+    """What the log leaves open of forces at contacts."""
 
     def fitted(self, dataset: Dataset, points: int | None) -> Posterior:
         """In the air of the log, where that moves."""
@@ -395,9 +397,7 @@ class _Functions:
         `beside` gives the likelihood in which numbers are free.
         """
         noise = with_sensor(resolved_noise(self.model.noise, rows), rows, self.sensor)
-        if self.model.contacts:
-            typical = typical_sizes(self.model, [rows])["force"]
-            noise = Unseen.of(self.model, rows, typical).with_pushes(noise, typical, len(rows))
+        noise = noise if self.unseen is None else self.unseen.with_pushes(noise, len(rows))
         model = replace(self.model, noise=noise)
         training = TrainingData.of(rows, model.robot.device, frames_of(rows))
         likelihood = MarginalLikelihood(model, training)

@@ -248,7 +248,7 @@ def fit_physical(
     if level is None or level.learn or level.acceleration is None:
         found_levels = Noise(tuple(np.sqrt((residual**2).mean(0)).clip(1e-12)))
         level = found_levels if noise is None else Noise(tuple(noise.acceleration), tuple(noise.force))
-        level = unseen.with_pushes(level, typical["force"])
+        level = unseen.with_pushes(level)
     return Solution(found, estimates, level, with_memory(logs[0], found), tuple(history) or (0.0,), fit.x)
 
 

@@ -28,7 +28,7 @@ from forcegp.inference import (
 )
 from forcegp.inference.memory import blas_threads
 from forcegp.inference.posterior import ExactPosterior
-from forcegp.noise import Noise
+from forcegp.noise import STATED, Noise
 from forcegp.parallel import Jobs, mapped
 from forcegp.posterior import Posterior
 from forcegp.posterior.fitted import DEVIATIONS
@@ -86,7 +86,7 @@ def first_start(
     """The moments, with what the caller gives in their place. Raises InvalidInput for what the model does not have."""
     first = dict(moments)
     for name, value in given.items():
-        if name in fixed:
+        if name in fixed or name in STATED:
             continue  # the noise that this fit holds fixed
         if name not in first:
             raise InvalidInput(f"start has {name!r}; the parameters of this model are {', '.join(sorted(first))}")

@@ -44,16 +44,20 @@ nobody calibrated, and friction (10 to 16 % and 10 % on that leg, 9.5 % on a UR1
 
 @dataclass(frozen=True, eq=False)
 class Unseen:
-    """Joints that something pushes, with how strongly (nv,) [N or Nm], and what contacts hide of every torque (nv,)."""
+    """Joints that something pushes, with how strongly (nv,) [N or Nm], and what contacts hide of every torque (nv,).
 
+    `typical` are sizes of joint forces in the log.
+    """
+
+    typical: Float[np.ndarray, " nv"]
     pushed: tuple[int, ...]
     pushing: Float[np.ndarray, " nv"]
     hidden: Float[np.ndarray, " nv"] | None
 
     @classmethod
     def of(cls, model: Model, log: Dataset, typical: Float[np.ndarray, " nv"]) -> "Unseen":
-        """Of a log; `typical` are sizes of its joint forces. Nothing is hidden where sensors measure all contacts."""
-        nothing = cls((), np.zeros_like(typical), None)
+        """Of a log. Nothing is hidden where sensors measure all contacts."""
+        nothing = cls(typical, (), np.zeros_like(typical), None)
         if not model.contacts or model.carries_known_forces:
             return nothing
         log = log.rows(evenly(log, ROWS))
@@ -68,18 +72,18 @@ class Unseen:
                 pushing[j] = _size(force)
         seen = all(contact.frame in rows.sensed for contact in model.contacts)
         hidden = None if seen else np.where(pushing > 0.0, FLAT * pushing, OF_TORQUE * typical)
-        return cls(tuple(np.flatnonzero(pushing).tolist()), pushing, hidden)
+        return cls(typical, tuple(np.flatnonzero(pushing).tolist()), pushing, hidden)
 
-    def with_pushes(self, noise: Noise, typical: Float[np.ndarray, " nv"], rows: int = 1) -> Noise:
+    def with_pushes(self, noise: Noise, rows: int = 1) -> Noise:
         """The noise with what pushes, and with that of joint forces where sensors show it, which is learned.
 
         A hand lasts: so many rows in which it pushes tell functions no more than one.
         """
         if noise.sensor is not None and noise.force is None:
-            noise = replace(noise, force=tuple(LEARNED * typical))
+            noise = replace(noise, force=tuple(LEARNED * self.typical))
         if not self.pushed:
             return noise
-        return replace(noise, pushes=tuple(np.maximum(FLAT * np.sqrt(rows) * self.pushing, NONE * typical)))
+        return replace(noise, pushes=tuple(np.maximum(FLAT * np.sqrt(rows) * self.pushing, NONE * self.typical)))
 
     def levels(
         self,

@@ -148,7 +148,7 @@ class Posterior(Fitted):
         B, motion = self.trained.unknown.direction(dynamics), dynamics.acceleration_map()
         latents = self.latents(dynamics, covariance or a is not None)
         seen = None if a is None else (a, given[ACCELERATION].exp())
-        whole, learned = joint_forces_given(latents, B, self._unlearned(dynamics), motion, seen)
+        whole, learned = joint_forces_given(latents, B, self.unlearned(dynamics), motion, seen)
         moving = (learned if seen is None else whole).through(motion.matrix, motion.offset)
         if not covariance:
             whole, learned, moving = (Gaussian(each.mean, None) for each in (whole, learned, moving))
@@ -168,7 +168,7 @@ class Posterior(Fitted):
             noise_covariance=noise,
         )
 
-    def _unlearned(self, dynamics: ConstrainedDynamics) -> Tensor | None:
+    def unlearned(self, dynamics: ConstrainedDynamics) -> Tensor | None:
         """The covariance of joint forces beside what was learned: noise, what pushed, and what contacts hid."""
         given, hidden = self.hyperparameters, self.settings.get("hidden_force")
         levels = [given[name].exp().square() for name in (FORCE, PUSHES) if name in given]

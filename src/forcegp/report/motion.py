@@ -16,6 +16,7 @@ from forcegp.data import Dataset
 from forcegp.errors import required_extra
 from forcegp.forces import Actuation, BaseWrench, ObservedWrench, RigidBodies, Rotor, Thrusters, Unknown
 from forcegp.mechanics import ConstrainedDynamics
+from forcegp.posterior.joint_forces import joint_forces_given
 from forcegp.posterior.posterior import Posterior
 from forcegp.report.shapes import LinkShape, link_shapes, poses_of_links, reach
 from forcegp.robots import Robot
@@ -154,14 +155,15 @@ def learned_forces(posterior: Posterior, dynamics: ConstrainedDynamics) -> list[
         groups.append(_at_joints(robot, dynamics, title, mean, own.std))
     if dynamics.contacts:
         map_ = dynamics.contact_force_map()
-        matrix, offset = (map_.matrix @ B).unflatten(-2, (-1, 3)), map_.offset.unflatten(-1, (-1, 3))
+        matrix, offset = map_.matrix.unflatten(-2, (-1, 3)), map_.offset.unflatten(-1, (-1, 3))
         points: dict[tuple[object, ...], list[int]] = {}
         for index, contact in enumerate(dynamics.contacts):
             if not getattr(contact, "turning", False):  # a torque
                 points.setdefault((contact.frame, contact.point), []).append(index)
+        whole, _ = joint_forces_given(latents, B, posterior.unlearned(dynamics), dynamics.acceleration_map(), None)
         for which in points.values():  # a foot that stands is three contacts, and one force
             contact = dynamics.contacts[which[0]]
-            force = latents.through(matrix[..., which, :, :].sum(-3), offset[..., which, :].sum(-2))
+            force = whole.through(matrix[..., which, :, :].sum(-3), offset[..., which, :].sum(-2))
             place = contact.position(dynamics.state.kinematics)
             groups.append(_at_point(f"contact force at {contact.frame}", place, force.mean, force.covariance))
     return groups
