@@ -301,14 +301,14 @@ def test_a_real_leg_tells_its_contact_force_without_the_sensor_after_a_calibrati
     model = Model(Robot.from_urdf(realdata / "hopper" / "teststand.urdf"), fixed_point("contact"))
     still, name = np.zeros_like(q), f"{FORCE}contact"
     raw = Dataset(q=q, v=still, u=u, a=still, time=time, model=model, measured={name: force})
-    log = Preparation(cutoff=20.0, every=5, trim=0.2).apply(raw)
+    log = Preparation(cutoff=20.0, every=10, trim=0.2).apply(raw)
     train, test = (log.rows(slice(*ends)) for ends in ((0, 2 * len(log) // 3), (2 * len(log) // 3, len(log))))
     laws = (Actuation(gain=LogNormal(1.0, 0.3)), GearFriction(), Offset())
 
     def left(forces, evidence):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)
-            points = 300 if evidence == Accelerations() else None
+            points = 150 if evidence == Accelerations() else None
             posterior = fit(model.with_forces(*forces), train, evidence, points=points, restarts=1)
         rows = with_memory(test, posterior.model)
         found = posterior.predict(rows.q, rows.v, rows.u, a=rows.a, of=[ContactForces("contact")])[0]

@@ -27,7 +27,7 @@ def learned():
 
 
 @pytest.mark.parametrize(
-    ("seed", "seconds"), [(1, 12.0), *(pytest.param(k, 60.0, marks=pytest.mark.nightly) for k in range(1, 7))]
+    ("seed", "seconds"), [(1, 8.0), *(pytest.param(k, 60.0, marks=pytest.mark.nightly) for k in range(1, 7))]
 )
 def test_timing_rotors_and_payload(seed, seconds):
     arm = LuGreArm(seed)
