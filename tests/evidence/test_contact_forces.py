@@ -15,6 +15,7 @@ from forcegp.errors import DatasetError, DataWarning, InvalidInput
 from forcegp.evidence.likelihood import MarginalLikelihood, TrainingData
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
+from forcegp.fit.fit import with_sensor
 from forcegp.fit.physical import typical_sizes
 from forcegp.fit.unseen import OF_TORQUE, PUSHED, Unseen
 from forcegp.forces import (
@@ -239,7 +240,16 @@ def test_a_joint_that_something_pushes_teaches_nothing(force, found):
     if found:
         with pytest.warns(DataWarning, match="nothing drives lift, u is 0 there"):
             posterior = fit(held(Viscous()), log, Torques())
-        assert posterior.model.noise.pushes[1] > 5.0 * push[0, 1]
+        assert posterior.model.noise.pushes[1] == pytest.approx(10.0 * push[0, 1], rel=0.3)
+
+
+def test_noise_that_nobody_states_begins_at_two_per_cent():
+    log = measured(on_plane(), on_plane(), rows=20)
+    noise = with_sensor(Noise(0.1), log, None)
+    assert noise.sensor == pytest.approx(0.02 * np.sqrt((log.measured[SENSOR] ** 2).mean()))
+    assert with_sensor(Noise(0.1), log, 0.7).sensor == 0.7
+    typical = np.array([1.0, 2.0, 3.0])
+    assert Unseen(typical, (), 0.0 * typical, None).with_pushes(noise).force == pytest.approx(0.02 * typical)
 
 
 class TestLogsOfSensors:

@@ -17,6 +17,7 @@ from forcegp.errors import DataWarning, InvalidInput, require_type, usable_argum
 from forcegp.evidence import Accelerations, ContactForces, Evidence, Motions, Torques, TrainingData
 from forcegp.evidence.likelihood import MarginalLikelihood, check_distance, problem_size
 from forcegp.evidence.parameter_space import ParameterSpace
+from forcegp.evidence.recorded_rows import sensed_of
 from forcegp.fit.doubts import (
     check_forces,
     doubts_of_past,
@@ -203,11 +204,6 @@ def _chosen(
     return Torques() if fixed else Torques(noisy="both"), refinement, sensors
 
 
-def frames_of(dataset: Dataset) -> list[str]:
-    """Where its force sensors are."""
-    return [name.removeprefix(FORCE) for name in dataset.measured]
-
-
 def with_sensor(noise: Noise, rows: Dataset, stated: float | None) -> Noise:
     """The noise with that of force sensors, where the log has them."""
     if not rows.measured or noise.sensor is not None:
@@ -223,7 +219,7 @@ def with_sensors(
     for each in sensors:
         each.check(dataset)
     at_contacts = {contact.frame for contact in model.contacts}
-    frames = frames_of(dataset)
+    frames = list(sensed_of(dataset))
     if sensors and all(each.frame for each in sensors):
         frames = [each.frame for each in sensors]
     elif not sensors:
@@ -399,7 +395,7 @@ class _Functions:
         noise = with_sensor(resolved_noise(self.model.noise, rows), rows, self.sensor)
         noise = noise if self.unseen is None else self.unseen.with_pushes(noise, len(rows))
         model = replace(self.model, noise=noise)
-        training = TrainingData.of(rows, model.robot.device, frames_of(rows))
+        training = TrainingData.of(rows, model.robot.device, sensed_of(rows))
         likelihood = MarginalLikelihood(model, training)
         model.check_states(training.q, training.v, training.u)
         check_distance(model, training)
