@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from forcegp.data import Dataset, evenly, recorded_motions
 from forcegp.errors import ForceGPError, InvalidInput
+from forcegp.evidence.recorded_rows import sensed_of
 from forcegp.forces import Actuation, JointFriction, LoadFriction, Offset, RigidBodies, Rotor, Unknown
 from forcegp.mechanics import Contact, Held, LoopClosure
 from forcegp.model import Model
@@ -233,7 +234,9 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
     grid: Any = figure.subplots(len(contacts), 1, squeeze=False)[:, 0]
     q, v, u = (torch.tensor(values) for values in (rows.q, rows.v, rows.u))
     with torch.no_grad():
-        multiplier, dynamics = posterior.predict(q, v, u).multiplier, posterior.dynamics(q, v, u)
+        sensed = {name: x for name, x in sensed_of(rows).items() if any(name == each.frame for each in contacts)}
+        given = torch.tensor(rows.a) if sensed else None  # as an estimator beside a sensor has it
+        multiplier, dynamics = posterior.predict(q, v, u, a=given).multiplier, posterior.dynamics(q, v, u)
         assert multiplier is not None, "models with forces predict lambda"
         own = rows.model.dynamics(q, v, u)
         size, other = (torch.linalg.vector_norm(each.normals, dim=-1).numpy() for each in (dynamics, own))
@@ -243,6 +246,10 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
         style.draw_line(axes, rows.time, nominal[:, index], style.KNOWN_PHYSICS, 1.1, "known physics alone")
         if truth is not None and truth.shape == other.shape == size.shape:
             style.draw_line(axes, rows.time, (other * truth)[:, index], style.TRUTH, 3.5, "true", alpha=0.3)
+        if contact.frame in sensed:
+            along = dynamics.normals[:, index].numpy() / size[:, [index]]
+            there = (along * sensed[contact.frame]).sum(1)
+            style.draw_line(axes, rows.time, there, style.TRUTH, 3.5, "measured", alpha=0.3)
         style.draw_band(axes, rows.time, mean[:, index], spread[:, index], alpha=0.3, label="95 % band")
         style.draw_line(axes, rows.time, mean[:, index], style.PREDICTION, 1.3, "predicted")
         axes.margins(x=0)
@@ -353,7 +360,7 @@ PICTURES: dict[str, tuple[Callable[[Posterior, Dataset], Figure], str]] = {
         "Every half second a prediction begins at the recorded state and follows the recorded u. The line is its "
         "error, the band its 95 % interval.",
     ),
-    "normal_force": (normal_force_figure, "The forces of contacts, which no sensor measured."),
+    "normal_force": (normal_force_figure, "The forces of contacts, and what sensors measured of them."),
     "prediction": (prediction_figure, "Accelerations over time, and their errors on the right."),
 }
 """By name, how each is drawn, and what is to be seen."""
