@@ -60,7 +60,8 @@ class Dataset(Summary):
         the unknown joint forces "Q_U" (rows, nv), their parts "Q_U.<name>" (rows, nv), forces on the robot
         "force.<name>" (rows, 3) [N, world axes], and "in_contact" (rows, m), 1 where a contact acts and 0 elsewhere.
     metadata: a copy of anything that JSON can hold.
-    strokes: what rows know of the motion before them (`forcegp.data.strokes`), for friction that remembers; not stored.
+    strokes: what rows know of the motion before them (`forcegp.data.strokes`), (rows, nv, k)
+        for friction that remembers. Behind a filter they are those before it; those of motors are not stored.
     transmission: of the motors whose strokes these are, (nv, nv); None: those of the joints.
     time_ordered: False for rows drawn in another order (`rows`): times are then only required to differ.
 
@@ -103,6 +104,11 @@ class Dataset(Summary):
             raise DatasetError(f"episode has shape {given.shape}; expected ({rows},).")
         put("episode", _read_only(given.astype(np.int64)))
         put("noise_std", _noise_std(self.noise_std, names))
+        if self.strokes is not None:
+            past = real_array("strokes", self.strokes, "fiu", DatasetError).astype(np.float64)
+            if past.ndim != 3 or past.shape[:2] != self.v.shape or not np.isfinite(past).all():
+                raise DatasetError(f"strokes have shape {past.shape}; give finite numbers ({rows}, {len(names)}, k).")
+            put("strokes", _read_only(past))
         put("measured", _measured(self.measured, rows, robot))
         put("truth", _truth(self.truth, names, rows, self.model))
         try:

@@ -226,7 +226,7 @@ def resample(dataset: Dataset, step: float) -> Dataset:
         parts.append({**signals, "time": time, "episode": np.full(count, number)})
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     measured = {name: joined.pop(name) for name in dataset.measured}
-    return replace(dataset, **joined, measured=measured, truth={}, noise_std=None)
+    return replace(dataset, **joined, measured=measured, truth={}, noise_std=None, strokes=None)
 
 
 def episodes_in_order(dataset: Dataset) -> list[tuple[int, Dataset, str]]:

@@ -30,6 +30,8 @@ def write_fields(path: Path, fields: Mapping[str, Any], units: Mapping[str, Any]
     arrays |= {f"truth/{name}": values for name, values in fields["truth"].items()}
     if names := list(fields["measured"]):  # of frames, which may hold a slash
         arrays["measured"] = np.stack([fields["measured"][name] for name in names])
+    if fields["strokes"] is not None and fields["transmission"] is None:
+        arrays["strokes"] = fields["strokes"]
     with atomic_file(path) as temporary, new_file(temporary) as file:
         for name, values in arrays.items():
             file.create_dataset(name, data=values, **(COMPRESSION if values.size else {}))
@@ -109,6 +111,7 @@ class _Reader:
         values["metadata"] = json.loads(self.text("metadata"))
         self.require(isinstance(values["metadata"], dict), ": 'metadata' must be a JSON object.")
         values["noise_std"] = self.array("noise_std") if "noise_std" in file else None
+        values["strokes"] = self.array("strokes") if "strokes" in file else None
         truth = file["truth"] if isinstance(file.get("truth", getlink=True), h5py.HardLink) else None
         self.require("truth" not in file or isinstance(truth, h5py.Group), ": 'truth' must be a group in this file.")
         names = list(truth) if isinstance(truth, h5py.Group) else []

@@ -22,6 +22,7 @@ from forcegp.data.filters import (
 )
 from forcegp.data.spectrum import FEWEST_ROWS, held_out_cutoff, motion_spectrum
 from forcegp.data.stance import estimate_stance
+from forcegp.data.strokes import with_strokes
 from forcegp.data.wind import estimate_thruster_lag, thruster_columns
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.robots.arguments import whole_number
@@ -175,6 +176,7 @@ def _cutoff(dataset: Dataset, source: Literal["q", "v"]) -> tuple[float | None, 
 def _filtered(chosen: Preparation, dataset: Dataset) -> Dataset:
     """Filtered, differentiated and shifted, with all its rows."""
     if chosen.cutoff is not None:
+        dataset = with_strokes(dataset)  # a filter rounds the reversals, which friction remembers by the millirad
         signals: tuple[Signal, ...] = ("q", "u") if chosen.differentiate == "q" else ("q", "v", "u")
         dataset = low_pass(dataset, float(chosen.cutoff), signals=signals)
         dataset = differentiated(dataset, chosen.differentiate)

@@ -1,6 +1,7 @@
 """Strokes of joints, from reversal to reversal: what friction with memory needs of the past, in every row by itself."""
 
 from dataclasses import replace
+from math import comb
 
 import numpy as np
 import torch
@@ -13,6 +14,10 @@ COUNT = 12
 """Strokes that a row remembers: of more, what friction still feels is smaller than 12 encoder steps times sigma."""
 STEPS = 2.0
 """Steps of an encoder within which a reversal counts as none."""
+NOISES, ORDER = 8.0, 6
+"""Standard deviations of white noise within which a reversal counts as none; they are those of sixth differences, in
+which motions below a tenth of the sample rate hardly show."""
+NORMAL = 0.6745  # median of absolute values of a standard normal variable
 ON_GRID, MOSTLY = 0.1, 0.9
 """Positions lie on a grid where so many of their differences are within this share of a whole number of steps."""
 
@@ -40,7 +45,7 @@ def strokes(
     out = np.zeros((len(dataset), dataset.nv, count))
     positions, steps = motor_positions(dataset, transmission)
     for joint in range(dataset.nv):
-        least = STEPS * steps[joint]
+        least = max(STEPS * steps[joint], NOISES * white_noise(dataset, positions[:, joint]))
         for episode in dataset.episodes:
             rows = np.flatnonzero(dataset.episode == episode)
             q = positions[rows, joint]
@@ -83,6 +88,16 @@ def encoder_step(dataset: Dataset, q: Float[np.ndarray, " rows"]) -> float:
         return 0.0
     steps = some / some.min()
     return float(some.min()) if (abs(steps - steps.round()) < ON_GRID).mean() > MOSTLY else 0.0
+
+
+def white_noise(dataset: Dataset, q: Float[np.ndarray, " rows"]) -> float:
+    """Standard deviation [rad or m] of independent noise in the positions of a joint, from the median of differences.
+
+    The d-th difference of white noise has binom(2 d, d) times its variance (Rice 1984, Annals of Statistics 12).
+    """
+    whole = dataset.episode[ORDER:] == dataset.episode[:-ORDER]
+    apart = np.abs(np.diff(q, ORDER))[whole]
+    return float(np.median(apart)) / (NORMAL * comb(2 * ORDER, ORDER) ** 0.5) if len(apart) else 0.0
 
 
 def turning_points(q: Float[np.ndarray, " rows"], least: float) -> Int[np.ndarray, " turns"]:
