@@ -50,6 +50,7 @@ def complete(rows: int = 40) -> Dataset:
         rows,
         noise_std=np.array([0.1, 0.2]),
         truth={"a": rng.normal(size=(rows, 2)), "lambda": np.zeros((rows, 0)), "Q_U": np.zeros((rows, 2))},
+        strokes=rng.normal(size=(rows, 2, 3)),
         metadata={"source": "a test", "nested": {"list": [1, 2.5, None, True], "text": "µ"}},
     )
 
@@ -57,8 +58,7 @@ def complete(rows: int = 40) -> Dataset:
 def arrays(data: Dataset) -> dict[str, np.ndarray]:
     found = {name: getattr(data, name) for name in ("q", "v", "u", "a", "time", "episode")}
     found |= {f"truth/{name}": values for name, values in data.truth.items()}
-    if data.noise_std is not None:
-        found["noise_std"] = data.noise_std
+    found |= {name: x for name in ("noise_std", "strokes") if (x := getattr(data, name)) is not None}
     return found
 
 

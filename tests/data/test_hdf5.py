@@ -103,6 +103,8 @@ def test_a_missing_field_is_named(file, name):
         ("metadata", ["{}", "{}"], "must hold one text"),
         ("truth/a", np.zeros((40, 9)), r"truth\['a'\] has shape"),
         ("truth", np.zeros(3), "'truth' must be a group"),
+        ("strokes", np.zeros((40, 3)), "strokes have shape"),
+        ("strokes", np.full((40, 2, 3), np.nan), "give finite numbers"),
         ("noise_std", -np.ones(2), "noise_std of joint 'shoulder' is -1.0"),
     ],
 )

@@ -1,6 +1,7 @@
 """A `Payload` that is estimated, against payloads that Pinocchio's inverse dynamics carries."""
 
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -8,7 +9,9 @@ import pytest
 import torch
 from tests.robots.pinocchio_oracle import Oracle
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, Preparation
+from forcegp.data.views import at_rest
+from forcegp.data.views import postures as posture_numbers
 from forcegp.errors import DatasetError, DataWarning, ForceGPError
 from forcegp.evidence import Torques, body_names, motion_residuals
 from forcegp.fit import fit
@@ -64,6 +67,56 @@ class Found:
 @pytest.fixture(scope="module")
 def found() -> Found:
     return Found(log(loaded(), 1, noise=0.05))
+
+
+def postures(seed, count, rows=100):
+    """Rests of two seconds, in which gears bear up to their breakaway, as they came: the same while they stand."""
+    rng, text = np.random.default_rng(seed), loaded()
+    oracle, rest, time = Oracle(text, ROBOT), np.repeat(np.arange(count), rows), 0.02 * np.arange(count * rows)
+    at = np.array(ARMS["ur5-free"][1]) + rng.uniform(-1.0, 1.0, (count, 6))
+    stuck = 2.0 * ROTORS * rng.choice([-1.0, 1.0], (count, 6)) * rng.uniform(0.7, 1.0, (count, 6))
+    none = np.zeros(6)
+    u = np.array([oracle.inverse_dynamics(q, none, none) for q in at]) + stuck
+    q, v = at[rest] + 1e-5 * rng.standard_normal((len(rest), 6)), 1e-3 * rng.standard_normal((len(rest), 6))
+    u = u[rest] + 0.05 * rng.standard_normal((len(rest), 6))
+    return Dataset(q=q, v=v, u=u, a=np.gradient(v, 0.02, axis=0), time=time, episode=rest, model=Model(ROBOT))
+
+
+def test_intervals_hold_what_gears_bear_in_postures():
+    """Each posture counts once, however many rows it has; the default filter leaves such logs as they are."""
+    held = []
+    for seed in range(6):
+        raw = postures(seed, 6)
+        prepared = Preparation(cutoff="auto").apply(raw)
+        assert prepared.metadata["preparation"]["cutoff"] is None
+        low, high = Found(prepared, laws=(Viscous(), Stribeck(), Offset())).intervals[0]
+        held.append(low <= MASS <= high)
+    assert sum(held) >= 5
+
+
+def test_what_rests_is_a_matter_of_the_whole_range():
+    data = postures(0, 3, rows=20)
+    sway = np.linspace(-1.0, 1.0, 20)[np.arange(60) % 20][:, None] * np.ptp(data.q, axis=0)
+    assert at_rest(replace(data, q=data.q + 0.004 * sway))
+    assert not at_rest(replace(data, q=data.q + 0.0075 * sway))
+    assert not at_rest(data.select_episodes([0, 1]))
+    assert not at_rest(log(TEXT, 0, seconds=2.0))
+
+
+def test_what_a_log_rests_in_is_one_piece():
+    """Moves of a second between rests of another, in one episode: each rest and the move before it stay together."""
+    time = 0.02 * np.arange(400)
+    s = np.clip(time % 2.0, 0.0, 1.0)
+    way = (time // 2.0 + s**3 * (10.0 - 15.0 * s + 6.0 * s**2))[:, None] * np.array([0.4, -0.3, 0.2, 0.5, 0.1, 0.3])
+    data = replace(log(TEXT, 0, seconds=8.0), q=way)
+    numbers = posture_numbers(data)
+    assert numbers is not None
+    assert [len(set(numbers[40 + 100 * k : 100 * k + 95])) for k in range(4)] == [1] * 4
+    assert np.unique(numbers).tolist() == [0, 1, 2, 3]
+    assert posture_numbers(log(TEXT, 0, seconds=8.0)) is None  # no rests
+    assert posture_numbers(data.rows(slice(0, 200))) is None  # too few
+    brief = replace(data, time=0.2 * time)  # of rests below .3 s there may be many
+    assert posture_numbers(brief) is None
 
 
 FINGER = """<joint name="{0}" type="revolute"><parent link="tool0"/><child link="{0}_link"/><axis xyz="0 0 1"/>{1}

@@ -14,8 +14,8 @@ from tests.posterior.arm import arm_model
 from forcegp import Accelerations, Dataset, Torques, export_c, fit, score
 from forcegp.control import ComputedTorque, ContactMonitor
 from forcegp.control.tracking import Past
-from forcegp.data import estimate_delay, with_memory, with_strokes
-from forcegp.data.strokes import encoder_step, strokes, turning_points
+from forcegp.data import Preparation, estimate_delay, with_memory, with_strokes
+from forcegp.data.strokes import encoder_step, strokes, turning_points, white_noise
 from forcegp.data.views import FORGOTTEN, past_known, recorded_motions
 from forcegp.errors import DataWarning, InvalidInput
 from forcegp.evidence import motion_residuals
@@ -350,6 +350,32 @@ def test_noise_of_an_encoder_does_not_wear_the_state_down():
             past.see(torch.tensor(0.01 + 1e-5 * chance.standard_normal(3)))
     assert bool((quiet.z > 0.99).all())
     assert bool((every.z < 0.5).all())
+
+
+def test_noise_of_positions_is_no_reversal():
+    """Its size is found at any rate, and motion is not taken for it."""
+    time, rng = DT * np.arange(8000), np.random.default_rng(0)
+    q = np.stack([0.4 * np.sin((1.0 + 0.3 * j) * time) for j in range(3)], 1)
+    v, a = np.gradient(q, time, axis=0), np.zeros_like(q)
+    smooth, noisy = log_of(q, v, a, a, time), log_of(q + 1e-4 * rng.standard_normal(q.shape), v, a, a, time)
+    assert [white_noise(noisy, each) for each in noisy.q.T] == pytest.approx(3 * [1e-4], rel=0.1)
+    assert [white_noise(each, each.q[:, 0]) for each in (smooth, smooth.rows(slice(None, None, 200)))] == [0.0, 0.0]
+    reversals = [(np.diff(np.sign(strokes(log)[:, :, 0]), axis=0) != 0).sum() for log in (smooth, noisy)]
+    assert abs(reversals[1] - reversals[0]) <= 3  # of three joints, at the first rows
+    still = log_of(1e-4 * rng.standard_normal(q.shape), a, a, a, time)
+    assert np.abs(strokes(still)[:, :, 1]).max() < 1e-3  # at rest there is no past, but for rare peaks
+
+
+def test_a_filter_does_not_round_the_reversals_that_friction_remembers():
+    """Strokes are those before the filter, also in a file, and so is the friction of a joint that moves and rests."""
+    time = DT * np.arange(6000)
+    steps = np.cumsum(np.where(np.arange(6000) % 1500 < 300, 2e-3, 0.0) * np.sign(np.sin(0.001 * np.arange(6000))))
+    q = np.stack([steps, 0.5 * np.sin(time), -0.5 * np.cos(time)], 1)
+    v = np.gradient(q, time, axis=0)
+    raw = log_of(q, v, np.gradient(v, time, axis=0), v, time)
+    filtered = Preparation(cutoff=2.0, every=3).apply(raw)
+    assert np.array_equal(np.asarray(filtered.strokes), strokes(raw)[::3])
+    assert not np.allclose(filtered.strokes, strokes(replace(filtered, strokes=None)), atol=1e-4)
 
 
 def test_rows_before_a_joint_has_moved_are_left_out():

@@ -18,7 +18,7 @@ from tests.fuzz.values import DAMAGE, JSON, JSON_EDITS, SCALARS, WORDS, Damage, 
 
 from forcegp import Dataset
 
-NAMES = words("q v u a time episode noise_std truth/a truth/lambda joint_names metadata model")
+NAMES = words("q v u a time episode noise_std strokes truth/a truth/lambda joint_names metadata model")
 ATTRIBUTES = ("format", "format_version", "written_by", "time_ordered", "units")
 ARRAYS = {
     "no quaternions": lambda x: x * 1.5,

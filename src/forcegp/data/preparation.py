@@ -23,6 +23,7 @@ from forcegp.data.filters import (
 from forcegp.data.spectrum import FEWEST_ROWS, held_out_cutoff, motion_spectrum
 from forcegp.data.stance import estimate_stance
 from forcegp.data.strokes import with_strokes
+from forcegp.data.views import at_rest
 from forcegp.data.wind import estimate_thruster_lag, thruster_columns
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.robots.arguments import whole_number
@@ -152,6 +153,8 @@ BEYOND_BASE = 8.0
 
 def _cutoff(dataset: Dataset, source: Literal["q", "v"]) -> tuple[float | None, str]:
     """What the spectrum shows, not far beyond a base on contacts, and what torques make of it [Hz]; and why."""
+    if at_rest(dataset):
+        return None, "the log is of postures, within which nothing moves; nothing is filtered"
     spectrum, model = motion_spectrum(dataset, source), dataset.model
     fastest = decisive = spectrum.cutoff
     for group in model.robot.layout.groups[:1] if model.touching else ():

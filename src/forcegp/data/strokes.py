@@ -14,9 +14,10 @@ COUNT = 12
 """Strokes that a row remembers: of more, what friction still feels is smaller than 12 encoder steps times sigma."""
 STEPS = 2.0
 """Steps of an encoder within which a reversal counts as none."""
-NOISES, ORDER = 8.0, 6
-"""Standard deviations of white noise within which a reversal counts as none; they are those of sixth differences, in
-which motions below a tenth of the sample rate hardly show."""
+NOISES = 8.0
+"""Standard deviations of white noise in positions within which a reversal counts as none."""
+ORDERS, AGREE = (5, 6), 1.25
+"""Differences of both orders find the same noise up to this factor; where motion or rounding dominates they do not."""
 NORMAL = 0.6745  # median of absolute values of a standard normal variable
 ON_GRID, MOSTLY = 0.1, 0.9
 """Positions lie on a grid where so many of their differences are within this share of a whole number of steps."""
@@ -91,13 +92,16 @@ def encoder_step(dataset: Dataset, q: Float[np.ndarray, " rows"]) -> float:
 
 
 def white_noise(dataset: Dataset, q: Float[np.ndarray, " rows"]) -> float:
-    """Standard deviation [rad or m] of independent noise in the positions of a joint, from the median of differences.
+    """Standard deviation [rad or m] of independent noise in the positions of a joint; 0 where motion hides it.
 
-    The d-th difference of white noise has binom(2 d, d) times its variance (Rice 1984, Annals of Statistics 12).
+    From medians of differences: the d-th of white noise has binom(2 d, d) times its variance (Rice 1984, Annals of
+    Statistics 12).
     """
-    whole = dataset.episode[ORDER:] == dataset.episode[:-ORDER]
-    apart = np.abs(np.diff(q, ORDER))[whole]
-    return float(np.median(apart)) / (NORMAL * comb(2 * ORDER, ORDER) ** 0.5) if len(apart) else 0.0
+    found = []
+    for order in ORDERS:
+        apart = np.abs(np.diff(q, order))[dataset.episode[order:] == dataset.episode[:-order]]
+        found.append(float(np.median(apart)) / (NORMAL * comb(2 * order, order) ** 0.5) if len(apart) else 0.0)
+    return found[-1] if max(found) < AGREE * min(found) else 0.0
 
 
 def turning_points(q: Float[np.ndarray, " rows"], least: float) -> Int[np.ndarray, " turns"]:

@@ -57,6 +57,41 @@ def move_on(dataset: Dataset) -> bool:
     return bool((np.median(steps, axis=0)[moving] < LEAP * spread[moving]).any())
 
 
+RESTS = 0.01
+"""Share of its whole range within which a joint rests."""
+STILL, SHORTEST, OFTEN = 1e-3, 0.3, 0.25
+"""Share of its range within which a joint stays for the shortest rest [s]; share of rows at rest in such a log."""
+
+
+def postures(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
+    """The rest that each row belongs to or comes after; None for a log of other motions.
+
+    A log of postures rests three times or more, in a quarter of its rows, with all joints at once.
+    """
+    if not dataset.time_ordered:
+        return None
+    least = RESTS * np.ptp(dataset.q, axis=0)
+    number, resting, count = np.zeros(len(dataset), int), 0, 0
+    for episode in dataset.episodes:
+        rows = np.flatnonzero(dataset.episode == episode)
+        q, time = dataset.q[rows], dataset.time[rows]
+        ahead = np.minimum(np.searchsorted(time, time + SHORTEST), len(rows) - 1)
+        still, last = (np.abs(q[ahead] - q) <= STILL / RESTS * least).all(1), 0
+        for begin, end in runs(still):
+            end = int(ahead[end - 1]) + 1
+            if time[end - 1] - time[begin] >= 0.99 * SHORTEST and (np.ptp(q[begin:end], axis=0) <= least).all():
+                number[rows[last:end]], last = count, end
+                resting, count = resting + end - begin, count + 1
+        number[rows[last:]] = max(count - 1, 0)
+    return number if count > 2 and resting >= OFTEN * len(dataset) else None
+
+
+def at_rest(dataset: Dataset) -> bool:
+    """Whether the log is of postures alone, each an episode: three or more, in which every joint rests."""
+    within = [np.ptp(dataset.q[dataset.episode == each], axis=0) for each in dataset.episodes]
+    return len(within) > 2 and bool((np.max(within, axis=0) <= RESTS * np.ptp(dataset.q, axis=0)).all())
+
+
 def runs(marked: Bool[np.ndarray, " rows"]) -> Int[np.ndarray, "runs 2"]:
     """First rows of all runs of True, and the rows after them."""
     return np.flatnonzero(np.diff(marked, prepend=False, append=False)).reshape(-1, 2)

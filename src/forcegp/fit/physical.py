@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 
 from forcegp.data import Dataset, evenly, with_memory
+from forcegp.data.views import at_rest, postures
 from forcegp.doubts import Doubt, Doubts, look
 from forcegp.errors import DatasetError, InvalidInput, require_type
 from forcegp.evidence import Accelerations, Torques
@@ -60,6 +61,7 @@ class Equations:
         self.measured = [part.moving(a) for part, a in zip(self.parts, self.each(self.a), strict=True)]
         self.held = _stacked([part.open if evidence.of_torque else part.held for part in self.parts])
         seconds = evidence.mean if isinstance(evidence, Torques) else None
+        self.at_rest = all(map(at_rest, logs))
         self.windows = None if seconds is None else WindowMeans(logs, seconds)
         self._stays: tuple[np.ndarray, ...] = ()
         """Regressors of the last search, which no coordinate changes."""
@@ -124,9 +126,16 @@ class Equations:
         return NoiseLevels(np.fmax(noise.acceleration, least.acceleration), np.fmax(noise.force, least.force))
 
     def stretches(self) -> list[np.ndarray]:
-        """Numbers of equations by stretch of time, some of each log in every one."""
+        """Numbers of equations by stretch of time, some of each log in every one; of postures each is one."""
         lengths = [len(log) for log in self.logs] if self.windows is None else self.windows.lengths
         nv, starts = self.a.shape[1], np.concatenate([[0], np.cumsum(lengths)])
+        found = [postures(log) for log in self.logs]
+        if all(each is not None and each.max() < STRETCHES for each in found):
+            # friction holds a share of the load, the same one as long as a joint stands
+            label = np.concatenate([each + STRETCHES * k for k, each in enumerate(found)])  # type: ignore[operator]
+            label = label if self.windows is None else label[self.windows.starts]
+            rests = [np.flatnonzero(label == each) for each in np.unique(label)]
+            return [(nv * each[:, None] + np.arange(nv)).ravel() for each in rests]
         numbers = []
         for log, start, length in zip(self.logs, starts, lengths, strict=False):
             order = np.arange(length)
@@ -236,7 +245,8 @@ def fit_physical(
             fit = search(white, start=fit.x, progress=note)
     found = space.model_at(fit.x)
     residual = equations.a - equations.accelerations(fit.x)[0]
-    doubts = [*_doubts_of_payloads(space, fit, equations.windows is not None), *_doubts_of_memory(space, fit.x)]
+    told = equations.windows is not None and not equations.at_rest  # a few postures bear what any numbers explain
+    doubts = [*_doubts_of_payloads(space, fit, told), *_doubts_of_memory(space, fit.x)]
     estimates = _estimates(space, fit, equations, evidence, thick)
     if not robot.space.is_vector_space:
         doubts += doubts_of_base(model, found, equations.parts[0], residual[: len(logs[0])])

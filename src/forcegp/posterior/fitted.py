@@ -194,7 +194,8 @@ class Estimates(Summary, Mapping[str, Estimate]):
         if moved:
             apart, count = np.stack(moved) - np.mean(moved, axis=0), len(moved)
             unseen = np.linalg.solve(whole, np.linalg.solve(whole, G).T)
-            covariance = (count - 1) / count * apart.T @ apart + unseen
+            reach = float(student.ppf(0.975, max(count - 1, 1))) / REACH  # of fewer stretches, such as postures
+            covariance = reach**2 * (count - 1) / count * apart.T @ apart + unseen
         given = parameters, values, slopes, np.linalg.inv(whole), prior
         return cls.of_covariance(*given, covariance=covariance, **more)
 
