@@ -18,8 +18,8 @@ demo: $(VENV)/.demo  ## simulate, learn and score; prints the table and writes a
 	$(BIN)/forcegp demo $(ARGS)
 
 # Files stay together, so that what a module shares is computed once.
-test: $(VENV)/.test  ## run the fast tests; every subject is in one
-	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
+test: $(VENV)/.test  ## run the fast tests; every subject is in one, but the browser (make test-browser)
+	$(BIN)/python -m pytest -n 2 --dist loadfile --ignore=tests/report/test_browser.py $(ARGS)
 
 test-all: $(VENV)/.test  ## run all tests, the slow ones too, and check annotated shapes at run time
 	FORCEGP_CHECK_SHAPES=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "" $(ARGS)

@@ -73,11 +73,6 @@ class Program:
         """All outputs, then what must be positive."""
         return [node for vector in self.outputs.values() for node in vector] + list(self.positive)
 
-    @property
-    def operations(self) -> int:
-        """Number of operations."""
-        return self.graph.operations(self.nodes)
-
 
 def write_function(
     name: str,

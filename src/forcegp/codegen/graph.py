@@ -130,10 +130,6 @@ class Graph:
                 wanted.update(self.operands(node))
         return sorted(wanted)
 
-    def operations(self, outputs: Iterable[int]) -> int:
-        """How many operations these nodes take."""
-        return sum(self.nodes[node][0] not in LEAVES for node in self.needed(outputs))
-
     def _simplified(self, operation: str, operands: tuple[int, ...], known: Sequence[float | None]) -> int | None:
         """A node that is equal whatever the inputs are, or None."""
         x = operands[0]
