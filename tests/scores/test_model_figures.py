@@ -2,15 +2,13 @@
 
 import numpy as np
 import pytest
-import torch
 
 from forcegp import Dataset, JointFriction, Viscous, fit
-from forcegp.errors import InvalidInput
 from forcegp.inference import OptimizerOptions
 from forcegp.posterior import Posterior
 from forcegp.progress import watched
 from forcegp.scores import model_pictures
-from forcegp.scores.figures.model import curve_panels, friction_curves_figure, motion_bands_figure, prediction_figure
+from forcegp.scores.figures.model import curve_panels, friction_curves_figure, prediction_figure
 from forcegp.simulation import FreeArmConfig, simulate_free_arm
 
 QUICK = OptimizerOptions(iterations=10)
@@ -38,32 +36,6 @@ def ends(band) -> tuple[np.ndarray, np.ndarray]:
     vertices = band.get_paths()[0].vertices
     times = np.unique(vertices[:, 0])
     return tuple(np.array([edge(vertices[vertices[:, 0] == t, 1]) for t in times]) for edge in (np.min, np.max))
-
-
-def test_errors_of_motions_and_their_bands(swinging, friction):
-    figure = motion_bands_figure(friction, swinging, seconds=2.0, horizon=0.25)
-    rows = swinging.rows(swinging.time <= 2.0)
-    dt = float(np.diff(rows.time).mean())
-    steps = round(0.25 / dt)
-    starts = np.searchsorted(rows.time, np.arange(0.0, rows.time[-1] - 0.25, 0.25) - 1e-9)
-    q0, v0 = (torch.tensor(x[starts]) for x in (rows.q, rows.v))
-    u = torch.tensor(np.stack([rows.u[k : k + steps] for k in starts]))
-    rollout = friction.rollout(q0, v0, u, dt, integrator="rk4", samples=24)
-    recorded = np.stack([rows.q[k : k + steps + 1] for k in starts])
-    low, high = torch.quantile(rollout.samples.q, torch.tensor([0.025, 0.975]).double(), dim=0).numpy()
-    for joint, axes in enumerate(figure.axes):
-        drawn = [line for line in axes.lines if len(line.get_ydata()) == steps + 1]
-        assert len(drawn) == len(starts) == len(axes.collections)
-        for motion, (line, band) in enumerate(zip(drawn, axes.collections, strict=True)):
-            np.testing.assert_allclose(
-                line.get_xdata(), rows.time[starts[motion] : starts[motion] + steps + 1], atol=1e-9
-            )
-            error = rollout.q[motion, :, joint].numpy() - recorded[motion, :, joint]
-            np.testing.assert_allclose(line.get_ydata(), error, atol=1e-12)
-            half = 0.5 * (high - low)[motion, :, joint]
-            np.testing.assert_allclose(ends(band), (-half, half), rtol=1e-6, atol=1e-9)
-    with pytest.raises(InvalidInput, match="no rows"):
-        motion_bands_figure(friction, swinging, start=99.0)
 
 
 def test_accelerations_with_both_bands(swinging, friction):
@@ -108,11 +80,6 @@ def test_every_picture_of_a_model_is_drawn_or_named(swinging, friction):
     told = []
     with watched(lambda *words: told.append(words)):
         pictures, missing = model_pictures(friction, swinging)
-    assert [each.name for each in pictures] == ["forces", "motions_ahead", "prediction"]
-    assert [each for each in told if each[1] == 3] == [(k, 3, each.name) for k, each in enumerate(pictures)]
-    assert missing == []
-    uneven = swinging.rows(np.flatnonzero(np.arange(len(swinging)) % 7))
-    pictures, missing = model_pictures(friction, uneven)
     assert [each.name for each in pictures] == ["forces", "prediction"]
-    assert len(missing) == 1
-    assert missing[0].startswith("motions ahead: not drawn, because ")
+    assert [each for each in told if each[1] == 2] == [(k, 2, each.name) for k, each in enumerate(pictures)]
+    assert missing == []

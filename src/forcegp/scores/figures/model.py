@@ -1,4 +1,4 @@
-"""Plots of one model on a recording (curves, accelerations, normal forces, motions), of contacts, and of scores."""
+"""Plots of one model on a recording (curves, accelerations, normal forces), of contacts, and of scores."""
 
 import math
 import re
@@ -12,7 +12,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from forcegp.data import Dataset, evenly, recorded_motions
+from forcegp.data import Dataset, evenly
 from forcegp.errors import ForceGPError, InvalidInput
 from forcegp.evidence.recorded_rows import sensed_of
 from forcegp.forces import Actuation, JointFriction, LoadFriction, Offset, RigidBodies, Rotor, Unknown
@@ -163,10 +163,6 @@ def _truth(posterior: Posterior, dataset: Dataset, panel: CurvePanel) -> tuple[n
     return at, law_forces(model, panel.joint, at) - rows.truth[key][:, panel.joint]
 
 
-LARGEST_GRID = 12
-SAMPLES = 24  # functions drawn for an interval where the model has no calibrated ones
-
-
 def model_pictures(posterior: Posterior, dataset: Dataset) -> tuple[list[style.Picture], list[str]]:
     """Every plot that the model and the recording allow, and why others are missing (uneven time steps, say)."""
     there = {"forces": curve_panels(posterior), "normal_force": posterior.model.contacts}
@@ -273,52 +269,6 @@ def _contact_labels(contact: Contact) -> tuple[str, str]:
     return f"{contact.frame} along {axis}", "force [N]"
 
 
-def motion_bands_figure(
-    posterior: Posterior, dataset: Dataset, *, start: float = 0.0, seconds: float = 6.0, horizon: float = 0.5
-) -> Figure:
-    """Errors of q: every `horizon` s a prediction begins at the recorded state and follows the recorded u.
-
-    Bands are 95 % intervals, calibrated or of functions drawn from the model. At most 12 joints. Raises InvalidInput
-    for uneven rows, or fewer than `horizon` lasts.
-    """
-    rows = style.window(dataset, start, seconds)
-    elapsed = rows.time - rows.time[0]
-    starts = np.searchsorted(elapsed, np.arange(0.0, elapsed[-1] - horizon, horizon) - 1e-9)
-    recorded = recorded_motions(rows, [int(row) for row in starts] or 1, horizon)
-    q0, v0, u = (torch.tensor(x) for x in (recorded.q[:, 0], recorded.v[:, 0], recorded.u))
-    calibrated = posterior.motion_intervals is not None
-    drawn = len(posterior.latent_names) > 0
-    samples = SAMPLES if drawn and not calibrated else 0
-    rollout = posterior.rollout(q0, v0, u, recorded.dt, integrator="rk4", samples=samples)
-    half_widths = None
-    if calibrated or samples:
-        low, high = rollout.interval()
-        half_widths = 0.5 * (high - low).cpu().numpy()
-    joints = min(rows.nv, LARGEST_GRID)
-    columns = 1 if joints < 3 else 2 if joints < 9 else 3
-    figure = style.new_figure(11.0, 1.0 + 1.55 * -(-joints // columns))
-    names, units = style.short_joint_names(rows.joint_names), style.joint_units(rows, "q")
-    panels = style.joint_panels(figure, joints, columns)
-    there = torch.as_tensor(recorded.q.copy(), device=rollout.q.device)
-    signed = -rollout.steps_to(there).cpu().numpy()
-    for joint, (axes, lowest) in enumerate(panels):
-        axes.axhline(0.0, color="#B8BCC2", linewidth=0.8)
-        for motion, row in enumerate(recorded.rows):
-            time = elapsed[row] + recorded.time
-            first = motion == 0
-            if half_widths is not None:
-                half = half_widths[motion, :, joint]
-                band = {"alpha": 0.28, "label": "95 % interval" if first else None}
-                style.draw_band(axes, time, np.zeros_like(half), half, **band)
-            label = "predicted − recorded" if first else None
-            style.draw_line(axes, time, signed[motion, :, joint], style.TRUTH, 1.1, label)
-        axes.margins(x=0)
-        style.quiet(axes, title=names[joint], y=units[joint], x="time [s]" if lowest else "")
-    shown = f" ({joints} of {rows.nv} joints)" if joints < rows.nv else ""
-    style.legend_above(figure, f"Errors of positions predicted {horizon:g} s ahead{shown}", panels[0][0])
-    return figure
-
-
 def contacts_figure(
     time: Float[np.ndarray, " rows"],
     distance: Float[np.ndarray, " rows"],
@@ -354,11 +304,6 @@ PICTURES: dict[str, tuple[Callable[[Posterior, Dataset], Figure], str]] = {
         friction_curves_figure,
         "Forces over velocity, with 95 % bands: the friction laws of the model and what was learned beside them. "
         "Ticks are the velocities of the training data.",
-    ),
-    "motions_ahead": (
-        motion_bands_figure,
-        "Every half second a prediction begins at the recorded state and follows the recorded u. The line is its "
-        "error, the band its 95 % interval.",
     ),
     "normal_force": (normal_force_figure, "The forces of contacts, and what sensors measured of them."),
     "prediction": (prediction_figure, "Accelerations over time, and their errors on the right."),

@@ -68,15 +68,6 @@ def draw_line(axes: Axes, x: Any, y: Any, color: str, width: float, label: str |
     axes.plot(x, y, color=color, linewidth=width, label=label, **more)
 
 
-def joint_panels(figure: FigureBase, count: int, columns: int) -> list[tuple[Axes, bool]]:
-    """Panels in rows of so many columns that share their times, and whether each is the lowest of its column."""
-    grid = figure.subplots(-(-count // columns), columns, sharex=True, squeeze=False).ravel()
-    for place, axes in enumerate(grid):
-        axes.tick_params(labelbottom=place + columns >= count)
-        axes.set_visible(place < count)
-    return [(axes, place + columns >= count) for place, axes in enumerate(grid[:count])]
-
-
 def heading(figure: FigureBase, text: str, *, size: float = LARGE) -> None:
     """A bold title above all panels, at the left."""
     figure.suptitle(text, fontsize=size, fontweight="bold", x=0.01, ha="left")
