@@ -61,7 +61,7 @@ class Equations:
         self.measured = [part.moving(a) for part, a in zip(self.parts, self.each(self.a), strict=True)]
         self.held = _stacked([part.open if evidence.of_torque else part.held for part in self.parts])
         seconds = evidence.mean if isinstance(evidence, Torques) else None
-        self.at_rest = all(map(at_rest, logs))
+        self.tell_bodies = seconds is not None and not all(map(at_rest, logs))  # any numbers explain a few postures
         self.windows = None if seconds is None else WindowMeans(logs, seconds)
         self._stays: tuple[np.ndarray, ...] = ()
         """Regressors of the last search, which no coordinate changes."""
@@ -134,8 +134,7 @@ class Equations:
             # friction holds a share of the load, the same one as long as a joint stands
             label = np.concatenate([each + STRETCHES * k for k, each in enumerate(found)])  # type: ignore[operator]
             label = label if self.windows is None else label[self.windows.starts]
-            rests = [np.flatnonzero(label == each) for each in np.unique(label)]
-            return [(nv * each[:, None] + np.arange(nv)).ravel() for each in rests]
+            return [(nv * np.flatnonzero(label == each)[:, None] + np.arange(nv)).ravel() for each in np.unique(label)]
         numbers = []
         for log, start, length in zip(self.logs, starts, lengths, strict=False):
             order = np.arange(length)
@@ -206,7 +205,7 @@ def fit_physical(
     bodies = any(getattr(law, "learn", ()) or (isinstance(law, Payload) and not law.known) for law in model.laws)
     robot, thick = thickened(model.robot) if bodies else (model.robot, ())
     model = replace(model, robot=robot)
-    most = rows_at_most(robot) if rows is None else rows
+    most = min(ROWS, EQUATIONS // robot.nv) if rows is None else rows
     logs = [with_memory(log, model) for log in logs]
     logs = [log.rows(evenly(log, most)) for log in logs]
     typical = typical_sizes(model, logs)
@@ -245,8 +244,7 @@ def fit_physical(
             fit = search(white, start=fit.x, progress=note)
     found = space.model_at(fit.x)
     residual = equations.a - equations.accelerations(fit.x)[0]
-    told = equations.windows is not None and not equations.at_rest  # a few postures bear what any numbers explain
-    doubts = [*_doubts_of_payloads(space, fit, told), *_doubts_of_memory(space, fit.x)]
+    doubts = [*_doubts_of_payloads(space, fit, equations.tell_bodies), *_doubts_of_memory(space, fit.x)]
     estimates = _estimates(space, fit, equations, evidence, thick)
     if not robot.space.is_vector_space:
         doubts += doubts_of_base(model, found, equations.parts[0], residual[: len(logs[0])])
@@ -324,11 +322,6 @@ def _weak_directions(space: ParameterSpace, information: np.ndarray, prior: np.n
         weak = np.linalg.eigvalsh(information[own, own]) < np.linalg.eigvalsh(prior[own, own]).mean()
         out[each.name] = int(weak.sum())
     return {name: count for name, count in sorted(out.items(), key=lambda entry: -entry[1]) if count}
-
-
-def rows_at_most(robot: Robot) -> int:
-    """Rows that are used where the caller gives no number."""
-    return min(ROWS, EQUATIONS // robot.nv)
 
 
 def typical_sizes(model: Model, logs: Sequence[Dataset]) -> dict[str, Float[np.ndarray, " nv"]]:

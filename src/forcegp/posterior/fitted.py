@@ -196,8 +196,7 @@ class Estimates(Summary, Mapping[str, Estimate]):
             unseen = np.linalg.solve(whole, np.linalg.solve(whole, G).T)
             reach = float(student.ppf(0.975, max(count - 1, 1))) / REACH  # of fewer stretches, such as postures
             covariance = reach**2 * (count - 1) / count * apart.T @ apart + unseen
-        given = parameters, values, slopes, np.linalg.inv(whole), prior
-        return cls.of_covariance(*given, covariance=covariance, **more)
+        return cls.of_covariance(parameters, values, slopes, np.linalg.inv(whole), prior, covariance, **more)
 
     @classmethod
     def of_covariance(
