@@ -99,6 +99,9 @@ def test_what_rests_is_a_matter_of_the_whole_range():
     sway = np.linspace(-1.0, 1.0, 20)[np.arange(60) % 20][:, None] * np.ptp(data.q, axis=0)
     assert at_rest(replace(data, q=data.q + 0.004 * sway))
     assert not at_rest(replace(data, q=data.q + 0.0075 * sway))
+    ramp = np.ptp(data.q, axis=0).max() * (np.arange(60) % 20) / 19.0
+    idle = [replace(data, q=np.column_stack([data.q[:, :5], share * ramp])) for share in (8e-4, 1.5e-3)]
+    assert list(map(at_rest, idle)) == [True, False]
     assert not at_rest(data.select_episodes([0, 1]))
     assert not at_rest(log(TEXT, 0, seconds=2.0))
 

@@ -57,8 +57,8 @@ def move_on(dataset: Dataset) -> bool:
     return bool((np.median(steps, axis=0)[moving] < LEAP * spread[moving]).any())
 
 
-RESTS = 0.01
-"""Share of its whole range within which a joint rests."""
+RESTS, IDLE = 0.01, 0.1
+"""Share of its whole range within which a joint rests; of the largest range, which counts for idle joints."""
 STILL, SHORTEST, OFTEN = 1e-3, 0.3, 0.25
 """Share of its range within which a joint stays for the shortest rest [s]; share of rows at rest in such a log."""
 
@@ -70,7 +70,7 @@ def postures(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
     """
     if not dataset.time_ordered:
         return None
-    least = RESTS * np.ptp(dataset.q, axis=0)
+    least = _within(dataset)
     number, resting, count = np.zeros(len(dataset), int), 0, 0
     for episode in dataset.episodes:
         rows = np.flatnonzero(dataset.episode == episode)
@@ -89,7 +89,12 @@ def postures(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
 def at_rest(dataset: Dataset) -> bool:
     """Whether the log is of postures alone, each an episode: three or more, in which every joint rests."""
     within = [np.ptp(dataset.q[dataset.episode == each], axis=0) for each in dataset.episodes]
-    return len(within) > 2 and bool((np.max(within, axis=0) <= RESTS * np.ptp(dataset.q, axis=0)).all())
+    return len(within) > 2 and bool((np.max(within, axis=0) <= _within(dataset)).all())
+
+
+def _within(dataset: Dataset) -> Float[np.ndarray, " nq"]:
+    span = np.ptp(dataset.q, axis=0)
+    return RESTS * np.maximum(span, IDLE * span.max())
 
 
 def runs(marked: Bool[np.ndarray, " rows"]) -> Int[np.ndarray, "runs 2"]:
