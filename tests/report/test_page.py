@@ -4,7 +4,6 @@ import base64
 import io
 import re
 
-import numpy as np
 import pytest
 from PIL import Image
 
@@ -18,6 +17,7 @@ from forcegp.report import (
     scores_sentence,
     write_page,
 )
+from forcegp.scores.figures.model import PICTURES
 
 
 def test_a_page_needs_no_network_is_small_and_shows_everything(page, tmp_path):
@@ -29,7 +29,7 @@ def test_a_page_needs_no_network_is_small_and_shows_everything(page, tmp_path):
     assert not re.findall(r'<(?:script|link|img)[^>]*(?:src|href)="https?:', player)
     assert page.best in text
     pictures = re.findall(r'<img src="data:image/png;base64,([^"]+)"', text)
-    assert len(pictures) == len(page.pictures) == 3  # friction curves, motions ahead, accelerations
+    assert len(pictures) == len(page.pictures) == 2  # friction curves, accelerations
     for picture in pictures:
         assert Image.open(io.BytesIO(base64.b64decode(picture))).width > 500
     (table,) = page.tables
@@ -58,12 +58,14 @@ def test_own_pages_are_recognised_and_kept(page, tmp_path):
     assert not is_page(tmp_path / "mine.html")
 
 
-def test_what_cannot_be_drawn_is_named(swinging, friction):
-    keep = np.sort(np.random.default_rng(0).choice(len(swinging), 300, replace=False))
-    uneven = swinging.rows(keep)
-    page = model_page(friction, uneven, title="t", best="b")
-    assert len(page.pictures) == 2
-    assert any(note.startswith("motions ahead: not drawn, because") for note in page.scene_notes)
+def test_what_cannot_be_drawn_is_named(swinging, friction, monkeypatch):
+    def refused(posterior, dataset):
+        raise InvalidInput("the log is too short.")
+
+    monkeypatch.setitem(PICTURES, "prediction", (refused, "none"))
+    page = model_page(friction, swinging, title="t", best="b")
+    assert len(page.pictures) == 1
+    assert "prediction: not drawn, because the log is too short." in page.scene_notes
 
 
 def test_the_sentence_is_true(swinging, friction):

@@ -61,7 +61,7 @@ class Dataset(Summary):
         "force.<name>" (rows, 3) [N, world axes], and "in_contact" (rows, m), 1 where a contact acts and 0 elsewhere.
     metadata: a copy of anything that JSON can hold.
     strokes: what rows know of the motion before them (`forcegp.data.strokes`), (rows, nv, k),
-        for friction that remembers. Behind a filter they are those before it; those of motors are not stored.
+        for friction that remembers. Of joints that rest they are those before a filter; those of motors are not stored.
     transmission: of the motors whose strokes these are, (nv, nv); None: those of the joints.
     time_ordered: False for rows drawn in another order (`rows`): times are then only required to differ.
 

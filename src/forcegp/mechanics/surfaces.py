@@ -4,9 +4,8 @@ The built-in ones are signed distances: a multiplier is the normal force in N. O
 """
 
 import math
-import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, TypeVar
 
@@ -15,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import ContactError, FileFormatError, InvalidInput, require_number
+from forcegp.errors import ContactError, FileFormatError, InvalidInput
 from forcegp.robots.arguments import finite_vector
 
 Kind = TypeVar("Kind")
@@ -68,7 +67,7 @@ class _Flat(Surface):
 
     @override
     def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        return p.new_tensor(self.normal).expand(p.shape)
+        return _tensor(self.normal, p).expand(p.shape)
 
     @override
     def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
@@ -85,13 +84,11 @@ class Plane(_Flat):
     def __post_init__(self) -> None:
         normal, length = direction("Plane normal", self.normal)
         object.__setattr__(self, "normal", normal)
-        object.__setattr__(
-            self, "offset", _number("Plane offset", self.offset, "give a number in m", -LARGEST) / length
-        )
+        object.__setattr__(self, "offset", _number("Plane offset", self.offset) / length)
 
     @override
     def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return p @ p.new_tensor(self.normal) - self.offset
+        return p @ _tensor(self.normal, p) - self.offset
 
 
 @dataclass(frozen=True)
@@ -117,21 +114,21 @@ class Sphere(Surface):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", _vector("Sphere center", self.center))
-        object.__setattr__(self, "radius", _number("Sphere radius", self.radius, "it must be positive (m)", TINY))
+        object.__setattr__(self, "radius", positive("Sphere radius", self.radius))
 
     @override
     def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return torch.linalg.vector_norm(p - p.new_tensor(self.center), dim=-1) - self.radius
+        return torch.linalg.vector_norm(p - _tensor(self.center, p), dim=-1) - self.radius
 
     @override
     def gradient(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        ray = p - p.new_tensor(self.center)
+        ray = p - _tensor(self.center, p)
         return ray / torch.linalg.vector_norm(ray, dim=-1, keepdim=True)
 
     @override
     def hessian(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
         normal = self.gradient(p)[..., None]  # (1 - n n^T) / |ray|
-        distance = torch.linalg.vector_norm(p - p.new_tensor(self.center), dim=-1)[..., None, None]
+        distance = torch.linalg.vector_norm(p - _tensor(self.center, p), dim=-1)[..., None, None]
         return (torch.eye(3, dtype=p.dtype, device=p.device) - normal @ normal.mT) / distance
 
 
@@ -175,13 +172,26 @@ def surface_to_dict(surface: Surface) -> dict[str, Any]:
     return {"type": name, **asdict(surface)}  # type: ignore[call-overload]  # every entry of SURFACES is a dataclass
 
 
-LARGEST, TINY = sys.float_info.max, math.ulp(0.0)
+def _tensor(values: Sequence[float], like: Tensor) -> Tensor:
+    return torch.tensor(values, dtype=like.dtype, device=like.device)
 
 
-def _number(name: str, value: Any, words: str, least: float) -> float:
-    number = value.item() if hasattr(value, "item") else value  # of NumPy and torch
-    require_number(name, number, words, least)
-    return float(number)
+def _number(name: str, value: object) -> float:
+    try:
+        number = math.nan if isinstance(value, str) else float(value)  # type: ignore[arg-type]  # what is no number is an error below
+    except (TypeError, ValueError, RuntimeError):
+        raise InvalidInput(f"{name} is {value!r}; give a number.") from None
+    if not math.isfinite(number):
+        raise InvalidInput(f"{name} is {value!r}; give a finite number.")
+    return number
+
+
+def positive(name: str, value: object) -> float:
+    """A finite number above 0, in m."""
+    number = _number(name, value)
+    if number <= 0.0:
+        raise InvalidInput(f"{name} is {number}; it must be positive (m).")
+    return number
 
 
 def _vector(name: str, values: object) -> Vector:
