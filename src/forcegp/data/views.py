@@ -77,7 +77,7 @@ def postures(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
         q, time = dataset.q[rows], dataset.time[rows]
         ahead = np.minimum(np.searchsorted(time, time + SHORTEST), len(rows) - 1)
         still, last = (np.abs(q[ahead] - q) <= STILL / RESTS * least).all(1), 0
-        for begin, end in runs(still):
+        for begin, end in runs(np.asarray(still)):
             end = int(ahead[end - 1]) + 1
             if time[end - 1] - time[begin] >= 0.99 * SHORTEST and (np.ptp(q[begin:end], axis=0) <= least).all():
                 number[rows[last:end]], last = count, end
