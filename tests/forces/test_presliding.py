@@ -367,7 +367,7 @@ def test_noise_of_positions_is_no_reversal():
 
 
 def test_a_filter_does_not_round_the_reversals_that_friction_remembers():
-    """Strokes are those before the filter, also in a file, and so is the friction of a joint that moves and rests."""
+    """Of a log of postures, strokes are those before the filter."""
     time = DT * np.arange(6000)
     steps = np.cumsum(np.where(np.arange(6000) % 1500 < 300, 2e-3, 0.0) * np.sign(np.sin(0.001 * np.arange(6000))))
     q = np.stack([steps, 0.5 * steps, -0.3 * steps], 1)

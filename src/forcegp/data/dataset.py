@@ -60,8 +60,8 @@ class Dataset(Summary):
         the unknown joint forces "Q_U" (rows, nv), their parts "Q_U.<name>" (rows, nv), forces on the robot
         "force.<name>" (rows, 3) [N, world axes], and "in_contact" (rows, m), 1 where a contact acts and 0 elsewhere.
     metadata: a copy of anything that JSON can hold.
-    strokes: what rows know of the motion before them (`forcegp.data.strokes`), (rows, nv, k),
-        for friction that remembers. Of joints that rest they are those before a filter; those of motors are not stored.
+    strokes: what rows know of the motion before them (`forcegp.data.strokes`), (rows, nv, k), for friction that
+        remembers. Of a log of postures they are those before its filter. Those of motors are not stored.
     transmission: of the motors whose strokes these are, (nv, nv); None: those of the joints.
     time_ordered: False for rows drawn in another order (`rows`): times are then only required to differ.
 

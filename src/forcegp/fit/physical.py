@@ -129,10 +129,9 @@ class Equations:
         """Numbers of equations by stretch of time, some of each log in every one; of postures each is one."""
         lengths = [len(log) for log in self.logs] if self.windows is None else self.windows.lengths
         nv, starts = self.a.shape[1], np.concatenate([[0], np.cumsum(lengths)])
-        found = [postures(log) for log in self.logs]
-        if all(each is not None and each.max() < STRETCHES for each in found):
-            # friction holds a share of the load, the same one as long as a joint stands
-            label = np.concatenate([each + STRETCHES * k for k, each in enumerate(found)])  # type: ignore[operator]
+        found = [each for log in self.logs if (each := postures(log)) is not None and each.max() < STRETCHES]
+        if len(found) == len(self.logs):  # friction holds the same share of the load as long as a joint stands
+            label = np.concatenate([each + STRETCHES * k for k, each in enumerate(found)])
             label = label if self.windows is None else label[self.windows.starts]
             return [(nv * np.flatnonzero(label == each)[:, None] + np.arange(nv)).ravel() for each in np.unique(label)]
         numbers = []

@@ -164,7 +164,7 @@ def _truth(posterior: Posterior, dataset: Dataset, panel: CurvePanel) -> tuple[n
 
 
 def model_pictures(posterior: Posterior, dataset: Dataset) -> tuple[list[style.Picture], list[str]]:
-    """Every plot that the model and the recording allow, and why others are missing (uneven time steps, say)."""
+    """Every plot that the model and the recording allow, and why others are missing."""
     there = {"forces": curve_panels(posterior), "normal_force": posterior.model.contacts}
     wanted, pictures, missing = [name for name in PICTURES if there.get(name, True)], [], []
     for done, name in enumerate(wanted):
