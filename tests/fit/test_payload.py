@@ -2,11 +2,13 @@
 
 from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
 import pytest
 import torch
+from scipy.stats import t as student
 from tests.robots.pinocchio_oracle import Oracle
 
 from forcegp.data import Dataset, Preparation
@@ -17,6 +19,7 @@ from forcegp.evidence import Torques, body_names, motion_residuals
 from forcegp.fit import fit
 from forcegp.forces import Body, Offset, Payload, RigidBodies, Rotor, Stribeck, Viscous
 from forcegp.model import Model
+from forcegp.posterior import Estimates
 from forcegp.robots import Robot
 from forcegp.robots.urdf_file import replace_inertial
 from forcegp.simulation import FreeArmConfig
@@ -118,8 +121,23 @@ def test_what_a_log_rests_in_is_one_piece():
     assert np.unique(numbers).tolist() == [0, 1, 2, 3]
     assert posture_numbers(log(TEXT, 0, seconds=8.0)) is None  # no rests
     assert posture_numbers(data.rows(slice(0, 200))) is None  # too few
-    brief = replace(data, time=0.2 * time)  # of rests below .3 s there may be many
-    assert posture_numbers(brief) is None
+    assert posture_numbers(replace(data, time=0.2 * time)) is None  # of rests below .3 s there may be many
+    assert posture_numbers(replace(data, time=0.5 * time)) is not None
+    s = np.clip((time % 2.0) / 1.5, 0.0, 1.0)[:, None]
+    seldom = np.floor(time / 2.0)[:, None] + s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+    assert posture_numbers(replace(data, q=seldom * way[-1])) is not None  # a third of the rows rest
+    creep = 5e-3 * time[:, None] * np.ptp(way, axis=0)
+    assert posture_numbers(replace(data, q=way + creep)) is None
+
+
+def test_few_postures_have_the_interval_of_student():
+    """The mean of three numbers, against the interval of a t distribution with two degrees of freedom."""
+    values, one = np.array([1.0, 1.5, 3.0]), np.ones((1, 1))
+    name = SimpleNamespace(name="mean", unit="1", start=0.0)
+    white = np.column_stack([np.ones(3), values.mean() - values])
+    found = Estimates.of_search([name], np.array([values.mean()]), one, white, [[0], [1], [2]], 1e-6 * one)
+    expected = student.interval(0.95, 2, values.mean(), values.std(ddof=1) / 3**0.5)
+    assert found["mean"].interval == pytest.approx(expected, rel=1e-6)
 
 
 FINGER = """<joint name="{0}" type="revolute"><parent link="tool0"/><child link="{0}_link"/><axis xyz="0 0 1"/>{1}

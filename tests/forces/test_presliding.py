@@ -362,6 +362,11 @@ def test_noise_of_positions_is_no_reversal():
     assert [white_noise(each, each.q[:, 0]) for each in (smooth, smooth.rows(slice(None, None, 200)))] == [0.0, 0.0]
     reversals = [(np.diff(np.sign(strokes(log)[:, :, 0]), axis=0) != 0).sum() for log in (smooth, noisy)]
     assert abs(reversals[1] - reversals[0]) <= 3  # of three joints, at the first rows
+    fast = replace(smooth, q=0.1 * np.sin(2.0 * np.pi * 0.195 * np.arange(8000))[:, None] * np.ones(3))
+    assert white_noise(fast, fast.q[:, 0]) == 0.0  # a fifth of the rate: orders differ by a factor of 1.7
+    way = np.interp(time, [0.0, 4.0, 5.0, 16.0], [0.0, 0.2, 0.1995, 0.5])[:, None] + np.zeros(3)
+    back = log_of(way + 1e-4 * rng.standard_normal(q.shape), a, a, a, time)
+    assert (strokes(back)[:, :, 1] != 0.0)[-1].all()  # five deviations back, and as many of noise, are a reversal
     still = log_of(1e-4 * rng.standard_normal(q.shape), a, a, a, time)
     assert np.abs(strokes(still)[:, :, 1]).max() < 1e-3  # at rest there is no past, but for rare peaks
 
