@@ -160,8 +160,6 @@ def _listed(numbers: Sequence[int]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-INTERVAL = (0.025, 0.975)
-
 HORIZONS = (0.1, 0.2, 0.5, 1.0)
 STARTS = 10
 GAP = 1.5  # a pause of more than this many median steps is a gap, over which no motion goes
