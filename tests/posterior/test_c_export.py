@@ -137,7 +137,8 @@ def test_steps_of_friction_and_their_derivatives(friction, states, integrator, t
         assert bits == 0
         for found, wanted in zip((q, v, A.reshape(6, 6), B.reshape(6, 3)), step, strict=False):
             np.testing.assert_allclose(found, wanted[k], rtol=1e-8, atol=1e-8)
-    assert set(made.differences) == {"arm_mean", "arm_linearize", "arm_step", "arm_step_jacobian"}
+    names = "mean", "linearize", "step", "step_jacobian", "inverse_dynamics", "forces"
+    assert set(made.differences) == {f"arm_{name}" for name in names}
     assert max(made.differences.values()) < 1e-8
 
 

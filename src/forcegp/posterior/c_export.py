@@ -21,9 +21,10 @@ from forcegp.data import units_for
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, require_type
 from forcegp.inference.posterior import ExactPosterior
 from forcegp.posterior.posterior import Posterior
+from forcegp.posterior.prediction import require_actuated
 from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.preparation import rows_for, sample_states
-from forcegp.posterior.programs import Physics, Programs, require_step
+from forcegp.posterior.programs import WITH_SLOPES, Physics, Programs, require_step
 
 STORED = 10
 """States of the self-test."""
@@ -41,9 +42,13 @@ def identifier(name: str) -> str:
 
 @dataclass(frozen=True)
 class Check:
-    """What a function of the program gives at states (n, nq + nv + nu), and how far it may be from that, relative."""
+    """What a function of the program gives at states (n, ...), and how far it may be from that, relative.
+
+    `sizes` are those of its arguments, q, v and u for most, which stand beside each other in a row of `states`.
+    """
 
     function: str
+    sizes: tuple[int, ...]
     states: np.ndarray
     wanted: list[np.ndarray]
     tolerance: float
@@ -73,12 +78,24 @@ class CFiles:
         """The functions of the program."""
         chosen = {"covariance": self.reference.kind == "compressed", "linearize": self.jacobian}
         chosen |= {"step": self.dt is not None, "step_jacobian": self.dt is not None and self.jacobian}
+        parts = len(self.code.physics.names)
+        chosen |= {"inverse_dynamics": self.solvable, "components": parts > 0}
+        chosen["deviations"] = chosen["covariance"] and parts > 0
         return ["mean", *(kind for kind, wanted in chosen.items() if wanted)]
+
+    @property
+    def solvable(self) -> bool:
+        """Whether a u is wanted for every acceleration."""
+        try:
+            require_actuated(self.posterior)
+        except InvalidInput:
+            return False
+        return True
 
     def write(self, folder: Path, source: str | None, said: str, checks: Sequence[Check]) -> None:
         """All files; `said` is how good the program is."""
         nq, nv, nu = self.code.sizes
-        start = [", ".join(map(repr, x.tolist())) for x in self.split(checks[0].states[0])]
+        start = [", ".join(map(repr, x.tolist())) for x in _split(checks[0].states[0], self.code.sizes)]
         program = sections(__name__, "exported_c/model.c")
         space = self.code.space
         stepped = "" if self.dt is None else self.code.step_source(self.integrator, self._stepped)
@@ -86,7 +103,12 @@ class CFiles:
         words |= dict(zip(("START_Q", "START_V", "START_U"), start, strict=True))
         words |= dict(zip(("STORED", "CALLS"), self._stored(checks), strict=True))
         words |= {"STEP": stepped, "SLOPES": program[self.integrator], "CHECKED": said}
-        words |= {"COMMENT": self._comment(said), "GIVEN": 0, "IMPLICIT": int(self.integrator == "implicit-midpoint")}
+        words |= {
+            "COMMENT": self._comment(said),
+            "GIVEN": 0,
+            "GIVEN_PARTS": 0,
+            "IMPLICIT": int(self.integrator == "implicit-midpoint"),
+        }
         words |= {"SOURCE": _plain(source or "not named"), "VERSION": importlib.metadata.version("forcegp")}
         moving = not space.is_vector_space
         words |= {"ALL": nq + nv + nu, "X": nq + nv, "COLUMNS": 2 * nv + nu, "TITLE": self._title}
@@ -94,9 +116,14 @@ class CFiles:
         words["ADVANCE"] = sections(__name__, "exported_c/advance.c")["turned" if moving else "added"]
         if "covariance" in self.kinds:
             words["GIVEN"] = len(self.code.program("covariance").nodes)
+            words["GIVEN_PARTS"] = len(self.code.program("deviations").outputs["covariance"])
         words = {word: filled(str(value), words) for word, value in words.items()}
         memory = self.posterior.model.memory.names
-        words["MEMORY"] = len(memory)
+        physics = self.code.physics
+        words |= {"MEMORY": len(memory), "COLUMN": self.posterior.model.memory_column, "PARTS": len(physics.names)}
+        words |= {"CONTACTS": len(self.posterior.model.contacts), "TERMS": len(physics.terms)}
+        words |= {"LAWS": len(physics.passive), "NAMED": ", ".join(map(_plain, physics.names))}
+        words["AFFINE"] = int(self.solvable and self.code.affine)
         kinds = (*(("integrate",) if moving else ()), *(("remember",) if memory else ()), *self.kinds)
         functions = filled("".join(program[kind] for kind in kinds), words)
         prototypes = re.findall(r"^(/\*[^{}]*?\*/\nint [^{]*?) {", functions, re.MULTILINE)
@@ -115,10 +142,6 @@ class CFiles:
         for file, content in files.items():
             (folder / file).write_text(content, encoding="ascii")
 
-    def split(self, rows: np.ndarray) -> list[np.ndarray]:
-        """q, v and u (..., size) of rows."""
-        return np.split(rows, np.cumsum(self.code.sizes)[:2], axis=-1)
-
     @property
     def _stepped(self) -> str:
         return "slopes" if self.integrator == "implicit-midpoint" else "mean"
@@ -129,21 +152,24 @@ class CFiles:
         wanted = {"covariance": "mean_and_terms"} if "covariance" in self.kinds else {}
         slopes = self.jacobian or (self.dt is not None and self._stepped == "slopes")
         wanted |= {"mean": "mean"} | ({"linearize": "slopes"} if slopes else {})
+        wanted |= {kind: kind for kind in ("components", "deviations") if kind in self.kinds}
+        wanted |= {"forces": "forces_at"} if self.solvable else {}
         yield head(1)
         for k, table in enumerate(code.tables("covariance" if "covariance" in wanted else "mean")):
             names.append(f"table{k}")
             yield f"static const double table{k}[] = {{\n{_numbers(table.tolist())}}};"
         yield f"static const double *const tables[] = {{{', '.join(names) or '0'}}};"
-        for kind in (False, True) if slopes else (False,):
+        for kind in (False, True) if WITH_SLOPES & wanted.keys() else (False,):
             yield from (part.c_source(1, kind) for part in code.sums)
         if "covariance" in wanted:
             yield from (part.roots_source(1, code.rank) for part in code.sums)
-            yield code.covariance_source().replace("void covariance(", "void covariance_of(")
+            yield code.covariance_source("covariance_of")
+            yield code.covariance_source("covariance_of_parts", len(code.physics.terms) * code.sizes[1])
         yield from code.motion_source(1)
         yield from code.memory_source(1)
         for kind, function in wanted.items():
             program = code.program(kind)
-            called = [part.name + ("_slopes" if kind == "linearize" else "") for part in code.sums]
+            called = [part.name + ("_slopes" if kind in WITH_SLOPES else "") for part in code.sums]
             yield write_function(function, program.graph, program.nodes, 1, called)
 
     @property
@@ -178,8 +204,7 @@ class CFiles:
             rows = rows[:: max(1, len(rows) // STORED)]
             states, what = check.states[rows], check.function.removeprefix(f"{self.name}_")
             arrays.append(_array(f"{what}_states", states))
-            places = np.cumsum(self.code.sizes)
-            given = [f"{what}_states[k]", *(f"{what}_states[k] + {place}" for place in places[:2])]
+            given = [f"{what}_states[k] + {place}" for place in np.cumsum([0, *check.sizes[:-1]])]
             made = [f"r{j}" for j in range(len(check.wanted))]
             lines = [f"double {r}[{wanted.shape[1]}];" for r, wanted in zip(made, check.wanted, strict=True)]
             lines.append(f"if ({check.function}({', '.join(given + made)})) failures++;")
@@ -189,6 +214,11 @@ class CFiles:
                 lines.append(f'compare("{check.function}", r{j}, {what}_{j}[k], {wanted.shape[1]}, {bound!r});')
             calls.append(f"  for (int k = 0; k < {len(states)}; k++) {{\n    " + "\n    ".join(lines) + "\n  }")
         return "\n".join(arrays), "\n".join(calls)
+
+
+def _split(rows: np.ndarray, sizes: Sequence[int]) -> list[np.ndarray]:
+    """What stands beside each other in rows (..., size)."""
+    return np.split(rows, np.cumsum(sizes)[:-1], axis=-1)
 
 
 def _numbers(values: Sequence[float]) -> str:
@@ -210,10 +240,11 @@ STATES = 300
 """States at which the program is compared."""
 MEAN_TOLERANCE = 5e-12
 """Largest difference relative to the largest value, unless `rounding` is larger."""
-LOOSER = {"covariance": 1e3, "linearize": 1e2, "step": 1e3, "step_jacobian": 1e3}
+LOOSER = {"covariance": 1e3, "linearize": 1e2, "step": 1e3, "step_jacobian": 1e3, "deviations": 1e3}
+LOOSER |= {"components": 10.0, "inverse_dynamics": 1e2}
 """How many times as much as the mean these may differ: more cancels in them."""
-BETWEEN = ("linearize", "step", "step_jacobian")
-SUFFIXES = {"covariance": "mean_covariance"}
+BETWEEN = ("linearize", "step", "step_jacobian", "inverse_dynamics")
+SUFFIXES = {"covariance": "mean_covariance", "components": "forces", "deviations": "forces_deviation"}
 
 
 @dataclass(frozen=True)
@@ -316,8 +347,17 @@ def _checks(export: CFiles) -> list[Check]:
     found = []
     for kind in export.kinds:
         states = between if kind in BETWEEN else sampled[finite]
-        q, v, u = states.split(sizes, dim=-1)
+        (q, v, u), given = states.split(sizes, dim=-1), sizes
         match kind:
+            case "inverse_dynamics":  # forward dynamics turned round
+                predicted, column = own.predict(q, v, u, covariance=False), own.model.memory_column
+                z = u[:, column : column + len(own.model.memory.names)]
+                wanted = [torch.cat([u[:, :column], u[:, column + z.shape[1] :]], dim=1)]
+                pressed = q[:, :0] if predicted.multiplier is None else predicted.multiplier.mean
+                states = torch.cat(beside := [q, v, predicted.mean, pressed, z], dim=1)
+                given = [x.shape[1] for x in beside]
+            case "components" | "deviations":
+                wanted = _parts(export, q, v, u)[: 1 + (kind == "deviations")]
             case "mean":
                 wanted = [export.posterior.predict(q, v, u, covariance=False).mean]
             case "covariance":
@@ -331,8 +371,24 @@ def _checks(export: CFiles) -> list[Check]:
                 wanted = list(made.linearize_step(q, v, u, export.dt or 0.0, export.integrator)[:4])
         values = [x.detach().flatten(1).numpy() for x in wanted]
         function = f"{export.name}_{SUFFIXES.get(kind, kind)}"
-        found.append(Check(function, states.numpy(), values, tolerance * LOOSER.get(kind, 1.0), set()))
+        found.append(Check(function, tuple(given), states.numpy(), values, tolerance * LOOSER.get(kind, 1.0), set()))
     return found
+
+
+def _parts(export: CFiles, q: Tensor, v: Tensor, u: Tensor) -> list[Tensor]:
+    """Joint forces (n, P, nv) of the passive laws and unknown forces, and standard deviations by torch."""
+    own, compressed, physics = export.posterior, export.reference.compressed, export.code.physics
+    with torch.no_grad():
+        dynamics = own.dynamics(q, v, u)
+        B = own.trained.unknown.direction(dynamics)
+        parts = physics.parts(dynamics, B, own.latents(dynamics, False).mean)
+        deviations = torch.zeros_like(parts)
+        if compressed is not None:
+            S = own.widening**2 * compressed.at(own.latent, physics.mixing(q, v, u)[1])
+            for k, which in enumerate(physics.terms.values(), len(physics.passive)):
+                own_B = B[..., which]
+                deviations[:, k] = ((own_B @ S[:, which, which]) * own_B).sum(-1).clamp_min(0.0).sqrt()
+    return [parts, deviations]
 
 
 def _compared(export: CFiles, checks: Sequence[Check], folder: Path) -> dict[str, float]:
@@ -363,7 +419,7 @@ def _difference(export: CFiles, function: Any, check: Check) -> float:
     worst = 0.0
     for row, state in enumerate(check.states):
         made = [np.full(x.shape[1], np.nan) for x in check.wanted]
-        bits = function(*(ctypes.c_void_p(x.ctypes.data) for x in (*export.split(state), *made)))
+        bits = function(*(ctypes.c_void_p(x.ctypes.data) for x in (*_split(state, check.sizes), *made)))
         pairs = zip(made, check.wanted, check.scales, strict=True)
         apart = float(np.max([np.abs(x - wanted[row]).max() / scale for x, wanted, scale in pairs]))
         if bits or (not apart <= check.tolerance and _solved(export, check, state, made)):
@@ -374,10 +430,16 @@ def _difference(export: CFiles, function: Any, check: Check) -> float:
 
 
 def _solved(export: CFiles, check: Check, state: np.ndarray, made: list[np.ndarray]) -> bool:
-    """Whether an implicit step ends at a solution, though at another one than torch finds."""
+    """Whether an implicit step, or a u, is a solution, though another one than torch finds."""
+    given = [torch.tensor(x) for x in _split(state, check.sizes)]
+    if check.function.endswith("_inverse_dynamics") and np.isfinite(made[0]).all():
+        q, v, a, _, z = given
+        u, column = torch.tensor(made[0]), export.posterior.model.memory_column
+        again = export.posterior.predict(q, v, torch.cat([u[:column], z, u[column:]]), covariance=False).mean
+        return float((again - a).norm()) <= 1e-9 * (1.0 + float(a.norm()))
     if export.integrator != "implicit-midpoint" or "_step" not in check.function or export.dt is None:
         return False
-    q, v, u = (torch.tensor(x) for x in export.split(state))
+    q, v, u = given
     m = 0.5 * (v + torch.tensor(made[1]))
     if not bool(m.isfinite().all()):
         return False

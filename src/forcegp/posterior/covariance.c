@@ -1,6 +1,6 @@
 
-static APART void covariance(const double *const *t, const double *y, double *out) {
-  enum {N = @JOINTS@, C = @LATENTS@, K = @RANK@};
+static APART void @COVARIANCE@(const double *const *t, const double *y, double *out) {
+  enum {N = @ROWS@, C = @LATENTS@, K = @RANK@};
   const double *W = y, *d = y + N * C;
   double P[C * K], Q[N * K];
   memset(P, 0, sizeof P);

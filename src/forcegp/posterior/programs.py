@@ -6,7 +6,7 @@ covariance and loops of steps, each compiled when it is first asked for.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial, reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from forcegp.codegen.library import RowFunction, aligned, load_library, vector_u
 from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput
 from forcegp.evidence.likelihood import Standardization
-from forcegp.forces import Actuation, RigidBodies, UnknownForces
+from forcegp.forces import Actuation, Law, RigidBodies, UnknownForces
 from forcegp.inference.one_input import drawn_calls, latent_calls, refreshed_calls
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PADDING, CompressedCovariance, KernelSum
@@ -28,7 +28,7 @@ from forcegp.mechanics import ConstrainedDynamics
 from forcegp.model import Model
 from forcegp.robots.manifold import ConfigurationSpace
 
-WITH_SLOPES = ("linearize", "forces")
+WITH_SLOPES = {"linearize", "forces"}
 STEPS = sections(__name__, "rollout_steps.c")
 """One step in C: from x = [q, v, u] to q1, v1, with the acceleration a at its beginning."""
 ON_A_MANIFOLD = "-on-a-manifold"
@@ -69,16 +69,33 @@ class Physics:
         dynamics = self.model.dynamics(q, v, u)
         return dynamics.H @ self.forces.direction(dynamics), self._features(dynamics)
 
+    @property
+    def passive(self) -> list[Law]:
+        """Laws beside actuation and bodies: what resists, and what a user would see apart."""
+        return [force for force in self.model.laws if not isinstance(force, Actuation | RigidBodies)]
+
+    def parts(self, dynamics: ConstrainedDynamics, B: Tensor, f: Tensor) -> Tensor:
+        """Joint forces (n, P, nv) of the passive laws, then of each unknown force: those of `names`."""
+        each = [force.force(dynamics.state) for force in self.passive]
+        each += [(B[..., which] @ f[..., which, None])[..., 0] for which in self.terms.values()]
+        return torch.stack(each, dim=-2) if each else B[..., :0].mT
+
+    @cached_property
+    def terms(self) -> dict[str, slice]:
+        """The latents of each unknown force."""
+        return {name: which for name, _, which in self.forces.named(self.model.robot)}
+
+    @property
+    def names(self) -> list[str]:
+        """Of `parts`."""
+        return [*(force.title for force in self.passive), *self.terms]
+
     def traced(self, q: Tensor, v: Tensor, u: Tensor, f: Tensor) -> list[Tensor]:
-        """[a, W, Q_K + Q_U, passive forces, M, A, b, features ...]: what programs are written from."""
+        """[a, W, Q_K + Q_U, `parts`, B, M, A, b, features ...]: what programs are written from."""
         dynamics = self.model.dynamics(q, v, u)
         B = self.forces.direction(dynamics)
-        passive = Q_U = (B @ f[..., None])[..., 0]
-        for force in self.model.laws:
-            if not isinstance(force, Actuation | RigidBodies):
-                passive = passive + force.force(dynamics.state)
-        Q = Q_U + dynamics.Q_K
-        around = passive, dynamics.M, dynamics.A, dynamics.b
+        Q = (B @ f[..., None])[..., 0] + dynamics.Q_K
+        around = self.parts(dynamics, B, f), B, dynamics.M, dynamics.A, dynamics.b
         return [dynamics.acceleration_under(Q), dynamics.H @ B, Q, *around, *self._features(dynamics)]
 
     def held(
@@ -118,7 +135,8 @@ class Traced(NamedTuple):
     features: list[list[int]]
     forces: list[int]
     around: list[int]
-    passive: list[int]
+    parts: list[list[int]]
+    B: list[list[int]]
     held: list[Any]  # what derivatives are made of where q does not add up
 
 
@@ -158,15 +176,15 @@ class Programs:
             return self.given[0]
         inputs = [*self.example, torch.ones(1, len(self._latents), dtype=torch.float64)]
         graph, found = trace(self.physics.traced, inputs)
-        (a, W, Q, passive, *around), features = ([x[0].tolist() for x in part] for part in (found[:7], found[7:]))
+        (a, W, Q, parts, B, *around), features = ([x[0].tolist() for x in part] for part in (found[:8], found[8:]))
         held: list[Any] = []
         if not self.space.is_vector_space:
-            m = found[5].shape[-2]
+            m = found[6].shape[-2]
             more = [torch.zeros(1, size, dtype=torch.float64) for size in (len(a), m, m)]
             graph.more_inputs(sum(x.numel() for x in more))
             held = [x[0].tolist() for x in trace(self.physics.held, [*inputs, *more], graph)[1]]
         flat = [int(node) for values in around for node in np.ravel(values)]
-        return Traced(graph, a, W, features, Q, flat, passive, held)
+        return Traced(graph, a, W, features, Q, flat, parts, B, held)
 
     @cached_property
     def _latents(self) -> list[int]:
@@ -174,7 +192,10 @@ class Programs:
         return [c for part in self.sums for c in part.latents]
 
     def program(self, kind: str) -> Program:
-        """The program "mean", "linearize", "covariance", "forces", or "passive" ones: all but actuation and bias."""
+        """The program "mean", "linearize", "covariance", "forces", or "passive": all but actuation and bias.
+
+        "components" are these one by one, "deviations" with standard deviations of the unknown ones.
+        """
         at, given, count = self.traced, dict(zip("qvu", self.sizes, strict=True)), sum(self.sizes)
         graph, f, slopes = Graph(count), {}, kind in WITH_SLOPES
         if kind == "linearize" and at.held:
@@ -191,7 +212,14 @@ class Programs:
                 slope = jacobian(graph, Q := copied(at.forces), graph.inputs[-self.sizes[2] :])
                 outputs = {"Q": Q, "around": [node for row in slope for node in row] + copied(at.around)}
             case "passive":
-                outputs = {"Q": copied(at.passive)}
+                zeros = [ZERO] * self.sizes[1]
+                outputs = {
+                    "Q": reduce(lambda x, y: list(map(partial(graph.apply, "add"), x, y)), map(copied, at.parts), zeros)
+                }
+            case "components" | "deviations":
+                outputs = {"Q": [node for part in at.parts for node in copied(part)]}
+                if kind == "deviations":
+                    outputs["covariance"] = self._terms(graph, copied, features, self._of_terms(at.B))
             case "mean":
                 outputs = {"a": copied(at.a)}
             case "linearize" if at.held:
@@ -200,11 +228,26 @@ class Programs:
                 rows = jacobian(graph, a := copied(at.a), graph.inputs)
                 outputs = {"a": a, "jacobian": [node for row in rows for node in row]}
             case _:
-                a, terms = copied(at.a), copied([row[c] for row in at.W for c in self._latents])
-                terms += [node for part, z in zip(self.sums, features, strict=True) for node in part.variance(graph, z)]
-                terms += [node for part, z in zip(self.sums, features, strict=True) for node in part.given(graph, z)]
-                outputs = {"a": a, "covariance": terms}
+                outputs = {"a": copied(at.a), "covariance": self._terms(graph, copied, features, at.W)}
         return Program(graph, given, outputs)
+
+    @cached_property
+    def affine(self) -> bool:
+        """Whether joint forces are affine in u: their slopes are numbers."""
+        program = self.program("forces")
+        slopes = program.outputs["around"][: self.sizes[1] * self.sizes[2]]
+        return all(program.graph.value(node) is not None for node in slopes)
+
+    def _terms(self, graph: Graph, copied: Copier, features: list[list[int]], rows: list[list[int]]) -> list[int]:
+        """What the C function of a covariance takes of these rows of mixing."""
+        terms = copied([row[c] for row in rows for c in self._latents])
+        terms += [node for part, z in zip(self.sums, features, strict=True) for node in part.variance(graph, z)]
+        return terms + [node for part, z in zip(self.sums, features, strict=True) for node in part.given(graph, z)]
+
+    def _of_terms(self, B: list[list[int]]) -> list[list[int]]:
+        """A row of mixing for each joint and unknown force."""
+        kept = [range(len(self._latents))[which] for which in self.physics.terms.values()]
+        return [[node if c in own else ZERO for c, node in enumerate(row)] for own in kept for row in B]
 
     def _implicit(self, graph: Graph, copied: Copier, a: list[int]) -> tuple[Graph, dict[str, list[int]]]:
         """The acceleration and its derivatives in a step from q, in v and in u, by `Physics.held`."""
@@ -291,14 +334,14 @@ class Programs:
         graph, nodes, _ = self.remembered
         return [write_function("remember", graph, nodes, lanes)]
 
-    def covariance_source(self) -> str:
-        """The C function that makes the covariance of the outputs of its program."""
-        calls, C = [], len(self._latents)
-        first, place = 0, self.sizes[1] * C + C
+    def covariance_source(self, name: str = "covariance", rows: int = 0) -> str:
+        """The C function that makes the covariance of so many outputs of its program, by default the acceleration's."""
+        calls, C, rows = [], len(self._latents), rows or self.sizes[1]
+        first, place = 0, rows * C + C
         for k, part in enumerate(self.sums):
             calls.append(f"{part.name}_roots(t[{k}], t[{len(self.sums) + k}], y + {place}, P + {first} * K);")
             first, place = first + len(part.latents), place + part.width
-        words = {"JOINTS": self.sizes[1], "LATENTS": C, "RANK": self.rank, "WIDENED": (self.widening**2).hex()}
+        words = {"COVARIANCE": name, "ROWS": rows, "LATENTS": C, "RANK": self.rank, "WIDENED": (self.widening**2).hex()}
         return filled(c_text(__name__, "covariance.c"), words | {"ROOTS": "\n  ".join(calls)})
 
     @property

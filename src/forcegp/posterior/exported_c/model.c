@@ -61,6 +61,80 @@ int @NAME@_mean_covariance(const double q[@NQ@], const double v[@NV@], const dou
   return stored(y, a, @NV@) | stored(c, covariance, @NV@ * @NV@);
 }
 
+//// inverse_dynamics
+/* u of the actuators that makes the acceleration a, which has to obey the contacts; normal_force: with how much each
+   contact presses on the robot, and memory: what friction remembers, both one number each or NULL for zeros */
+int @NAME@_inverse_dynamics(const double q[@NQ@], const double v[@NV@], const double a[@NV@],
+                          const double *normal_force, const double *memory, double u[@NV@]) {
+  enum {N = @NV@, NU = @NU@, K = @MEMORY@, AT = @COLUMN@, M = @CONTACTS@, ROUNDS = 60};
+  double x[@ALL@], y[N + N * NU + N * N + M * N + M], wanted[N], J[N][N + 1], most = 0.0, before = HUGE_VAL, w = 1.0;
+  const double *Q = y, *slope = y + N, *mass = slope + N * NU, *A = mass + N * N;
+  int found = stored(q, x, @NQ@) | stored(v, x + @NQ@, N) | stored(a, wanted, N);
+  (void)A; (void)normal_force; (void)memory;
+  for (int k = 0; k < NU; k++) x[@X@ + k] = 0.0;
+  for (int k = 0; k < K && memory; k++) found |= stored(memory + k, x + @X@ + AT + k, 1);
+  for (int k = 0; k < M && normal_force; k++) found |= stored(normal_force + k, J[0], 1);
+  for (int i = 0; i < N; i++) u[i] = found ? NAN : 0.0;
+  if (found) return @NAME@_INPUT_NOT_FINITE;
+  for (int round = 0; round < ROUNDS; round++) { /* Newton's method; one round where friction does not depend on u */
+    for (int i = 0; i < N; i++) x[@X@ + i + (i < AT ? 0 : K)] = u[i];
+    forces_at(tables, 1, x, y);
+    for (int i = 0; i < N && !round; i++) {
+      wanted[i] = 0.0;
+      for (int j = 0; j < N; j++) wanted[i] += mass[N * i + j] * a[j];
+      for (int k = 0; k < M && normal_force; k++) wanted[i] -= A[N * k + i] * normal_force[k];
+      if (fabs(wanted[i]) > most) most = fabs(wanted[i]);
+    }
+    double left = 0.0;
+    for (int i = 0; i < N; i++) {
+      for (int j = 0; j < N; j++) J[i][j] = slope[NU * i + j + (j < AT ? 0 : K)];
+      J[i][N] = wanted[i] - Q[i];
+      left += J[i][N] * J[i][N];
+    }
+    left = sqrt(left);
+    if (!(left - left == 0.0)) break;
+    if (left <= 1e-12 * (1.0 + most)) return @NAME@_OK;
+    w = left < before ? 1.0 : 0.5 * w; /* friction that turns over is passed with shorter steps */
+    before = left;
+    for (int p = 0; p < N; p++) {
+      int best = p;
+      for (int i = p + 1; i < N; i++) if (fabs(J[i][p]) > fabs(J[best][p])) best = i;
+      for (int j = p; j <= N; j++) { const double z = J[p][j]; J[p][j] = J[best][j]; J[best][j] = z; }
+      for (int i = 0; i < N; i++) if (i != p) {
+        const double s = J[i][p] / J[p][p];
+        for (int j = p; j <= N; j++) J[i][j] -= s * J[p][j];
+      }
+    }
+    for (int i = 0; i < N; i++) u[i] += w * J[i][N] / J[i][i];
+    if (@AFFINE@) return stored(u, wanted, N);
+  }
+  for (int i = 0; i < N; i++) u[i] = NAN;
+  return @NAME@_STEP_NOT_FOUND;
+}
+
+//// components
+/* joint forces, a row for each of: @NAMED@ */
+int @NAME@_forces(const double q[@NQ@], const double v[@NV@], const double u[@NU@], double force[@PARTS@ * @NV@]) {
+  double x[@ALL@], y[@PARTS@ * @NV@];
+  if (refused(q, v, u, x, force, @PARTS@ * @NV@)) return @NAME@_INPUT_NOT_FINITE;
+  components(tables, 1, x, y);
+  return stored(y, force, @PARTS@ * @NV@);
+}
+
+//// deviations
+/* the same and their standard deviations, zero for laws */
+int @NAME@_forces_deviation(const double q[@NQ@], const double v[@NV@], const double u[@NU@],
+                          double force[@PARTS@ * @NV@], double deviation[@PARTS@ * @NV@]) {
+  enum {P = @PARTS@ * @NV@, T = @TERMS@ * @NV@};
+  double x[@ALL@], y[P + @GIVEN_PARTS@], c[T * T];
+  if (refused(q, v, u, x, force, P) | refused(q, v, u, x, deviation, P)) return @NAME@_INPUT_NOT_FINITE;
+  deviations(tables, 1, x, y);
+  covariance_of_parts(tables, y + P, c);
+  for (int i = 0; i < P; i++) deviation[i] = 0.0;
+  for (int i = 0; i < T; i++) deviation[P - T + i] = c[T * i + i] > 0.0 ? sqrt(c[T * i + i]) : 0.0;
+  return stored(y, force, P) | stored(deviation, x, 1);
+}
+
 //// linearize
 /* the same and its derivatives: jacobian[@COLUMNS@ i + k] = d a_i / d [@STATE@]_k */
 int @NAME@_linearize(const double q[@NQ@], const double v[@NV@], const double u[@NU@], double a[@NV@],

@@ -19,7 +19,7 @@ enum {
   @NAME@_OK = 0,
   @NAME@_INPUT_NOT_FINITE = 1,
   @NAME@_RESULT_NOT_FINITE = 4, /* singular there, or outside the range of a table */
-  @NAME@_STEP_NOT_FOUND = 8 /* Newton's method did not find an implicit step: take a shorter one */
+  @NAME@_STEP_NOT_FOUND = 8 /* Newton's method did not find an implicit step (take a shorter one), or u */
 };
 
 @PROTOTYPES@
