@@ -11,7 +11,17 @@ import pytest
 from tests.posterior.arm import arm_data
 
 QUICK = ("--points", 12, "--iterations", 2, "--restarts", 1, "--no-checks")
-FILES = {"arm.c", "arm.h", "arm_external.c", "arm_acados.c", "CMakeLists.txt", "example.c", "self_test.c", "README.txt"}
+FILES = {
+    "arm.c",
+    "arm.h",
+    "arm.hpp",
+    "arm_external.c",
+    "arm_acados.c",
+    "CMakeLists.txt",
+    "example.c",
+    "self_test.c",
+    "README.txt",
+}
 
 
 @pytest.fixture(scope="module")

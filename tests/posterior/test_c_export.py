@@ -4,7 +4,7 @@ import ctypes
 import shutil
 import subprocess
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +12,16 @@ import pytest
 import torch
 from tests.posterior.arm import arm_data, arm_model
 
-from forcegp import Dataset, Model, Robot, export_c
+from forcegp import ContactMonitor, Dataset, Model, Robot, export_c
 from forcegp.codegen.c_writer import write_function
-from forcegp.errors import NumericalError
+from forcegp.errors import InvalidInput, NumericalError
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
+from forcegp.forces.joint_laws import GearFriction
 from forcegp.inference import OptimizerOptions
-from forcegp.posterior import Posterior, c_export
-from forcegp.posterior.c_export import identifier, rounding
+from forcegp.posterior import Posterior, c_files
+from forcegp.posterior.c_export import rounding
+from forcegp.posterior.c_files import identifier
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1")
 DT = 0.02
@@ -142,6 +144,102 @@ def test_steps_of_friction_and_their_derivatives(friction, states, integrator, t
     assert max(made.differences.values()) < 1e-8
 
 
+def test_the_torques_for_a_motion_and_every_force_are_those_of_the_model(friction, states, tmp_path):
+    """Under a load that depends on u: Newton's method, and at a contact that is pressed."""
+    export_c(friction, tmp_path / "arm", covariance=True)
+    library = compiled(tmp_path / "arm", "arm.c")
+    q, v, _ = states
+    a = np.random.default_rng(1).normal(size=q.shape)
+    wanted = friction.predictor(covariance="none", compile=False).inverse_dynamics(q, v, a, [12.0]).mean
+    parts = friction.components(*states)
+    for k in range(5):
+        bits, (u,) = call(library.arm_inverse_dynamics, [3], q[k], v[k], a[k], [12.0], [])
+        assert bits == 0
+        np.testing.assert_allclose(u, wanted[k], rtol=1e-10, atol=1e-10)
+        bits, (force, deviation) = call(library.arm_forces_deviation, [6, 6], *(x[k] for x in states))
+        assert bits == 0
+        rows = np.stack([force.reshape(-1, 3), deviation.reshape(-1, 3)], axis=1)
+        found = dict(zip(parts, rows, strict=True))
+        for name, part in parts.items():
+            np.testing.assert_allclose(found[name][0], part.joint_force.mean[k], rtol=1e-9, atol=1e-12)
+            exact = part.joint_force.covariance[k].diagonal().clamp_min(0.0).sqrt().numpy()
+            assert (found[name][1] > exact * (1.0 - 1e-6) - 1e-9).all()
+            np.testing.assert_allclose(found[name][1], exact, rtol=0.05, atol=1e-3)
+    assert call(library.arm_inverse_dynamics, [3], q[0], v[0], [np.inf, 0.0, 0.0], [0.0], [])[0] == 1
+
+
+CPP = """#include "arm.hpp"
+#include <cstdio>
+int main() {
+  static_assert(sizeof(arm::Velocities) == 3 * sizeof(double));
+  const auto found = arm::inverse_dynamics({0.1, 0.2, 0.3}, {0.5, -0.5, 0.5}, {1.0, 0.0, -1.0}, {}, MEMORY);
+  arm::Monitor monitor;
+  for (int k = 0; k < 3; k++) monitor.step({0.1 * k, 0.2, 0.3}, {0.5, -0.5, 0.5}, found.value);
+  const auto seen = monitor.step({0.4, 0.2, 0.3}, {0.5, -0.5, 0.5}, {90.0, 0.0, 0.0});
+  std::array<arm::Velocities, PARTS> force;
+  const int bits = arm::forces({0.1, 0.2, 0.3}, {0.5, -0.5, 0.5}, {}, force);
+  const auto z = arm::remember(MEMORY, {0.0, 0.0, 0.0}, {1.0, 0.0, 0.0}, 0.01);
+  std::printf("%.17g %.17g %d %g", found.value[0], seen.distance, bits + found.status + seen.status, z[0]);
+}"""
+
+
+def test_friction_that_remembers_and_a_monitor_of_contacts(tmp_path):
+    """The torques for a motion with what was remembered, the monitor sample by sample, and both from C++."""
+    gear = GearFriction(0.8, 0.1, 0.05, 0.2, 0.3, 0.1, sigma=40.0, memory=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        options = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
+        free = arm_model().with_contacts([])
+        posterior = fit(
+            free.with_forces(gear, JointFriction()), replace(arm_data(30, 0), model=free, truth={}), **options
+        )
+    rng, time = np.random.default_rng(0), np.arange(6000)[:, None] * 0.01
+    q = 0.4 * np.sin(time * [0.7, 1.1, 1.3] + [0.0, 1.0, 2.0])
+    v, u = np.gradient(q, 0.01, axis=0), rng.normal(size=q.shape)
+    monitor = ContactMonitor(posterior.predictor(), dt=0.01).calibrate([(q, v, u)])
+    made = export_c(posterior, tmp_path / "arm", covariance=True, monitor=monitor)
+    assert made.differences["arm_monitor_step"] < 1e-9
+    library = compiled(tmp_path / "arm", "arm.c")
+    z = [0.3, -0.9, 1.0]
+    wanted = posterior.predictor(covariance="none").inverse_dynamics(q[7], v[7], u[7], memory=z).mean
+    bits, (found,) = call(library.arm_inverse_dynamics, [3], q[7], v[7], u[7], [], z)
+    assert bits == 0
+    np.testing.assert_allclose(found, wanted, rtol=1e-11)
+    u[100:] += 60.0  # something pushes
+    seen = monitor.run(q[:200], v[:200], u[:200])
+    assert 0 < int(seen.alarm.sum()) < 100
+    state = np.zeros(100)
+    for k in range(200):
+        torque, distance, alarm = np.zeros(3), np.zeros(1), np.zeros(1, np.int32)
+        assert not library.arm_monitor_step(*map(pointer, (state, q[k], v[k], u[k], torque, distance, alarm)))
+        np.testing.assert_allclose(torque, seen.torque[k], rtol=1e-9, atol=1e-12)
+        assert bool(alarm) == bool(seen.alarm[k])
+        np.testing.assert_allclose(distance, seen.distance[k], rtol=1e-7, atol=1e-12)
+    with pytest.raises(InvalidInput, match="counts another covariance than the program has"):
+        export_c(posterior, tmp_path / "other", monitor=monitor)
+    if shutil.which("c++"):
+        memory = "{0.3, -0.9, 1.0}"
+        (tmp_path / "arm" / "main.cpp").write_text(CPP.replace("MEMORY", memory).replace("PARTS", "2"))
+        steps = [
+            "cc -std=c99 -c arm.c",
+            "c++ -std=c++17 -Wall -Wextra -Wconversion -Wshadow -Werror main.cpp arm.o -o x",
+        ]
+        for step in steps:
+            subprocess.run(step.split(), cwd=tmp_path / "arm", check=True)
+        told = subprocess.run(["./x"], cwd=tmp_path / "arm", capture_output=True, text=True, check=True).stdout.split()
+        again = call(library.arm_inverse_dynamics, [3], [0.1, 0.2, 0.3], [0.5, -0.5, 0.5], [1.0, 0.0, -1.0], [], z)[1][
+            0
+        ]
+        assert float(told[0]) == pytest.approx(again[0], rel=1e-12)
+        assert float(told[1]) > 0.0
+        assert told[2] == "0"
+        assert float(told[3]) == pytest.approx(1.0, abs=1e-6)  # a turn of 1 rad forgets everything
+
+
+def pointer(x):
+    return ctypes.c_void_p(x.ctypes.data)
+
+
 def test_the_self_test_the_example_and_the_commands_of_the_readme_work(complete, tmp_path):
     folder = tmp_path / "copy"
     shutil.copytree(complete, folder)
@@ -262,7 +360,7 @@ def test_a_program_that_differs_is_not_written(posterior, tmp_path, monkeypatch)
     def spoiled(*arguments):
         return write_function(*arguments).replace("  y[0] = ", "  y[0] = 1e-6 + ")
 
-    monkeypatch.setattr(c_export, "write_function", spoiled)
+    monkeypatch.setattr(c_files, "write_function", spoiled)
     with pytest.raises(NumericalError, match=r"arm_mean of the compiled program and forcegp differ by .* nothing was"):
         export_c(posterior, tmp_path / "arm")
     assert list(tmp_path.iterdir()) == []

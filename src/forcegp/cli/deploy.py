@@ -23,17 +23,29 @@ from forcegp.scores.page import number
 
 
 @dataclass(frozen=True, kw_only=True)
+class AlarmOptions:
+    """When a monitor says that something touches the robot."""
+
+    false_alarms: Annotated[float, arg(metavar="N")] = 0.1
+    """Accepted false alarms per hour."""
+    bandwidth: Annotated[float, arg(metavar="HZ")] = 2.0
+    """Cut-off of the low-pass filter on the torques. A higher one is faster, a lower one finds smaller forces."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Export(Command):
     """Write a fitted model as a program that needs no Python.
 
     c: C99 with the weights inside and <math.h> only, a header, an example, a self-test, a CMakeLists.txt, and forms
-    for CasADi's external and acados' generic functions. It is compiled and compared with the model before it is there.
+    for CasADi's external and acados' generic functions. Accelerations, the torques for a wanted motion, every force by
+    itself, what friction remembers. It is compiled and compared with the model before it is there.
     casadi: CasADi functions with all derivatives, for casadi.Function.load (pip install 'forcegp[casadi]').
 
     For example:
       forcegp export run --to c --out deployed --covariance
       forcegp export run --to casadi --out planner --steps 0.02
       forcegp export run --to c --out mpc --jacobian --steps 0.02 --integrator implicit-midpoint
+      forcegp export run --to c --out watch --free morning.h5
     """
 
     model: Annotated[Positional[Path], MODEL, arg(metavar="RUN")]
@@ -52,6 +64,10 @@ class Export(Command):
     """How the step of --steps is computed: symplectic-euler, rk4 or implicit-midpoint (stiff friction)."""
     unchecked: bool = False
     """Do not compile the program and compare it with the model."""
+    free: Annotated[str | None, unless_given("FREE.h5", "no monitor", str)] = None
+    """With a monitor of contacts, calibrated by a log of 40 s or more of free motion that was not used for training, at
+    whose rate it is to be called."""
+    alarms: AlarmOptions = AlarmOptions()
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Write and show."""
@@ -69,7 +85,20 @@ class Export(Command):
 def _c(options: Export, terminal: Terminal, posterior: Any, folder: Path) -> dict[str, Any]:
     same = {name: getattr(options, name) for name in ("covariance", "jacobian", "steps", "unchecked")}
     integrator = options.integrator or "symplectic-euler"
-    made = forcegp.export_c(posterior, folder, **same, integrator=integrator, source=str(options.model))
+    monitor = None
+    if options.free is not None:
+        free, log = Path(options.free), _dataset(Path(options.free), posterior)
+        dt = forcegp.data.filters.uniform_step(log.time[log.episode == log.episodes[0]], options.free)
+        spread = "compressed" if options.covariance else "none"
+        monitor = forcegp.ContactMonitor(
+            posterior.predictor(covariance=spread), dt=dt, bandwidth=options.alarms.bandwidth
+        )
+        with terminal.progress("calibrating"):
+            known = [each[1:] for each in _motions(log, free, dt)]
+            monitor.calibrate(known, false_alarms_per_hour=options.alarms.false_alarms)
+    made = forcegp.export_c(
+        posterior, folder, **same, integrator=integrator, source=str(options.model), monitor=monitor
+    )
     terminal.show(
         columns(str(options.out), ["file", "bytes"], [[file, f"{size:,}"] for file, size in made.files.items()])
     )
@@ -79,7 +108,7 @@ def _c(options: Export, terminal: Terminal, posterior: Any, folder: Path) -> dic
 
 
 def _casadi(options: Export, terminal: Terminal, posterior: Any, folder: Path) -> dict[str, Any]:
-    for name in ("covariance", "jacobian", "unchecked"):
+    for name in ("covariance", "jacobian", "unchecked", "free"):
         if getattr(options, name):
             raise InvalidInput(f"--{name} is for --to c; CasADi functions have all derivatives, and no covariance.")
     given = {"steps": options.steps, "integrator": options.integrator or "symplectic-euler"}
@@ -119,10 +148,7 @@ class Monitor(Command):
     free: Annotated[str, arg(metavar="S|FREE.h5")]
     """Motion of 40 s or more without contacts, not used for training: the first S seconds of LOG, which are not
     searched, or another log."""
-    false_alarms: Annotated[float, arg(metavar="N")] = 0.1
-    """Accepted false alarms per hour."""
-    bandwidth: Annotated[float, arg(metavar="HZ")] = 2.0
-    """Cut-off of the low-pass filter on the torques. A higher one is faster, a lower one finds smaller forces."""
+    alarms: AlarmOptions = AlarmOptions()
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Calibrate, look, draw and show."""
@@ -142,9 +168,9 @@ class Monitor(Command):
         else:
             first, rows = motions[0], round(min(seconds / dt, float(len(motions[0][0]))))
             known, motions[0] = [tuple(x[:rows] for x in first[1:])], tuple(x[rows:] for x in first)
-        monitor = forcegp.ContactMonitor(posterior.predictor(), dt=dt, bandwidth=self.bandwidth)
+        monitor = forcegp.ContactMonitor(posterior.predictor(), dt=dt, bandwidth=self.alarms.bandwidth)
         with terminal.progress("looking"):
-            monitor.calibrate(known, false_alarms_per_hour=self.false_alarms)
+            monitor.calibrate(known, false_alarms_per_hour=self.alarms.false_alarms)
             parts = [(time, q, monitor.run(q, v, u)) for time, q, v, u in motions if len(time) > 1]
         if not parts:
             raise InvalidInput(f"nothing is left of {self.log} after --free {self.free}.")
@@ -152,7 +178,7 @@ class Monitor(Command):
         content = {
             "run": str(self.model),
             "log": str(self.log),
-            **{name: getattr(self, name) for name in ("free", "false_alarms", "bandwidth")},
+            **{"free": self.free, **vars(self.alarms)},
             **{"dt": dt, "threshold": monitor.threshold, "seconds": sum(len(time) for time, *_ in parts) * dt},
         }
         title = f"{self.log.name}: {len(contacts)} contacts in {content['seconds']:.0f} s"

@@ -79,7 +79,7 @@ class ContactMonitor:
         require_number("bandwidth", bandwidth, words, below=0.5 / dt)
         self.robot: Robot = plain.robot
         self.dt, self.bandwidth = float(dt), float(bandwidth)
-        self._keep = math.exp(-2.0 * math.pi * bandwidth * dt)
+        self.keep = math.exp(-2.0 * math.pi * bandwidth * dt)
         self.noise: NoiseLevels | None = None
         self.threshold = math.inf
         self._maxima = (0.0, 1.0)
@@ -123,7 +123,7 @@ class ContactMonitor:
         middle = 0.5 * (before[0] + sample[0]), 0.5 * (before[1] + sample[1])
         step = (*middle, before[2], (sample[1] - before[1]) / self.dt)
         tau, M, extra = self._torques(*(x[None] for x in step))
-        self._torque = self._torque + (1.0 - self._keep) * (tau[0] - self._torque)
+        self._torque = self._torque + (1.0 - self.keep) * (tau[0] - self._torque)
         return self._state(self._torque, self._distance(self._torque[None], self._covariance(M, extra))[0])
 
     def run(self, q: Any, v: Any, u: Any) -> ContactState:
@@ -184,7 +184,7 @@ class ContactMonitor:
         self.past = Past(model_of(self.model))
         middle = 0.5 * (q[1:] + q[:-1]), 0.5 * (v[1:] + v[:-1])
         tau, M, extra = self._torques(*middle, u[:-1], (v[1:] - v[:-1]) / self.dt)
-        filtered = lfilter([1.0 - self._keep], [1.0, -self._keep], tau.numpy(), axis=0)
+        filtered = lfilter([1.0 - self.keep], [1.0, -self.keep], tau.numpy(), axis=0)
         return torch.from_numpy(filtered)[settle:], M[settle:], None if extra is None else extra[settle:]
 
     def _torques(self, q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:

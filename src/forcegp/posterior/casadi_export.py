@@ -22,7 +22,8 @@ from forcegp.codegen.tracing import trace
 from forcegp.errors import NumericalError, require_type, required_extra
 from forcegp.inference.prepared_kernels import KernelSum
 from forcegp.integration import INTEGRATORS, integrator_named
-from forcegp.posterior.c_export import identifier, rounding
+from forcegp.posterior.c_export import rounding
+from forcegp.posterior.c_files import identifier
 from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.preparation import rows_for, sample_states
 from forcegp.posterior.programs import Programs, require_step

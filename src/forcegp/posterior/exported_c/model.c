@@ -112,6 +112,85 @@ int @NAME@_inverse_dynamics(const double q[@NQ@], const double v[@NV@], const do
   return @NAME@_STEP_NOT_FOUND;
 }
 
+//// monitor
+/* what touches the robot since the last sample: the external joint torque, low-pass filtered, the squared Mahalanobis
+   distance from free motion, and whether that is over the threshold of @THRESHOLD@. To be called every @PERIOD@ s with
+   u of the actuators, which acts from now on; the first call only looks. The state belongs to the caller, zeros at
+   first; what is not finite breaks it off, and the next sample begins anew */
+int @NAME@_monitor_step(@NAME@_monitor_state *state, const double q[@NQ@], const double v[@NV@], const double u[@NV@],
+                      double torque[@NV@], double *distance, int *alarm) {
+  enum {N = @NV@, NU = @NU@, K = @MEMORY@, AT = @COLUMN@, M = @CONTACTS@};
+  static const double accelerations[] = {@ACCELERATIONS@}, forces[] = {@FORCES@};
+  double x[@ALL@], y[N + N * NU + N * N + M * N + M], S[N][N + 1], C[N * N], MC[N * N], d = 0.0;
+  const double *mass = y + N + N * NU;
+  int found = stored(q, x, N) | stored(v, x + N, N) | stored(u, x + 2 * N, N), begun = state->begun;
+  (void)MC;
+  state->begun = 0;
+  *distance = NAN; *alarm = 0;
+  for (int i = 0; i < N; i++) torque[i] = NAN;
+  if (found) return @NAME@_INPUT_NOT_FINITE;
+  for (int i = 0; i < N; i++) { /* in the middle of the step, under the u of its beginning */
+    x[i] = 0.5 * (state->q[i] + q[i]); x[N + i] = 0.5 * (state->v[i] + v[i]);
+    x[2 * N + i + (i < AT ? 0 : K)] = state->u[i];
+    C[i] = (v[i] - state->v[i]) / @PERIOD@;
+    state->q[i] = q[i]; state->v[i] = v[i]; state->u[i] = u[i];
+  }
+  state->begun = 1;
+  if (begun) {
+    @REMEMBER@
+    forces_at(tables, 1, x, y);
+    for (int i = 0; i < N; i++) {
+      double tau = -y[i];
+      for (int j = 0; j < N; j++) tau += mass[N * i + j] * C[j];
+      state->torque[i] += @SHARE@ * (tau - state->torque[i]);
+    }
+    for (int i = 0; i < N; i++) for (int j = 0; j <= i; j++) {
+      S[i][j] = i == j ? forces[i] * forces[i] : 0.0;
+      for (int k = 0; k < N; k++)
+        S[i][j] += mass[N * i + k] * accelerations[k] * accelerations[k] * mass[N * k + j];
+    }
+    @OPEN@
+    for (int j = 0; j < N; j++) for (int i = j; i < N; i++) { /* S = L L^T; the distance is |L^-1 torque|^2 */
+      for (int k = 0; k < j; k++) S[i][j] -= S[i][k] * S[j][k];
+      S[i][j] = i == j ? sqrt(S[i][j]) : S[i][j] / S[j][j];
+    }
+    for (int i = 0; i < N; i++) {
+      S[i][N] = state->torque[i];
+      for (int k = 0; k < i; k++) S[i][N] -= S[i][k] * S[k][N];
+      S[i][N] /= S[i][i];
+      d += S[i][N] * S[i][N];
+    }
+  }
+  *alarm = d > @THRESHOLD@;
+  return stored(state->torque, torque, N) | stored(&d, distance, 1);
+}
+
+//// monitor_memory
+if (state->moved) {
+      double z[2 * N + K + 1], next[K];
+      for (int k = 0; k < K; k++) z[k] = state->memory[k];
+      for (int i = 0; i < N; i++) { z[K + i] = state->middle[i]; z[K + N + i] = x[i]; }
+      z[K + 2 * N] = 0.0;
+      remember(tables, 1, z, next);
+      for (int k = 0; k < K; k++) state->memory[k] = next[k];
+    }
+    for (int i = 0; i < N; i++) state->middle[i] = x[i];
+    state->moved = 1;
+    for (int k = 0; k < K; k++) x[2 * N + AT + k] = state->memory[k];
+
+//// monitor_open
+{ /* what the posterior leaves open: M Cov(a) M */
+      double a[@GIVEN@];
+      mean_and_terms(tables, 1, x, a);
+      covariance_of(tables, a + N, C);
+      for (int i = 0; i < N; i++) for (int j = 0; j < N; j++) {
+        MC[N * i + j] = 0.0;
+        for (int k = 0; k < N; k++) MC[N * i + j] += mass[N * i + k] * C[N * k + j];
+      }
+      for (int i = 0; i < N; i++) for (int j = 0; j <= i; j++)
+        for (int k = 0; k < N; k++) S[i][j] += MC[N * i + k] * mass[N * k + j];
+    }
+
 //// components
 /* joint forces, a row for each of: @NAMED@ */
 int @NAME@_forces(const double q[@NQ@], const double v[@NV@], const double u[@NU@], double force[@PARTS@ * @NV@]) {
@@ -240,4 +319,10 @@ int @NAME@_step_jacobian(const double q[@NQ@], const double v[@NV@], const doubl
       const double dm = K[i][c] / J[i][i];
       S[i][c] += dt * dm; S[N + i][c] = 2.0 * dm - S[N + i][c];
     }
+
+//// monitor_state
+typedef struct { /* of one robot, zeros at first */
+  double q[@NQ@], v[@NV@], u[@NV@], torque[@NV@], middle[@NQ@], memory[@MEMORY@ + 1];
+  int begun, moved;
+} @NAME@_monitor_state;
 

@@ -22,7 +22,7 @@ enum {
   @NAME@_STEP_NOT_FOUND = 8 /* Newton's method did not find an implicit step (take a shorter one), or u */
 };
 
-@PROTOTYPES@
+@STATE_OF_MONITOR@@PROTOTYPES@
 
 #ifdef __cplusplus
 }
