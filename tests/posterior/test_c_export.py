@@ -412,3 +412,15 @@ def test_cmake_builds_and_tests(complete, tmp_path):
         assert done.returncode == 0, done.stderr
     assert subprocess.run(["ctest"], cwd=tmp_path, capture_output=True, check=False).returncode == 0
     assert (tmp_path / "libarm.a").exists()
+    subprocess.run(["cmake", "--install", ".", "--prefix", str(tmp_path / "there")], cwd=tmp_path, check=True)
+    (mine := tmp_path / "mine").mkdir()
+    (mine / "main.cpp").write_text(
+        '#include "arm.hpp"\nint main() { return arm::forward_dynamics({}, {}, {}).status; }'
+    )
+    (mine / "CMakeLists.txt").write_text(
+        "cmake_minimum_required(VERSION 3.10)\nproject(mine CXX)\nset(CMAKE_CXX_STANDARD 17)\n"
+        "find_package(arm REQUIRED)\nadd_executable(mine main.cpp)\ntarget_link_libraries(mine arm::model)\n"
+    )
+    for command in (["-S", ".", "-B", "b", f"-DCMAKE_PREFIX_PATH={tmp_path / 'there'}"], ["--build", "b"]):
+        subprocess.run(["cmake", *command], cwd=mine, check=True, capture_output=True)
+    assert subprocess.run([mine / "b" / "mine"], check=False).returncode == 0
