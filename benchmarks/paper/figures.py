@@ -121,6 +121,8 @@ def rollouts_figure(arrays: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]
         axes.set_yscale("log")
     panels[0, 0].set_ylim(1e-6, 1e1)
     panels[1, 0].set_ylim(1e-17, 1e0)
+    for axes in panels[:, 0]:
+        plain_ticks(axes.yaxis)
     legend_below(figure, panels[0, 0])
     return figure
 

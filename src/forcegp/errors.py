@@ -4,6 +4,7 @@ import contextlib
 import difflib
 import importlib
 import math
+import re
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, TypeVar
 
@@ -113,6 +114,23 @@ class RobotFileWarning(DataWarning):
 
 class ContactWarning(DataWarning):
     """The rows contradict the contacts that are stated: no motion along the surface, or no force."""
+
+
+def printable(text: str) -> str:
+    r"""The text with what would act on a terminal instead of being seen written out, as in \x1b.
+
+    Control characters but line breaks and tabs, and what turns the direction of writing round (Unicode, TR 36, 2.10).
+    """
+    return re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]", _written, text)
+
+
+def _written(found: re.Match[str]) -> str:
+    return ascii(found[0])[1:-1]
+
+
+def spreadsheet_cell(text: str) -> str:
+    """The text for a cell of a CSV file: what a spreadsheet would compute gets a quotation mark before it (OWASP)."""
+    return f"'{text}" if text[:1] in ("=", "+", "-", "@", "\t", "\r") else text
 
 
 def require_type(name: str, given: object, kind: type[Kind], example: str = "") -> Kind:

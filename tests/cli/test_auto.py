@@ -10,8 +10,10 @@ import pytest
 
 from forcegp import Dataset, Robot, load_posterior
 from forcegp.cli.auto import best_sentence
+from forcegp.cli.logs import prepared_rows
 from forcegp.cli.main import parse_arguments
 from forcegp.cli.terminal import Terminal
+from forcegp.data import Preparation
 from forcegp.evidence import motion_residuals
 from forcegp.scores import Scores
 from forcegp.simulation import FreeArmConfig
@@ -122,6 +124,15 @@ def test_the_printed_command_keeps_every_option():
     mapping = command.columns.mapped([], Terminal(json=False))
     again = parse_arguments(shlex.split(command._command(mapping))[1:])
     assert again == command
+
+
+def test_a_log_that_needs_no_filter_says_so():
+    data = simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=8.0, seed=1, noise=0.0))
+    found = Preparation(cutoff="auto").resolved(data)
+    assert found.changes_nothing
+    rows, same = prepared_rows(Terminal(json=True), found, data, thin=True)
+    assert rows.metadata["preparation"]["why"] == found.why
+    assert len(rows) == len(same) == len(data)
 
 
 @pytest.mark.parametrize(

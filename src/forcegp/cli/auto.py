@@ -337,7 +337,7 @@ def answer_lines(
     return [
         ("log", f"{len(dataset)} rows, {seconds:.3g} s at {rate:.4g} Hz, {freedoms}{jitter}"),
         ("corrected", mistakes),
-        ("timing", f"{shifted}; {filtered}, every {prepared['every']}. row"),
+        ("timing", f"{shifted}; {filtered}, {'all rows' if prepared['every'] == 1 else f"every {prepared['every']}. row"}"),
         *([("stance", stance_text(prepared))] if "stance" in prepared else []),
         *of_joints,
         *([("whole mass", f"{mass:.4g} ± {1.96 * error:.1g} kg{by}")] if moving else []),

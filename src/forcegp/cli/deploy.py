@@ -18,7 +18,7 @@ from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, NUMBERS, Command, begins, listed, numbers_of, unless_given
 from forcegp.cli.robot_options import CONTACTS, RobotOptions, parse_contacts, require_same_joints
 from forcegp.cli.terminal import Terminal, columns
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, spreadsheet_cell
 from forcegp.scores.page import number
 
 
@@ -187,7 +187,8 @@ class Monitor(Command):
             with (folder / "contacts.csv").open("w", encoding="utf-8", newline="") as file:
                 table = csv.DictWriter(file, COLUMNS, lineterminator="\n")
                 table.writeheader()
-                table.writerows(contacts)
+                for each in contacts:
+                    table.writerow({k: spreadsheet_cell(x) if isinstance(x, str) else x for k, x in each.items()})
             time, _, state = max(parts, key=lambda part: len(part[0]))
             shown = [(each["start"], each["end"]) for each in contacts if time[0] <= each["start"] <= time[-1]]
             arrays = time, state.distance.numpy(), monitor.threshold, state.torque.numpy()

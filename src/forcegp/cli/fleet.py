@@ -17,7 +17,7 @@ from forcegp.atomic_files import write_text
 from forcegp.cli.arguments import COMMANDS, command_class, parsed
 from forcegp.cli.command import Command, options_of
 from forcegp.cli.terminal import Terminal, facts
-from forcegp.errors import FileFormatError, ForceGPError, InvalidInput
+from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, spreadsheet_cell
 from forcegp.jobs import JOBS, Job, JobStore, run_jobs
 from forcegp.parallel import Jobs
 
@@ -164,7 +164,8 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
     writer.writerow([*own, "warnings", *numbers])
     for row in rows:
         cells = [row["numbers"].get(name, "") for name in numbers]
-        writer.writerow([*(row[name] for name in own), len(row["warnings"]), *cells])
+        every = [*(row[name] for name in own), len(row["warnings"]), *cells]
+        writer.writerow([spreadsheet_cell(cell) if isinstance(cell, str) else cell for cell in every])
     return text.getvalue()
 
 

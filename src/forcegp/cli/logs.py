@@ -71,7 +71,7 @@ def prepared_rows(
     terminal: Terminal, preparation: forcegp.data.Preparation, raw: forcegp.Dataset, *, thin: bool
 ) -> tuple[forcegp.Dataset, forcegp.Dataset]:
     """Rows to learn from, with `thin` as many as the filter leaves, and the same at the full rate."""
-    if preparation.changes_nothing:
+    if preparation.changes_nothing and not preparation.why:  # what was looked for and not found is reported
         return raw, raw
     preparation = resolved(terminal, preparation, raw)
     every = preparation.thinning(raw) if thin else preparation.every

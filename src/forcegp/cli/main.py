@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from forcegp.cli.arguments import parsed
 from forcegp.cli.command import Command, values_of
 from forcegp.cli.terminal import Terminal, with_option_names
-from forcegp.errors import ForceGPError
+from forcegp.errors import ForceGPError, printable
 
 ARGUMENTS: Mapping[str, Mapping[str, str]] = {
     "excite": {"start": "posture", "motions": "tries", "surface": "avoid"},
@@ -96,5 +96,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _fail(message: str, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
-    print(f"forcegp: {' '.join(message.split())}", file=sys.stderr)
+    print(f"forcegp: {printable(' '.join(message.split()))}", file=sys.stderr)
     return code

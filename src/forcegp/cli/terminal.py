@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
+from forcegp.errors import printable
 from forcegp.progress import watched
 
 if TYPE_CHECKING:
@@ -61,8 +62,17 @@ class ProgressCallback(Protocol):
 
 def _console(**how: Any) -> Console:
     from rich.console import Console
+    from rich.segment import Segment
 
-    return Console(highlight=False, **how)
+    class Plain(Console):
+        """Shows names as they are, whatever they mean to a terminal."""
+
+        def render(self, *given: Any, **more: Any) -> Any:
+            for segment in super().render(*given, **more):
+                shown = segment.control or printable(segment.text) == segment.text
+                yield segment if shown else Segment(printable(segment.text), segment.style)
+
+    return Plain(highlight=False, markup=False, emoji=False, **how)
 
 
 class Terminal:
@@ -133,15 +143,15 @@ class Terminal:
     def command(self, words: str) -> None:
         """A command to copy, in one line whatever the width."""
         if not self.json:
-            self.out.print(words, style="bold", markup=False, soft_wrap=True)
+            self.out.print(words, style="bold", soft_wrap=True)
 
     def note(self, text: str) -> None:
         """Report on stderr what was done."""
-        self.err.print(self.worded(text), style="dim", markup=False)
+        self.err.print(self.worded(text), style="dim")
 
     def warn(self, text: str) -> None:
         """Print a warning on stderr."""
-        self.err.print(f"warning: {' '.join(self.worded(text).split())}", style="yellow", markup=False)
+        self.err.print(f"warning: {' '.join(self.worded(text).split())}", style="yellow")
 
     def worded(self, text: str) -> str:
         """A sentence of the library in terms of this command's options."""
@@ -157,8 +167,8 @@ class Terminal:
             with watched(lines):
                 yield lines
             return
-        of_a_task = TextColumn("{task.description}"), BarColumn(bar_width=30), TimeElapsedColumn()
-        left = TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}")
+        of_a_task = TextColumn("{task.description}", markup=False), BarColumn(bar_width=30), TimeElapsedColumn()
+        left = TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}", markup=False)
         with Progress(SpinnerColumn(), *of_a_task, *left, console=self.err, transient=True) as bars:
             task = bars.add_task(what, total=None, note="")
 

@@ -289,6 +289,7 @@ def contacts_figure(
     style.draw_line(above, time, np.full_like(time, threshold), style.TRUTH, 1.0, "threshold", linestyle=style.DASHED)
     above.set_yscale("log")
     above.set_ylim(bottom=max(0.1, float(np.quantile(distance, 0.01))))
+    style.plain_ticks(above.yaxis)
     style.quiet(above, y="squared distance [σ²]")
     names = style.short_joint_names(joints)
     for joint, name in enumerate(names):
