@@ -309,6 +309,7 @@ def answer_lines(
     shifted += f", rotors follow within {1e3 * lag:.0f} ms" if lag else ""
     filtered = "no filter" if prepared["cutoff"] is None else f"filter at {prepared['cutoff']:g} Hz"
     joints, moving = robot.single_joint_names, robot.base != "fixed"
+    filtered += f", every {prepared['every']}. row" if prepared["every"] > 1 else ", all rows"
     freedoms = f"a base that moves and {len(joints)} joints" if moving else f"{len(dataset.joint_names)} joints"
     q, force, inertia = (
         " or ".join(dict.fromkeys(two[robot.joint(name).type == "prismatic"] for name in joints))
@@ -337,7 +338,7 @@ def answer_lines(
     return [
         ("log", f"{len(dataset)} rows, {seconds:.3g} s at {rate:.4g} Hz, {freedoms}{jitter}"),
         ("corrected", mistakes),
-        ("timing", f"{shifted}; {filtered}, {'all rows' if prepared['every'] == 1 else f"every {prepared['every']}. row"}"),
+        ("timing", f"{shifted}; {filtered}"),
         *([("stance", stance_text(prepared))] if "stance" in prepared else []),
         *of_joints,
         *([("whole mass", f"{mass:.4g} ± {1.96 * error:.1g} kg{by}")] if moving else []),
