@@ -29,8 +29,8 @@ def test_a_figure_that_cannot_be_drawn_leaves_the_old_file_and_nothing_else(tmp_
     path = tmp_path / "old.png"
     path.write_bytes(b"old")
     figure = new_figure(2.0, 2.0)
-    figure.subplots().set_title(r"$\frac{$")
-    with pytest.raises(ValueError, match="frac"):
+    figure.set_size_inches(1e6, 1e6)  # more than any renderer holds
+    with pytest.raises(ValueError, match="Image size"):
         save_figure(figure, path)
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
