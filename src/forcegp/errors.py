@@ -116,6 +116,19 @@ class ContactWarning(DataWarning):
     """The rows contradict the contacts that are stated: no motion along the surface, or no force."""
 
 
+LARGEST = 1e9
+"""Numbers of robots and laws beyond this, in SI units, are mistakes: no mass, inertia, damping or stiffness is."""
+
+
+def require_plausible(stored: Any, name: str = "") -> None:
+    """Raise ValueError for a number that no robot has in SI units, whatever it is."""
+    for key, value in stored.items() if isinstance(stored, Mapping) else enumerate(stored):
+        if isinstance(value, Mapping | list):
+            require_plausible(value, f"{name}{key} ")
+        elif isinstance(value, int | float) and abs(value) > LARGEST:
+            raise ValueError(f"{name}{key} is {value:g}, more than {LARGEST:g} in SI units")
+
+
 def printable(text: str) -> str:
     r"""The text with what would act on a terminal instead of being seen written out, as in \x1b.
 

@@ -44,7 +44,8 @@ def test_the_step_is_the_predictors_and_the_reward_the_callers(settings, predict
     seen, _ = env.reset(seed=2)
     u = np.array([[1.0], [-2.0], [99.0]])
     after, rewards, over, late, info = env.step(u)
-    q, v = predictor.step(seen[:, :1], seen[:, 1:], u.clip(-5.0, 5.0), 0.05, "implicit-midpoint")
+    q, v = predictor.step(seen[:, :1], seen[:, 1:], u.clip(-5.0, 5.0), 0.05, "rk4")
+    assert env.integrator == "rk4"
     np.testing.assert_allclose(after, np.hstack([q, v]), rtol=1e-9)
     np.testing.assert_allclose(rewards, -(q[:, 0].numpy() ** 2))
     for flags in (over, late, info["diverged"]):
@@ -72,12 +73,14 @@ def test_every_episode_has_one_drawn_function(settings, predictor):
 
 
 def test_a_motion_that_diverges_ends_its_episode_at_its_last_state(settings):
-    env = RobotVectorEnv(2, **settings | {"start": lambda _, n: (np.zeros((n, 1)), np.full((n, 1), 99.9))})
-    seen, _ = env.reset(seed=0)
+    env = RobotVectorEnv(2, **settings)
+    env.reset(seed=0)
+    env.v = np.full((2, 1), 99.9)  # far beyond its limit, where the other one only ends
     with pytest.warns(UserWarning, match="diverged"):
         after, _, over, _, info = env.step(np.array([[5.0], [-5.0]]))
-    assert over.tolist() == info["diverged"].tolist() == [True, False]
-    assert np.array_equal(after[0], seen[0])
+    assert info["diverged"].tolist() == [True, False]
+    assert over.all()
+    assert env.v[0] == 99.9
     assert np.isfinite(after).all()
 
 
@@ -94,12 +97,42 @@ def test_motions_are_divided_among_as_many_functions_as_there_are(predictor):
         ({"draw": -1}, "draw"),
         ({"num_envs": 0}, "num_envs"),
         ({"dt": -0.1}, "time step"),
+        ({"dt": 10.0}, "dt is 10.0; one step lasts 1 s at most"),
         ({"steps": 0}, "steps"),
     ],
 )
 def test_settings_that_mean_nothing(settings, changes, message):
     with pytest.raises(InvalidInput, match=message):
         RobotVectorEnv(**settings | changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"reward": lambda *x: np.zeros((1, 1))}, r"reward returned .*; return finite numbers \(1,\), one per robot"),
+        ({"reward": lambda *x: np.array([np.nan])}, "reward returned"),
+        ({"terminated": lambda *x: np.array([0.0])}, "terminated returned .* return True or False"),
+        ({"start": lambda generator, n: (np.full((n, 1), 50.0), np.zeros((n, 1)))}, "within the limits of the joints"),
+        ({"start": lambda generator, n: (np.zeros(n), np.zeros(n))}, r"q of shape \(1,\) and v of shape \(1,\)"),
+        ({"start": lambda generator, n: (np.full((n, 1), np.nan), np.zeros((n, 1)))}, "return finite ones"),
+    ],
+)
+def test_what_the_callers_functions_return_is_checked(settings, changes, message):
+    env = RobotVectorEnv(**settings | changes)
+    with pytest.raises(InvalidInput, match=message):
+        env.reset(seed=0), env.step(np.zeros((1, 1)))
+
+
+def test_an_episode_ends_at_the_limits_of_a_joint(settings):
+    env = RobotVectorEnv(2, **settings | {"start": lambda generator, n: (np.full((n, 1), 8.9), np.zeros((n, 1)))})
+    assert env.observation_space.contains(env.reset(seed=0)[0])
+    assert (env.single_observation_space.high == [9.0, 9.0]).all()
+    for _ in range(40):
+        seen, _, over, *_ = env.step(np.array([[5.0], [-5.0]]))
+        assert env.observation_space.contains(seen)
+        if over.any():
+            break
+    assert over.tolist() == [True, False]
 
 
 def test_models_that_have_no_functions_or_are_none(settings, predictor):

@@ -7,7 +7,9 @@ import torch
 
 from forcegp import Dataset, JointFriction, Model, Noise, Robot, fit
 from forcegp.control import MPPI
+from forcegp.control.tracking import usual_integrator
 from forcegp.errors import InvalidInput, NumericalError
+from forcegp.forces import Viscous
 
 MASS, DT, STEPS = 2.0, 0.05, 30
 STATE_COST, TORQUE_COST = np.diag([1.0, 0.1]), 0.01
@@ -90,6 +92,20 @@ def test_without_a_finite_cost_it_raises_or_holds(predictor):
     safe = holding([1.0], [0.0])
     assert torch.equal(holding([6.0], [0.0]), safe)
     assert holding.held == 1
+
+
+@pytest.mark.parametrize(("damping", "wanted"), [(15.0, "rk4"), (15.0 * 1.8, "implicit-midpoint")])
+def test_motions_are_implicit_where_a_step_is_long_beside_the_rates(damping, wanted):
+    """The rate of viscous friction, near .75 and 1.35 per step of .1 s."""
+    model = Model(Robot.from_urdf_text(SLIDER))
+    rng = np.random.default_rng(0)
+    q, v, u = rng.uniform(-2.0, 2.0, (3, 20, 1))
+    rows = Dataset(q=q, v=v, u=u, a=(u - damping * v) / MASS, time=np.arange(20) * 0.1, model=model)
+    forces = (Viscous(damping), JointFriction())
+    posterior = fit(model.with_forces(*forces, noise=Noise(0.01, learn=False)), rows, restarts=1)
+    assert usual_integrator(posterior.predictor(covariance="none"), 0.1) == wanted
+    control = MPPI(posterior.predictor(covariance="none"), cost, dt=0.1, steps=3, torque_limits=9.0)
+    assert control.integrator == wanted
 
 
 @pytest.mark.parametrize(

@@ -130,12 +130,35 @@ def test_the_old_model_can_be_loaded_after_an_overwrite_that_failed(posterior, c
         ({"format_version": 7}, "format version 7, .* reads 1; use the version that wrote it .* or fit again"),
         ({"model": {}}, "incomplete or damaged"),
         ({"settings": 5}, "incomplete or damaged"),
+        ({"settings": {"points": "many"}}, "points is many"),
         ({"result": {"value": "abc"}}, "incomplete or damaged"),
     ],
 )
 def test_a_changed_document_is_refused(run, change, message):
     document = json.loads((run / "model.json").read_text())
     (run / "model.json").write_text(json.dumps(document | change))
+    write_digests(run)
+    with pytest.raises(FileFormatError, match=message):
+        load_posterior(run)
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "message"),
+    [
+        (("gravity",), [0.0, 0.0, 1e300], "gravity 2 is 1e\\+300, more than 1e\\+09 in SI units"),
+        (("gravity",), [0.0, 0.0, 2000.0], "gravity is .*; give m/s"),
+        (("forces", 0, "gain"), 1e300, "forces 0 gain is 1e"),
+        (("noise", "acceleration"), [1e300] * 3, "noise acceleration 0 is 1e"),
+    ],
+)
+def test_numbers_that_no_robot_has_are_refused(run, part, value, message):
+    document = json.loads((run / "model.json").read_text())
+    *holders, last = part
+    holder = document["model"]
+    for key in holders:
+        holder = holder[key]
+    holder[last] = value
+    (run / "model.json").write_text(json.dumps(document))
     write_digests(run)
     with pytest.raises(FileFormatError, match=message):
         load_posterior(run)

@@ -11,28 +11,31 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from typing_extensions import override
 
-from forcegp.control.tracking import per_joint
-from forcegp.errors import InvalidInput, require_type
+from forcegp.control.tracking import per_joint, usual_integrator
+from forcegp.errors import InvalidInput, require_number, require_type
 from forcegp.integration.integrators import check_time_step
 from forcegp.posterior import load_posterior
 from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.predictor import Predictor
 from forcegp.robots.arguments import whole_number
 
+LONGEST = 1.0  # s, of a step
+
 
 class RobotVectorEnv(VectorEnv):
     """`num_envs` robots at once under the learned forces, by `predictor.rollouts`; the task is the caller's.
 
     Observations are [q, v] (num_envs, 2 nv), actions torques u (num_envs, nv) in Nm (N), held for `dt` seconds. An
-    episode that ended, or whose motion diverges (`terminated`, `info["diverged"]`), begins anew with the next step.
+    episode that ended, or whose motion diverges (`terminated`, `info["diverged"]`), begins anew with the next step. It
+    ends as well where a joint leaves the limits of position or velocity that the robot's file states.
 
     * model: a predictor, a posterior, or the folder of one. draw: 0 moves under the mean, k draws k functions from the
       posterior, of which every episode takes one: domain randomisation.
     * reward(q, v, u, q_next, v_next) -> (n,), terminated(q, v) -> (n,), start(generator, n) -> q, v take and return
       arrays of n rows; without them 0, never, and at rest at q = 0. `steps` truncates an episode. torque_limits have to
-      be finite.
+      be finite. integrator: None takes `usual_integrator`; the attribute says which it is.
 
-    Raises InvalidInput for settings that do not fit.
+    Raises InvalidInput for settings that do not fit, and for what the caller's functions return.
     """
 
     def __init__(
@@ -47,7 +50,7 @@ class RobotVectorEnv(VectorEnv):
         reward: Callable[..., np.ndarray] | None = None,
         terminated: Callable[..., np.ndarray] | None = None,
         start: Callable[..., tuple[np.ndarray, np.ndarray]] | None = None,
-        integrator: str = "implicit-midpoint",
+        integrator: str | None = None,
         threads: int | None = 1,
     ) -> None:
         model = load_posterior(model) if isinstance(model, str | Path) else model
@@ -60,14 +63,20 @@ class RobotVectorEnv(VectorEnv):
         self.steps = None if steps is None else whole_number("steps", steps, 1)
         check_time_step(dt)
         self.dt, self.reward, self.terminated, self.start = dt, reward, terminated, start
-        self._how = {"integrator": integrator, "threads": threads}
         robot = self.predictor.posterior.model.robot
         robot.require_vectors("environments")
+        require_number("dt", float(dt), f"one step lasts {LONGEST:g} s at most", below=LONGEST * (1.0 + 1e-9))
+        self.integrator = integrator or usual_integrator(model, dt)
+        self._how = {"integrator": self.integrator, "threads": threads}
         limits = [joint.effort_limit for joint in robot.joints] if torque_limits is None else torque_limits
         self._limits = limits = per_joint("torque_limits", limits, robot.nv).numpy()
         if not limits.any() or not np.isfinite(limits).all():
             raise InvalidInput(f"torque_limits are {limits.tolist()}; give finite ones in Nm or N, not all zero.")
-        self.single_observation_space = Box(-np.inf, np.inf, (2 * robot.nv,), np.float64)
+        # a velocity of 0 is what files say that state none
+        ends = [(joint.lower, joint.upper, joint.velocity_limit or np.inf) for joint in robot.joints]
+        low, high, fastest = np.array(ends, dtype=float).T
+        self._low, self._high = np.append(low, -fastest), np.append(high, fastest)
+        self.single_observation_space = Box(self._low, self._high, dtype=np.float64)
         self.single_action_space = Box(-limits, limits, dtype=np.float64)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -94,8 +103,11 @@ class RobotVectorEnv(VectorEnv):
         if anew.any() or not lasted.all():
             moves = (lasted & ~anew)[:, None]
             self.q, self.v = np.where(moves, q_next, q), np.where(moves, v_next, v)
-        rewards = np.zeros(self.num_envs) if self.reward is None else self.reward(q, v, u, self.q, self.v)
-        over = ~lasted | (False if self.terminated is None else self.terminated(self.q, self.v))
+        rewards, over = np.zeros(self.num_envs), ~lasted | self._beyond(self.q, self.v)
+        if self.reward is not None:
+            rewards = self._one_each("reward", self.reward(q, v, u, self.q, self.v), "fiub", "finite numbers")
+        if self.terminated is not None:
+            over = over | self._one_each("terminated", self.terminated(self.q, self.v), "b", "True or False")
         self.age = self.age + 1
         late = np.zeros(self.num_envs, bool) if self.steps is None else self.age >= self.steps
         if anew.any():
@@ -106,7 +118,15 @@ class RobotVectorEnv(VectorEnv):
 
     def _begin(self, which: np.ndarray) -> None:
         count, nv = int(which.sum()), self.q.shape[1]
-        q, v = (np.zeros((count, nv)),) * 2 if self.start is None else self.start(self.np_random, count)
+        q = v = np.zeros((count, nv))
+        if self.start is not None:
+            q, v = (np.asarray(x) for x in self.start(self.np_random, count))
+            fits = q.shape == v.shape == (count, nv) and {q.dtype.kind, v.dtype.kind} <= {"f", "i"}
+            if not fits or not np.isfinite(q + v).all() or self._beyond(q, v).any():
+                raise InvalidInput(
+                    f"start returned q of shape {q.shape} and v of shape {v.shape}; return finite ones ({count}, {nv}) "
+                    "within the limits of the joints."
+                )
         self.q, self.v, self.age = self.q.copy(), self.v.copy(), np.where(which, 0, self.age)
         self.q[which], self.v[which], self._ended = q, v, np.zeros(self.num_envs, bool)
         if self.draw:
@@ -114,7 +134,18 @@ class RobotVectorEnv(VectorEnv):
             self.function[which] = self.np_random.integers(self.draw, size=count)
 
     def _observed(self) -> np.ndarray:
-        return np.concatenate([self.q, self.v], axis=1)
+        return np.concatenate([self.q, self.v], axis=1).clip(self._low, self._high)
+
+    def _beyond(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Which robots have left the limits of their joints."""
+        x = np.concatenate([q, v], axis=1)
+        return ((x < self._low) | (x > self._high)).any(axis=1)
+
+    def _one_each(self, name: str, given: Any, kinds: str, what: str) -> np.ndarray:
+        values = np.asarray(given)
+        if values.shape != (self.num_envs,) or values.dtype.kind not in kinds or not np.isfinite(values).all():
+            raise InvalidInput(f"{name} returned {given!r:.80}; return {what} ({self.num_envs},), one per robot.")
+        return values
 
     def _moved(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """q, v of all robots after a step, each under its own function."""

@@ -16,6 +16,7 @@ from forcegp.integration.integrators import check_time_step
 from forcegp.model import Model
 from forcegp.posterior.prediction import JointForces, require_actuated
 from forcegp.posterior.predictor import Predictor
+from forcegp.posterior.preparation import rows_for
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, real_tensor, whole_number
 from forcegp.robots.compiled import CompiledRobot
@@ -298,6 +299,31 @@ class HybridForce(TrackingController):
         return self.predictor.inverse_dynamics(q, v_d, a, self.wanted).mean if u is None else u
 
 
+LOOKED_AT, SLOPE, SLOW = 50, 1e-4, 1.0
+"""Training states at which rates are looked at, the change of q and v for them, and the largest rate times a step for
+which rk4 is taken: it diverges beyond 2.8."""
+
+
+def usual_integrator(predictor: Predictor, dt: float) -> str:
+    """rk4 where forces change little within dt seconds, else the implicit midpoint rule, some ten times as slow.
+
+    Rates are the eigenvalues of da/dv and the square roots of those of da/dq, at training states and at rest there.
+    """
+    own = predictor.posterior
+    rows = rows_for(own.training, own.trained, own.model)
+    q, v, u = (x[:: max(1, len(x) // LOOKED_AT)] for x in (rows.q, rows.v, rows.u))
+    q, v, u = torch.cat([q, q]), torch.cat([v, 0.0 * v]), torch.cat([u, u])
+
+    def rate(change: Callable[[Tensor], tuple[Tensor, Tensor]]) -> float:
+        steps = SLOPE * torch.eye(v.shape[1], dtype=v.dtype, device=v.device)
+        ends = [[predictor.mean(*change(sign * step), u) for sign in (1.0, -1.0)] for step in steps]
+        slopes = torch.stack([(high - low) / (2.0 * SLOPE) for high, low in ends], dim=-1)
+        return float(torch.linalg.eigvals(slopes).abs().max())
+
+    fastest = max(rate(lambda x: (q, v + x)), math.sqrt(rate(lambda x: (q + x, v))))
+    return "rk4" if fastest * dt <= SLOW else "implicit-midpoint"
+
+
 Cost = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Costs (...) of whole motions q, v (..., T+1, nv) in rad, rad/s (m, m/s) under torques u (..., T, nv) in Nm (N)."""
 
@@ -320,6 +346,7 @@ class MPPI(Controller):
     * torque_limits: largest absolute torques in Nm (N), a number or one per joint; None takes the efforts of the URDF.
     * noise: largest standard deviation around the plan, None for half the limits; it falls to a twentieth from sequence
       to sequence. on_failure: "raise", or "hold" for the last torque.
+    * integrator: of the motions; None takes `usual_integrator`. The attribute `integrator` says which it is.
 
     Raises InvalidInput for arguments that do not fit, NumericalError where no sequence has a finite cost.
     """
@@ -335,7 +362,7 @@ class MPPI(Controller):
         samples: int = 128,
         noise: Any = None,
         functions: int = 0,
-        integrator: str = "implicit-midpoint",
+        integrator: str | None = None,
         seed: int = 0,
         threads: int | None = 1,
         on_failure: OnFailure = "raise",
@@ -355,7 +382,13 @@ class MPPI(Controller):
         apart = torch.arange(self.steps, dtype=torch.float64)
         self._colour = torch.linalg.cholesky(CORRELATION ** (apart[:, None] - apart).abs())
         self._scales = torch.logspace(math.log10(SMALLEST_SCALE), 0.0, self.samples, dtype=torch.float64)
-        self._how: dict[str, Any] = {"integrator": integrator, "functions": functions, "seed": seed, "threads": threads}
+        self.integrator = integrator or usual_integrator(predictor, self.dt)
+        self._how: dict[str, Any] = {
+            "integrator": self.integrator,
+            "functions": functions,
+            "seed": seed,
+            "threads": threads,
+        }
 
     @override
     def restart(self) -> None:

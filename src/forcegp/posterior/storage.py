@@ -31,7 +31,7 @@ RESULT = {"value": float, "history": tuple, "status": str, "converged": bool, "e
 """What is stored of a search."""
 ROWS = ("q", "v", "u", "a")
 SETTINGS: dict[str, tuple[int | str, ...]] = {
-    **dict.fromkeys(("widening", "correlated_rows", "rows_added"), ()),
+    **dict.fromkeys(("widening", "correlated_rows", "rows_added", "points", "learning_points"), ()),
     "data.episodes": ("episodes",),
     "hidden_force": ("nv",),
     "motion_intervals.horizons": ("horizons",),

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import RobotFileWarning, usable_arguments
+from forcegp.errors import InvalidInput, RobotFileWarning, require_plausible, usable_arguments
 from forcegp.robots.arguments import (
     JointValues,
     Positions,
@@ -46,6 +46,7 @@ from forcegp.robots.urdf_file import (
 )
 
 GRAVITY = (0.0, 0.0, -9.81)
+STRONGEST_GRAVITY = 1000.0  # m/s^2; the Sun has 274
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -159,6 +160,8 @@ class Robot(RobotStructure, RigidBodyDynamics):
         named = problems.given | {"locked": locked, "inertias": inertias if inertias != "strict" else None}
         problems.given = {name: value for name, value in named.items() if value}
         down, robot = finite_vector("gravity", gravity, 3), None
+        if np.linalg.norm(down) > STRONGEST_GRAVITY:
+            raise InvalidInput(f"gravity is {gravity!r}; give m/s^2, {STRONGEST_GRAVITY:g} at most.")
         description = parse_urdf(text, problems)
         if not description.complete:  # nothing can be said of a tree that lacks joints
             problems.raise_all()
@@ -184,7 +187,8 @@ class Robot(RobotStructure, RigidBodyDynamics):
 
     @classmethod
     def from_stored(cls, stored: Mapping[str, Any]) -> "Robot":
-        """The robot that :meth:`to_stored` gave."""
+        """The robot that :meth:`to_stored` gave, in what `Model.to_dict` gave. ValueError for implausible numbers."""
+        require_plausible(stored)
         return cls._again(stored["urdf"], "stored URDF", stored)
 
     @classmethod

@@ -11,7 +11,7 @@ import numpy as np
 from defusedxml import DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden
 from defusedxml import ElementTree as SafeElementTree
 
-from forcegp.errors import RobotModelError
+from forcegp.errors import LARGEST, RobotModelError
 from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import rotation_from_rpy, transform
 
@@ -217,6 +217,8 @@ class _Part:
         value = self.parsed(text, what)
         if math.isnan(value) or (default == 0.0 and negative and math.isinf(value)):
             raise RobotModelError(f"{self}: {what} is {'NaN' if math.isnan(value) else 'inf'}; give a finite number.")
+        if negative and default == 0.0 and value > LARGEST:
+            raise RobotModelError(f"{self}: {what} is {value:g}, more than {LARGEST:g} in SI units; correct it.")
         if negative and value < 0.0:
             self.problems.note(f"a negative {what} is taken as {negative}", self.owner)
             return default
