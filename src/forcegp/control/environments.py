@@ -139,7 +139,7 @@ class RobotVectorEnv(VectorEnv):
     def _beyond(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Which robots have left the limits of their joints."""
         x = np.concatenate([q, v], axis=1)
-        return ((x < self._low) | (x > self._high)).any(axis=1)
+        return np.any((x < self._low) | (x > self._high), axis=1)
 
     def _one_each(self, name: str, given: Any, kinds: str, what: str) -> np.ndarray:
         values = np.asarray(given)
