@@ -114,7 +114,7 @@ def workflow(repository, name):
 
 @pytest.mark.parametrize("name", ["checks", "nightly", "release"])
 def test_workflows_run_what_there_is(repository, name):
-    """Every step either uses an action of a version, or runs; every target of make exists."""
+    """Every step either uses an action of one commit, or runs; every target of make exists."""
     content = workflow(repository, name)
     assert set(content) >= {"name", True, "permissions", "jobs"}  # YAML 1.1 reads the key `on` as True
     assert content["permissions"] == {"contents": "read"}
@@ -123,7 +123,7 @@ def test_workflows_run_what_there_is(repository, name):
         assert job["timeout-minutes"] <= 360
         for step in job["steps"]:
             assert ("uses" in step) != ("run" in step)
-            assert re.fullmatch(r"[\w-]+/[\w-]+@(v\d+|release/v1)", step.get("uses", "a/b@v1"))
+            assert re.fullmatch(r"[\w-]+/[\w-]+@[0-9a-f]{40}", step.get("uses", "a/b@" + "0" * 40))
             assert set(re.findall(r"^make ([a-z-]+)", step.get("run", ""), re.M)) <= targets
 
 
@@ -132,7 +132,15 @@ def test_releases_are_published_without_a_secret_and_only_from_tags(repository):
     assert content[True] == {"push": {"tags": ["v*"]}}
     publish = content["jobs"]["publish"]
     assert publish["permissions"] == {"id-token": "write"}
-    assert publish["needs"] == "build"
+    assert publish["needs"] == ["check", "wheel", "try"]
+    installs = [step["run"] for step in content["jobs"]["wheel"]["steps"] if "install" in step.get("run", "")]
+    assert installs == [
+        "python -m pip install --require-hashes --only-binary :all: -r .github/release-requirements.txt"
+    ]
+    pinned = (repository / ".github" / "release-requirements.txt").read_text()
+    assert len(re.findall(r"^[\w-]+==", pinned, re.M)) <= pinned.count("--hash=sha256:")
+    made = project(repository)["build-system"]["requires"]
+    assert all(re.search(rf"^{re.split('[<>=]', each)[0]}==", pinned, re.M) for each in made)
     assert "secrets." not in (repository / ".github/workflows/release.yml").read_text()
 
 

@@ -59,3 +59,14 @@ def test_version_and_help_through_the_module(installed):
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert all(re.search(rf"^\W*{command}\s", done.stdout, re.M) for command in COMMANDS)
+
+
+def test_an_environment_that_libraries_do_not_take_is_one_sentence(tmp_path):
+    words = [sys.executable, "-m", "forcegp", "robot", "no.urdf"]
+    how = {"cwd": tmp_path, "capture_output": True, "text": True, "check": False}
+    done = subprocess.run(words, env={**os.environ, "SOURCE_DATE_EPOCH": "x"}, **how)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "forcegp: SOURCE_DATE_EPOCH is 'x'; give whole seconds, or unset it.\n"
+    done = subprocess.run(words, env={**os.environ, "PYTHONWARNINGS": "error"}, **how)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "no such file" in done.stderr

@@ -5,6 +5,7 @@ import sys
 from xml.etree import ElementTree
 
 import numpy as np
+import pinocchio
 import pytest
 import torch
 from hypothesis import given
@@ -16,6 +17,7 @@ from tests.robots.test_mimic import CHAIN_MIMICS, with_mimics
 from tests.robots.test_urdf_errors import SMALL
 
 from forcegp.errors import (
+    LARGEST,
     MissingExtra,
     NonPhysicalInertia,
     RobotFileWarning,
@@ -181,3 +183,26 @@ def test_a_frame_without_mass_loses_its_inertia():
 def test_an_impossible_mass_is_not_mended(mass, why):
     with pytest.raises(NonPhysicalInertia, match=why):
         Robot.from_urdf_text(URDF.format(mass=mass, ixx=0.02), inertias="nearest")
+
+
+def test_written_files_have_the_limits_without_which_others_refuse_them(tmp_path):
+    """Of joints for which the file states none or half of them: urdfdom, by which Pinocchio reads, needs all."""
+    inertia = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    link = f'<link name="{{}}"><inertial><mass value="1"/>{inertia}</inertial></link>'
+    joint = '<joint name="j{0}" type="{1}"><parent link="l{0}"/><child link="l{2}"/><axis xyz="0 1 0"/>{3}</joint>'
+    kinds = [("revolute", ""), ("revolute", '<limit lower="-1" upper="2"/>'), ("prismatic", '<limit effort="5"/>')]
+    text = "".join(link.format(f"l{k}") for k in range(4))
+    text += "".join(joint.format(k, kind, k + 1, limit) for k, (kind, limit) in enumerate(kinds))
+    robot = Robot.from_urdf_text(f'<robot name="r">{text}</robot>')
+    with pytest.raises(ValueError, match=r"."):
+        pinocchio.buildModelFromXML(robot.urdf_text)
+    robot.to_urdf(tmp_path / "r.urdf")
+    model = pinocchio.buildModelFromUrdf(str(tmp_path / "r.urdf"))
+    again = Robot.from_urdf(tmp_path / "r.urdf")
+    assert model.upperPositionLimit.tolist() == [LARGEST, 2.0, LARGEST]
+    for one, other in zip(robot.joints, again.joints, strict=True):
+        assert all(
+            getattr(one, name) == getattr(other, name) for name in ("lower", "upper", "velocity_limit", "effort_limit")
+        )
+    assert again.joints[0].effort_limit == math.inf
+    assert again.joints[2].effort_limit == 5.0

@@ -53,6 +53,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"forcegp {__version__}")
         return OK
     debug, command = "--debug" in given, None
+    if arguments is None and sys.warnoptions:  # -W and PYTHONWARNINGS: what a library calls is no error of its user
+        warnings.resetwarnings()
+        warnings.simplefilter("ignore", DeprecationWarning)
+    if not (epoch := os.environ.get("SOURCE_DATE_EPOCH", "0")).isdigit():  # which libraries read when imported
+        return _fail(f"SOURCE_DATE_EPOCH is {epoch!r}; give whole seconds, or unset it.", USER_ERROR, debug)
     showwarning, terminate = warnings.showwarning, None
     with contextlib.suppress(ValueError):  # not in the main thread
         # so that temporary files are removed then, too

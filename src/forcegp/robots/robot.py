@@ -41,6 +41,7 @@ from forcegp.robots.urdf_file import (
     with_armature,
     with_chosen_inertias,
     with_joint_values,
+    with_limits,
     with_note,
     write_text,
 )
@@ -256,15 +257,17 @@ class Robot(RobotStructure, RigidBodyDynamics):
     def to_urdf(self, path: str | Path | None = None) -> str:
         """The URDF text, written to ``path`` if given, with a RobotFileWarning about rotor inertias.
 
-        They are attributes ``armature`` of ``<dynamics>``, which other programs leave out.
+        They are attributes ``armature`` of ``<dynamics>``, which other programs leave out. Joints have the limits
+        without which urdfdom refuses a file: ``LARGEST`` where the robot's file states none.
         """
         if rotors := [joint.name for joint in self.joints if joint.armature]:
             source, owners = self.source if path is None else Path(path).name, ", ".join(rotors)
             seen = f"{source}: only forcegp reads rotor inertias from URDF, those of {owners}; give them to others."
             warnings.warn(seen, RobotFileWarning, stacklevel=2)
+        text = with_limits(self.urdf_text)
         if path is not None:
-            write_text(self.urdf_text, Path(path))
-        return self.urdf_text
+            write_text(text, Path(path))
+        return text
 
     @usable_arguments("Robot.to_mjcf")
     def to_mjcf(self, path: str | Path | None = None, loops: Sequence[LoopDescription] = ()) -> str:

@@ -96,7 +96,10 @@ class Mimic:
 
 @dataclass(frozen=True)
 class Joint:
-    """One ``<joint>``. Positions in rad or m, velocities per s, efforts in Nm or N; missing limits are infinite."""
+    """One ``<joint>``. Positions in rad or m, velocities per s, efforts in Nm or N.
+
+    Limits that are missing, or of `LARGEST` and beyond, are infinite.
+    """
 
     name: str
     type: str  # 'revolute' | 'continuous' | 'prismatic', of a file also 'fixed' and 'floating'
@@ -319,10 +322,10 @@ def _joint(at: _Part, name: str, links: dict[str, InertialDescription | None]) -
         child=ends["child"],
         origin=origin,
         axis=tuple((axis / length).tolist()) if directed else (1.0, 0.0, 0.0),
-        lower=lower,
-        upper=upper,
-        velocity_limit=limit.number("velocity", math.inf, "no limit"),
-        effort_limit=limit.number("effort", math.inf, "no limit"),
+        lower=lower if lower > -LARGEST else -math.inf,
+        upper=upper if upper < LARGEST else math.inf,
+        velocity_limit=fastest if (fastest := limit.number("velocity", math.inf, "no limit")) < LARGEST else math.inf,
+        effort_limit=most if (most := limit.number("effort", math.inf, "no limit")) < LARGEST else math.inf,
         damping=dynamics.number("damping", 0.0, "none"),
         friction=dynamics.number("friction", 0.0, "none"),
         armature=dynamics.number("armature", 0.0, "none") if kind in MOVABLE else 0.0,

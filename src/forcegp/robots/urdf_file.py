@@ -10,7 +10,7 @@ from defusedxml import minidom
 from jaxtyping import Float
 
 from forcegp.atomic_files import write_bytes
-from forcegp.errors import InvalidInput, NonPhysicalInertia, RobotModelError, UnknownName, required_extra
+from forcegp.errors import LARGEST, InvalidInput, NonPhysicalInertia, RobotModelError, UnknownName, required_extra
 from forcegp.robots.arguments import Problems, Vector, by_joint, finite_vector
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import Layout
@@ -124,6 +124,24 @@ def with_armature(
     for name, value in ((joints[k], values[k]) for k in free if values[k]):
         raise InvalidInput(f"armature of joint {name!r} is {value:g}; a base that moves has no rotors, give 0.")
     return with_joint_values(text, layout, {"armature": values.tolist()}, source=source)
+
+
+def with_limits(text: str) -> str:
+    """URDF text whose joints have the limits that urdfdom needs: `LARGEST`, which reads as none, where it has none."""
+    document, lacking = _document(text), False
+    for joint in document.documentElement.childNodes:
+        bounded = joint.nodeName == "joint" and joint.getAttribute("type") in ("revolute", "prismatic")
+        if not bounded:
+            continue
+        limit = _child(joint, "limit") or joint.appendChild(document.createElement("limit"))
+        ends = (
+            {} if limit.hasAttribute("lower") or limit.hasAttribute("upper") else {"lower": -LARGEST, "upper": LARGEST}
+        )
+        for name, value in {**ends, "effort": LARGEST, "velocity": LARGEST}.items():
+            if not limit.hasAttribute(name):
+                limit.setAttribute(name, f"{value:g}")
+                lacking = True
+    return _written(document) if lacking else text
 
 
 def with_note(text: str, note: str) -> str:
