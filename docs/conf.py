@@ -27,6 +27,7 @@ html_theme = "furo"
 html_math_renderer = "mathml"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_favicon = "_static/favicon.svg"
 html_title = f"forcegp {release}"
 exclude_patterns = ["_extensions", "_static"]
 
