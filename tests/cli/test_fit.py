@@ -135,7 +135,7 @@ WRONG = [
     ("--forces gp:joint --evidence torques", "functions are learned from accelerations"),
     ("--forces viscous --evidence acceleration", "did you mean 'accelerations'?"),
     ("--evidence torques,accelerations --forces viscous", "the same rows twice"),
-    ("--forces gp:independent --evidence motions:1", "motions refine physics, and gp:independent has none"),
+    ("--forces gp:independent --evidence motions:1", "motions refine numbers of laws and bodies"),
     ("--forces gp:joint --baseline arm.h5", "a baseline is for payloads"),
     ("--jobs 0", "jobs is 0; give"),
     ("--engine fast", "engine"),

@@ -1,15 +1,13 @@
 """Refinement on recorded motions where the base moves: derivatives, what is recovered, and turns of the world."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 from tests.fit.test_motion_fit import refined
 from tests.posterior import floating_arm
 
-from forcegp import Dataset, JointFriction
-from forcegp.data.views import all_motions, recorded_motions
+from forcegp import Dataset
+from forcegp.data.views import all_motions
 from forcegp.fit import fit as fit_model
 from forcegp.fit.motion_fit import MotionFit
 from forcegp.fit.motion_unknowns import Unknowns
@@ -30,7 +28,7 @@ def test_derivatives_in_every_unknown_and_start(switched):
     """Of whitened residuals by finite differences, away from the recorded motions."""
     log = floating_arm.recording(3, 0.5, floating_arm.satellite())
     log = with_switch(log) if switched else log
-    posterior = fit_model(log.model.with_forces(JointFriction(("shoulder",))), log, points=20, restarts=1)
+    posterior = fit_model(log.model, log, points=20, restarts=1)
     unknowns = Unknowns.of(posterior, log, True)
     recorded, stride = all_motions(log, 0.16, 0.04)
     assert stride == 2
@@ -69,25 +67,3 @@ def test_friction_and_mass_are_recovered_in_any_axes_of_the_world():
     masses = [[better.model.robot.link(name).mass for name in ("hull", "arm")] for better in fits]
     assert sum(masses[0]) == pytest.approx(10.0, rel=0.01)
     assert masses[1] == pytest.approx(masses[0], rel=1e-4)
-
-
-@pytest.mark.nightly
-def test_functions_are_refined_too():
-    """Friction that no law describes, from accelerations that are far off."""
-    given = floating_arm.satellite()
-    train, test = (floating_arm.recording(seed, 2.0, given) for seed in (1, 2))
-    noisy = train.a + np.random.default_rng(0).standard_normal(train.a.shape)
-    rough = fit_model(
-        given.with_forces(JointFriction(("shoulder",))),
-        replace(train, a=noisy, noise_std=[1.0] * 7, truth={}),
-        points=60,
-        restarts=1,
-    )
-    better = refined(rough, train, 0.5, bodies=False)
-    there = recorded_motions(test, 10, 0.5)
-    errors = []
-    for posterior in (rough, better):
-        moved = posterior.rollout(there.q[:, 0], there.v[:, 0], there.u, there.dt, integrator="rk4")
-        off = given.robot.difference(moved.q[:, -1], torch.tensor(there.q[:, -1]))
-        errors.append(float(off.square().mean().sqrt()))
-    assert errors[1] < 0.2 * errors[0]

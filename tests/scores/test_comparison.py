@@ -6,7 +6,7 @@ import shutil
 from dataclasses import fields
 
 import pytest
-from tests.fit.test_motion_fit import bump, recording
+from tests.fit.test_motion_fit import line, recording
 from tests.scores.moving_arm import given_system, moving_arm
 
 from forcegp import JointForces, JointFriction, score
@@ -172,6 +172,7 @@ def test_folders_of_others_are_not_touched(data, tmp_path):
         (("gp:joint@measured",), {}, "no evidence 'measured'"),
         (("identified+viscous",), {}, "`identified` has its laws already"),
         (("given@motions:1",), {}, "nothing to refine on motions"),
+        (("identified+gp:joint@motions:1",), {}, "the model has unknown forces"),
         (("given",), {"seeds": 0}, "seeds=0"),
         (("given",), {"points": 1000}, "two thirds"),
         (("given",), {"restarts": 0}, "restarts is 0"),
@@ -187,11 +188,11 @@ def test_what_makes_no_sense_is_refused_before_anything_is_written(data, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
-NAMES = "identified+gp:joint-friction", "identified+gp:joint-friction@motions:.5"
+NAMES = "identified", "identified@motions:.5"
 
 
 def test_models_refined_on_motions_move_better_and_laws_stand_side_by_side():
-    data = recording(bump, 1, seconds=8.0)
+    data = recording(line, 1, seconds=8.0)
     dry, viscous = "bodies+viscous+coulomb", "bodies+viscous+coulomb:0"
     how = {"points": 60, "horizons": (0.25, 0.5), "starts": 6, "restarts": 1, "seeds": 1}
     scores = score((*NAMES, dry, viscous), data, split="blocks:4:2,4", **how)

@@ -119,5 +119,5 @@ def test_laws_are_refined_on_motions_and_a_short_log_says_why_intervals_are_not_
     same, why = with_intervals_of_motions(posterior, recorded.rows(slice(20)))
     assert same is posterior
     assert why.startswith("intervals of motions are not calibrated: ")
-    with pytest.raises(InvalidInput, match="gp:independent has none"):
+    with pytest.raises(InvalidInput, match="the model has unknown forces"):
         learn(model.black_box(), recorded, [Motions(0.5)])

@@ -66,7 +66,8 @@ class Fit(Command):
     For example:
       forcegp fit train.h5 --points 100 --out run
       forcegp fit log.h5 --forces bodies,viscous,coulomb,offset,rotor --out identified
-      forcegp fit log.h5 --identified identified --forces gp:joint-friction --evidence accelerations,motions:1 --out run
+      forcegp fit log.h5 --forces viscous,coulomb,rotor --evidence torques,motions:1 --out refined
+      forcegp fit log.h5 --identified identified --forces gp:joint-friction --out run
       forcegp fit train.h5 --forces gp:independent --points 100 --out baseline
     """
 

@@ -70,8 +70,7 @@ class Torques(Evidence):
 class Motions(Evidence):
     """Recorded positions over windows of so many `seconds`, which refine what other evidence found.
 
-    Forces, the bodies of the robot with `bodies`, and unknown functions, from q and u of each row, and v where windows
-    begin.
+    Laws, and the bodies of the robot with `bodies`, from q and u of each row, and v where windows begin.
     """
 
     name: ClassVar[str] = "motions"
@@ -83,6 +82,15 @@ class Motions(Evidence):
     @usable_arguments("Motions")
     def __post_init__(self) -> None:
         require_number("Motions seconds", self.seconds, "give the length of windows in s, a positive number")
+
+    @staticmethod
+    def refuse(unknown_forces: Sequence[object]) -> None:
+        """Raise InvalidInput where there are unknown forces: these learn from accelerations."""
+        if unknown_forces:
+            raise InvalidInput(
+                "motions refine numbers of laws and bodies, and the model has unknown forces, which learn from "
+                "accelerations; refine the laws first, and learn the forces beside them without motions."
+            )
 
 
 @dataclass(frozen=True)

@@ -288,17 +288,16 @@ class MarginalLikelihood:
         parameters: Mapping[str, Tensor],
         engine: Engine | None = None,
         *,
-        start: Tensor | None = None,
         at_parameters: bool = False,
     ) -> LatentPosterior:
-        """The posterior of the latent functions at fixed parameters; `start` as for `Engine.condition`.
+        """The posterior of the latent functions at fixed parameters.
 
         Kernels that are `at_parameters` hold them already, and are not copied.
         """
         kernels = kernels if at_parameters else kernels.at(parameters)
         with torch.no_grad():
             terms = self.terms(parameters)
-            return (engine or Exact()).condition(kernels, terms, start=start)
+            return (engine or Exact()).condition(kernels, terms)
 
     @property
     def noise(self) -> Noise:

@@ -194,6 +194,8 @@ def _chosen(
             "motions beside them if these shall refine it."
         )
     refinement = motions[0] if motions else None
+    if refinement is not None:
+        refinement.refuse(start.trained.unknown_forces if isinstance(start, Posterior) else model.unknown_forces)
     if isinstance(start, Posterior) and (refinement is None or others):
         raise InvalidInput("start is a posterior; it is refined by Motions() alone: give that as the evidence.")
     if others:

@@ -1,9 +1,9 @@
-"""What moves is what is fitted: laws, inertias and latent functions refined on recorded positions.
+"""What moves is what is fitted: laws and inertias refined on recorded positions.
 
-    1/2 sum_kij (q_kij - q_ij(x_k, p))^2 / (tau_j sigma_j^2) + 1/2 |w|^2 + 1/2 |prior(p)|^2 + 1/2 sum_k |x_k - x_k0|^2
+    1/2 sum_kij (q_kij - q_ij(x_k, p))^2 / (tau_j sigma_j^2) + 1/2 |prior(p)|^2 + 1/2 sum_k |x_k - x_k0|^2
 
-over initial states x_k of windows, numbers p and weights w of the functions; tau_j is how many rows one independent
-residual is worth. Gauss-Newton; initial states are eliminated window by window; the covariance is Laplace's.
+over initial states x_k of windows and numbers p; tau_j is how many rows one independent residual is worth.
+Gauss-Newton; initial states are eliminated window by window; the covariance is Laplace's.
 """
 
 import math
@@ -17,11 +17,9 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.data.views import RecordedMotions, all_motions
-from forcegp.errors import InvalidInput, NonPhysicalInertia, NumericalError
+from forcegp.errors import NonPhysicalInertia, NumericalError
 from forcegp.evidence.least_squares import correlation_time
-from forcegp.fit.motion_unknowns import SCALES, Unknowns
-from forcegp.inference.engines import InducingWeights
-from forcegp.inference.likelihood import factorize
+from forcegp.fit.motion_unknowns import Unknowns
 from forcegp.integration.midpoint_sensitivities import WindowMotions, window_motions
 from forcegp.model import Model
 from forcegp.posterior import Posterior
@@ -42,10 +40,6 @@ MOST_DAMPING = 1e6
 """Beyond it steps are too small to matter."""
 SETTLED = 0.02
 """Relative change of the noise that ends the rounds."""
-SUPPORT = 15.0
-"""Nats of evidence below which a function is left out: three times what counts as decisive (Kass & Raftery, "Bayes
-factors", JASA 1995), for how many rows are independent is known to a factor. Where laws were all there was, functions
-had up to 12 in ten simulated logs; where there was more, a million."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +164,7 @@ class MotionFit:
     def step(self, x: Tensor, N: Tensor, right: Tensor) -> Float[Tensor, " P"]:
         """The change that solves N dx = right. Coordinates that it would take beyond their limits end there.
 
-        All others are solved for again, given those, for with latent functions beside them they depend on each other.
+        All others are solved for again, given those, for they depend on each other.
         """
         low, high, longest = self.unknowns.limits
         free, dx = torch.ones_like(x, dtype=torch.bool), torch.zeros_like(x)
@@ -201,8 +195,8 @@ class MotionFit:
                 here = there
         return here, damping
 
-    def solved(self, x: Tensor) -> tuple["MotionFit", _Point, Tensor, Tensor]:
-        """The minimum that is reached from x, the noise and sigma that residuals have there, and the scales of weights.
+    def solved(self, x: Tensor) -> tuple[_Point, Tensor, Tensor]:
+        """The minimum that is reached from x, the noise and sigma that residuals have there.
 
         Raises NumericalError where no motion is found near the recorded one.
         """
@@ -214,25 +208,13 @@ class MotionFit:
                 "model that fits the accelerations better."
             )
         sigma, noise = self.noise(here.motions)
-        fit = self
         for number in range(ROUNDS):
             tell(number, ROUNDS, f"all rows, rms of q {float(sigma.square().mean().sqrt()):.3g}")
-            here, damping = fit.minimized(here, noise, sigma, damping)
-            before, (sigma, noise) = torch.cat([noise, fit.unknowns.scales]), self.noise(here.motions)
-            if fit.unknowns.weights.count:
-                N, *_ = fit.curvature(here, noise, sigma)
-                fit = replace(fit, unknowns=fit.unknowns.rescaled(here.x, N))
-            if bool(((torch.cat([noise, fit.unknowns.scales]) - before).abs() <= SETTLED * before).all()):
+            here, damping = self.minimized(here, noise, sigma, damping)
+            before, (sigma, noise) = noise, self.noise(here.motions)
+            if bool(((noise - before).abs() <= SETTLED * before).all()):
                 break
-        if not fit.unknowns.weights.count:
-            return fit, here, noise, sigma
-        N, *_ = fit.curvature(here, noise, sigma)
-        weak = fit.unknowns.support(here.x, N) < SUPPORT
-        if bool(weak.any()):
-            scales = torch.where(weak, SCALES[0], fit.unknowns.scales)
-            fit = replace(fit, unknowns=replace(fit.unknowns, scales=scales))
-            here, _ = fit.minimized(here, noise, sigma, damping)
-        return fit, here, noise, sigma
+        return here, noise, sigma
 
     def noise(self, motions: WindowMotions) -> tuple[Tensor, Tensor]:
         """sigma_j, and sigma_j sqrt(tau_j) with tau_j the rows that an independent residual is worth."""
@@ -247,58 +229,27 @@ class MotionFit:
 def refine_on_motions(
     posterior: Posterior, dataset: Dataset, seconds: float, bodies: bool, stated: Model | None = None
 ) -> Posterior:
-    """Known laws, bodies and latent functions fitted to the recorded positions, beginning from this posterior.
+    """Known laws and bodies fitted to the recorded positions, beginning from this posterior.
 
     Numbers that the laws of `stated` know by a standard deviation of 0 stay.
     Raises InvalidInput for models without physics, windows that no episode has room for and uneven steps,
     NumericalError where no motion is found near the recorded one.
     """
     require_unobserved(posterior, "refinements on motions")
-    if posterior.carries_known_forces:
-        raise InvalidInput(
-            "the model has no rigid bodies in its mean, so its processes hold gravity and inertia, which motions of "
-            "seconds do not tell; give it RigidBodies()."
-        )
     seen = in_own_air(posterior, dataset)
     if seen is not dataset:
         posterior = posterior.with_model(seen.model)
     recorded, stride = all_motions(seen, seconds, STEP)
-    unknowns = Unknowns.of(posterior, seen, bodies, stated)
-    found = _refined(*MotionFit(recorded, stride, unknowns).solved(unknowns.first), seconds, bodies)
-    return found if seen is dataset else replace(found, target=unobserved(found.model))
-
-
-def _refined(fit: MotionFit, here: _Point, noise: Tensor, sigma: Tensor, seconds: float, bodies: bool) -> Posterior:
-    """The posterior there, with the covariance of the weights and of the numbers."""
-    N, *_ = fit.curvature(here, noise, sigma)
-    unknowns = fit.unknowns
-    (x, _), others = unknowns.split(here.x), unknowns.sizes[0]
-    weights = replace(unknowns.weights, mean=here.x[others:])
-    if weights.count:
-        marginal = N[others:, others:]
-        if others:
-            marginal = marginal - N[others:, :others] @ torch.linalg.solve(N[:others, :others], N[:others, others:])
-        weights = replace(weights, precision=factorize((0.5 * (marginal + marginal.mT)).clone))
-    found = unknowns.posterior(here.x, weights)
-    engine = found.engine if not weights.count else InducingWeights(tuple(len(z) for z in weights.points))
-    told = {
-        "seconds": seconds,
-        "bodies": bodies,
-        "windows": len(fit.recorded.rows),
-        "step": fit.h,
-        "rms": sigma.tolist(),
-        "scales": unknowns.scales.tolist(),
-        "not_told": [
-            name for name, s in zip(found.latent_names, unknowns.scales, strict=True) if float(s) <= SCALES[0]
-        ],
-    }
-    estimates = found.estimates
-    if others:
-        space, covariance = unknowns.space, torch.linalg.inv(N)[:others, :others].cpu().numpy()
-        prior = space.prior(x)[1]
+    fit = MotionFit(recorded, stride, Unknowns.of(posterior, seen, bodies, stated))
+    here, noise, sigma = fit.solved(fit.unknowns.first)
+    found, estimates, space = fit.unknowns.posterior(here.x), posterior.estimates, fit.unknowns.space
+    told = {"seconds": seconds, "bodies": bodies, "windows": len(recorded.rows), "step": fit.h, "rms": sigma.tolist()}
+    if space.size:
+        covariance = torch.linalg.inv(fit.curvature(here, noise, sigma)[0]).numpy()
+        x, prior = here.x.numpy(), fit.unknowns.prior(here.x)[1].numpy()
         estimates = Estimates.of_covariance(
             space.parameters, space.numbers(x), space.number_slopes(x), covariance, prior,
-            evidence=f"motions of {seconds:g} s", rows=fit.recorded.q.shape[0] * fit.recorded.q.shape[1],
+            evidence=f"motions of {seconds:g} s", rows=recorded.q.shape[0] * recorded.q.shape[1],
         )  # fmt: skip
-    found = replace(found, engine=engine, estimates=estimates)
-    return found.with_settings(motions=told, engine=engine.to_dict(), widening=1.0)
+    found = replace(found, estimates=estimates).with_settings(motions=told)
+    return found if seen is dataset else replace(found, target=unobserved(found.model))

@@ -9,13 +9,12 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, require_known, require_number, usable_arguments
 from forcegp.inference.dense_kernels import LatentKernels
-from forcegp.inference.inducing import InducingPosterior, WeightSpace
-from forcegp.inference.likelihood import CholeskyFactor, Terms
+from forcegp.inference.inducing import InducingPosterior
+from forcegp.inference.likelihood import Terms
 from forcegp.inference.memory import USABLE, free_memory, gib, require_memory
 from forcegp.inference.posterior import ExactPosterior, LatentPosterior
 
@@ -67,8 +66,8 @@ class Engine(ABC):
         """Memory that conditioning on so many rows takes at least."""
 
     @abstractmethod
-    def condition(self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None) -> LatentPosterior:
-        """The posterior given the data; `start` is an earlier `solution` of the same engine.
+    def condition(self, kernels: LatentKernels, terms: Terms) -> LatentPosterior:
+        """The posterior given the data.
 
         Raises NotEnoughMemory before anything large is allocated, NumericalError where the engine fails.
         """
@@ -76,10 +75,6 @@ class Engine(ABC):
     def require_memory(self, size: ProblemSize, device: torch.device) -> None:
         """Raise NotEnoughMemory where conditioning needs more memory than is free."""
         require_memory(self.required_bytes(size), f"engine {self.name!r} on N={size.rows} rows", self.remedy, device)
-
-    def solution(self, posterior: LatentPosterior) -> Tensor | None:
-        """What makes conditioning again cheap, to be stored with a model; None where nothing does."""
-        return None
 
     def to_dict(self) -> dict[str, Any]:
         """Name and settings as plain JSON values."""
@@ -102,7 +97,7 @@ class Exact(Engine):
         return self.required_bytes(size) + 24 * size.latents * size.rows**2
 
     @override
-    def condition(self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None) -> LatentPosterior:
+    def condition(self, kernels: LatentKernels, terms: Terms) -> LatentPosterior:
         self.require_memory(ProblemSize.of(terms), terms.W.device)
         return ExactPosterior.condition(kernels, terms)
 
@@ -130,46 +125,12 @@ class Inducing(Engine):
         return 8 * (3 * weights**2 + 20_000 * self.points + 12 * size.rows * size.latents * size.outputs)
 
     @override
-    def condition(self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None) -> LatentPosterior:
+    def condition(self, kernels: LatentKernels, terms: Terms) -> LatentPosterior:
         self.require_memory(ProblemSize.of(terms), terms.W.device)
         return InducingPosterior.condition(kernels, terms, points=self.points, tolerance=self.tolerance)
 
 
-@dataclass(frozen=True)
-class InducingWeights(Engine):
-    """Weights of inducing points that were found elsewhere, as from motions: `points` of each latent.
-
-    Rows cannot be conditioned on by it: places, means and precision are stored with the model.
-    """
-
-    name: ClassVar[str] = "inducing-weights"
-    remedy: ClassVar[str] = "refine a model with fewer inducing points"
-    points: tuple[int, ...] = ()
-
-    @override
-    def required_bytes(self, size: ProblemSize) -> int:
-        return 16 * sum(self.points) ** 2
-
-    @override
-    def condition(self, kernels: LatentKernels, terms: Terms, *, start: Tensor | None = None) -> LatentPosterior:
-        sizes = [count * z.shape[-1] for count, z in zip(self.points, terms.features, strict=True)]
-        count = sum(self.points)
-        if start is None or start.numel() != sum(sizes) + count + count**2:
-            raise InvalidInput(
-                "a model refined on motions is conditioned on them, not on rows; fit again, and refine again."
-            )
-        *places, mean, lower = start.split([*sizes, count, count**2])
-        shaped = [z.view(n, like.shape[-1]) for z, n, like in zip(places, self.points, terms.features, strict=True)]
-        return InducingPosterior(kernels, WeightSpace.at(kernels, shaped, CholeskyFactor(lower.view(count, -1)), mean))
-
-    @override
-    def solution(self, posterior: LatentPosterior) -> Tensor | None:
-        assert isinstance(posterior, InducingPosterior)
-        space = posterior.space
-        return torch.cat([*(z.flatten() for z in space.points), space.mean, space.precision.lower.tril().flatten()])
-
-
-ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Exact, Inducing, InducingWeights)}
+ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Exact, Inducing)}
 
 
 @dataclass(frozen=True)
@@ -197,7 +158,7 @@ def engine_from_dict(stored: object) -> Engine:
         raise InvalidInput(f"stored engine {stored!r} is not a name with settings; there are {', '.join(ENGINES)}")
     kind = ENGINES.get(str(stored.get("name")))
     known = {field.name for field in fields(kind)} if kind is not None else set()  # type: ignore[arg-type]  # a dataclass
-    settings = {name: tuple(x) if isinstance(x, list) else x for name, x in stored.items() if name != "name"}
+    settings = {name: x for name, x in stored.items() if name != "name"}
     if kind is None or not set(settings) <= known:
         raise InvalidInput(f"stored engine {dict(stored)!r} is unknown; there are {', '.join(ENGINES)}")
     return kind(**settings)

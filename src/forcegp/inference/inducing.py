@@ -78,7 +78,11 @@ class WeightSpace:
         t: Float[Tensor, "N r"],
     ) -> "WeightSpace":
         """Condition on all rows; time O(N P^2). Raises NumericalError where the points cannot be factorised."""
-        prior = cls.at(kernels, points, CholeskyFactor(C.new_zeros(0, 0)), C.new_zeros(0))
+        points = tuple(z.detach() for z in points)
+        lowers = tuple(
+            factorize(partial(kernel.cross, z, z)).lower.tril() for kernel, z in zip(kernels.dense, points, strict=True)
+        )
+        prior = cls(kernels, points, lowers, CholeskyFactor(C.new_zeros(0, 0)), C.new_zeros(0), 0.0)
         slices = prior.slices
         pairs = (C[..., :, None] * C[..., None, :]).sum(1)  # C_i^T C_i
         target = (C * t[..., None]).sum(1)  # C_i^T t_i
@@ -98,18 +102,7 @@ class WeightSpace:
                     B[slices[c], slices[d]] += (left * pairs[rows, c, d]) @ other.mT
         precision = factorize(B.clone)
         mean = precision.solve(right[:, None])[:, 0] if prior.count else right
-        return cls(kernels, prior.points, prior.lowers, precision, mean, float(left_out) / max(1, len(C)))
-
-    @classmethod
-    def at(
-        cls, kernels: LatentKernels, points: Sequence[Float[Tensor, "_ _"]], precision: CholeskyFactor, mean: Tensor
-    ) -> "WeightSpace":
-        """With weights found elsewhere. Raises NumericalError where the points' kernel matrix cannot be factorised."""
-        points = tuple(z.detach() for z in points)
-        lowers = tuple(
-            factorize(partial(kernel.cross, z, z)).lower.tril() for kernel, z in zip(kernels.dense, points, strict=True)
-        )
-        return cls(kernels, points, lowers, precision, mean, 0.0)
+        return cls(kernels, points, lowers, precision, mean, float(left_out) / max(1, len(C)))
 
     @property
     def count(self) -> int:

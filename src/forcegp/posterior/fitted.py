@@ -346,14 +346,13 @@ class Fitted(Summary):
         result: OptimizationResult,
         settings: Mapping[str, Any],
         engine: Engine | None = None,
-        solution: Tensor | None = None,
         estimates: Estimates | None = None,
     ) -> AnyFitted:
-        """The posterior at given hyper-parameters, without a search; `solution` is what its `engine` had found."""
+        """The posterior at given hyper-parameters, without a search."""
         likelihood = MarginalLikelihood(model, replace(training, correlated_rows=settings.get("correlated_rows", 1.0)))
         engine = engine or Exact()
         # now: a failure belongs to the fit, not to the first prediction
-        latent = likelihood.condition(likelihood.kernels, hyperparameters, engine, start=solution)
+        latent = likelihood.condition(likelihood.kernels, hyperparameters, engine)
         found = dict(hyperparameters), result, dict(settings), latent, engine, estimates or Estimates()
         return cls(model, likelihood, *found)
 
@@ -371,11 +370,6 @@ class Fitted(Summary):
     def noise_std(self) -> Float[Tensor, "nv"]:
         """Standard deviation of the acceleration noise per joint, given, learned or estimated."""
         return self.hyperparameters[ACCELERATION].exp()
-
-    @property
-    def solution(self) -> Tensor | None:
-        """What conditioning on these rows again can begin from, stored with the model; None where it is cheap."""
-        return self.engine.solution(self.latent)
 
     @cached_property
     def negative_log_likelihood(self) -> float:

@@ -370,7 +370,6 @@ class Posterior(Fitted):
             result,
             self.settings,
             engine=self.engine,
-            solution=None if self.solution is None else self.solution.to(at),
             estimates=self.estimates,
         )
         carried = there if self.target is None else there.with_model(self.target.to(device))

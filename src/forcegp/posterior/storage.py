@@ -43,7 +43,6 @@ SETTINGS: dict[str, tuple[int | str, ...]] = {
 POSITIVE = ("widening", "hidden_force", "correlated_rows", "horizons", "deviations")
 UNUSABLE = (ArithmeticError, AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError)
 UNUSABLE += (SafetensorError, ForceGPError)
-SOLUTION = "latent.solution"
 TRAINING, REFERENCE, PARAMETERS = "training.", "reference.", "parameters."
 ROBOT, TARGET = "robot.urdf", "target.urdf"
 
@@ -78,8 +77,6 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     for prefix, rows in ((TRAINING, posterior.training), (REFERENCE, posterior.training.reference)):
         tensors |= {prefix + name: value for name in ROWS if (value := getattr(rows, name, None)) is not None}
         tensors |= {f"{prefix}{FORCE}{name}": value for name, value in (rows.sensed if rows else {}).items()}
-    if (solution := posterior.solution) is not None:
-        tensors[SOLUTION] = solution
     with atomic_folder(path, overwrite=overwrite) as folder:
         folder.mkdir()
         # safetensors' own `save_file` ignores the umask; rows of one tensor may share memory with another's
@@ -119,7 +116,6 @@ def load_posterior(path: str | Path) -> Posterior:
             OptimizationResult(parameters, **found),
             settings,
             None if engine is None else engine_from_dict(engine),
-            tensors.get(SOLUTION),
             Estimates.from_dict(document["estimates"]),
         )
         if posterior.likelihood.parameter_shapes != {name: tuple(value.shape) for name, value in parameters.items()}:

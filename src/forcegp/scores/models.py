@@ -1,7 +1,7 @@
 """Models by name, one way to learn them, and the models of a comparison.
 
 A name is FORCES[@EVIDENCE], both as for `forcegp fit` but joined by "+": forces beside those of the robot as given or
-as `identified`, such as viscous+gp:joint, identified+gp:joint-friction@accelerations+motions:1.
+as `identified`, such as viscous+gp:joint, identified@accelerations+motions:1.
 """
 
 import hashlib
@@ -112,8 +112,8 @@ def learn(
         notes.append(
             f"evidence: {first.name}, and forces measured at {listed([x.frame or 'all frames' for x in sensors])}"
         )
-    if motions and any(isinstance(force, IndependentAccelerations) for force in model.unknown_forces):
-        raise InvalidInput("motions refine physics, and gp:independent has none; leave them out.")
+    if motions:
+        Motions.refuse(model.unknown_forces)
     if not model.unknown_forces and (isinstance(first, Torques) or model.is_open):
         posterior = fit(model, dataset, others, baseline=baseline)
     else:
@@ -284,8 +284,8 @@ def default_models(model: Model) -> tuple[str, ...]:
         return GIVEN, IDENTIFIED, "gp:independent", "gp:joint-accelerations", usual_forces(model)
     moved = f"{EVIDENCE}motions:1" if model.robot.space.is_vector_space else ""
     on_forces = [f"{IDENTIFIED}+gp:{name}" for name in ("joint-accelerations", "joint", "joint-friction")]
-    refined = (f"{IDENTIFIED}{moved}", f"{on_forces[-1]}{moved}") if moved else ()
-    return GIVEN, IDENTIFIED, *refined[:1], "gp:independent", *on_forces, *refined[1:]
+    refined = (f"{IDENTIFIED}{moved}",) if moved else ()
+    return GIVEN, IDENTIFIED, *refined, "gp:independent", *on_forces
 
 
 def candidates(given: Mapping[str, Given] | Sequence[str], model: Model, identification: str) -> dict[str, Candidate]:
@@ -326,7 +326,9 @@ def candidate(name: str, given: Given, model: Model, identification: str) -> Can
     elif on_identified:
         own, _, usual = identification.partition(EVIDENCE)
         key = f"{own}{EVIDENCE}{text if text and not unknown else usual}"
-    if motions and key is None and not unknown:
+    if motions:
+        Motions.refuse(unknown)
+    if motions and key is None:
         raise InvalidInput(f"model {name!r} has nothing to refine on motions; add forces.")
     kind = kind_of(described, key is not None) if unknown or key else "given"
     where = f", beside {key}" if key and words else f": {key}" if key else ""
