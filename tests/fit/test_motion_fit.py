@@ -12,8 +12,7 @@ from forcegp.data.views import all_motions, recorded_motions
 from forcegp.errors import DataWarning, InvalidInput, NumericalError
 from forcegp.evidence import Motions, Torques
 from forcegp.fit import fit as fit_model
-from forcegp.fit.motion_fit import MotionFit
-from forcegp.fit.motion_unknowns import Unknowns
+from forcegp.fit.motion_fit import MotionFit, Unknowns
 from forcegp.forces import Actuation, Coulomb, Normal, RigidBodies, Rotor, Viscous
 from forcegp.noise import Noise
 
@@ -148,7 +147,9 @@ def test_derivatives_in_every_unknown(contacts):
     recorded, stride = all_motions(replace(data, q=data.q[:1].repeat(24, 0)), 0.05, 0.01)
     fit = MotionFit(recorded, stride, unknowns)
     generator = torch.Generator().manual_seed(0)
-    x = unknowns.first + 0.05 * torch.rand(len(unknowns.first), generator=generator, dtype=torch.float64)
+    x = torch.as_tensor(unknowns.space.start) + 0.05 * torch.rand(
+        unknowns.space.size, generator=generator, dtype=torch.float64
+    )
     one, small = torch.ones(3, dtype=torch.float64), 1e-5
     here = fit.at(x, fit.start, one, one, None)
     assert bool(here.motions.found.all())

@@ -9,8 +9,7 @@ from tests.posterior import floating_arm
 from forcegp import Dataset
 from forcegp.data.views import all_motions
 from forcegp.fit import fit as fit_model
-from forcegp.fit.motion_fit import MotionFit
-from forcegp.fit.motion_unknowns import Unknowns
+from forcegp.fit.motion_fit import MotionFit, Unknowns
 from forcegp.mechanics import fixed_point
 from forcegp.model import Model
 
@@ -34,7 +33,9 @@ def test_derivatives_in_every_unknown_and_start(switched):
     assert stride == 2
     fit = MotionFit(recorded, stride, unknowns)
     generator, noise = torch.Generator().manual_seed(0), torch.linspace(0.5, 2.0, 7, dtype=torch.float64)
-    x = unknowns.first + 0.05 * torch.rand(len(unknowns.first), generator=generator, dtype=torch.float64)
+    x = torch.as_tensor(unknowns.space.start) + 0.05 * torch.rand(
+        unknowns.space.size, generator=generator, dtype=torch.float64
+    )
     states = fit.start + 0.1 * torch.rand(fit.start.shape, generator=generator, dtype=torch.float64)
     here, small = fit.at(x, states, noise, noise, None), 1e-5
     assert bool(here.motions.found.all())

@@ -58,7 +58,7 @@ def test_motions_are_those_of_the_integrator(given, passes, monkeypatch):
     monkeypatch.setattr(midpoint_sensitivities, "MOST_PASSES", passes)  # one: all are stepped through one by one
     model, q0, v0, u, guess = given
     of = accelerations(model, levels(model), 0.01)
-    found = window_motions(of, q0, v0, u, H, guess, derivatives=False)
+    found = window_motions(of, q0, v0, u, H, guess)
     assert bool(found.found.all())
     q, v = q0, v0
     for k in range(STEPS):
@@ -76,9 +76,9 @@ def test_derivatives_are_those_of_finite_differences(given):
     def q_at(dq, dv, friction):
         of = accelerations(model, levels(model) + friction, 0.1)
         start = robot.integrate(q0, torch.as_tensor(dq).expand(nv).double())
-        return window_motions(of, start, v0 + dv, u, H, guess, derivatives=False).q
+        return window_motions(of, start, v0 + dv, u, H, guess).q
 
-    found = window_motions(accelerations(model, levels(model), 0.1), q0, v0, u, H, guess, derivatives=True)
+    found = window_motions(accelerations(model, levels(model), 0.1), q0, v0, u, H, guess)
     e, f = small * torch.randn(2, 2 * nv, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     for derivative, ends in (  # along one direction of all, which shows every entry
         (found.in_start @ e, [q_at(sign * e[:nv], sign * e[nv:], 0.0) for sign in (1.0, -1.0)]),
@@ -98,5 +98,5 @@ def test_windows_without_an_end_are_reported(given):
         a, slope = rows_jacobian(lambda v: away(q, v, u), v)
         return Linear(a, torch.zeros_like(slope), slope)
 
-    found = window_motions(Accelerations(away, linear, model.robot.space), q0, v0.abs(), u, H, guess, derivatives=False)
+    found = window_motions(Accelerations(away, linear, model.robot.space), q0, v0.abs(), u, H, guess)
     assert not bool(found.found.any())

@@ -63,10 +63,9 @@ def window_motions(
     h: float,
     guess: tuple[Float[Tensor, "K T nq"], Float[Tensor, "K T nv"]],
     *,
-    derivatives: bool,
     patient: bool = True,
 ) -> WindowMotions:
-    """The motions from (q0, v0) under u, from a guess of the middles, and their derivatives where those are asked for.
+    """The motions from (q0, v0) under u, from a guess of the middles, and their derivatives.
 
     Windows that `MOST_PASSES` do not find are stepped through if `patient`; where that fails, too, `found` is False.
     """
@@ -86,9 +85,7 @@ def window_motions(
         there_q, there_v, ended = _step_by_step(accelerations, q0[left], v0[left], u[left], h)
         found[left] = ended
         middle_q[left[ended]], middle_v[left[ended]] = there_q[ended], there_v[ended]
-    q, v, *_, slopes = _pass(accelerations, q0, v0, u, (middle_q, middle_v), h, derivatives)
-    if not derivatives:
-        return WindowMotions(q, v, middle_q, middle_v, found)
+    q, v, *_, slopes = _pass(accelerations, q0, v0, u, (middle_q, middle_v), h, True)
     start = 2 * v0.shape[-1]
     return WindowMotions(q, v, middle_q, middle_v, found, slopes[..., :start], slopes[..., start:])
 
