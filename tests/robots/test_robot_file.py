@@ -206,3 +206,15 @@ def test_written_files_have_the_limits_without_which_others_refuse_them(tmp_path
         )
     assert again.joints[0].effort_limit == math.inf
     assert again.joints[2].effort_limit == 5.0
+
+
+@pytest.mark.parametrize(
+    ("place", "mass", "named"), [("0 0 9", 2e-9, False), ("0 0 11", 1.0, True), ("0 0 1", 5e-10, True)]
+)
+def test_lengths_in_millimetres_and_bodies_without_weight_are_named(place, mass, named, recwarn):
+    inertia = '<inertia ixx="1e-9" iyy="1e-9" izz="1e-9" ixy="0" ixz="0" iyz="0"/>'
+    link = f'<link name="l"><inertial><mass value="{mass}"/>{inertia}</inertial></link><link name="base"/>'
+    joint = f'<joint name="j" type="continuous"><origin xyz="{place}"/><parent link="base"/><child link="l"/></joint>'
+    Robot.from_urdf_text(f'<robot name="r">{link}{joint}</robot>')
+    told = " ".join(str(each.message) for each in recwarn)
+    assert ("are lengths in metres? (origin of j)" in told or "are masses in kilograms? (l)" in told) == named

@@ -17,6 +17,8 @@ from forcegp.robots.inertia import rotation_from_rpy, transform
 
 MOST_TAGS = 200_000
 """A robot file of two hundred joints has some ten thousand."""
+FAR, LIGHT = 10.0, 1e-9
+"""Lengths in m and masses in kg that are named: of a file in millimetres or grams, or with a slip of the pen."""
 MECHANICS = ("inertial", "origin", "parent", "child", "axis", "limit", "dynamics", "mimic")
 """Parts of a link or joint that are read."""
 DEFINITIONS = ("}arg", "}property", "}macro")
@@ -157,6 +159,13 @@ def parse_urdf(text: str, problems: Problems) -> RobotDescription:
     for joint, part in parts.items():
         with problems.collected():
             joints.append(_joint(_Part(part, f"joint {joint!r}", problems), joint, links))
+    far = {f"centre of mass of {link}": at.center_of_mass for link, at in links.items() if at is not None}
+    for what, place in (far | {f"origin of {joint.name}": joint.origin[:3, 3] for joint in joints}).items():
+        if np.linalg.norm(place) > FAR:
+            problems.note(f"more than {FAR:g} m away; are lengths in metres?", what)
+    for link, at in links.items():
+        if at is not None and 0.0 < at.mass < LIGHT:
+            problems.note(f"lighter than {LIGHT:g} kg; are masses in kilograms?", link)
     return RobotDescription(name, source, links, tuple(joints), len(joints) == len(parts))
 
 
