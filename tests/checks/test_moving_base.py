@@ -74,6 +74,28 @@ def test_an_accelerometer_is_no_acceleration(log):
     assert (doubt.about, doubt.level) == ("base acceleration", "look")
 
 
+def test_accelerations_in_world_axes_are_named_also_where_they_are_no_larger_than_the_true_ones(log):
+    turn = 0.9
+    spin = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, turn, *[0.0] * 12], dtype=torch.float64)
+    q = log.model.robot.integrate(torch.tensor(log.q), spin).numpy()
+    q[:, :3] = log.q[:, :3]
+    rotation = log.model.robot.frame_pose(torch.tensor(q), "trunk")[:, :3, :3].numpy()
+    c, s = np.cos(turn), np.sin(turn)
+    yaw = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    v, a = log.v.copy(), log.a.copy()
+    for x in (v, a):
+        x[:, :3], x[:, 3:6] = x[:, :3] @ yaw.T, x[:, 3:6] @ yaw.T
+    turned = replace(log, q=q, v=v, a=a)
+    assert not [each for each in quick_check(turned) if each.about == "base acceleration"]
+    world = a.copy()
+    linear = a[:, :3] + np.cross(v[:, 3:6], v[:, :3])
+    world[:, :3], world[:, 3:6] = ((rotation @ x[:, :, None])[..., 0] for x in (linear, a[:, 3:6]))
+    (doubt,) = [each for each in quick_check(replace(turned, a=world)) if each.about == "base acceleration"]
+    assert doubt.level == "wrong"
+    assert doubt.numbers["error"] < 2.0 * doubt.numbers["size"]
+    assert "--axes a=world" in doubt.command
+
+
 @pytest.mark.parametrize("what", ["deg/s", "sign"])
 def test_velocities_of_the_joints_are_compared_beside_a_base(log, what, tmp_path):
     """The mistake is named, flags of feet are not blamed for it, and its correction leaves the base as it was."""

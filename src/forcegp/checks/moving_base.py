@@ -33,7 +33,8 @@ LEAST = 0.01  # of the speed: a smaller error is that of rounding
 THOUSANDS = 10.0  # times the weight: a larger force is one of lengths in mm
 GAP = 1.5  # times the usual time of so many rows: a longer one has a gap
 RPM = 2.0 * np.pi / 60.0
-IMU = {"axes": {"a": ("imu",)}}
+READINGS = ("imu", "body"), ("world", "world")
+"""Axes of linear and angular accelerations in which logs have them beside those of the body."""
 
 
 @dataclass(frozen=True)
@@ -88,23 +89,30 @@ def base_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         each = v.unflatten(0, windows.rows.shape)
         change = (each[:, -1] - each[:, 0]) / windows.step
         error, size = _rms(change - windows.mean(a)), _rms(change)
-        measured = in_base(at, a, ("imu", "body"), v, model.robot.gravity)
-        specific = _rms(change - windows.mean(measured))
-        if error <= 2.0 * size:  # noise of the velocities alone makes both large
+        readings = {axes: in_base(at, a, (axes, linear), v, model.robot.gravity) for axes, linear in READINGS}
+        errors = {axes: _rms(change - windows.mean(measured)) for axes, measured in readings.items()}
+        axes = min(errors, key=errors.__getitem__)
+        other = errors[axes] < CLEARLY * error
+        if error <= 2.0 * size and not other:  # noise of the velocities alone makes both large
             continue
-        kind, remedy, imu = look, "Differentiate v: a is its derivative in body axes, without gravity and w x v.", {}
+        kind, remedy, correction = (
+            look,
+            "Differentiate v: a is its derivative in body axes, without gravity and w x v.",
+            {},
+        )
         seen = (
             f"the acceleration of {group.name!r} is off from the change of its velocity by {error:.2g}, which itself "
+            f"is {size:.2g}."
         )
-        seen += f"is {size:.2g}."
-        if specific < CLEARLY * error:
-            kind, remedy, imu = wrong, "Differentiate v.", IMU
+        if other:
+            kind, remedy, correction = wrong, "Differentiate v.", {"axes": {"a": (axes,)}}
+            words = {"imu": "what an accelerometer measures", "world": "given in world axes"}[axes]
             seen = (
-                f"the acceleration of {group.name!r} is what an accelerometer measures: as the change of its velocity "
+                f"the acceleration of {group.name!r} is {words}: as the change of its velocity it is off by "
+                f"{error:.2g}, read so by {errors[axes]:.2g}."
             )
-            seen += f"it is off by {error:.2g}, with gravity and w x v taken into account by {specific:.2g}."
-        numbers = {"error": error, "specific": specific, "size": size}
-        yield kind(about="base acceleration", what=seen, do=remedy, correction=imu, numbers=numbers)
+        numbers = {"error": error, "specific": errors["imu"], "size": size}
+        yield kind(about="base acceleration", what=seen, do=remedy, correction=correction, numbers=numbers)
 
 
 def carried_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
