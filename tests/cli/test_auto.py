@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from forcegp import Dataset, Robot, load_posterior
-from forcegp.cli.auto import best_sentence
+from forcegp.cli.auto import verdict
 from forcegp.cli.logs import prepared_rows
 from forcegp.cli.main import parse_arguments
 from forcegp.cli.terminal import Terminal
@@ -90,7 +90,7 @@ def test_the_answer_holds_what_was_simulated(answered):
     answer = "\n".join(content["answer"])
     assert "payload: none" in answer
     assert re.search(r"u was logged 2\.\d ms early", answer)  # of steps of 4.2 ms, in which a controller holds it
-    assert 8 <= len(content["answer"]) <= 11
+    assert 8 <= len(content["answer"]) <= 12
 
 
 @pytest.mark.nightly
@@ -162,20 +162,32 @@ def _stopped(*_):
 
 
 @pytest.mark.usefixtures("unchecked")  # its dataset is none
-def test_a_model_that_is_worse_than_none_is_not_trusted():
-    """Where all motions diverge and accelerations are wrong by more than they vary."""
+def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
     dataset = SimpleNamespace(units={"q": "rad"})
 
-    def scores(errors, moved, squared):
-        table = {"acceleration": {"nrmse": errors}, "position after 1 s": {"rmse": [moved] * 3}}
-        motions = {"horizons": [1.0], "squared": [[squared]]}
+    def told(errors, moved=0.01, shares=None, covered=0.94):
+        table = {"acceleration": {"nrmse": errors, "coverage_95": [covered] * 3}}
+        table |= {"position after 1 s": {"rmse": [moved] * 3}}
+        table |= {"force": {"share": shares}} if shares else {}
+        motions = {"horizons": [1.0], "squared": [[1e-4]]}
         run = {"split": "s", "seed": 0, "error": None, "table": table, "motions": motions, "stretches": {}}
         names = ("hip", "knee", "wrist")
         about = {"given": {"kind": "given", "summary": ""}}
-        return Scores(models=about, runs={"given": [run]}, joint_names=names, units={})
+        return verdict(Scores(models=about, runs={"given": [run]}, joint_names=names, units={}), dataset)
 
-    lost = scores([328.2] * 3, None, 1.0)  # motions are there, and none of them lasted
-    assert best_sentence(lost, dataset).startswith("Trust none of these models: on unseen time, accelerations")
-    told = best_sentence(scores([0.1, 0.16, 2.8], 0.01, 1e-4), dataset)  # noise of a alone
-    assert told.startswith("Trust the model “the URDF”: on unseen time, positions 1 s ahead are wrong by 0.01 rad")
-    assert told.endswith("But its accelerations are wrong by 1 of their standard deviation.")
+    lost = told([328.2, 0.9, None], None)
+    assert lost.startswith("Do not use any of these models: on unseen time the best one, “the URDF”, leaves of the acc")
+    assert "hip 32820 %, knee 90 %, wrist not known from this log" in lost
+    some = told([0.1, 0.16, 2.8])
+    assert some.startswith("Use “the URDF” for hip, knee: on unseen time it leaves 10 to 16 % of each acceleration")
+    assert some.endswith("Not for the others, of whose acceleration is left: wrist 280 %.")
+    # a light wrist has no acceleration to speak of, and a torque that is known to 5 %
+    whole = told([0.1, 0.16, 2.8], shares=[0.02, 0.03, 0.05])
+    assert whole == (
+        "Use “the URDF”: on unseen time it leaves 2 to 5 % of each torque, "
+        "and positions 1 s ahead are wrong by 0.01 rad."
+    )
+    assert "wrist 51 %" in told([0.1] * 3, shares=[0.02, 0.03, 0.51])
+    assert told([0.1] * 3, None).endswith("but its motions diverge: do not simulate with it.")
+    assert told([0.1] * 3, covered=0.57).endswith("Do not trust its intervals: those of 95 % hold 57 %.")
+    assert "intervals" not in told([0.1] * 3, covered=0.81)

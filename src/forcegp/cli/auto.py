@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import time
 from collections.abc import Mapping
@@ -27,6 +28,7 @@ from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal, doubts_table, facts
 from forcegp.doubts import Doubt, Doubts, wrong
 from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUnit, NumericalError
+from forcegp.scores.accuracy import ACCELERATION, FORCE
 from forcegp.scores.page import number
 
 MOST_CORRECTIONS = 8
@@ -135,7 +137,7 @@ class Auto(Command):
             "code": self._code(terminal, posterior),
         }
         answer = answer_lines(content, dataset, recording, identified, held, scores)
-        best = best_sentence(scores, dataset)
+        best = verdict(scores, dataset)
         content |= {"answer": [": ".join(line) for line in answer], "best": best}
         self._write_report(terminal, posterior, recording, content, answer, scores)
         content |= {"cpu_seconds": time.process_time() - begin}
@@ -345,34 +347,63 @@ def answer_lines(
         ("payload", held + by),
         ("models", f"error of q after 1 s [{'rad or m' if moving else q}] / nRMSE of the acceleration, on unseen time: "
                    f"{errors}"),
-        ("trust", f"{short_name(best)}{intervals}"),
+        *left_of_torques(scores, best),
+        ("best", f"{short_name(best)}{intervals}"),
         ("record next", command + (f" (least is known of {weak})" if weak else "")),
         ("wrote", f"{out}/report.html, {out}/model, {out}/identified.urdf, {out}/validation/report.md"),
     ]  # fmt: skip
 
 
-def best_sentence(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> str:
-    """Which model to trust, and how much better than the URDF it is on unseen time."""
+def left_of_torques(scores: forcegp.scores.Scores, best: str) -> list[tuple[str, str]]:
+    """The line on what each model leaves of the recorded torques of the joints; none where u has other columns."""
+    shares = {}
+    for name in dict.fromkeys(("given", "identified", best)):
+        if name in scores.models and "share" in scores.quantities(name).get(FORCE, ()):
+            numbers = scores.columns("share", FORCE, name)
+            shares[short_name(name)] = " ".join("–" if x is None else f"{100.0 * x:.2g}" for x in numbers)
+    told = "; ".join(f"{name} {numbers}" for name, numbers in shares.items())
+    return [("torque left", f"on unseen time, % of the recorded one of each joint: {told}")] if told else []
+
+
+USABLE, LEAST_COVERAGE = 0.5, 0.8
+"""Largest share of a torque's deviation, or of an acceleration's, that a joint may leave on unseen time, and the least
+coverage of 95 % intervals that is no reason to doubt them."""
+
+
+def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> str:
+    """Use it, use it for these joints, or do not use it; what it was measured by, and against the URDF alone."""
     best = scores.recommended
     assert best is not None, "a model was scored"
-    name, motion, error = short_name(best), _motion(scores, best), _acceleration(scores, best)
-    wrong = "" if error is None else f"wrong by {error:.2g} of their standard deviation"
-    poor = error is not None and error >= 1.0  # no better than a = 0
-    if motion is None and poor:
+    quantity, score = (FORCE, "share") if "share" in scores.quantities(best).get(FORCE, ()) else (ACCELERATION, "nrmse")
+    what = "torque" if quantity == FORCE else "acceleration"
+    left = [math.inf if x is None else x for x in scores.columns(score, quantity, best)]
+    good = [name for name, x in zip(scores.joint_names, left, strict=True) if x <= USABLE]
+    lost = [f"{name} {100.0 * x:.0f} %" if math.isfinite(x) else f"{name} not known from this log"
+            for name, x in zip(scores.joint_names, left, strict=True) if x > USABLE]  # fmt: skip
+    use = f"“{short_name(best)}”"
+    if not good:
         return (
-            f"Trust none of these models: on unseen time, accelerations of the best one, “{name}”, are {wrong}. "
-            "Forces, flags of stance, units or the robot's file are wrong."
+            f"Do not use any of these models: on unseen time the best one, {use}, leaves of the {what} of "
+            f"{', '.join(lost)}. Forces, flags of stance, units or the robot's file are wrong, or motions are too small."
         )
-    urdf = (_acceleration if motion is None else _motion)(scores, "given")
-    against = "" if urdf is None or best == "given" else f", with the URDF alone by {urdf:.2g}"
-    if motion is None:
-        return f"Trust the model “{name}”{f': on unseen time, accelerations are {wrong}{against}' if wrong else ''}."
-    if urdf is None and "given" in scores.models:
-        against = "; with the URDF alone they diverge"
-    unit = dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m"
-    ahead = f"positions {scores.horizons[-1]:g} s ahead are wrong by {motion:.2g} {unit}{against}"
-    doubt = f" But its accelerations are {wrong}." if poor else ""
-    return f"Trust the model “{name}”: on unseen time, {ahead}.{doubt}"
+    finite = [x for x in left if x <= USABLE]
+    told = f"on unseen time it leaves {100.0 * min(finite):.2g} to {100.0 * max(finite):.2g} % of each {what}"
+    motion, urdf = _motion(scores, best), _motion(scores, "given")
+    if motion is not None:
+        unit = dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m"
+        against = "they diverge" if urdf is None else f"{urdf:.2g}"
+        against = f", with the URDF alone {against}" if "given" in scores.models and best != "given" else ""
+        told += f", and positions {scores.horizons[-1]:g} s ahead are wrong by {motion:.2g} {unit}{against}"
+    elif scores.horizons:
+        told += ", but its motions diverge: do not simulate with it"
+    covered = scores.value("coverage_95", model=best)
+    doubt = "" if covered is None or covered >= LEAST_COVERAGE else (
+        f" Do not trust its intervals: those of 95 % hold {100.0 * covered:.0f} %."
+    )  # fmt: skip
+    if not lost:
+        return f"Use {use}: {told}.{doubt}"
+    others = f"Not for the others, of whose {what} is left: {', '.join(lost)}."
+    return f"Use {use} for {', '.join(good)}: {told}. {others}{doubt}"
 
 
 def _motion(scores: forcegp.scores.Scores, model: str) -> float | None:

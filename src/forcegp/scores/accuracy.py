@@ -155,6 +155,8 @@ def row_scores(
     table[ALL_JOINTS] = {"nlpd": [float(rows.negative_log_density.mean())]}
     measured = table[ACCELERATION]
     measured["nrmse"] = plain(np.array(measured["rmse"], dtype=float) / _spread(test.a))
+    if test.u.shape == test.a.shape:  # what is left of each torque, where 1 is no better than its mean
+        table[FORCE]["share"] = plain(np.array(table[FORCE]["rmse"], dtype=float) / _spread(test.u))
     density = norm.logpdf(test.a, rows.mean, np.sqrt(rows.measurement_variance))
     measured["nlpd"] = plain(-np.asarray(density).mean(axis=0))
     measured["noise_std"] = plain(posterior.noise_std.detach().cpu().numpy())
