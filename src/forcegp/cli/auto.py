@@ -384,7 +384,7 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> str:
     if not good:
         return (
             f"Do not use any of these models: on unseen time the best one, {use}, leaves of the {what} of "
-            f"{', '.join(lost)}. Forces, flags of stance, units or the robot's file are wrong, or motions are too small."
+            f"{', '.join(lost)}. Forces, flags of stance, units or the robot's file are wrong, or it hardly moves."
         )
     finite = [x for x in left if x <= USABLE]
     told = f"on unseen time it leaves {100.0 * min(finite):.2g} to {100.0 * max(finite):.2g} % of each {what}"
