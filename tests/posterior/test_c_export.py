@@ -217,6 +217,11 @@ def test_friction_that_remembers_and_a_monitor_of_contacts(tmp_path):
         np.testing.assert_allclose(distance, seen.distance[k], rtol=1e-7, atol=1e-12)
     with pytest.raises(InvalidInput, match="counts another covariance than the program has"):
         export_c(posterior, tmp_path / "other", monitor=monitor)
+    laws = fit(free.with_forces(gear), replace(arm_data(30, 0), model=free, truth={}), restarts=1)
+    for model in (laws.predictor(), laws.model):  # nothing is open where nothing is unknown
+        known = ContactMonitor(model, dt=0.01).calibrate([(q, v, u)])
+        made = export_c(laws, tmp_path / type(model).__name__, monitor=known)
+        assert made.differences["arm_monitor_step"] < 1e-9
     if shutil.which("c++"):
         memory = "{0.3, -0.9, 1.0}"
         (tmp_path / "arm" / "main.cpp").write_text(CPP.replace("MEMORY", memory).replace("PARTS", "2"))

@@ -112,8 +112,9 @@ def _check_monitor(monitor: Any, posterior: Posterior, reference: Predictor) -> 
     """Raise InvalidInput for one that is not calibrated, of another model, or that needs another covariance."""
     if getattr(monitor, "noise", None) is None:
         raise InvalidInput("this monitor is not calibrated: call calibrate([(q, v, u)]) with free motion first.")
-    own = getattr(monitor.model, "posterior", None)
-    if own is not posterior or monitor.open != (reference.kind == "compressed") or monitor.model.kind == "exact":
+    same = monitor.model is posterior.model or getattr(monitor.model, "posterior", None) is posterior
+    kind = monitor.model.kind if monitor.open and posterior.latent_names else "none"
+    if not same or kind != ("compressed" if reference.kind == "compressed" else "none"):
         raise InvalidInput(
             "the monitor is that of another model, or counts another covariance than the program has; make it of "
             "posterior.predictor() and export with `covariance`, or of posterior.predictor(covariance='none') without."

@@ -149,7 +149,7 @@ class CFiles:
         words: dict[str, object] = {"STATE_OF_MONITOR": program["monitor_state"], "PERIOD": repr(monitor.dt)}
         words |= {"THRESHOLD": repr(monitor.threshold), "SHARE": repr(1.0 - monitor.keep)}
         words |= {"REMEMBER": program["monitor_memory"] if self.posterior.model.memory.names else ""}
-        words |= {"OPEN": program["monitor_open"] if monitor.open else ""}
+        words |= {"OPEN": program["monitor_open"] if "covariance" in self.kinds else ""}
         noise = {"ACCELERATIONS": monitor.noise.acceleration, "FORCES": monitor.noise.force}
         return words | {word: ", ".join(map(repr, x.tolist())) for word, x in noise.items()}
 
