@@ -163,8 +163,8 @@ def parse_urdf(text: str, problems: Problems) -> RobotDescription:
     for what, place in (far | {f"origin of {joint.name}": joint.origin[:3, 3] for joint in joints}).items():
         if np.linalg.norm(place) > FAR:
             problems.note(f"more than {FAR:g} m away; are lengths in metres?", what)
-    for link, at in links.items():
-        if at is not None and 0.0 < at.mass < LIGHT:
+    for link in (joint.child for joint in joints if joint.type != "fixed"):  # others weigh with what they are fixed to
+        if (at := links.get(link)) is not None and 0.0 < at.mass < LIGHT:
             problems.note(f"lighter than {LIGHT:g} kg; are masses in kilograms?", link)
     return RobotDescription(name, source, links, tuple(joints), len(joints) == len(parts))
 
