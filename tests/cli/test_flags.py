@@ -80,6 +80,12 @@ def test_what_is_no_list_is_refused_in_one_line(words, message):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("name", ["__time", "--stamp"])
+def test_a_value_may_begin_with_dashes_or_underscores(name):
+    found = parse_arguments(["import", "x.csv", "--time", name, "--q", "__q", "--ned", "--out", "o.h5"])
+    assert (found.columns.time, found.columns.q, found.columns.ned) == (name, "__q", True)
+
+
 @pytest.mark.parametrize("command", ARGUMENTS)
 def test_what_arguments_are_called_as_options_are_options(command):
     options = {option.replace("-", "_") for option in ARGUMENTS[command].values()}

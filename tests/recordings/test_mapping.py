@@ -172,6 +172,8 @@ def test_names_are_guessed_only_where_nothing_else_can_be_meant(tmp_path):
         guessed_columns("q", JOINTS, source)
     with pytest.raises(InvalidInput, match="time could be time or t"):
         guessed_time(source, [])
+    source = open_source(write_text(tmp_path / "plot.csv", {"__time": columns["time"], "q_elbow": columns["time"]}))
+    assert guessed_time(source, []) == "__time"
 
 
 BODY = '<inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>'

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from tests.data.samples import model
 from tests.recordings.log_files import EPOCH, joint_states, motion
 
 from forcegp.errors import FileFormatError
-from forcegp.recordings import open_source
+from forcegp.recordings import ColumnMapping, import_recordings, open_source
 from forcegp.recordings.ros_bag import numbers
 
 typesys = pytest.importorskip("rosbags.typesys")
@@ -32,6 +33,44 @@ def test_joint_states_go_by_the_names_of_joints():
     assert numbers(message, ("effort",)) == {"effort.elbow": 2.0, "effort.é/_": 3.0}
     with pytest.raises(FileFormatError, match="2 names but 1 values of 'position'"):
         numbers(joint_state(("a", "b"), (1.0,)))
+
+
+CONTROLLER = """std_msgs/Header header
+string[] joint_names
+trajectory_msgs/JointTrajectoryPoint[] points
+trajectory_msgs/JointTrajectoryPoint feedback"""
+ROS2.register(typesys.get_types_from_msg(CONTROLLER, "any_msgs/msg/Controller"))
+
+
+def controller(names, positions):
+    own = {name: np.zeros(0) for name in ("velocities", "accelerations", "effort")}
+    past = ROS2.types["builtin_interfaces/msg/Duration"](sec=0, nanosec=0)
+    point = ROS2.types["trajectory_msgs/msg/JointTrajectoryPoint"](positions=positions, time_from_start=past, **own)
+    header = joint_state((), ()).header
+    kind = ROS2.types["any_msgs/msg/Controller"]
+    return kind(header=header, joint_names=list(names), points=[point], feedback=point)
+
+
+def test_names_of_joints_hold_for_the_messages_inside():
+    vectors = {}
+    found = numbers(controller(("elbow", "base"), np.array([1.0, 2.0])), None, vectors)
+    inside = {f"{at}.positions.{name}" for at in ("points[0]", "feedback") for name in ("elbow", "base")}
+    assert inside < found.keys()
+    assert found["feedback.positions.base"] == 2.0
+    assert vectors["feedback.positions"] == ["feedback.positions.elbow", "feedback.positions.base"]
+
+
+def test_a_vector_whose_messages_name_the_joints_is_put_into_their_order(tmp_path):
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    q = motion()["q"]
+    with Writer(tmp_path / "log", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        connection = bag.add_connection("/state", "any_msgs/msg/Controller", typestore=ROS2)
+        for row, values in enumerate(q):
+            message = controller(("elbow", "shoulder"), values[::-1].copy())
+            bag.write(connection, EPOCH + 10**7 * row, ROS2.serialize_cdr(message, connection.msgtype))
+    mapping = ColumnMapping(time="/state:log_time", q=("/state:feedback.positions",), u=("0",))
+    np.testing.assert_array_equal(import_recordings([tmp_path / "log"], mapping, model=model("continuous")).q, q)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import importlib
 import io
 import re
 from collections.abc import Mapping, Sequence
-from itertools import takewhile
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes
@@ -87,7 +86,7 @@ def parsed(words: Sequence[str]) -> Command:
     config = (FlagCreatePairsOff, OmitArgPrefixes)
     if {"-h", "--help"} & set(others):
         tyro.cli(with_texts(kind), prog=f"forcegp {name}", args=["--help"], config=config)
-    _check_options(name, kind, others)
+    others = _checked(name, kind, others)
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
@@ -99,21 +98,33 @@ def parsed(words: Sequence[str]) -> Command:
         raise InvalidInput(f"{reason} See forcegp {name} --help.") from None
 
 
-def _check_options(name: str, kind: type[Command], words: Sequence[str]) -> None:
-    """Raise InvalidInput for options that the command does not have, and for those that are given twice."""
+def _checked(name: str, kind: type[Command], words: Sequence[str]) -> list[str]:
+    """The words, with values that begin with two dashes or underscores joined to their option.
+
+    Raises InvalidInput for options that the command does not have, and for those that are given twice.
+    """
     flags = {flag: option for name, option in options_of(kind).items() if (flag := option.flag(name))}
-    given: set[str] = set()
-    for word in takewhile("--".__ne__, words):
-        flag = word.partition("=")[0].replace("_", "-")
-        if not flag.startswith("--"):
+    given, joined, waits = set[str](), list[str](), False
+    for place, word in enumerate(words):
+        if word == "--":
+            return [*joined, *words[place:]]
+        flag = "--" + word.partition("=")[0].removeprefix("--").replace("_", "-")
+        if waits and word.startswith(("--", "__")) and flag not in flags:
+            joined[-1] += f"={word}"
+            waits = False
             continue
-        if flag not in flags:
-            close = difflib.get_close_matches(flag, flags, n=1)
-            hint = f" Did you mean {close[0]}?" if close else ""
-            raise InvalidInput(f"forcegp {name} has no option {flag}.{hint} See forcegp {name} --help.")
-        if flag in given and not flags[flag].repeats:
-            raise InvalidInput(f"{flag} is given twice; give it once, a list with commas.")
-        given.add(flag)
+        waits = False
+        if word.startswith("--"):
+            if flag not in flags:
+                close = difflib.get_close_matches(flag, flags, n=1)
+                hint = f" Did you mean {close[0]}?" if close else ""
+                raise InvalidInput(f"forcegp {name} has no option {flag}.{hint} See forcegp {name} --help.")
+            if flag in given and not flags[flag].repeats:
+                raise InvalidInput(f"{flag} is given twice; give it once, a list with commas.")
+            given.add(flag)
+            waits = "=" not in word and not isinstance(flags[flag].default, bool)
+        joined.append(word)
+    return joined
 
 
 def one_line(box: str) -> str:

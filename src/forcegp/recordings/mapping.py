@@ -320,7 +320,7 @@ def guessed_time(source: Source, used: Sequence[str]) -> str | None:
     by_format = source.time_beside(used)
     if by_format is not None:
         return by_format
-    named = [column for column in source.columns() if column.lower() in WORDS["time"]]
+    named = [column for column in source.columns() if column.lower().strip("_") in WORDS["time"]]
     if len(named) > 1:
         raise InvalidInput(f"{source.path}: the time could be {' or '.join(named)}; choose with `time`.")
     return named[0] if named else None

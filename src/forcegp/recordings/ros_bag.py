@@ -23,8 +23,9 @@ ROWS_AT_A_TIME = 2**16  # numbers of Python take ten times the memory of those i
 STAMP = "header.stamp"
 LOOKED_AT = 100  # messages of each topic that decide which columns there are: publishers may share a topic
 JOINT_STATE = "sensor_msgs/msg/JointState"
+NAMES = re.compile(r"name|\w*names")
+"""Fields whose texts name the elements of vectors beside them, and of those in messages beside them."""
 TWICE = re.compile(r"(pose|twist|accel)\.\1$")
-OF_JOINTS = ("position", "velocity", "effort")
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 NANOSECONDS = 10**9
 NUMBER, ARRAY = (int, float), (np.ndarray, list)  # a union written at the call would be made for every field
@@ -33,8 +34,8 @@ NUMBER, ARRAY = (int, float), (np.ndarray, list)  # a union written at the call 
 class RosBag(Source):
     """The numeric fields of all messages, called `TOPIC:field`.
 
-    Fields are `/wrench:wrench.force.x`, `/commands:data[3]`; those of a sensor_msgs/JointState go by joint name,
-    `/joint_states:position.elbow`. Times are `TOPIC:header.stamp` (when it was measured) and `TOPIC:log_time` (when the
+    Fields are `/wrench:wrench.force.x`, `/commands:data[3]`; where a message names its joints, they go by these names:
+    `/joint_states:position.elbow`, `/controller_state:feedback.positions.elbow`. Times are `TOPIC:header.stamp` (when it was measured) and `TOPIC:log_time` (when the
     recorder got it), in ns. One table is one topic, with a row for every message that has all columns asked for;
     `read_on_one_clock` joins several.
 
@@ -72,11 +73,16 @@ class RosBag(Source):
     def _topics(self) -> Mapping[str, tuple[str, ...]]:
         """Topic -> its columns."""
         found: dict[str, dict[str, None]] = {}
+        self._named = dict[str, dict[str, None]]()
         with self._open() as reader:
             for connection in reader.connections:
                 names = found.setdefault(connection.topic, {})
                 for _, _, raw in islice(reader.messages([connection]), LOOKED_AT):
-                    names |= dict.fromkeys(numbers(reader.deserialize(raw, connection.msgtype)))
+                    vectors: dict[str, list[str]] = {}
+                    names |= dict.fromkeys(numbers(reader.deserialize(raw, connection.msgtype), None, vectors))
+                    for vector, elements in vectors.items():
+                        own = self._named.setdefault(f"{connection.topic}:{vector}", {})
+                        own |= dict.fromkeys(f"{connection.topic}:{name}" for name in elements)
                     names[LOG_TIME] = None
         return {topic: tuple(f"{topic}:{name}" for name in names) for topic, names in found.items()}
 
@@ -87,17 +93,13 @@ class RosBag(Source):
     @property
     @override
     def vectors(self) -> Mapping[str, tuple[str, ...]]:
-        """`TOPIC:position` for all joints of a JointState, in the order of the messages, and vectors of geometry.
+        """`TOPIC:position` for all joints that messages name, in their order, and vectors of geometry.
 
         A pose is x, y, z of its place and x, y, z, w of its turn, a twist its linear and its angular part.
         """
-        found = dict(super().vectors)
-        known = set(self.columns())
+        found, known = dict(super().vectors), set(self.columns())
+        found |= {vector: tuple(names) for vector, names in self._named.items()}
         for name in self.columns():
-            for kind in OF_JOINTS:
-                topic, found_kind, joint = name.partition(f":{kind}.")
-                if found_kind and joint:
-                    found[f"{topic}:{kind}"] = (*found.get(f"{topic}:{kind}", ()), name)
             axes = tuple(f"{name[:-1]}{axis}" for axis in "xyzw")
             if name.endswith(".x") and known.issuperset(axes[:3]):
                 found[name[:-2]] = axes[: 4 if axes[3] in known else 3]
@@ -160,39 +162,58 @@ class RosBag(Source):
         return {name: np.concatenate(own[1:] or own) for name, own in pieces.items()}
 
 
-def numbers(message: Any, fields: Collection[str] | None = None) -> dict[str, int | float]:
-    """The numbers of a message by path, `wrench.force.x` or `data[3]`; stamps in ns, joints of a JointState by name.
+def numbers(
+    message: Any, fields: Collection[str] | None = None, vectors: dict[str, list[str]] | None = None
+) -> dict[str, int | float]:
+    """The numbers of a message by path, `wrench.force.x` or `data[3]`; stamps in ns, elements that have names by these.
 
     Texts and vectors of more than `LONGEST_VECTOR` numbers are left out; with `fields`, all but these fields of the
-    message. Raises FileFormatError for a JointState whose names and values differ in number.
+    message. `vectors` receives the paths of the elements of every vector whose elements have names.
+    Raises FileFormatError for a JointState whose names and values differ in number.
     """
     found: dict[str, int | float] = {}
-    for name, value in vars(message).items():
-        if fields is not None and name not in fields:
-            continue
-        if name in OF_JOINTS and message.__msgtype__ == JOINT_STATE:
-            if len(value) not in (0, len(message.name)):
-                raise FileFormatError(
-                    f"a JointState has {len(message.name)} names but {len(value)} values of {name!r}."
-                )
-            found.update(zip((f"{name}.{joint}" for joint in message.name), value.tolist(), strict=False))
-        else:
-            _collect(value, name, found)
+    _collect(message, "", (), fields, {} if vectors is None else vectors, found)
     return found
 
 
-def _collect(value: Any, path: str, found: dict[str, int | float]) -> None:
-    if isinstance(value, NUMBER):
-        found[path] = value
-    elif isinstance(value, ARRAY):
-        if isinstance(value, list) or len(value) <= LONGEST_VECTOR:
-            for index, element in enumerate(value if isinstance(value, list) else value.tolist()):
-                _collect(element, f"{path}[{index}]", found)
-    elif not isinstance(value, str):
-        if value.__msgtype__ in TIMES:
+def _collect(
+    message: Any,
+    before: str,
+    names: Sequence[str],
+    fields: Collection[str] | None,
+    vectors: dict[str, list[str]],
+    found: dict[str, int | float],
+) -> None:
+    """The fields of a message; `names` are those that a message around it gives to elements."""
+    parts = vars(message)
+    own = (texts for name, texts in parts.items() if NAMES.fullmatch(name) and isinstance(texts, list))
+    names = next((texts for texts in own if len(set(map(str, texts))) == len(texts)), names)
+    for name, value in parts.items():
+        path = before + name
+        if (fields is not None and name not in fields) or isinstance(value, str):
+            continue
+        if isinstance(value, NUMBER):
+            found[path] = value
+        elif isinstance(value, ARRAY):
+            if isinstance(value, np.ndarray) and len(value) > LONGEST_VECTOR:
+                continue
+            if message.__msgtype__ == JOINT_STATE and len(value) not in (0, len(names)):
+                raise FileFormatError(f"a JointState has {len(names)} names but {len(value)} values of {name!r}.")
+            elements = value if isinstance(value, list) else value.tolist()
+            paths = [f"{path}[{index}]" for index in range(len(elements))]
+            if len(names) == len(elements):
+                paths = [f"{path}.{each}" for each in names]
+            if elements and isinstance(elements[0], NUMBER):
+                found.update(zip(paths, elements, strict=True))
+                if len(names) == len(elements):
+                    vectors[path] = paths
+            elif elements and not isinstance(elements[0], str):
+                for inside, element in zip(paths, elements, strict=True):
+                    _collect(element, f"{inside}.", names, None, vectors, found)
+        elif value.__msgtype__ in TIMES:
             found[path] = value.sec * NANOSECONDS + value.nanosec
         else:
-            found.update((f"{path}.{name}", part) for name, part in numbers(value).items())
+            _collect(value, f"{path}.", names, None, vectors, found)
 
 
 @dataclass(frozen=True)

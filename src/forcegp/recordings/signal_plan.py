@@ -252,10 +252,12 @@ def _sensor(mapping: ColumnMapping, frame: str, source: Source, model: forcegp.M
 
 def _expressions(patterns: Sequence[str], joints: Sequence[str], source: Source, may_lack: bool) -> list[Expression]:
     names: list[str] = []
-    columns = source.columns()
+    columns, vectors = source.columns(), source.vectors
     for pattern in patterns:
         for text in expanded(pattern, joints):
-            names += [text] if text in columns else source.vectors.get(text, (text,))
+            by_name = [f"{text}.{joint}" for joint in joints]  # messages may list the joints in another order
+            known = text not in columns and joints and set(by_name) <= set(vectors.get(text, ()))
+            names += [text] if text in columns else by_name if known else vectors.get(text, (text,))
     return [
         LACKING
         if may_lack and LACKS.fullmatch(name) and name not in columns
