@@ -185,3 +185,41 @@ def test_stamps_in_nanoseconds_keep_their_last_digit(tmp_path):
     mapping = ColumnMapping(time="stamp", q=("q{1..2}",), u=("0",), unit={"time": ("ns",)})
     found = imported(tmp_path / "log.csv", mapping)
     np.testing.assert_array_equal(found.time, data["time"])
+
+
+def test_velocities_that_hold_no_number_are_derived_and_said(tmp_path):
+    data = motion()
+    for lacking in ([0, 1], [1]):
+        columns = table(data) | {f"v_{JOINTS[joint]}": np.full(200, np.nan) for joint in lacking}
+        found = imported(write_text(tmp_path / "log.csv", columns), NAMES, bad_rows="skip")
+        expected = np.where(np.isin([0, 1], lacking), differentiate(data["q"], data["time"]), data["v"])
+        np.testing.assert_allclose(found.v, expected, rtol=1e-12)
+        done = found.metadata["import"]
+        assert [f"every v of {', '.join(JOINTS[joint] for joint in lacking)} is missing" in note
+                for note in done["recordings"][0]["notes"]] == [True]  # fmt: skip
+        assert done["signals"]["v"] == ("" if len(lacking) == 2 else "logged and ") + "central differences of q"
+
+
+def test_rows_that_lack_a_value_are_left_out_up_to_a_twentieth(tmp_path):
+    data = motion()
+
+    def log(*rows, names=("u_elbow",)):
+        columns = {name: values.copy() for name, values in table(data).items()}
+        for name in names:
+            columns[name][list(rows)] = np.nan
+        return write_text(tmp_path / "log.csv", columns)
+
+    everything = [name for name in table(data) if name != "time"]
+    for names, options in ((["u_elbow"], {"bad_rows": "skip"}), (everything, {}), (["time"], {"bad_rows": "skip"})):
+        found = imported(log(0, 50, 51, names=names), NAMES, rate="log", **options)
+        np.testing.assert_array_equal(found.q, np.delete(data["q"], [0, 50, 51], axis=0))
+        assert found.metadata["import"]["recordings"][0]["notes"] == [
+            "rows left out because they lack a value: 3 of 200"
+        ]
+        assert found.metadata["import"]["recordings"][0]["repeated_stamps_dropped"] == 0
+    assert imported(log(*range(10, 20)), NAMES, bad_rows="skip").episodes == (0, 1)
+    with pytest.raises(DatasetError, match=r"11 of 200 rows lack a value, .* 5% at most"):
+        imported(log(*range(10, 21)), NAMES, bad_rows="skip")
+    for names in (everything, ["u_elbow"]):
+        with pytest.raises(DatasetError, match=r"is missing \(empty or NaN\) at row 10 .*`bad_rows` skip"):
+            imported(log(*range(10, 21), names=names), NAMES)

@@ -153,12 +153,15 @@ class ColumnOptions:
     """Leave out what comes later."""
     unwrap: bool = False
     """Continue angles of joints that jump by a turn."""
+    bad_rows: Literal["refuse", "skip"] = "refuse"
+    """skip: leave out rows that lack a value, up to 5 % of a log; their number is printed. Rows that lack all are never
+    refused."""
     beyond_limits: bool = False
     """Accept positions beyond the limits of the URDF."""
 
     def options(self) -> forcegp.recordings.ImportOptions:
         """How rows come of columns. Raises InvalidInput."""
-        same = ("gap", "start", "end", "unwrap", "beyond_limits")
+        same = ("gap", "start", "end", "unwrap", "bad_rows", "beyond_limits")
         given: dict[str, Any] = {name: getattr(self, name) for name in same} | {"rate": self.rate}
         if self.rate not in ("auto", "log"):
             complaint = f"--rate is {self.rate!r}; give rows per second, auto or log."

@@ -42,6 +42,8 @@ class ImportOptions:
         that rate; "log" keeps every stamp.
     start, end: seconds from the first row of each episode that are kept.
     unwrap: add whole turns to positions of turning joints where they jump by more than half a turn.
+    bad_rows: "skip" leaves out rows in which a value is missing or no finite number, up to 5 % of a log; "refuse" only
+        those in which every value is.
     beyond_limits: accept positions beyond the limits of the URDF.
     stance: "auto" takes logs whose u lacks the switches of contacts. They are 0 in the dataset, and "open_switches" of
         what was done names them: `Preparation(stance="auto")` has to find them. "log" refuses such logs.
@@ -54,6 +56,7 @@ class ImportOptions:
     start: float | None = None
     end: float | None = None
     unwrap: bool = False
+    bad_rows: Literal["refuse", "skip"] = "refuse"
     beyond_limits: bool = False
     stance: Literal["log", "auto"] = "log"
 
@@ -65,8 +68,9 @@ class ImportOptions:
             raise InvalidInput(f"rate is {self.rate!r}; give rows per second, 'auto' or 'log'.")
         if self.start is not None and self.end is not None and not self.start < self.end:
             raise InvalidInput(f"start ({self.start} s) must come before end ({self.end} s).")
-        if self.stance not in ("log", "auto"):
-            raise InvalidInput(f"stance is {self.stance!r}; allowed: 'log' or 'auto'.")
+        for name, allowed in (("stance", ("log", "auto")), ("bad_rows", ("refuse", "skip"))):
+            if getattr(self, name) not in allowed:
+                raise InvalidInput(f"{name} is {getattr(self, name)!r}; allowed: {allowed[0]!r} or {allowed[1]!r}.")
 
 
 def import_recordings(
@@ -182,7 +186,8 @@ def _what_was_done(
 ) -> dict[str, Any]:
     files = dict.fromkeys(file for _, source in sources for file in source.files())
     made = {"u": "none", "v": "central differences of q", "a": "central differences of v"}
-    lacking = {name for name, entries in plan.layout.derived.items() if entries}
+    lacking = {name: len(rows) for own in recordings for name, rows in own.layout.derived.items() if rows}
+    whole = {name for name, count in lacking.items() if count == sum(x.signal == name for x in plan.signals)}
     return {
         "files": [{"name": str(file), "bytes": file.stat().st_size, "sha256": file_digest(file)} for file in files],
         "mapping": mapping.plain(),
@@ -197,7 +202,11 @@ def _what_was_done(
         },
         "open_switches": list(plan.open_switches),
         "signals": {
-            name: f"logged and {made[name]}" if name in lacking else "logged" if name in plan.logged else made[name]
+            name: made[name]
+            if name not in plan.logged or name in whole
+            else f"logged and {made[name]}"
+            if name in lacking
+            else "logged"
             for name in SIGNALS
         },
         "recordings": [recording.told for recording in recordings],

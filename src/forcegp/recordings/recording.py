@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
@@ -76,8 +76,14 @@ def read_recording(
     read = read_on_one_clock(source, plan)
     columns = read.columns
     rows = len(columns[plan.columns[0]])
-    time, begin = _seconds(plan, source, columns, rows)
     values = np.stack([item.value(columns, rows) for item in plan.signals], axis=1)
+    lost = _lost(label, plan, columns, values, skip=options.bad_rows == "skip")
+    derived, unlogged = _unlogged(plan, values)
+    if lost.any():  # stand-ins that nobody sees: the rows before them
+        good = np.where(lost, np.argmin(lost), np.arange(rows))
+        columns = {name: column[np.maximum.accumulate(good)] for name, column in columns.items()}
+        values = values[np.maximum.accumulate(good)]
+    time, begin = _seconds(plan, source, columns, rows)
     _require_finite(values, columns, plan, source, time)
     episodes = np.zeros((1, 2), np.int64) if plan.episode is None else _episodes(columns[plan.episode], source)
     jumps = _continued(plan, values, episodes[:, 1], options.unwrap)
@@ -85,12 +91,52 @@ def read_recording(
         _require_plausible_positions(label, values, plan, robot, believed)
     signals = {name: values[:, [item.signal == name for item in plan.signals]] for name in plan.logged}
     signals["q"], turned, told = read_poses(plan.layout.space, plan.orientation, source, signals["q"], episodes[:, 1])
-    layout = replace(plan.layout, held=read.held or plan.layout.held)
-    stretches, step, worst, left_out = _stretches(label, source, time, episodes, read, options)
+    layout = replace(plan.layout, held=read.held or plan.layout.held, derived=derived)
+    stretches, step, worst, left_out = _stretches(label, source, time, episodes, read, options, lost)
     seconds = float(sum(np.ptp(time[rows]) for _, rows in stretches))
     about = {"name": label, "rows": rows, "seconds": seconds, "median_step": step, "largest_deviation_of_a_step": worst}
-    about |= {**left_out, "notes": [*read.notes, *told]}
+    skipped = [f"rows left out because they lack a value: {lost.sum()} of {rows}"] if lost.any() else []
+    about |= {**left_out, "notes": [*read.notes, *unlogged, *skipped, *told]}
     return Recording(about, source, signals, time, begin, (*jumps, *turned), layout, stretches, step, worst)
+
+
+def _unlogged(plan: SignalPlan, values: Float[np.ndarray, "rows signals"]) -> tuple[dict[str, list[int]], list[str]]:
+    """Entries of v and a to be derived, those that hold no number at all among them, which become 0; and remarks."""
+    derived, notes = {name: list(rows) for name, rows in plan.layout.derived.items()}, list[str]()
+    for name in ("v", "a"):
+        own = [column for column, item in enumerate(plan.signals) if item.signal == name]
+        empty = [row for row, column in enumerate(own) if np.isnan(values[:, column]).all()]
+        if empty and (len(empty) == len(own) or plan.layout.space.is_vector_space):
+            values[:, [own[row] for row in empty]] = 0.0
+            derived[name] = sorted({*empty, *derived.get(name, ())})
+            joints = ", ".join(plan.signals[own[row]].joint for row in empty)
+            notes.append(f"every {name} of {joints} is missing, so it is derived (--{name} derive)")
+    return derived, notes
+
+
+MOST_LOST = 0.05
+"""Of the rows: a driver loses single messages, and what lacks more is another topic, sensor or log."""
+
+
+def _lost(
+    label: str, plan: SignalPlan, columns: Columns, values: Float[np.ndarray, "rows signals"], *, skip: bool
+) -> Bool[np.ndarray, " rows"]:
+    """Rows to leave out: those without any value, and with `skip` those without one of them or without a stamp."""
+    missing = np.logical_not(np.isfinite(values))
+    there = ~missing.all(axis=0)  # what the log lacks throughout is no loss of rows
+    measured = there & np.array([bool(item.expression.weights) for item in plan.signals])
+    lost: np.ndarray = missing[:, measured].all(axis=1)
+    if skip:
+        lost = missing[:, there].any(axis=1)
+        for name in (*(plan.time.weights if plan.time else ()), *([plan.episode] if plan.episode else ())):
+            lost |= ~np.isfinite(columns[name])
+    count, rows = int(lost.sum()), len(values)
+    if skip and count > MOST_LOST * rows:
+        raise DatasetError(
+            f"{label}: {count} of {rows} rows lack a value, and `bad_rows` skip leaves out {MOST_LOST:.0%} at most. "
+            "Map other columns, or repair the log."
+        )
+    return lost if count <= MOST_LOST * rows else np.zeros(rows, bool)  # then the first value that is missing is named
 
 
 def _seconds(plan: SignalPlan, source: Source, columns: Columns, rows: int) -> tuple[np.ndarray, float]:
@@ -188,7 +234,7 @@ def _require_finite(
     raise DatasetError(
         f"{source.path}: column {name!r} ({item.signal} of joint {item.joint!r}) is {_shown(value)} at "
         f"{source.place(row)}, {time[row]:.6g} s from the start; {int((~np.isfinite(values)).sum())} such values. "
-        "Repair or remove these rows, or map another column."
+        "Repair these rows, map another column, or leave such rows out by `bad_rows` skip."
     )
 
 
@@ -262,7 +308,13 @@ SLOWEST, FASTEST = 2.0, 2e5
 
 
 def _stretches(
-    label: str, source: Source, time: Float[np.ndarray, " rows"], episodes: np.ndarray, read: Read, options: Any
+    label: str,
+    source: Source,
+    time: Float[np.ndarray, " rows"],
+    episodes: np.ndarray,
+    read: Read,
+    options: Any,
+    lost: Bool[np.ndarray, " rows"],
 ) -> tuple[tuple[tuple[int, np.ndarray], ...], float, float, dict[str, Any]]:
     """Rows between gaps, their median step, the worst relative deviation from it, and what was left out.
 
@@ -287,9 +339,10 @@ def _stretches(
         raise DatasetError(f"{label}: all rows have the same time stamp; map another column as the time.")
     typical = float(np.median(positive))
     _require_rate(label, typical)
-    kept = np.diff(time, prepend=-np.inf) >= REPEATED * typical
-    kept[begins] = True
-    repeated = len(kept) - int(kept.sum())
+    kept = ~lost
+    kept[~lost] = np.diff(time[~lost], prepend=-np.inf) >= REPEATED * typical
+    kept[begins] = ~lost[begins]
+    repeated = int((~lost & ~kept).sum())
     since = time - np.repeat(time[begins], np.diff([*begins, len(time)]))
     start, end = -np.inf if options.start is None else options.start, np.inf if options.end is None else options.end
     kept &= (since >= start) & (since <= end)

@@ -34,10 +34,10 @@ NUMBER, ARRAY = (int, float), (np.ndarray, list)  # a union written at the call 
 class RosBag(Source):
     """The numeric fields of all messages, called `TOPIC:field`.
 
-    Fields are `/wrench:wrench.force.x`, `/commands:data[3]`; where a message names its joints, they go by these names:
-    `/joint_states:position.elbow`, `/controller_state:feedback.positions.elbow`. Times are `TOPIC:header.stamp` (when it was measured) and `TOPIC:log_time` (when the
-    recorder got it), in ns. One table is one topic, with a row for every message that has all columns asked for;
-    `read_on_one_clock` joins several.
+    Fields are `/wrench:wrench.force.x`, `/commands:data[3]`; where a message names its joints, by these names:
+    `/joint_states:position.elbow`, `/controller_state:feedback.positions.elbow`. Times are `TOPIC:header.stamp` (when
+    it was measured) and `TOPIC:log_time` (when the recorder got it), in ns. One table is one topic, with a row for
+    every message that has all columns asked for; `read_on_one_clock` joins several.
 
     Raises MissingExtra without `rosbags`.
     """
