@@ -125,9 +125,9 @@ def _lost(
     missing = np.logical_not(np.isfinite(values))
     there = ~missing.all(axis=0)  # what the log lacks throughout is no loss of rows
     measured = there & np.array([bool(item.expression.weights) for item in plan.signals])
-    lost: np.ndarray = missing[:, measured].all(axis=1)
+    lost = np.array(missing[:, measured].all(axis=1))
     if skip:
-        lost = missing[:, there].any(axis=1)
+        lost = np.array(missing[:, there].any(axis=1))
         for name in (*(plan.time.weights if plan.time else ()), *([plan.episode] if plan.episode else ())):
             lost |= ~np.isfinite(columns[name])
     count, rows = int(lost.sum()), len(values)
