@@ -193,21 +193,10 @@ BROKEN = {
     "text": Broken(
         text(lambda t: t.replace(t.splitlines()[5].split(",")[2], "stop", 1)), "'q_elbow' holds 'stop' at row 4"
     ),
-    "dates": Broken(
-        written("log.csv", b"time,q,u\n2024-01-01 12:00:00.5,0,0\n"),
-        "Write the time as a number of seconds",
-        "--time time --q q,q --u u,u --robot arm.urdf",
-    ),
-    "decimal commas": Broken(
-        written("log.csv", b"time;q;u\n0,5;0;0\n"),
-        "Write decimal points instead of commas",
-        "--time time --q q,q --u u,u --robot arm.urdf",
-    ),
     "ragged": Broken(text(lambda t: t + "1.0,2.0\n"), "row 200 (line 202) has 2 fields instead of 7"),
     "duplicate names": Broken(text(lambda t: t.replace("v_elbow", "q_elbow")), "'q_elbow' stands over columns 3, 5"),
     "no header": Broken(text(lambda t: t[t.index("\n") + 1 :]), "add --headerless 7"),
     "binary": Broken(written("log.csv", bytes(range(256)) * 9), "holds binary data"),
-    "latin-1": Broken(written("log.csv", "time,q_größe\n0,1\n".encode("latin-1")), "not UTF-8 text"),
     "pickle": Broken(written("log.pkl", pickle.dumps([1])), "reading those runs code"),
     "folder": Broken(folder_of_logs, "no ROS 2 bag (metadata.yaml)"),
     "gzip bomb": Broken(bomb_of_gzip, "no log of sensors shrinks so far"),

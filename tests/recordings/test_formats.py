@@ -17,7 +17,7 @@ from tests.recordings.log_files import (
 )
 from tests.recordings.source_conformance import SourceConformance
 
-from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.errors import DataWarning, FileFormatError, InvalidInput
 from forcegp.recordings import open_source
 
 
@@ -67,6 +67,67 @@ class TestHeaderless(TestCsv):
 
     def expected(self):
         return {f"c{index + 1}": values for index, values in enumerate(table(motion()).values())}
+
+
+class TestExportOfADrive(Tables):
+    """Preamble, a line of units, decimal commas, letters of Windows."""
+
+    def write(self, folder):
+        names = [f"{name}°" for name in table(motion())]
+        rows = zip(*table(motion()).values(), strict=True)
+        lines = ["\t".join(repr(float(value)) for value in row).replace(".", ",") for row in rows]
+        head = ["Trace 2", "Date\t2024-01-01", "", "\t".join(names), "s\t" + "\t".join(["°"] * 6)]
+        (folder / "log.txt").write_bytes("\r\n".join([*head, *lines]).encode("cp1252"))
+        return folder / "log.txt"
+
+    def truncated(self, path):
+        return None
+
+    def expected(self):
+        return {f"{name}°": values for name, values in table(motion()).items()}
+
+    def test_what_was_taken_for_something_is_said(self, source):
+        assert source.notes() == (
+            "its letters are taken for cp1252",
+            "a line beside the names is left out: s, °",
+        )
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig", "cp1252"])
+@pytest.mark.parametrize(
+    ("head", "row", "seconds"),
+    [
+        ("s;rad\nt;größe", "{0},5;0,25", [0.5, 1.5, 2.5]),
+        ("t,größe", "{0}.5,.25", [0.5, 1.5, 2.5]),
+        ("t größe\n[s] [°]", "  {0}.5   .25 ", [0.5, 1.5, 2.5]),
+        ("t;größe", "{0}.5;.25;", [0.5, 1.5, 2.5]),
+        ("t;größe", "12:00:0{0},5;0,25", [43200.5, 43201.5, 43202.5]),
+        ("t,größe", "1970-01-02T00:00:0{0}.5Z,.25", [86400.5, 86401.5, 86402.5]),
+        ("t;größe", "2.1.1970 00:00:0{0},5;0,25", [86400.5, 86401.5, 86402.5]),
+    ],
+)
+def test_texts_of_other_programs(tmp_path, encoding, head, row, seconds):
+    lines = [row.format(second) for second in range(3)]
+    (tmp_path / "log.txt").write_bytes("\n".join([head, *lines]).encode(encoding))
+    read = open_source(tmp_path / "log.txt").read(["t", "größe"])
+    np.testing.assert_array_equal(read["t"], seconds)
+    np.testing.assert_array_equal(read["größe"], 0.25)
+
+
+def test_clocks_go_on_over_midnight(tmp_path):
+    (tmp_path / "log.csv").write_text("t,q\n23:59:59.5,0\n00:00:00.5,0\n00:00:01.5,0\n")
+    np.testing.assert_array_equal(open_source(tmp_path / "log.csv").read(["t"])["t"], 86399.5 + np.arange(3.0))
+
+
+@pytest.mark.parametrize("end", ["7,1", "7,1,-", "7"])
+def test_a_line_that_was_cut_is_left_out_with_a_warning(tmp_path, end):
+    (tmp_path / "log.csv").write_text("t,q,u\n1,2,3\n4,5,6\n" + end)
+    with pytest.warns(DataWarning, match="middle of a line: the 2 whole lines before are read"):
+        read = open_source(tmp_path / "log.csv").read(["t", "u"])
+    np.testing.assert_array_equal(read["u"], [3.0, 6.0])
+    (tmp_path / "log.csv").write_text("t,q,u\n1,2,3\n4,5\n4,5,6\n" + end)
+    with pytest.raises(FileFormatError, match=r"row 1 \(line 3\) has 2 fields instead of 3"):
+        open_source(tmp_path / "log.csv").read(["t", "u"])
 
 
 class TestParquet(Tables):

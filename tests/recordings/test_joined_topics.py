@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.recordings.log_files import EPOCH
+from tests.data import samples
+from tests.recordings.log_files import EPOCH, write_text
 
 from forcegp import Model, Robot
 from forcegp.data import Dataset
@@ -213,3 +214,24 @@ def test_stamps_that_run_backwards_are_refused(tmp_path, flight):
     messages += [("/rotors", int(nanoseconds(t)), commands([0.0] * 4)) for t in np.arange(0, 1, 0.01)]
     with pytest.raises(DatasetError, match="time runs backwards"):
         imported(written(tmp_path, messages), flight)
+
+
+def test_a_table_of_several_topics_is_joined_by_its_time(tmp_path):
+    """As plotting programs export them: cells of the other topics are empty. Straight lines are joined exactly."""
+    rows = np.arange(40)
+    time = 0.01 * rows + 0.004 * (rows % 2)
+    cells = {"__time": time, "/q[0]": 2 * time, "/q[1]": -time, "/v[0]": 2 + time, "/v[1]": 3 * time}
+    cells |= {"/u[0]": 5 * time, "/u[1]": time}
+    for name in cells:
+        if name != "__time":
+            cells[name] = np.where(rows % 2 == (name[1] != "q"), cells[name], np.nan)
+    cells["/v[1]"][1] = np.nan  # one value that was lost
+    mapping = ColumnMapping(time="__time", q=("/q",), v=("/v",), u=("/u",))
+    found = import_recordings([write_text(tmp_path / "log.csv", cells)], mapping, model=samples.model("continuous"))
+    own = time[4:-1:2]
+    np.testing.assert_allclose(found.time, own - own[0], atol=1e-15)
+    np.testing.assert_allclose(found.q, np.stack([2 * own, -own], axis=1), rtol=1e-13)
+    np.testing.assert_allclose(found.v, np.stack([2 + own, 3 * own], axis=1), rtol=1e-13)
+    np.testing.assert_allclose(found.u[:, 0], 5 * time[3:-2:2], rtol=1e-13)  # held
+    [note] = found.metadata["import"]["recordings"][0]["notes"]
+    assert note.startswith("rows are those of /q[0]: /v[0] interpolated, u held, /v[1] interpolated; 2 rows")

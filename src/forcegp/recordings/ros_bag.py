@@ -1,7 +1,7 @@
 """Bags of ROS 1 and 2, .mcap and .db3, read with `rosbags` (extra "logs"); several topics on one clock."""
 
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -135,6 +135,14 @@ class RosBag(Source):
         """The topic that has a column."""
         return next(topic for topic, names in self._topics.items() if name in names)
 
+    def stamp_beside(self, topic: str, wanted: str) -> str:
+        """The clock of a topic: that of the time where the topic has it. Raises InvalidInput for another kind."""
+        kinds = [wanted, *((STAMP, LOG_TIME) if wanted in (STAMP, LOG_TIME) else ())]
+        found = next((f"{topic}:{kind}" for kind in kinds if f"{topic}:{kind}" in self.columns()), None)
+        if found is None:
+            raise InvalidInput(f"{self.path}: {topic} has no {wanted}; name as `time` a {LOG_TIME}.")
+        return found
+
     @override
     def table(self, names: Sequence[str]) -> Columns:
         topics = sorted({self.topic_of(name) for name in names})
@@ -232,20 +240,33 @@ class Read:
                       axis=0)  # fmt: skip
 
 
+MOST_WHOLE = 0.5
+"""Of the rows of a table: where more have all columns, the others were lost, and no topics stand side by side."""
+
+
 def read_on_one_clock(source: Source, plan: SignalPlan) -> Read:
-    """The columns of a plan, all at the messages of the topic of its time.
+    """The columns of a plan, all at the messages of the topic of its time; of a sparse table, of its positions.
 
     Angles that move by half a turn or more between two messages are held, as they wrap, and of quaternions the sign
     means nothing. Raises InvalidInput where joining has no meaning, DatasetError for stamps that run backwards or do
     not overlap.
     """
-    if not isinstance(source, RosBag) or len({source.topic_of(name) for name in plan.columns}) == 1:
+    read: Callable[[str, list[str]], Columns]
+    topics = {name: source.topic_of(name) for name in plan.columns} if isinstance(source, RosBag) else {}
+    if isinstance(source, RosBag) and len({*topics.values()}) > 1:
+        beside = source.stamp_beside
+        read = lambda topic, names: source.read(list(dict.fromkeys(names)))  # noqa: E731
+    else:
         columns = source.read(plan.columns)
-        return Read(columns, source.notes())
+        topics, filled = _topics(columns, plan)
+        if not topics:
+            return Read(columns, source.notes())
+        beside = lambda topic, wanted: wanted  # noqa: E731
+        read = lambda topic, names: {name: columns[name][filled[topic]] for name in names}  # noqa: E731
     if plan.time is None or not plan.time.is_column:
         raise InvalidInput(f"{source.path}: several topics are joined by their stamps; name one column as `time`.")
     [time] = plan.time.weights
-    clock, seconds = source.topic_of(time), plan.time_unit.in_si(np.ones(1)).item()
+    clock, seconds = topics[time], plan.time_unit.in_si(np.ones(1)).item()
     measured = {name for item in plan.signals if item.signal != "u" for name in item.expression.weights}
     most, turns, held = dict[str, float](), dict[str, list[str]](), set(plan.layout.held)
     inputs = [item for item in plan.signals if item.signal == "u"]
@@ -256,21 +277,21 @@ def read_on_one_clock(source: Source, plan: SignalPlan) -> Read:
         if item.signal == "q" and item.unit.si == "rad":  # half a turn, in the units of the log
             half = np.pi / item.unit.in_si(np.ones(1)).item()
             most |= {name: half / max(abs(weight), 1e-300) for name, weight in item.expression.weights.items()}
-        if item.signal == "u" and (far := {x for x in item.expression.weights if source.topic_of(x) != clock}):
+        if item.signal == "u" and (far := {x for x in item.expression.weights if topics[x] != clock}):
             most |= dict.fromkeys(far - measured, 0.0)
             held.add(inputs.index(item))
     own: dict[str, list[str]] = {clock: [time]}
     for name in plan.columns:
-        own.setdefault(source.topic_of(name), []).append(name)
-    found = source.read(list(dict.fromkeys(own[clock])))
+        own.setdefault(topics[name], []).append(name)
+    found = read(clock, own[clock])
     notes, ways, tracks = list(source.notes()), list[str](), []
     stamps = found[time]
     kept = np.ones(len(stamps), bool)
     for topic in [topic for topic in own if topic != clock]:
-        stamp = _stamp_beside(source, topic, time.removeprefix(f"{clock}:"))
-        read = source.read(list(dict.fromkeys([stamp, *own[topic]])))
+        stamp = beside(topic, time.removeprefix(f"{clock}:"))
+        track = read(topic, [stamp, *own[topic]])
         notes += source.notes()
-        steps = np.diff(read[stamp]) * seconds
+        steps = np.diff(track[stamp]) * seconds
         if len(steps) and steps.min() < 0.0:
             raise DatasetError(
                 f"{source.path}: the stamps of {topic} run backwards by {-steps.min():.6g} s; topics are joined in the "
@@ -278,8 +299,8 @@ def read_on_one_clock(source: Source, plan: SignalPlan) -> Read:
             )
         largest = np.array([most.get(name, np.inf) for name in own[topic]])
         places = [[own[topic].index(name) for name in turn] for turn in turns.values() if {*turn} <= {*own[topic]}]
-        table = np.stack([read[name] for name in own[topic]], axis=1).astype(np.float64)
-        values, ages, there = _at(stamps, read[stamp], table, largest, places)
+        table = np.stack([track[name] for name in own[topic]], axis=1).astype(np.float64)
+        values, ages, there = _at(stamps, track[stamp], table, largest, places)
         how = "interpolated" if largest.all() else "interpolated, u held" if largest.any() else "held"
         other = stamp.removeprefix(topic) != time.removeprefix(clock)
         ways.append(f"{topic} {how}" + f" (by {LOG_TIME})" * other)
@@ -295,7 +316,9 @@ def read_on_one_clock(source: Source, plan: SignalPlan) -> Read:
     lost = f"; {outside} rows before the first or behind the last message of a topic left out" * bool(outside)
     notes.append(f"rows are those of {clock}: {', '.join(ways)}{lost}")
     columns = {name: found[name][kept] for name in plan.columns}
-    return Read(columns, tuple(notes), tuple(sorted(held)), tuple((step, ages[kept]) for step, ages in tracks))
+    return Read(
+        columns, tuple(dict.fromkeys(notes)), tuple(sorted(held)), tuple((step, ages[kept]) for step, ages in tracks)
+    )
 
 
 def _at(
@@ -322,10 +345,22 @@ def _at(
     return values + share[:, None] * change, np.where(span > 0, span, since), there
 
 
-def _stamp_beside(bag: RosBag, topic: str, wanted: str) -> str:
-    """The clock of a topic: that of the time where the topic has it. Raises InvalidInput for another kind."""
-    kinds = [wanted, *((STAMP, LOG_TIME) if wanted in (STAMP, LOG_TIME) else ())]
-    found: Any = next((f"{topic}:{kind}" for kind in kinds if f"{topic}:{kind}" in bag.columns()), None)
-    if found is None:
-        raise InvalidInput(f"{bag.path}: {topic} has no {wanted}; name as `time` a {LOG_TIME}.")
-    return found
+MOST_WHOLE = 0.5
+"""Of the rows of a table: where more have all columns, the others were lost, and no topics stand side by side."""
+
+
+def _topics(columns: Columns, plan: SignalPlan) -> tuple[dict[str, str], dict[str, Bool[np.ndarray, " rows"]]]:
+    """Columns of a table by topic, called by its first column, and where it has values: exports join several topics.
+
+    The time is that of the positions. One topic for a table of whole rows, or without a column of the time.
+    """
+    shared = {name for name in columns if plan.episode == name or (plan.time and name in plan.time.weights)}
+    filled = {name: ~np.isnan(values) for name, values in columns.items() if name not in shared}
+    filled = {name: own if own.any() else ~own for name, own in filled.items()}
+    positions = [name for item in plan.signals if item.signal == "q" for name in item.expression.weights]
+    whole = not filled or np.all(list(filled.values()), axis=0).mean() > MOST_WHOLE
+    if whole or plan.time is None or not plan.time.is_column or not positions:
+        return {}, filled
+    first: dict[bytes, str] = {}
+    topics = {name: first.setdefault(own.tobytes(), name) for name, own in filled.items()}
+    return topics | dict.fromkeys(shared, topics[positions[0]]), filled

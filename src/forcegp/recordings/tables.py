@@ -1,18 +1,25 @@
 """Tables: CSV, TSV and other text with one row per line, also compressed (.gz), and Parquet, read by pyarrow."""
 
+import codecs
 import csv
 import gzip
 import io
 import re
+import warnings
+from collections import Counter
 from collections.abc import Sequence
+from datetime import date
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 from pyarrow import csv as arrow_csv
 from typing_extensions import override
 
-from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.errors import DataWarning, FileFormatError, InvalidInput
+from forcegp.recordings.mapping import UNITS
 from forcegp.recordings.source import (
     Columns,
     Source,
@@ -30,8 +37,16 @@ DELIMITERS = {"comma": ",", "tab": "\t", "semicolon": ";", "blanks": BLANKS}
 
 _COMMENT_LINE = re.compile(rb"^[ \t]*#[^\n]*\n?", re.MULTILINE)
 _OUTER_BLANKS = re.compile(rb"^[ \t]+|[ \t]+$", re.MULTILINE)
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
+_NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*(e[+-]?\d+)?|[.,]\d+(e[+-]?\d+)?|inf|nan)", re.IGNORECASE)
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(e[+-]?\d+)?", re.IGNORECASE)
 _LONG_INTEGER = re.compile(r"\d{16,19}")
+_TIME = re.compile(
+    r"(?=.*\d[-/.:]\d)(\d{4}([-/.])\d\d?\2\d\d?|\d\d?\.\d\d?\.\d{4})?[T ]*"
+    r"(\d\d?:\d\d(?::\d\d(?:[.,]\d+)?)?)?(?:Z|[+-]\d\d:?\d\d)?"
+)
+_UNITS = {unit.lower() for units in UNITS.values() for unit in units} | {"%", "sec", "°", "°/s", "-", "", "degrees"}
+LAST_LINES = 20
+"""Of those that are looked at: they are rows, whatever stands above."""
 _CONVERSION = re.compile(
     r"In CSV column #(\d+): (?:Row #(\d+): )?CSV conversion error to \w+: invalid value '(.*)'", re.DOTALL
 )
@@ -51,9 +66,10 @@ class DelimitedText(Source):
         if headerless is not None and headerless < 1:
             raise InvalidInput(f"headerless is {headerless}; give the number of columns, at least 1.")
         with reading(path, "text"), self._opened() as stream:
+            self._notes = ["its letters are taken for cp1252"] if self.encoding == "cp1252" else []
             self._look(stream.peek(1), headerless, delimiter)
 
-    def _opened(self) -> io.BufferedReader:
+    def _opened(self) -> Any:
         """The bytes of the file, expanded if it is called .gz. Raises FileFormatError for bytes that are no text."""
         path, compressed = self.path, self.path.suffix.lower() == ".gz"
         if compressed:
@@ -73,42 +89,52 @@ class DelimitedText(Source):
             first = stream.peek(FIRST_BYTES)[:FIRST_BYTES]
             if not first.strip():
                 raise FileFormatError(f"{path} is empty; give a log with rows.")
+            self.encoding = _encoding(first)
+            if self.encoding != "utf-8":
+                with stream:
+                    text = stream.read().decode(self.encoding, "replace")
+                stream = io.BufferedReader(io.BytesIO(text.encode()), 2**20)
+                first = stream.peek(FIRST_BYTES)[:FIRST_BYTES]
             if b"\0" in first:
                 raise FileFormatError(
                     f"{path} holds binary data, not text; if it is another format, give it that format's extension."
                 )
-            first[: first.rfind(b"\n") + 1 or None].decode("utf-8")
-        except BaseException as error:
+        except BaseException:
             stream.close()
-            if isinstance(error, UnicodeDecodeError):
-                where = f"byte {error.start} is {first[error.start]:#04x}"
-                raise FileFormatError(f"{path} is not UTF-8 text ({where}); save it as UTF-8.") from error
             raise
         return stream
 
     def _look(self, first: bytes, headerless: int | None, delimiter: str | None) -> None:
-        """Find header, delimiter, number of lines before the first row, and whether there are comments."""
-        lines, comments, self._lines_before = [], [], 0
-        for raw in first.splitlines(keepends=True):
-            text = raw.decode("utf-8", "replace").lstrip("\ufeff").strip("\r\n")
+        """Find delimiter, header, the number of lines before the first row, and whether there are comments."""
+        lines, places, comments = list[str](), list[int](), list[str]()
+        whole = first[: first.rfind(b"\n") + 1] if first.count(b"\n") > 1 else first
+        for place, raw in enumerate(whole.splitlines()):
+            text = raw.decode("utf-8", "replace")
             if text.lstrip().startswith("#"):
-                comments.append(text.lstrip()[1:].strip())
+                comments += [] if len(lines) > 1 else [text.lstrip()[1:].strip()]
             elif text.strip():
                 lines.append(text)
-            self._lines_before += not lines
-            if len(lines) == 2:
-                break
+                places.append(place)
         if not lines:
             raise FileFormatError(f"{self.path} holds no rows, only comments or empty lines.")
         self._comments = bool(comments)
-        self._delimiter = delimiter or _detected_delimiter(lines, self.path)
-        fields = row = self._fields(lines[0])
-        numbers = all(_NUMBER.fullmatch(field) for field in fields)
+        self._delimiter = delimiter or _detected_delimiter(lines[-LAST_LINES:])
+        table = [self._fields(line) for line in lines]
+        width = Counter(map(len, table[-LAST_LINES:])).most_common(1)[0][0]
+        columns = zip(*(row for row in table[-LAST_LINES:] if len(row) == width), strict=True)
+        numeric = [sum(map(_is_number, column)) * 2 >= len(column) for column in columns]
+
+        def is_row(fields: Sequence[str]) -> bool:
+            holds = [_is_number(field) for field, own in zip(fields, numeric, strict=False) if own]
+            return len(fields) == width and any(fields) and bool(holds) and all(holds)
+
+        begin = next((place for place, fields in enumerate(table) if is_row(fields)), 1)
+        fields = table[begin] if begin < len(table) else []
         self._lines_per_row = 1
         if headerless is not None:
-            if not numbers:
+            if begin:
                 raise FileFormatError(
-                    f"{self.path} begins with {fields[0]!r}, which is no number; leave `headerless` out."
+                    f"{self.path} begins with {table[0][0]!r}, which is no number; leave `headerless` out."
                 )
             if len(fields) not in (1, headerless):
                 raise FileFormatError(
@@ -117,7 +143,7 @@ class DelimitedText(Source):
                 )
             self._columns = [f"c{index + 1}" for index in range(headerless)]
             self._lines_per_row = headerless // len(fields)
-        elif numbers:
+        elif not begin:
             self._columns = self._fields(comments[-1]) if comments else []
             if len(self._columns) != len(fields):
                 raise FileFormatError(
@@ -125,14 +151,21 @@ class DelimitedText(Source):
                     "or how many numbers make a row where every line holds one."
                 )
         else:
-            if len(lines) < 2:
+            if begin == len(table):
                 raise FileFormatError(f"{self.path} has a header but no rows.")
-            self._columns = [name or f"column{index + 1}" for index, name in enumerate(fields)]
-            row = self._fields(lines[1])
-            self._lines_before += 1
+            above = list(takewhile(lambda row: len(row) == len(fields), reversed(table[:begin])))[::-1]
+            names = max(above or table[begin - 1 : begin], key=lambda row: len({*map(_plain, row)} - _UNITS))
+            beside = [", ".join(dict.fromkeys(filter(None, row))) for row in above if row is not names]
+            self._notes += [f"a line beside the names is left out: {text:.80}" for text in beside if text]
+            if len(names) + 1 == len(fields) and not fields[-1]:  # rows that end with a delimiter
+                names = [*names, ""]
+            self._columns = [name or f"column{index + 1}" for index, name in enumerate(names)]
+        self._lines_before = places[begin]
         require_distinct(self.path, self._columns)
-        whole = zip(self._columns, row if self._lines_per_row == 1 else (), strict=False)
+        whole = list(zip(self._columns, fields if self._lines_per_row == 1 else (), strict=False))
         self._long_integers = {name for name, text in whole if _LONG_INTEGER.fullmatch(text)}
+        self._clocks = {name for name, text in whole if _TIME.fullmatch(text)}
+        self._decimal = "," if any(_DECIMAL_COMMA.fullmatch(x) for row in table[begin:] for x in row) else "."
 
     def _fields(self, line: str) -> list[str]:
         if self._delimiter == BLANKS:
@@ -146,6 +179,10 @@ class DelimitedText(Source):
         return tuple(self._columns)
 
     @override
+    def notes(self) -> tuple[str, ...]:
+        return tuple(self._notes)
+
+    @override
     def place(self, row: int) -> str:
         if self._comments:
             return super().place(row)
@@ -156,9 +193,14 @@ class DelimitedText(Source):
         stacked = self._lines_per_row > 1
         stored = ["c1"] if stacked else self._columns
         wanted = stored if stacked else list(names)
-        kinds = {name: pa.int64() if name in self._long_integers else pa.float64() for name in stored}
-        table = self._parsed(stored, wanted, kinds)
-        columns = {name: arrow_numbers(table.column(name)) for name in wanted}
+        kinds = dict.fromkeys(stored, pa.float64()) | dict.fromkeys(self._long_integers, pa.int64())
+        table = self._parsed(stored, wanted, kinds | dict.fromkeys(self._clocks, pa.string()))
+        columns = {
+            name: _seconds(table.column(name).to_pylist())
+            if name in self._clocks
+            else arrow_numbers(table.column(name))
+            for name in wanted
+        }
         if not stacked:
             return columns
         values, width = columns["c1"], self._lines_per_row
@@ -175,22 +217,30 @@ class DelimitedText(Source):
             for _ in range(self._lines_before):
                 stream.readline()
             source: Any = stream
-            if blanks or self._comments:
-                text = _COMMENT_LINE.sub(b"", stream.read())
+            if blanks or self._comments or not threads:
+                text = _COMMENT_LINE.sub(b"", stream.read()) if self._comments else stream.read()
+                if not threads and not text.endswith(b"\n"):  # is it the line at which the log was cut?
+                    text = text[: text.rfind(b"\n") + 1]
                 if blanks:
                     text = re.sub(rb"[ \t]+", b"\t", _OUTER_BLANKS.sub(b"", text.replace(b"\r\n", b"\n")))
                 source = io.BytesIO(text)
             try:
-                return arrow_csv.read_csv(
+                table = arrow_csv.read_csv(
                     source,
                     read_options=arrow_csv.ReadOptions(use_threads=threads, block_size=BLOCK, column_names=stored),
                     parse_options=arrow_csv.ParseOptions(delimiter="\t" if blanks else self._delimiter),
-                    convert_options=arrow_csv.ConvertOptions(include_columns=wanted, column_types=kinds),
+                    convert_options=arrow_csv.ConvertOptions(
+                        include_columns=wanted, column_types=kinds, decimal_point=self._decimal
+                    ),
                 )
             except pa.ArrowInvalid as error:
                 if threads:  # pyarrow counts rows on one thread only
                     return self._parsed(stored, wanted, kinds, threads=False)
                 raise self._told_by_pyarrow(error) from error
+            if not threads:
+                whole = f"the {len(table)} whole lines before are read"
+                warnings.warn(f"{self.path} ends in the middle of a line: {whole}.", DataWarning, stacklevel=2)
+            return table
 
     def _told_by_pyarrow(self, error: Exception) -> FileFormatError:
         text = str(error)
@@ -204,7 +254,7 @@ class DelimitedText(Source):
             name = "c1" if self._lines_per_row > 1 else self._columns[int(column)]
             where = f" at {line(row)}" if row else ""
             return FileFormatError(
-                f"{self.path}: column {name!r} holds {value!r}{where}, which is no number. {_remedy(value)}"
+                f"{self.path}: column {name!r} holds {value!r}{where}, which is no number. Repair or remove that row."
             )
         if ragged:
             row, expected, found = ragged.groups()
@@ -216,23 +266,44 @@ class DelimitedText(Source):
         return FileFormatError(f"{self.path} cannot be read as text: {text}")
 
 
-def _remedy(value: str) -> str:
-    if re.fullmatch(r"[+-]?\d+,\d+", value):
-        return "Write decimal points instead of commas."
-    if re.match(r"\d{4}-\d\d-\d\d|\d+:\d\d", value):
-        return "Write the time as a number of seconds, or give `step`."
-    return "Repair or remove that row."
+def _encoding(first: bytes) -> str:
+    """UTF-8 and UTF-16 where they show themselves, else the letters of Windows in Western Europe."""
+    if first.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    try:
+        first[: first.rfind(b"\n") + 1 or None].decode("utf-8")
+    except UnicodeDecodeError:
+        return "utf-8" if b"\0" in first else "cp1252"
+    return "utf-8-sig" if first.startswith(codecs.BOM_UTF8) else "utf-8"
 
 
-def _detected_delimiter(lines: Sequence[str], path: Path) -> str:
-    """The delimiter that stands equally often in the header and in the first row."""
-    for letter in ("\t", ",", ";"):
-        counts = {line.count(letter) for line in lines}
-        if letter in lines[0] and (len(counts) == 1 or letter == ","):
-            return letter
-    words = {len(line.split()) for line in lines}
-    if len(words) == 1 and words != {1}:
-        return BLANKS
-    if any(letter in lines[0] for letter in ";|") or len(lines[0].split()) > 1:
-        raise FileFormatError(f"{path}: its delimiter cannot be detected; add `delimiter`.")
-    return ","
+def _plain(field: str) -> str:
+    return field.strip("[]() ").lower()
+
+
+def _is_number(field: str) -> bool:
+    """Whether a row may hold this: a number, a time, or nothing where a value was lost."""
+    return not field or _NUMBER.fullmatch(field) is not None or _TIME.fullmatch(field) is not None
+
+
+def _seconds(texts: Sequence[str | None]) -> np.ndarray:
+    """Dates and clock times in s; clocks without a date go on over midnight. NaN for what is neither."""
+    seconds = np.full(len(texts), np.nan)
+    for row, found in enumerate(_TIME.fullmatch((text or "").strip()) for text in texts):
+        if found is not None:
+            day = [int(part) for part in re.split(r"\D", found[1] or "1970-1-1")]
+            days = date(*(day if day[0] > 31 else reversed(day))).toordinal() - date(1970, 1, 1).toordinal()
+            hour, minute, second = f"{found[3] or '0:0'}:0".replace(",", ".").split(":")[:3]
+            seconds[row] = 86400.0 * days + 3600 * int(hour) + 60 * int(minute) + float(second)
+    return seconds + 86400.0 * np.cumsum(np.diff(seconds, prepend=seconds[:1]) < -43200.0)
+
+
+def _detected_delimiter(lines: Sequence[str]) -> str:
+    """The delimiter between which the most numbers stand, of equal ones that with more lines of nothing else."""
+
+    def numbers(delimiter: str) -> tuple[int, int]:
+        table = [line.split(None if delimiter == BLANKS else delimiter) for line in lines]
+        found = [[_is_number(field.strip(' "')) and bool(field) for field in row] for row in table]
+        return sum(map(sum, found)), sum(map(all, found))
+
+    return max((",", "\t", ";", "|", BLANKS), key=numbers)
