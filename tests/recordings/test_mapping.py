@@ -13,7 +13,7 @@ from forcegp.cli.main import parse_arguments
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 from forcegp.recordings import ColumnMapping, by_quantity, listed, open_source
-from forcegp.recordings.mapping import expanded, guessed_columns, guessed_time, log_unit, parse_expression
+from forcegp.recordings.mapping import combined, expanded, guessed_columns, guessed_time, log_unit, parse_expression
 from forcegp.recordings.signal_plan import signal_plan
 
 COLUMNS = ("theta1", "theta2", "theta", "a-b", "a", "b", "/js:position.j1", "x[0]", "1e3")
@@ -92,6 +92,20 @@ def test_a_combination_has_the_value_of_its_terms(terms, data):
 )
 def test_patterns(pattern, names):
     assert expanded(pattern, JOINTS) == names
+
+
+@pytest.mark.parametrize(
+    ("pattern", "texts"),
+    [
+        ("2*(d{1..2}-q{1..2})", ["2*(d1-q1)", "2*(d2-q2)"]),
+        ("{.5,3}*effort.{joints}", [".5*effort.shoulder", "3*effort.elbow"]),
+        ("2*a{1..2}_{1..2}", ["2*a1_1", "2*a1_2", "2*a2_1", "2*a2_2"]),
+        ("a-{1..2}-{1..2}", ["a-1-1", "a-1-2", "a-2-1", "a-2-2"]),
+        ("{1..2}*a{1..3}", ["1*a1", "1*a2", "1*a3", "2*a1", "2*a2", "2*a3"]),
+    ],
+)
+def test_braces_of_a_combination_go_on_together(pattern, texts):
+    assert combined(pattern, JOINTS, {"a-1-1"}) == texts
 
 
 @pytest.mark.parametrize("pattern", ["a{1..}", "a{", "a}", "a{b}", "a{}", "a{1..99999}", "{0..99}{0..99}"])

@@ -251,6 +251,19 @@ def expanded(pattern: str, joints: Sequence[str]) -> list[str]:
     return texts
 
 
+def combined(pattern: str, joints: Sequence[str], names: Collection[str]) -> list[str]:
+    """As `expanded`; in a combination of columns, whose `names` are known, braces of equal length go on together."""
+    before, *others = BRACES.split(pattern)
+    inside, after = others[::2], others[1::2]
+    choices = [_choices(pattern, each, joints) for each in inside]
+    joined = len(inside) > 1 and all(re.search(r"[-+*/()]", text) for text in after[:-1])
+    if not joined or len(set(map(len, choices))) > 1:
+        return expanded(pattern, joints)
+    rows = zip(*choices, strict=True)
+    texts = [before + "".join(choice + text for choice, text in zip(row, after, strict=True)) for row in rows]
+    return expanded(pattern, joints) if texts[0] in names else texts
+
+
 COMMA = re.compile(r",(?![^{\[]*[}\]])(?=(?:[^`]*`[^`]*`)*[^`]*$)")
 
 
