@@ -307,7 +307,7 @@ def open_source(
 def _kind(path: Path) -> str:
     """The extension without .gz, or "ros2"."""
     if path.is_dir():
-        if (path / "metadata.yaml").is_file():
+        if (path / "metadata.yaml").is_file() or any(path.glob("*.mcap")):
             return "ros2"
         raise FileFormatError(f"{path} is a folder, but no ROS 2 bag (metadata.yaml); give the files in it.")
     if not path.is_file():

@@ -1,6 +1,10 @@
 """Bags of ROS 1 and 2, .mcap and .db3, read with `rosbags` (extra "logs"); several topics on one clock."""
 
 import re
+import shutil
+import tempfile
+import warnings
+import weakref
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,7 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 from typing_extensions import override
 
-from forcegp.errors import DatasetError, FileFormatError, InvalidInput, required_extra
+from forcegp.errors import DatasetError, DataWarning, FileFormatError, InvalidInput, required_extra
+from forcegp.recordings.cut_mcap import is_cut, whole_copy
 from forcegp.recordings.signal_plan import SignalPlan
 from forcegp.recordings.source import LONGEST_VECTOR, Columns, Source, reading, require_plausible_size
 from forcegp.robots.manifold import QUATERNION
@@ -48,20 +53,27 @@ class RosBag(Source):
         super().__init__(path)
         self._left_out = 0
         self.ros1 = path.suffix.lower() == ".bag"
+        own = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+        cut = [file for file in own if is_cut(file)]
+        self._read = own if cut or not (path / "metadata.yaml").is_file() else [path]
+        if cut:
+            copies = Path(tempfile.mkdtemp())
+            weakref.finalize(self, shutil.rmtree, copies)
+            self._read = [whole_copy(file, copies) if file in cut else file for file in own]
         if not self.columns():
             raise FileFormatError(f"{path} holds no messages with numbers.")
+        if cut:
+            with self._open() as reader:
+                whole = f"the {reader.message_count} whole messages before are read"
+            warnings.warn(f"{path} ends in the middle of a record: {whole}.", DataWarning, stacklevel=2)
 
     @contextmanager
     def _open(self) -> Iterator[Any]:
         reader_of = required_extra("rosbags.highlevel", "logs", "reading bags").AnyReader
         types = required_extra("rosbags.typesys", "logs", "reading bags")
         known = types.get_typestore(types.Stores.ROS1_NOETIC if self.ros1 else types.Stores.LATEST)
-        if self.path.is_dir() and not (self.path / "metadata.yaml").is_file():
-            raise FileFormatError(
-                f"{self.path} has no metadata.yaml; give a whole ROS 2 bag, or its .mcap or .db3 file."
-            )
         # Exception: rosbags meets damaged files with whatever its parsers, sqlite, zstd and lz4 raise
-        with reading(self.path, "a bag", Exception), reader_of([self.path], default_typestore=known) as reader:
+        with reading(self.path, "a bag", Exception), reader_of(self._read, default_typestore=known) as reader:
             # rosbags 0.11 does not publish its list of MCAP chunks; a version without it reads them unchecked
             for storage in (getattr(bag, "storage", None) for bag in reader.readers):
                 for store in getattr(storage, "storages", [storage]):  # a directory has several, a file is one
