@@ -1,12 +1,15 @@
-"""Files that hold arrays by name: NumPy archives (.npz), HDF5 of any layout, MATLAB files of all versions, Parquet."""
+"""Files that hold arrays by name: NumPy archives (.npz), HDF5 of any layout, MATLAB of all versions, Parquet, JSON."""
 
 import fnmatch
+import json
 import math
 import re
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -16,7 +19,7 @@ from numpy.lib import format as npy
 from pyarrow import parquet, types
 from typing_extensions import override
 
-from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.errors import DataWarning, FileFormatError, InvalidInput
 from forcegp.recordings.source import (
     LONGEST_VECTOR,
     Columns,
@@ -28,6 +31,7 @@ from forcegp.recordings.source import (
     require_distinct,
     require_plausible_size,
 )
+from forcegp.recordings.tables import seconds_of
 from forcegp.summary import listed
 
 SEPARATOR = "/"
@@ -171,7 +175,7 @@ def _stored(path: Path, group: h5py.Group, prefix: str) -> Iterator[tuple[str, t
                 f"{path}: {full!r} is in another file, and links to other files are not followed; give that file, or "
                 "copy the data into one."
             )
-        if isinstance(item, h5py.Group) and not name.startswith("#"):  # MATLAB keeps contents of cells there
+        if isinstance(item, h5py.Group):
             if prefix.count("/") > 32:
                 raise FileFormatError(f"{path}: its groups are nested more than 32 deep.")
             yield from _stored(path, item, f"{full}/")
@@ -181,24 +185,22 @@ def _stored(path: Path, group: h5py.Group, prefix: str) -> Iterator[tuple[str, t
 
 
 MATLAB = "a MATLAB file"
-NOT_NUMBERS = {"cell", "object", "opaque", "function", "unknown"}
+INTERNAL = "#"  # begins names under which MATLAB keeps the contents of cells
 
 
 def matlab_arrays(path: Path) -> Arrays:
-    """Of a .mat file: its matrices, and those in structs, called `struct/field`. Vectors may lie either way.
+    """Of a .mat file: its matrices, and those in structs, called `struct/field`, and in cells. Vectors lie either way.
 
     Of version 5 to 7, scipy reads whole variables, so what these hold must fit into memory. One of 7.3 is HDF5 whose
-    arrays lie column by column. Raises FileFormatError for cells, which have no columns.
+    arrays lie column by column.
     """
     if path.is_file() and h5py.is_hdf5(path):
         arrays = hdf5_arrays(path)
         with reading(path, MATLAB), h5py.File(path, "r") as file:
-            named = ((name, item) for name, item in file.items() if item is not None)  # None: a link to nothing
-            cells = [name for name, item in named if item.attrs.get("MATLAB_class", b"") == b"cell"]
-        if cells and not arrays:
-            raise _cell(path, cells[0])
-        upright = {name: _upright(shape[::-1]) for name, (shape, _) in arrays.items()}
-        return {
+            owners = [name for name in file if not name.startswith(INTERNAL) and _refers(file.get(name))]
+            cells = _lists({name: _referred(file, file[name]) for name in owners})
+        upright = {name: _upright(shape[::-1]) for name, (shape, _) in arrays.items() if not name.startswith(INTERNAL)}
+        return cells | {
             name: (shape, lambda name=name, shape=shape: arrays[name][1]().T.reshape(shape))
             for name, shape in upright.items()
         }
@@ -206,37 +208,96 @@ def matlab_arrays(path: Path) -> Arrays:
 
     with reading(path, MATLAB, matlab.MatReadError, NotImplementedError, MemoryError, IndexError):
         size = path.stat().st_size
-        for name, shape, kind in matlab.whosmat(str(path)):
+        for name, shape, _ in matlab.whosmat(str(path)):
             require_plausible_size(path, repr(name), 8 * math.prod(shape), size)
-            if kind in NOT_NUMBERS:
-                raise _cell(path, name)
-        content = loadmat(str(path), struct_as_record=True)
-    found: dict[str, np.ndarray] = {}
-
-    def collect(name: str, value: np.ndarray) -> None:
-        if value.dtype.names and value.size == 1:
-            for field in value.dtype.names:
-                collect(f"{name}/{field}", value.ravel()[0][field])
-        elif value.dtype.hasobject:
-            raise _cell(path, name)
-        elif value.dtype.kind in "fiu":
-            found[name] = value.reshape(_upright(value.shape))
-
-    for name, value in content.items():
-        if not name.startswith("__"):
-            collect(name, value)
-    return {name: (values.shape, lambda values=values: values) for name, values in found.items()}
+        content = loadmat(str(path), simplify_cells=True)
+        return _lists({name: value for name, value in content.items() if not name.startswith("__")})
 
 
 def _upright(shape: tuple[int, ...]) -> tuple[int, ...]:
     return (shape[1], 1) if len(shape) == 2 and shape[0] == 1 and shape[1] > 1 else shape
 
 
-def _cell(path: Path, name: str) -> FileFormatError:
-    return FileFormatError(
-        f"{path}: {name!r} is a cell, an object or an array of structs, which has no columns; "
-        "save matrices of numbers (cell2mat)."
-    )
+def _refers(item: Any) -> bool:
+    """Whether there is a cell or an array of structs in this part of an HDF5 file."""
+    return any(map(_refers, item.values())) if isinstance(item, h5py.Group) else getattr(item, "dtype", None) == object
+
+
+def _referred(file: h5py.File, item: Any) -> Any:
+    """The content of a part of a MATLAB file as mappings, lists and arrays."""
+    if isinstance(item, h5py.Group):
+        fields = {name: _referred(file, inside) for name, inside in item.items()}
+        if (
+            len({len(own) if isinstance(own, list) else -1 for own in fields.values()} - {-1})
+            == 1
+            == len({type(own) for own in fields.values()})
+        ):  # an array of structs
+            return [dict(zip(fields, each, strict=True)) for each in zip(*fields.values(), strict=True)]
+        return fields
+    if item.dtype == object:
+        return [_referred(file, file[reference]) for reference in item[()].T.ravel()]
+    return np.squeeze(item[()].T)
+
+
+def json_arrays(path: Path) -> Arrays:
+    """Of JSON, or of lines that are JSON each: arrays, and rows of a list of objects. The last line may be cut."""
+    with reading(path, "JSON"):
+        text = path.read_text(encoding="utf-8-sig")
+        try:
+            return _lists(json.loads(text))
+        except json.JSONDecodeError:
+            *lines, last = filter(str.strip, text.splitlines())
+            rows = [json.loads(line) for line in lines]
+            try:
+                rows.append(json.loads(last))
+            except json.JSONDecodeError:
+                if not rows:
+                    raise
+                whole = f"the {len(rows)} whole lines before are read"
+                warnings.warn(f"{path} ends in the middle of a line: {whole}.", DataWarning, stacklevel=2)
+            return _lists(rows)
+
+
+def _lists(content: Any) -> Arrays:
+    """The arrays of numbers in mappings and lists."""
+    found = {name.lstrip(SEPARATOR): values for name, values in _numbers("", content)}
+    return {name: (values.shape, lambda values=values: values) for name, values in found.items()}
+
+
+def _numbers(name: str, value: Any) -> Iterator[tuple[str, np.ndarray]]:
+    """Entries of a list are rows where they are alike and more than each has numbers; else they are called 1, 2, ..."""
+    if isinstance(value, Mapping):
+        texts = (own for key, own in value.items() if key == "name" or key.endswith("names"))
+        names = next((own for own in texts if isinstance(own, list) and all(isinstance(x, str) for x in own)), ())
+        for key, inside in value.items():
+            by_name = isinstance(inside, list) and len(inside) == len(names) > 0 and inside is not names
+            yield from _numbers(f"{name}/{key}", dict(zip(names, inside, strict=True)) if by_name else inside)
+    elif isinstance(value, str):
+        [seconds] = seconds_of([value])
+        if np.isfinite(seconds):
+            yield name, np.array(seconds)
+    elif (array := _array(value)) is not None:
+        yield name, array
+    elif isinstance(value, list | np.ndarray):
+        parts = [dict(_numbers("", inside)) for inside in value]
+        shapes = {(key, own.shape) for part in parts for key, own in part.items()}
+        alike = dict(shapes)
+        if len(alike) == len(shapes) and all(math.prod(shape) < len(parts) for shape in alike.values()):
+            for key, shape in {key: own.shape for part in parts for key, own in part.items()}.items():
+                yield name + key, np.array([part.get(key, np.full(shape, np.nan)) for part in parts])
+        else:
+            for number, part in enumerate(parts, 1):
+                yield from ((f"{name}/{number}{key}", own) for key, own in part.items())
+
+
+def _array(value: Any) -> np.ndarray | None:
+    """None for what is no array of numbers; what is missing in one is NaN."""
+    try:
+        array = np.array(value)
+        array = np.array(value, dtype=np.float64) if array.dtype == object else array
+    except (TypeError, ValueError):
+        return None
+    return array if array.dtype.kind in "fiub" else None
 
 
 PARQUET = "a Parquet file"
@@ -287,4 +348,7 @@ ARRAYS: dict[str, Callable[[Path], Arrays]] = {
     ".hdf5": hdf5_arrays,
     ".parquet": parquet_arrays,
     ".pq": parquet_arrays,
+    ".json": json_arrays,
+    ".jsonl": json_arrays,
+    ".ndjson": json_arrays,
 }

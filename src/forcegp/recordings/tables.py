@@ -196,7 +196,7 @@ class DelimitedText(Source):
         kinds = dict.fromkeys(stored, pa.float64()) | dict.fromkeys(self._long_integers, pa.int64())
         table = self._parsed(stored, wanted, kinds | dict.fromkeys(self._clocks, pa.string()))
         columns = {
-            name: _seconds(table.column(name).to_pylist())
+            name: seconds_of(table.column(name).to_pylist())
             if name in self._clocks
             else arrow_numbers(table.column(name))
             for name in wanted
@@ -286,7 +286,7 @@ def _is_number(field: str) -> bool:
     return not field or _NUMBER.fullmatch(field) is not None or _TIME.fullmatch(field) is not None
 
 
-def _seconds(texts: Sequence[str | None]) -> np.ndarray:
+def seconds_of(texts: Sequence[str | None]) -> np.ndarray:
     """Dates and clock times in s; clocks without a date go on over midnight. NaN for what is neither."""
     seconds = np.full(len(texts), np.nan)
     for row, found in enumerate(_TIME.fullmatch((text or "").strip()) for text in texts):
