@@ -10,7 +10,6 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-import scipy.io
 from numpy.lib import format as npy
 from tests.recordings.log_files import (
     motion,
@@ -130,13 +129,6 @@ def bomb_of_gzip(folder: Path) -> Path:
     return folder / "log.csv.gz"
 
 
-def cells(folder: Path) -> Path:
-    made = np.empty(2, object)
-    made[:] = [np.ones(3), np.ones(4)]
-    scipy.io.savemat(folder / "log.mat", {"q": made})
-    return folder / "log.mat"
-
-
 def linked(folder: Path) -> Path:
     write_hdf5(folder / "other.h5", motion())
     with h5py.File(folder / "log.h5", "w") as file:
@@ -221,7 +213,6 @@ BROKEN = {
     "Python objects": Broken(lambda f: archive(f, q=np.array([{}], object)), "reading them runs code", ARRAYS),
     "other lengths": Broken(lambda f: archive(f, u=np.ones((7, 2))), "different numbers of rows", ARRAYS),
     "no such group": Broken(archive, "no array or group", f"{ARRAYS} --episodes run*"),
-    "cells": Broken(cells, "'q' is a cell", ARRAYS),
     "external link": Broken(linked, "links to other files are not followed", ARRAYS),
     "hollow HDF5": Broken(hollow, "shrinks so far", ARRAYS),
     "two topics": Broken(

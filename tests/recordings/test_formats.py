@@ -1,7 +1,11 @@
 """Every format passes the same tests."""
 
+import json
+
+import h5py
 import numpy as np
 import pytest
+import scipy.io
 from tests.recordings.log_files import (
     EPOCH,
     JOINTS,
@@ -195,6 +199,65 @@ class TestMatlab73(Tables):
 
     def expected(self):
         return arrays("")
+
+
+def nested(rows=7):
+    """Entries of a list that are rows, and episodes of other lengths."""
+    alike = [{"t": 0.5 * row, "q": [row, -row], "mode": "auto"} for row in range(rows)]
+    return {"log": alike, "runs": [{"t": [0.0, 1.0]}, {"t": [2.0, 3.0, 4.0]}]}
+
+
+def write_json(folder):
+    (folder / "log.json").write_text(json.dumps(nested()))
+    return folder / "log.json"
+
+
+def write_cells(folder):
+    """An array of structs, and a cell of structs."""
+    log = np.array(
+        [(each["t"], np.array(each["q"], float)) for each in nested()["log"]], dtype=[("t", "O"), ("q", "O")]
+    )
+    runs = np.empty(2, object)
+    runs[:] = [{"t": np.array(run["t"])} for run in nested()["runs"]]
+    scipy.io.savemat(folder / "log.mat", {"log": log, "runs": runs, "name": "arm"})
+    return folder / "log.mat"
+
+
+def write_cells73(folder):
+    with h5py.File(folder / "log.mat", "w") as file:
+        for field, values in (("t", [0.5 * row for row in range(7)]), ("q", [[[row], [-row]] for row in range(7)])):
+            inside = [file.create_dataset(f"#refs#/{field}{row}", data=value).ref for row, value in enumerate(values)]
+            file.create_dataset(f"log/{field}", data=np.array([inside]).T, dtype=h5py.ref_dtype)
+        for run, values in enumerate(nested()["runs"], 1):
+            file[f"runs/{run}/t"] = np.array(values["t"])[:, None]
+    return folder / "log.mat"
+
+
+@pytest.mark.parametrize("write", [write_json, write_cells, write_cells73])
+def test_lists_of_objects_are_rows_or_episodes(tmp_path, write):
+    source = open_source(write(tmp_path))
+    assert set(source.columns()) == {"log/t", "log/q[0]", "log/q[1]", "runs/1/t", "runs/2/t"}
+    read = source.read(["log/t", "log/q[1]"])
+    np.testing.assert_array_equal(read["log/t"], 0.5 * np.arange(7))
+    np.testing.assert_array_equal(read["log/q[1]"], -np.arange(7))
+    np.testing.assert_array_equal(open_source(tmp_path / source.path.name, within="runs/2").read(["t"])["t"], [2, 3, 4])
+
+
+def test_lines_of_json_are_rows_and_the_last_may_be_cut(tmp_path):
+    stamps = [f"2024-01-01T00:00:0{row}.5Z" for row in range(4)]
+    lines = [
+        {"stamp": stamp, "names": ["b", "a"], "pos": [row, 2 * row], "u": None if row else 3}
+        for row, stamp in enumerate(stamps)
+    ]
+    (tmp_path / "log.jsonl").write_text("\n".join(map(json.dumps, lines))[:-5])
+    with pytest.warns(DataWarning, match="the 3 whole lines before are read"):
+        read = open_source(tmp_path / "log.jsonl").read(["stamp", "pos/a", "u"])
+    np.testing.assert_array_equal(read["stamp"] - read["stamp"][0], [0, 1, 2])
+    np.testing.assert_array_equal(read["pos/a"], [0, 2, 4])
+    np.testing.assert_array_equal(read["u"], [3, np.nan, np.nan])
+    (tmp_path / "log.jsonl").write_text('{"t": 1\n{"t": 2}\n')
+    with pytest.raises(FileFormatError, match=r"log\.jsonl cannot be read as JSON"):
+        open_source(tmp_path / "log.jsonl").columns()
 
 
 class Bags(Tables):

@@ -7,6 +7,7 @@ import re
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -186,6 +187,7 @@ def _stored(path: Path, group: h5py.Group, prefix: str) -> Iterator[tuple[str, t
 
 MATLAB = "a MATLAB file"
 INTERNAL = "#"  # begins names under which MATLAB keeps the contents of cells
+REFERENCE = np.dtype(object)
 
 
 def matlab_arrays(path: Path) -> Arrays:
@@ -197,10 +199,10 @@ def matlab_arrays(path: Path) -> Arrays:
     if path.is_file() and h5py.is_hdf5(path):
         arrays = hdf5_arrays(path)
         with reading(path, MATLAB), h5py.File(path, "r") as file:
-            owners = [name for name in file if not name.startswith(INTERNAL) and _refers(file.get(name))]
-            cells = _lists({name: _referred(file, file[name]) for name in owners})
-        upright = {name: _upright(shape[::-1]) for name, (shape, _) in arrays.items() if not name.startswith(INTERNAL)}
-        return cells | {
+            if file.visititems(lambda _, item: True if getattr(item, "dtype", None) == REFERENCE else None):
+                return _lists({name: _referred(file, file[name]) for name in map(str, file) if name[0] != INTERNAL})
+        upright = {name: _upright(shape[::-1]) for name, (shape, _) in arrays.items() if name[0] != INTERNAL}
+        return {
             name: (shape, lambda name=name, shape=shape: arrays[name][1]().T.reshape(shape))
             for name, shape in upright.items()
         }
@@ -218,23 +220,11 @@ def _upright(shape: tuple[int, ...]) -> tuple[int, ...]:
     return (shape[1], 1) if len(shape) == 2 and shape[0] == 1 and shape[1] > 1 else shape
 
 
-def _refers(item: Any) -> bool:
-    """Whether there is a cell or an array of structs in this part of an HDF5 file."""
-    return any(map(_refers, item.values())) if isinstance(item, h5py.Group) else getattr(item, "dtype", None) == object
-
-
 def _referred(file: h5py.File, item: Any) -> Any:
-    """The content of a part of a MATLAB file as mappings, lists and arrays."""
+    """The content of a part of a MATLAB file as mappings, lists (cells, fields of arrays of structs) and arrays."""
     if isinstance(item, h5py.Group):
-        fields = {name: _referred(file, inside) for name, inside in item.items()}
-        if (
-            len({len(own) if isinstance(own, list) else -1 for own in fields.values()} - {-1})
-            == 1
-            == len({type(own) for own in fields.values()})
-        ):  # an array of structs
-            return [dict(zip(fields, each, strict=True)) for each in zip(*fields.values(), strict=True)]
-        return fields
-    if item.dtype == object:
+        return {name: _referred(file, item[name]) for name in item}
+    if item.dtype == REFERENCE:
         return [_referred(file, file[reference]) for reference in item[()].T.ravel()]
     return np.squeeze(item[()].T)
 
@@ -249,55 +239,46 @@ def json_arrays(path: Path) -> Arrays:
             *lines, last = filter(str.strip, text.splitlines())
             rows = [json.loads(line) for line in lines]
             try:
-                rows.append(json.loads(last))
+                return _lists([*rows, json.loads(last)])
             except json.JSONDecodeError:
                 if not rows:
                     raise
-                whole = f"the {len(rows)} whole lines before are read"
-                warnings.warn(f"{path} ends in the middle of a line: {whole}.", DataWarning, stacklevel=2)
-            return _lists(rows)
+        whole = f"the {len(rows)} whole lines before are read"
+        warnings.warn(f"{path} ends in the middle of a line: {whole}.", DataWarning, stacklevel=2)
+        return _lists(rows)
 
 
 def _lists(content: Any) -> Arrays:
     """The arrays of numbers in mappings and lists."""
-    found = {name.lstrip(SEPARATOR): values for name, values in _numbers("", content)}
+    found = {name.lstrip(SEPARATOR): values for name, values in _numbers(content, "")}
     return {name: (values.shape, lambda values=values: values) for name, values in found.items()}
 
 
-def _numbers(name: str, value: Any) -> Iterator[tuple[str, np.ndarray]]:
+def _numbers(value: Any, name: str) -> Iterator[tuple[str, np.ndarray]]:
     """Entries of a list are rows where they are alike and more than each has numbers; else they are called 1, 2, ..."""
     if isinstance(value, Mapping):
-        texts = (own for key, own in value.items() if key == "name" or key.endswith("names"))
-        names = next((own for own in texts if isinstance(own, list) and all(isinstance(x, str) for x in own)), ())
+        texts = (own for key, own in value.items() if (key == "name" or key.endswith("names")) and type(own) is list)
+        names = next(texts, ())
         for key, inside in value.items():
-            by_name = isinstance(inside, list) and len(inside) == len(names) > 0 and inside is not names
-            yield from _numbers(f"{name}/{key}", dict(zip(names, inside, strict=True)) if by_name else inside)
-    elif isinstance(value, str):
-        [seconds] = seconds_of([value])
-        if np.isfinite(seconds):
-            yield name, np.array(seconds)
-    elif (array := _array(value)) is not None:
-        yield name, array
-    elif isinstance(value, list | np.ndarray):
-        parts = [dict(_numbers("", inside)) for inside in value]
-        shapes = {(key, own.shape) for part in parts for key, own in part.items()}
-        alike = dict(shapes)
-        if len(alike) == len(shapes) and all(math.prod(shape) < len(parts) for shape in alike.values()):
-            for key, shape in {key: own.shape for part in parts for key, own in part.items()}.items():
+            named = type(inside) is list and inside is not names and len(inside) == len(names) > 0
+            yield from _numbers(dict(zip(names, inside, strict=True)) if named else inside, f"{name}/{key}")
+        return
+    array = seconds_of([value])[0] if isinstance(value, str) else value
+    with suppress(TypeError, ValueError):
+        array = np.array(array)
+        array = np.array(value, dtype=np.float64) if array.dtype == object else array
+        if array.dtype.kind in "fiub" and not (isinstance(value, str) and np.isnan(array)):
+            yield name, array
+            return
+    if isinstance(value, list | np.ndarray):
+        parts = [dict(_numbers(inside, "")) for inside in value]
+        shapes = {key: own.shape for part in parts for key, own in part.items()}
+        if all(own.shape == shapes[key] and own.size < len(parts) for part in parts for key, own in part.items()):
+            for key, shape in shapes.items():
                 yield name + key, np.array([part.get(key, np.full(shape, np.nan)) for part in parts])
         else:
             for number, part in enumerate(parts, 1):
                 yield from ((f"{name}/{number}{key}", own) for key, own in part.items())
-
-
-def _array(value: Any) -> np.ndarray | None:
-    """None for what is no array of numbers; what is missing in one is NaN."""
-    try:
-        array = np.array(value)
-        array = np.array(value, dtype=np.float64) if array.dtype == object else array
-    except (TypeError, ValueError):
-        return None
-    return array if array.dtype.kind in "fiub" else None
 
 
 PARQUET = "a Parquet file"

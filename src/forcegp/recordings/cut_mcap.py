@@ -3,10 +3,10 @@
 import io
 import sys
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from forcegp.errors import required_extra
 from forcegp.recordings.source import reading, require_plausible_size
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -29,29 +29,24 @@ def whole_copy(path: Path, folder: Path) -> Path:
     copy = folder / path.name
     with reading(path, "a bag", Exception), path.open("rb") as file, copy.open("wb") as made:
         made.write(file.read(len(MAGIC)))
-        for kind, record, whole in _records(file):
-            if kind == DATA_END:
-                break
-            content = record[9:]
+        for kind, content, record in _records(file):
             size, name = int.from_bytes(content[16:24], "little"), int.from_bytes(content[28:32], "little")
             if kind == CHUNK:
                 require_plausible_size(path, "a chunk", size, len(content))
-            if whole:
-                made.write(record)
-            elif kind == CHUNK:
+            if kind == CHUNK and not record:
                 packed = content[40 + name :]
                 if name:
                     module, reader = READERS[content[32 : 32 + name].decode()]
-                    unpacker = getattr(required_extra(module, "logs", "reading bags"), reader)()
-                    packed = unpacker.decompress(packed, max_length=size)
-                made.writelines(inside for _, inside, complete in _records(io.BytesIO(packed)) if complete)
+                    packed = getattr(import_module(module), reader)().decompress(packed, max_length=size)
+                record = b"".join(inside for _, _, inside in _records(io.BytesIO(packed)))
+            made.write(b"" if kind >= DATA_END else record)
         made.write(END)
     return copy
 
 
-def _records(file: Any) -> Iterator[tuple[int, bytes, bool]]:
-    """Kind, bytes, and whether none are missing."""
+def _records(file: Any) -> Iterator[tuple[int, bytes, bytes]]:
+    """Kind, content, and the whole record, which is empty at the cut."""
     while len(head := file.read(9)) == 9:
         length = int.from_bytes(head[1:], "little")
         content = file.read(min(length, sys.maxsize))
-        yield head[0], head + content, len(content) == length
+        yield head[0], content, head + content if len(content) == length else b""

@@ -1,6 +1,7 @@
 """`import_recordings`: from log files to one dataset; which reader reads which file, and files side by side."""
 
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -186,29 +187,17 @@ def _what_was_done(
 ) -> dict[str, Any]:
     files = dict.fromkeys(file for _, source in sources for file in source.files())
     made = {"u": "none", "v": "central differences of q", "a": "central differences of v"}
-    lacking = {name: len(rows) for own in recordings for name, rows in own.layout.derived.items() if rows}
-    whole = {name for name, count in lacking.items() if count == sum(x.signal == name for x in plan.signals)}
+    lacking = {name: max(len(own.layout.derived.get(name, ())) for own in recordings) for name in SIGNALS}
+    entries = Counter(item.signal for item in plan.signals)
+    logged = {name: f"logged and {made[name]}" if count else "logged" for name, count in lacking.items()}
+    columns = [(x.signal, x.expression.text) for x in plan.signals if x.signal != "u" or x.expression is not LACKING]
     return {
         "files": [{"name": str(file), "bytes": file.stat().st_size, "sha256": file_digest(file)} for file in files],
         "mapping": mapping.plain(),
         "guessed": list(plan.guessed),
-        "columns": {
-            name: [
-                x.expression.text
-                for x in plan.signals
-                if x.signal == name and not (name == "u" and x.expression is LACKING)
-            ]
-            for name in plan.logged
-        },
+        "columns": {name: [text for signal, text in columns if signal == name] for name in plan.logged},
         "open_switches": list(plan.open_switches),
-        "signals": {
-            name: made[name]
-            if name not in plan.logged or name in whole
-            else f"logged and {made[name]}"
-            if name in lacking
-            else "logged"
-            for name in SIGNALS
-        },
+        "signals": {name: made[name] if lacking[name] == entries[name] else logged[name] for name in SIGNALS},
         "recordings": [recording.told for recording in recordings],
         "resampled_to_step": step,
         "episodes": [],

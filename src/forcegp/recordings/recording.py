@@ -92,7 +92,7 @@ def read_recording(
     signals = {name: values[:, [item.signal == name for item in plan.signals]] for name in plan.logged}
     signals["q"], turned, told = read_poses(plan.layout.space, plan.orientation, source, signals["q"], episodes[:, 1])
     layout = replace(plan.layout, held=read.held or plan.layout.held, derived=derived)
-    stretches, step, worst, left_out = _stretches(label, source, time, episodes, read, options, lost)
+    stretches, step, worst, left_out = _stretches(label, source, time, episodes, replace(read, lost=lost), options)
     seconds = float(sum(np.ptp(time[rows]) for _, rows in stretches))
     about = {"name": label, "rows": rows, "seconds": seconds, "median_step": step, "largest_deviation_of_a_step": worst}
     skipped = [f"rows left out because they lack a value: {lost.sum()} of {rows}"] if lost.any() else []
@@ -308,13 +308,7 @@ SLOWEST, FASTEST = 2.0, 2e5
 
 
 def _stretches(
-    label: str,
-    source: Source,
-    time: Float[np.ndarray, " rows"],
-    episodes: np.ndarray,
-    read: Read,
-    options: Any,
-    lost: Bool[np.ndarray, " rows"],
+    label: str, source: Source, time: Float[np.ndarray, " rows"], episodes: np.ndarray, read: Read, options: Any
 ) -> tuple[tuple[tuple[int, np.ndarray], ...], float, float, dict[str, Any]]:
     """Rows between gaps, their median step, the worst relative deviation from it, and what was left out.
 
@@ -339,10 +333,10 @@ def _stretches(
         raise DatasetError(f"{label}: all rows have the same time stamp; map another column as the time.")
     typical = float(np.median(positive))
     _require_rate(label, typical)
-    kept = ~lost
-    kept[~lost] = np.diff(time[~lost], prepend=-np.inf) >= REPEATED * typical
-    kept[begins] = ~lost[begins]
-    repeated = int((~lost & ~kept).sum())
+    kept = ~read.lost
+    kept[kept] = np.diff(time[kept], prepend=-np.inf) >= REPEATED * typical
+    kept[begins] = ~read.lost[begins]
+    repeated = int((~read.lost & ~kept).sum())
     since = time - np.repeat(time[begins], np.diff([*begins, len(time)]))
     start, end = -np.inf if options.start is None else options.start, np.inf if options.end is None else options.end
     kept &= (since >= start) & (since <= end)

@@ -5,9 +5,9 @@ import shutil
 import tempfile
 import warnings
 import weakref
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -20,7 +20,7 @@ from typing_extensions import override
 from forcegp.errors import DatasetError, DataWarning, FileFormatError, InvalidInput, required_extra
 from forcegp.recordings.cut_mcap import is_cut, whole_copy
 from forcegp.recordings.signal_plan import SignalPlan
-from forcegp.recordings.source import LONGEST_VECTOR, Columns, Source, reading, require_plausible_size
+from forcegp.recordings.source import LONGEST_VECTOR, Columns, Source, element_names, reading, require_plausible_size
 from forcegp.robots.manifold import QUATERNION
 
 LOG_TIME = "log_time"
@@ -85,7 +85,7 @@ class RosBag(Source):
     def _topics(self) -> Mapping[str, tuple[str, ...]]:
         """Topic -> its columns."""
         found: dict[str, dict[str, None]] = {}
-        self._named = dict[str, dict[str, None]]()
+        self._named = dict[str, tuple[str, ...]]()
         with self._open() as reader:
             for connection in reader.connections:
                 names = found.setdefault(connection.topic, {})
@@ -93,8 +93,9 @@ class RosBag(Source):
                     vectors: dict[str, list[str]] = {}
                     names |= dict.fromkeys(numbers(reader.deserialize(raw, connection.msgtype), None, vectors))
                     for vector, elements in vectors.items():
-                        own = self._named.setdefault(f"{connection.topic}:{vector}", {})
-                        own |= dict.fromkeys(f"{connection.topic}:{name}" for name in elements)
+                        of = f"{connection.topic}:"
+                        own = dict.fromkeys((*self._named.get(of + vector, ()), *(of + name for name in elements)))
+                        self._named[of + vector] = tuple(own)
                     names[LOG_TIME] = None
         return {topic: tuple(f"{topic}:{name}" for name in names) for topic, names in found.items()}
 
@@ -109,8 +110,7 @@ class RosBag(Source):
 
         A pose is x, y, z of its place and x, y, z, w of its turn, a twist its linear and its angular part.
         """
-        found, known = dict(super().vectors), set(self.columns())
-        found |= {vector: tuple(names) for vector, names in self._named.items()}
+        known, found = set(self.columns()), {**super().vectors, **self._named}
         for name in self.columns():
             axes = tuple(f"{name[:-1]}{axis}" for axis in "xyzw")
             if name.endswith(".x") and known.issuperset(axes[:3]):
@@ -147,14 +147,6 @@ class RosBag(Source):
         """The topic that has a column."""
         return next(topic for topic, names in self._topics.items() if name in names)
 
-    def stamp_beside(self, topic: str, wanted: str) -> str:
-        """The clock of a topic: that of the time where the topic has it. Raises InvalidInput for another kind."""
-        kinds = [wanted, *((STAMP, LOG_TIME) if wanted in (STAMP, LOG_TIME) else ())]
-        found = next((f"{topic}:{kind}" for kind in kinds if f"{topic}:{kind}" in self.columns()), None)
-        if found is None:
-            raise InvalidInput(f"{self.path}: {topic} has no {wanted}; name as `time` a {LOG_TIME}.")
-        return found
-
     @override
     def table(self, names: Sequence[str]) -> Columns:
         topics = sorted({self.topic_of(name) for name in names})
@@ -188,62 +180,55 @@ def numbers(
     """The numbers of a message by path, `wrench.force.x` or `data[3]`; stamps in ns, elements that have names by these.
 
     Texts and vectors of more than `LONGEST_VECTOR` numbers are left out; with `fields`, all but these fields of the
-    message. `vectors` receives the paths of the elements of every vector whose elements have names.
-    Raises FileFormatError for a JointState whose names and values differ in number.
+    message. `vectors` receives the paths in every vector whose elements have names. Raises FileFormatError for a
+    JointState whose names and values differ in number.
     """
     found: dict[str, int | float] = {}
-    _collect(message, "", (), fields, {} if vectors is None else vectors, found)
-    return found
 
-
-def _collect(
-    message: Any,
-    before: str,
-    names: Sequence[str],
-    fields: Collection[str] | None,
-    vectors: dict[str, list[str]],
-    found: dict[str, int | float],
-) -> None:
-    """The fields of a message; `names` are those that a message around it gives to elements."""
-    parts = vars(message)
-    own = (texts for name, texts in parts.items() if NAMES.fullmatch(name) and isinstance(texts, list))
-    names = next((texts for texts in own if len(set(map(str, texts))) == len(texts)), names)
-    for name, value in parts.items():
-        path = before + name
-        if (fields is not None and name not in fields) or isinstance(value, str):
-            continue
-        if isinstance(value, NUMBER):
-            found[path] = value
-        elif isinstance(value, ARRAY):
-            if isinstance(value, np.ndarray) and len(value) > LONGEST_VECTOR:
+    def collect(message: Any, before: str, names: Sequence[str]) -> None:
+        own = (texts for name, texts in vars(message).items() if NAMES.fullmatch(name) and isinstance(texts, list))
+        names = next((texts for texts in own if len(set(map(str, texts))) == len(texts)), names)
+        for name, value in vars(message).items():
+            path = before + name
+            if (fields is not None and not before and name not in fields) or isinstance(value, str):
                 continue
-            if message.__msgtype__ == JOINT_STATE and len(value) not in (0, len(names)):
-                raise FileFormatError(f"a JointState has {len(names)} names but {len(value)} values of {name!r}.")
-            elements = value if isinstance(value, list) else value.tolist()
-            paths = [f"{path}[{index}]" for index in range(len(elements))]
-            if len(names) == len(elements):
-                paths = [f"{path}.{each}" for each in names]
-            if elements and isinstance(elements[0], NUMBER):
-                found.update(zip(paths, elements, strict=True))
+            if isinstance(value, NUMBER):
+                found[path] = value
+            elif isinstance(value, ARRAY):
+                if message.__msgtype__ == JOINT_STATE and len(value) not in (0, len(names)):
+                    raise FileFormatError(f"a JointState has {len(names)} names but {len(value)} values of {name!r}.")
+                elements = value if isinstance(value, list) else value.tolist() if len(value) <= LONGEST_VECTOR else []
+                paths = element_names(path, len(elements))
                 if len(names) == len(elements):
-                    vectors[path] = paths
-            elif elements and not isinstance(elements[0], str):
-                for inside, element in zip(paths, elements, strict=True):
-                    _collect(element, f"{inside}.", names, None, vectors, found)
-        elif value.__msgtype__ in TIMES:
-            found[path] = value.sec * NANOSECONDS + value.nanosec
-        else:
-            _collect(value, f"{path}.", names, None, vectors, found)
+                    paths = [f"{path}.{each}" for each in names]
+                if elements and isinstance(elements[0], NUMBER):
+                    found.update(zip(paths, elements, strict=True))
+                    if vectors is not None and len(names) == len(elements):
+                        vectors[path] = paths
+                elif elements and not isinstance(elements[0], str):
+                    for inside, element in zip(paths, elements, strict=True):
+                        collect(element, f"{inside}.", names)
+            elif value.__msgtype__ in TIMES:
+                found[path] = value.sec * NANOSECONDS + value.nanosec
+            else:
+                collect(value, f"{path}.", names)
+
+    collect(message, "", ())
+    return found
 
 
 @dataclass(frozen=True)
 class Read:
-    """Columns of one length, remarks, rows of u that hold, and of other topics the median step and the age per row."""
+    """Columns of one length, remarks, columns of u that hold, of other topics the median step and the age per row.
+
+    And rows that were lost.
+    """
 
     columns: Columns
     notes: tuple[str, ...]
     held: tuple[int, ...] = ()
     silent: tuple[tuple[float, Float[np.ndarray, " rows"]], ...] = ()
+    lost: Bool[np.ndarray, " rows"] = field(default_factory=lambda: np.zeros(0, bool))
 
     def paused(self, gap: float | None, steps: float) -> Bool[np.ndarray, " rows"]:
         """Rows for which a topic was silent: for `gap` seconds, or so many of its median steps."""
@@ -263,18 +248,18 @@ def read_on_one_clock(source: Source, plan: SignalPlan) -> Read:
     means nothing. Raises InvalidInput where joining has no meaning, DatasetError for stamps that run backwards or do
     not overlap.
     """
-    read: Callable[[str, list[str]], Columns]
     topics = {name: source.topic_of(name) for name in plan.columns} if isinstance(source, RosBag) else {}
-    if isinstance(source, RosBag) and len({*topics.values()}) > 1:
-        beside = source.stamp_beside
-        read = lambda topic, names: source.read(list(dict.fromkeys(names)))  # noqa: E731
-    else:
-        columns = source.read(plan.columns)
-        topics, filled = _topics(columns, plan)
+    whole, filled = Columns(), dict[str, np.ndarray]()
+    if len({*topics.values()}) < 2:
+        whole = source.read(plan.columns)
+        topics, filled = _topics(whole, plan)
         if not topics:
-            return Read(columns, source.notes())
-        beside = lambda topic, wanted: wanted  # noqa: E731
-        read = lambda topic, names: {name: columns[name][filled[topic]] for name in names}  # noqa: E731
+            return Read(whole, source.notes())
+
+    def read(topic: str, names: Sequence[str]) -> Columns:
+        names = list(dict.fromkeys(names))
+        return {name: whole[name][filled[topic]] for name in names} if whole else source.read(names)
+
     if plan.time is None or not plan.time.is_column:
         raise InvalidInput(f"{source.path}: several topics are joined by their stamps; name one column as `time`.")
     [time] = plan.time.weights
@@ -300,7 +285,7 @@ def read_on_one_clock(source: Source, plan: SignalPlan) -> Read:
     stamps = found[time]
     kept = np.ones(len(stamps), bool)
     for topic in [topic for topic in own if topic != clock]:
-        stamp = beside(topic, time.removeprefix(f"{clock}:"))
+        stamp = _stamp_beside(source, topic, time.removeprefix(f"{clock}:"))
         track = read(topic, [stamp, *own[topic]])
         notes += source.notes()
         steps = np.diff(track[stamp]) * seconds
@@ -328,9 +313,8 @@ def read_on_one_clock(source: Source, plan: SignalPlan) -> Read:
     lost = f"; {outside} rows before the first or behind the last message of a topic left out" * bool(outside)
     notes.append(f"rows are those of {clock}: {', '.join(ways)}{lost}")
     columns = {name: found[name][kept] for name in plan.columns}
-    return Read(
-        columns, tuple(dict.fromkeys(notes)), tuple(sorted(held)), tuple((step, ages[kept]) for step, ages in tracks)
-    )
+    silent = tuple((step, ages[kept]) for step, ages in tracks)
+    return Read(columns, tuple(dict.fromkeys(notes)), tuple(sorted(held)), silent)
 
 
 def _at(
@@ -355,6 +339,17 @@ def _at(
     change = np.where(np.abs(later - values) < most, later - values, 0.0)
     share = np.divide(since, span, out=np.zeros(len(time)), where=span > 0)
     return values + share[:, None] * change, np.where(span > 0, span, since), there
+
+
+def _stamp_beside(source: Source, topic: str, wanted: str) -> str:
+    """The clock of a topic: that of the time where the topic has it. Raises InvalidInput for another kind."""
+    if not isinstance(source, RosBag):
+        return wanted
+    kinds = [wanted, *((STAMP, LOG_TIME) if wanted in (STAMP, LOG_TIME) else ())]
+    found = next((f"{topic}:{kind}" for kind in kinds if f"{topic}:{kind}" in source.columns()), None)
+    if found is None:
+        raise InvalidInput(f"{source.path}: {topic} has no {wanted}; name as `time` a {LOG_TIME}.")
+    return found
 
 
 MOST_WHOLE = 0.5

@@ -9,7 +9,7 @@ import warnings
 from collections import Counter
 from collections.abc import Sequence
 from datetime import date
-from itertools import takewhile
+from itertools import compress, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -48,9 +48,9 @@ _UNITS = {unit.lower() for units in UNITS.values() for unit in units} | {"%", "s
 LAST_LINES = 20
 """Of those that are looked at: they are rows, whatever stands above."""
 _CONVERSION = re.compile(
-    r"In CSV column #(\d+): (?:Row #(\d+): )?CSV conversion error to \w+: invalid value '(.*)'", re.DOTALL
+    r"In CSV column #(\d+): Row #(\d+): CSV conversion error to \w+: invalid value '(.*)'", re.DOTALL
 )
-_RAGGED = re.compile(r"(?:Row #(\d+): )?Expected (\d+) columns, got (\d+)")
+_RAGGED = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+)")
 
 
 class DelimitedText(Source):
@@ -123,12 +123,8 @@ class DelimitedText(Source):
         width = Counter(map(len, table[-LAST_LINES:])).most_common(1)[0][0]
         columns = zip(*(row for row in table[-LAST_LINES:] if len(row) == width), strict=True)
         numeric = [sum(map(_is_number, column)) * 2 >= len(column) for column in columns]
-
-        def is_row(fields: Sequence[str]) -> bool:
-            holds = [_is_number(field) for field, own in zip(fields, numeric, strict=False) if own]
-            return len(fields) == width and any(fields) and bool(holds) and all(holds)
-
-        begin = next((place for place, fields in enumerate(table) if is_row(fields)), 1)
+        like = [len(row) == width and any(row) and all(map(_is_number, compress(row, numeric))) for row in table]
+        begin = like.index(True) if any(numeric) and any(like) else 1
         fields = table[begin] if begin < len(table) else []
         self._lines_per_row = 1
         if headerless is not None:
@@ -154,7 +150,10 @@ class DelimitedText(Source):
             if begin == len(table):
                 raise FileFormatError(f"{self.path} has a header but no rows.")
             above = list(takewhile(lambda row: len(row) == len(fields), reversed(table[:begin])))[::-1]
-            names = max(above or table[begin - 1 : begin], key=lambda row: len({*map(_plain, row)} - _UNITS))
+            names = max(
+                above or table[begin - 1 : begin],
+                key=lambda row: len({field.strip("[]() ").lower() for field in row} - _UNITS),
+            )
             beside = [", ".join(dict.fromkeys(filter(None, row))) for row in above if row is not names]
             self._notes += [f"a line beside the names is left out: {text:.80}" for text in beside if text]
             if len(names) + 1 == len(fields) and not fields[-1]:  # rows that end with a delimiter
@@ -195,12 +194,8 @@ class DelimitedText(Source):
         wanted = stored if stacked else list(names)
         kinds = dict.fromkeys(stored, pa.float64()) | dict.fromkeys(self._long_integers, pa.int64())
         table = self._parsed(stored, wanted, kinds | dict.fromkeys(self._clocks, pa.string()))
-        columns = {
-            name: seconds_of(table.column(name).to_pylist())
-            if name in self._clocks
-            else arrow_numbers(table.column(name))
-            for name in wanted
-        }
+        columns = {name: arrow_numbers(table.column(name)) for name in {*wanted} - self._clocks}
+        columns |= {name: seconds_of(table.column(name).to_pylist()) for name in self._clocks.intersection(wanted)}
         if not stacked:
             return columns
         values, width = columns["c1"], self._lines_per_row
@@ -244,26 +239,16 @@ class DelimitedText(Source):
 
     def _told_by_pyarrow(self, error: Exception) -> FileFormatError:
         text = str(error)
-        converted, ragged = _CONVERSION.search(text), _RAGGED.search(text)
 
         def line(number: str) -> str:
             return self.place((int(number) - 1) // self._lines_per_row)  # pyarrow counts from 1
 
-        if converted:
-            column, row, value = converted.groups()
-            name = "c1" if self._lines_per_row > 1 else self._columns[int(column)]
-            where = f" at {line(row)}" if row else ""
-            return FileFormatError(
-                f"{self.path}: column {name!r} holds {value!r}{where}, which is no number. Repair or remove that row."
-            )
-        if ragged:
-            row, expected, found = ragged.groups()
-            where = f"{line(row)} has" if row else "one row has"
-            return FileFormatError(
-                f"{self.path}: {where} {found} fields instead of {expected}. Repair or remove it "
-                "(the end of a log is often cut)."
-            )
-        return FileFormatError(f"{self.path} cannot be read as text: {text}")
+        if found := _CONVERSION.search(text):
+            name = "c1" if self._lines_per_row > 1 else self._columns[int(found[1])]
+            text = f"column {name!r} holds {found[3]!r} at {line(found[2])}, which is no number. Repair or remove it."
+        elif found := _RAGGED.search(text):
+            text = f"{line(found[1])} has {found[3]} fields instead of {found[2]}. Repair or remove it."
+        return FileFormatError(f"{self.path}: {text}")
 
 
 def _encoding(first: bytes) -> str:
@@ -275,10 +260,6 @@ def _encoding(first: bytes) -> str:
     except UnicodeDecodeError:
         return "utf-8" if b"\0" in first else "cp1252"
     return "utf-8-sig" if first.startswith(codecs.BOM_UTF8) else "utf-8"
-
-
-def _plain(field: str) -> str:
-    return field.strip("[]() ").lower()
 
 
 def _is_number(field: str) -> bool:
