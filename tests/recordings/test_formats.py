@@ -134,6 +134,24 @@ def test_a_line_that_was_cut_is_left_out_with_a_warning(tmp_path, end):
         open_source(tmp_path / "log.csv").read(["t", "u"])
 
 
+def test_lines_of_other_widths_and_texts_for_numbers_are_left_out_if_asked_for(tmp_path):
+    rows = [f"{row},{row}" for row in range(40)]
+    rows[7], rows[20], rows[30] = "-- reconnect --", "20,ERR", "30"
+    (tmp_path / "log.csv").write_text("\n".join(["t,q", *rows, ""]))
+    with pytest.raises(FileFormatError, match=r"row 7 \(line 9\) has 1 fields instead of 2.*`bad_rows` skip"):
+        open_source(tmp_path / "log.csv").read(["q"])
+    source = open_source(tmp_path / "log.csv")
+    source.lenient = True
+    np.testing.assert_array_equal(
+        source.read(["q"])["q"], [np.nan if x == 20 else x for x in range(40) if x not in (7, 30)]
+    )
+    assert source.notes() == ("lines left out because they have other than 2 fields: 2",)
+    rows[31] = "31"
+    (tmp_path / "log.csv").write_text("\n".join(["t,q", *rows, ""]))
+    with pytest.raises(FileFormatError, match="3 lines have other than 2 fields"):
+        source.read(["q"])
+
+
 class TestParquet(Tables):
     def write(self, folder):
         return write_parquet(folder / "log.parquet", table(motion()))

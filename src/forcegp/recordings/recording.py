@@ -16,7 +16,7 @@ from forcegp.data.configurations import following
 from forcegp.errors import DatasetError, FileFormatError, MistakenUnit
 from forcegp.recordings.ros_bag import Read, read_on_one_clock
 from forcegp.recordings.signal_plan import Layout, SignalPlan, spans
-from forcegp.recordings.source import Columns, Source
+from forcegp.recordings.source import MOST_LOST, Columns, Source
 from forcegp.robots.manifold import POSITIONS, TURN, ConfigurationSpace
 
 Jumps = tuple[Int[np.ndarray, " jumps"], str, str]
@@ -73,6 +73,7 @@ def read_recording(
     """
     if not plan.columns:
         raise FileFormatError(f"{label} has no rows; give a log with rows.")
+    source.lenient = options.bad_rows == "skip"
     read = read_on_one_clock(source, plan)
     columns = read.columns
     rows = len(columns[plan.columns[0]])
@@ -112,10 +113,6 @@ def _unlogged(plan: SignalPlan, values: Float[np.ndarray, "rows signals"]) -> tu
             joints = ", ".join(plan.signals[own[row]].joint for row in empty)
             notes.append(f"every {name} of {joints} is missing, so it is derived (--{name} derive)")
     return derived, notes
-
-
-MOST_LOST = 0.05
-"""Of the rows: a driver loses single messages, and what lacks more is another topic, sensor or log."""
 
 
 def _lost(

@@ -16,6 +16,7 @@ Columns = dict[str, np.ndarray]
 """Columns of equal length by name: float64 (rows,), or int64 where the file holds integers (stamps in nanoseconds)."""
 
 LONGEST_VECTOR = 4096  # columns of a table in one array; wider ones are pictures and the like, not signals of joints
+MOST_LOST = 0.05  # of the rows: a driver loses single messages; what lacks more is another topic, sensor or log
 ELEMENT = re.compile(r"(?P<vector>.*)\[\d+\]$", re.DOTALL)
 
 
@@ -29,6 +30,8 @@ class Source(ABC):
     Raises FileFormatError, with the path and what to do, from the constructor or from any method.
     """
 
+    lenient = False
+    """Whether rows that cannot be read, up to MOST_LOST of them, are left out."""
     row_word: ClassVar[str] = "row"
     """What one row is called in messages."""
 

@@ -21,6 +21,7 @@ from typing_extensions import override
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput
 from forcegp.recordings.mapping import UNITS
 from forcegp.recordings.source import (
+    MOST_LOST,
     Columns,
     Source,
     arrow_numbers,
@@ -45,6 +46,7 @@ _TIME = re.compile(
     r"(\d\d?:\d\d(?::\d\d(?:[.,]\d+)?)?)?(?:Z|[+-]\d\d:?\d\d)?"
 )
 _UNITS = {unit.lower() for units in UNITS.values() for unit in units} | {"%", "sec", "°", "°/s", "-", "", "degrees"}
+_REMEDY = "Repair or remove it, or leave such rows out by `bad_rows` skip."
 LAST_LINES = 20
 """Of those that are looked at: they are rows, whatever stands above."""
 _CONVERSION = re.compile(
@@ -67,6 +69,7 @@ class DelimitedText(Source):
             raise InvalidInput(f"headerless is {headerless}; give the number of columns, at least 1.")
         with reading(path, "text"), self._opened() as stream:
             self._notes = ["its letters are taken for cp1252"] if self.encoding == "cp1252" else []
+            self._no_numbers: list[str] = []
             self._look(stream.peek(1), headerless, delimiter)
 
     def _opened(self) -> Any:
@@ -211,28 +214,44 @@ class DelimitedText(Source):
         with reading(self.path, "text"), self._opened() as stream:
             for _ in range(self._lines_before):
                 stream.readline()
-            source: Any = stream
+            source, cut = stream, False
             if blanks or self._comments or not threads:
                 text = _COMMENT_LINE.sub(b"", stream.read()) if self._comments else stream.read()
-                if not threads and not text.endswith(b"\n"):  # is it the line at which the log was cut?
+                cut = not threads and not text.endswith(b"\n")  # is it the line at which the log was cut?
+                if cut:
                     text = text[: text.rfind(b"\n") + 1]
                 if blanks:
                     text = re.sub(rb"[ \t]+", b"\t", _OUTER_BLANKS.sub(b"", text.replace(b"\r\n", b"\n")))
                 source = io.BytesIO(text)
+            ragged: list[Any] = []
+            words = {*arrow_csv.ConvertOptions().null_values, *self._no_numbers}
+            skip = (lambda row: ragged.append(row) or "skip") if self.lenient else None
             try:
                 table = arrow_csv.read_csv(
                     source,
                     read_options=arrow_csv.ReadOptions(use_threads=threads, block_size=BLOCK, column_names=stored),
-                    parse_options=arrow_csv.ParseOptions(delimiter="\t" if blanks else self._delimiter),
+                    parse_options=arrow_csv.ParseOptions(
+                        delimiter="\t" if blanks else self._delimiter, invalid_row_handler=skip
+                    ),
                     convert_options=arrow_csv.ConvertOptions(
-                        include_columns=wanted, column_types=kinds, decimal_point=self._decimal
+                        include_columns=wanted, column_types=kinds, decimal_point=self._decimal, null_values=[*words]
                     ),
                 )
             except pa.ArrowInvalid as error:
                 if threads:  # pyarrow counts rows on one thread only
                     return self._parsed(stored, wanted, kinds, threads=False)
+                found = _CONVERSION.search(str(error))
+                if self.lenient and found and len(self._no_numbers) < LAST_LINES:
+                    self._no_numbers.append(found[3])
+                    return self._parsed(stored, wanted, kinds, threads=False)
                 raise self._told_by_pyarrow(error) from error
-            if not threads:
+            if len(ragged) > MOST_LOST * (len(table) + len(ragged)):
+                raise FileFormatError(
+                    f"{self.path}: {len(ragged)} lines have other than {len(stored)} fields; repair it."
+                )
+            if ragged:
+                self._notes += [f"lines left out because they have other than {len(stored)} fields: {len(ragged)}"]
+            if cut:
                 whole = f"the {len(table)} whole lines before are read"
                 warnings.warn(f"{self.path} ends in the middle of a line: {whole}.", DataWarning, stacklevel=2)
             return table
@@ -245,9 +264,9 @@ class DelimitedText(Source):
 
         if found := _CONVERSION.search(text):
             name = "c1" if self._lines_per_row > 1 else self._columns[int(found[1])]
-            text = f"column {name!r} holds {found[3]!r} at {line(found[2])}, which is no number. Repair or remove it."
+            text = f"column {name!r} holds {found[3]!r} at {line(found[2])}, which is no number. {_REMEDY}"
         elif found := _RAGGED.search(text):
-            text = f"{line(found[1])} has {found[3]} fields instead of {found[2]}. Repair or remove it."
+            text = f"{line(found[1])} has {found[3]} fields instead of {found[2]}. {_REMEDY}"
         return FileFormatError(f"{self.path}: {text}")
 
 
