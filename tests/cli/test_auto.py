@@ -116,7 +116,7 @@ def test_correct_does_it_at_once(folder, forcegp, monkeypatch):
 
 
 def test_the_printed_command_keeps_every_option():
-    columns = "--headerless 1,2 --side-by-side --time a:c1 --q b --u 0 --delimiter ; --sign u=1,-1 --robot arm.urdf"
+    columns = "--headerless 1,2 --side-by-side --time a:c1 --q b --u 0 --sign u=1,-1 --robot arm.urdf"
     others = "--accept --overwrite --cutoff 9 --every 3 --lock finger=0.1 --gravity=-9.81,0,0 --link tool"
     others += " --forces given --forces gp:joint,viscous --out here"
     words = ["auto", "a.txt", "b.txt", *columns.split(), *others.split()]

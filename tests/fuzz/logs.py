@@ -92,9 +92,7 @@ class Log:
     more: tuple[str, ...]
 
 
-OPTIONS = words(
-    "--rate --gap --start --end --cutoff --delimiter --headerless --unit --sign --step --episode --episodes"
-)
+OPTIONS = words("--rate --gap --start --end --cutoff --headerless --unit --sign --step --episode --episodes")
 MORE = st.lists(st.tuples(st.sampled_from((*OPTIONS, "--a", "--orientation", "--axes")), WORDS), max_size=2).map(
     lambda pairs: tuple(word for pair in pairs for word in pair) if len(pairs) == 2 else ()
 )

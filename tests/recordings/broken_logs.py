@@ -187,7 +187,9 @@ BROKEN = {
     ),
     "ragged": Broken(text(lambda t: t + "1.0,2.0\n"), "row 200 (line 202) has 2 fields instead of 7"),
     "duplicate names": Broken(text(lambda t: t.replace("v_elbow", "q_elbow")), "'q_elbow' stands over columns 3, 5"),
-    "no header": Broken(text(lambda t: t[t.index("\n") + 1 :]), "add --headerless 7"),
+    "no header": Broken(
+        text(lambda t: t[t.index("\n") + 1 :]), "no column 'q_shoulder' in log.csv. Valid columns: c1, c2"
+    ),
     "binary": Broken(written("log.csv", bytes(range(256)) * 9), "holds binary data"),
     "pickle": Broken(written("log.pkl", pickle.dumps([1])), "reading those runs code"),
     "folder": Broken(folder_of_logs, "no ROS 2 bag (metadata.yaml)"),

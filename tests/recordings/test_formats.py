@@ -352,7 +352,7 @@ def test_a_name_of_a_column_that_is_too_long_is_refused(tmp_path):
 
 
 def test_options_of_other_formats_are_refused(tmp_path):
-    with pytest.raises(InvalidInput, match="mean nothing to"):
+    with pytest.raises(InvalidInput, match="`headerless` means nothing to"):
         open_source(write_parquet(tmp_path / "log.parquet", table(motion(10))), headerless=7)
     with pytest.raises(InvalidInput, match="means nothing to"):
         open_source(write_text(tmp_path / "log.csv", table(motion(10))), within="run1")

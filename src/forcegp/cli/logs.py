@@ -137,9 +137,7 @@ class ColumnOptions:
     episodes: Text = None
     """A pattern for arrays or groups of one file, each of which is an episode: piece*, data/demo_*."""
     headerless: Text = None
-    """Text without names of columns: how many numbers make a row, for all files or for each: 1,7,7."""
-    delimiter: Annotated[str | None, unless_given("comma|tab|semicolon|blanks|LETTER", "detected", str)] = None
-    """What separates the columns of a text."""
+    """Text with one number per line: how many make a row, for all files or for each: 1,7,7."""
     side_by_side: bool = False
     """The files are one recording, with a signal in each; columns are called FILE:column."""
     gap: Annotated[float | None, unless_given("S", "10 median steps", float)] = None
@@ -206,8 +204,6 @@ class ColumnOptions:
         }
         lists = {name: text for name, text in given.items() if name in (*"qvua", "joints") and text is not None}
         given |= {name: tuple(forcegp.recordings.listed(str(text))) for name, text in lists.items()}
-        if self.delimiter is not None:
-            given["delimiter"] = forcegp.recordings.DELIMITERS.get(self.delimiter, self.delimiter)
         if self.headerless is not None:
             words = str(self.headerless).split(",")
             if not all(word.strip().isdigit() for word in words):

@@ -1,4 +1,3 @@
-from .tables import DELIMITERS as DELIMITERS
 from .importing import (
     ImportOptions as ImportOptions, import_recordings as import_recordings, open_source as open_source,
 )

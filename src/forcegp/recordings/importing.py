@@ -141,7 +141,7 @@ def _sources(paths: Sequence[Path], mapping: ColumnMapping) -> list[tuple[str, S
 
     def opened(index: int, within: str | None = None) -> Source:
         width = widths[index if len(widths) > 1 else 0] if widths else None
-        return open_source(paths[index], headerless=width, delimiter=mapping.delimiter, within=within)
+        return open_source(paths[index], headerless=width, within=within)
 
     if mapping.side_by_side:
         if mapping.episodes is not None:
@@ -271,21 +271,19 @@ READABLE = ", ".join([*(f"{name}[.gz]" for name in TEXT), *TABLES, *ARRAYS]) + "
 PICKLES = {".pkl", ".pickle", ".npy", ".pt", ".pth", ".joblib"}
 
 
-def open_source(
-    path: Path, *, headerless: int | None = None, delimiter: str | None = None, within: str | None = None
-) -> Source:
+def open_source(path: Path, *, headerless: int | None = None, within: str | None = None) -> Source:
     """The reader for a log, chosen by its extension or, for a folder, by what is in it.
 
-    Parameters: `headerless` and `delimiter` as for `DelimitedText`, `within` as for `ArrayFile`.
+    Parameters: `headerless` as for `DelimitedText`, `within` as for `ArrayFile`.
     Raises FileFormatError for what cannot be read, InvalidInput for parameters that mean nothing to the format.
     """
     kind = _kind(path)
-    if kind not in TEXT and (headerless or delimiter):
-        raise InvalidInput(f"`headerless` and `delimiter` mean nothing to {path}; they are for text files.")
+    if kind not in TEXT and headerless:
+        raise InvalidInput(f"`headerless` means nothing to {path}; it is for text files.")
     if kind not in ARRAYS and within is not None:
         raise InvalidInput(f"`episodes` means nothing to {path}; it is for {', '.join(ARRAYS)} files.")
     if kind in TEXT:
-        return DelimitedText(path, headerless=headerless, delimiter=delimiter)
+        return DelimitedText(path, headerless=headerless)
     if kind in ARRAYS:
         if kind in (".h5", ".hdf5", ".mat") and is_dataset(path):
             raise FileFormatError(f"{path} is a dataset of forcegp already; there is nothing to import.")

@@ -94,7 +94,6 @@ class ColumnMapping:
     episode: a column that numbers the episodes.
     episodes: a pattern (`piece*`) for arrays or groups of the file, each of which is an episode.
     headerless: for text without header, the columns of each file in their order.
-    delimiter: for text, if it cannot be detected.
     side_by_side: the files given are one recording, not one each.
 
     Raises InvalidInput for units that do not exist and numbers that make no sense.
@@ -116,12 +115,11 @@ class ColumnMapping:
     episode: str | None = None
     episodes: str | None = None
     headerless: tuple[int, ...] = ()
-    delimiter: str | None = None
     side_by_side: bool = False
 
     @usable_arguments("ColumnMapping")
     def __post_init__(self) -> None:
-        kinds = dict.fromkeys("qvua", Sequence) | dict.fromkeys(("time", "episode", "episodes", "delimiter"), str)
+        kinds = dict.fromkeys("qvua", Sequence) | dict.fromkeys(("time", "episode", "episodes"), str)
         for name, kind in kinds.items():
             if getattr(self, name) is not None:
                 require_type(name, getattr(self, name), kind)

@@ -169,7 +169,7 @@ def signal_plan(
     switches = len({x.switch for x in (model.contacts if may_lack_switches else ())} - {None})
     if switches and len(found.get("u", ())) == len(model.inputs) - switches:
         found["u"] = [*found.get("u", ()), *[LACKING] * switches]
-    for signal, why in (("q", "positions"), ("u", "forces of the actuators; 0 for a passive robot")):
+    for signal, why in (("q", "positions"), ("u", "forces or efforts of the actuators; 0 for a passive robot")):
         if signal not in found and log[signal]:
             lacking = [name for name in joints if not any(map(named_after(name).search, source.columns()))]
             raise InvalidInput(

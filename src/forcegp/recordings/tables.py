@@ -33,9 +33,6 @@ from forcegp.recordings.source import (
 FIRST_BYTES = 2**16  # what is looked at to detect the header, the delimiter and whether there are comments
 BLOCK = 2**22  # bytes that pyarrow parses at a time; no line may be longer
 BLANKS = "blanks"
-DELIMITERS = {"comma": ",", "tab": "\t", "semicolon": ";", "blanks": BLANKS}
-"""By the names that people may use for them."""
-
 _COMMENT_LINE = re.compile(rb"^[ \t]*#[^\n]*\n?", re.MULTILINE)
 _OUTER_BLANKS = re.compile(rb"^[ \t]+|[ \t]+$", re.MULTILINE)
 _NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*(e[+-]?\d+)?|[.,]\d+(e[+-]?\d+)?|inf|nan)", re.IGNORECASE)
@@ -59,18 +56,17 @@ class DelimitedText(Source):
     """A table as text. The first line that is not a comment (#) names the columns, unless `headerless` counts them.
 
     path: .csv, .tsv, .txt or .dat, also with .gz. headerless: number of columns of a file without a header, called c1,
-    c2, ...; where every line holds one number, so many lines make a row. delimiter: ",", ";", tab, another single
-    letter, or "blanks" for any run of them; default: detected from the first lines.
+    c2, ...; where every line holds one number, so many lines make a row.
     """
 
-    def __init__(self, path: Path, *, headerless: int | None = None, delimiter: str | None = None) -> None:
+    def __init__(self, path: Path, *, headerless: int | None = None) -> None:
         super().__init__(path)
         if headerless is not None and headerless < 1:
             raise InvalidInput(f"headerless is {headerless}; give the number of columns, at least 1.")
         with reading(path, "text"), self._opened() as stream:
             self._notes = ["its letters are taken for cp1252"] if self.encoding == "cp1252" else []
             self._no_numbers: list[str] = []
-            self._look(stream.peek(1), headerless, delimiter)
+            self._look(stream.peek(1), headerless)
 
     def _opened(self) -> Any:
         """The bytes of the file, expanded if it is called .gz. Raises FileFormatError for bytes that are no text."""
@@ -107,7 +103,7 @@ class DelimitedText(Source):
             raise
         return stream
 
-    def _look(self, first: bytes, headerless: int | None, delimiter: str | None) -> None:
+    def _look(self, first: bytes, headerless: int | None) -> None:
         """Find delimiter, header, the number of lines before the first row, and whether there are comments."""
         lines, places, comments = list[str](), list[int](), list[str]()
         whole = first[: first.rfind(b"\n") + 1] if first.count(b"\n") > 1 else first
@@ -121,7 +117,7 @@ class DelimitedText(Source):
         if not lines:
             raise FileFormatError(f"{self.path} holds no rows, only comments or empty lines.")
         self._comments = bool(comments)
-        self._delimiter = delimiter or _detected_delimiter(lines[-LAST_LINES:])
+        self._delimiter = _detected_delimiter(lines[-LAST_LINES:])
         table = [self._fields(line) for line in lines]
         width = Counter(map(len, table[-LAST_LINES:])).most_common(1)[0][0]
         columns = zip(*(row for row in table[-LAST_LINES:] if len(row) == width), strict=True)
@@ -130,25 +126,16 @@ class DelimitedText(Source):
         begin = like.index(True) if any(numeric) and any(like) else 1
         fields = table[begin] if begin < len(table) else []
         self._lines_per_row = 1
-        if headerless is not None:
-            if begin:
-                raise FileFormatError(
-                    f"{self.path} begins with {table[0][0]!r}, which is no number; leave `headerless` out."
-                )
-            if len(fields) not in (1, headerless):
-                raise FileFormatError(
-                    f"{self.path} has {len(fields)} numbers on its first line; `headerless` is {headerless}. "
-                    "Either so many stand on every line, or one."
-                )
-            self._columns = [f"c{index + 1}" for index in range(headerless)]
-            self._lines_per_row = headerless // len(fields)
-        elif not begin:
-            self._columns = self._fields(comments[-1]) if comments else []
-            if len(self._columns) != len(fields):
-                raise FileFormatError(
-                    f"{self.path} begins with numbers, not with names of columns; add `headerless` {len(fields)}, "
-                    "or how many numbers make a row where every line holds one."
-                )
+        if headerless is not None and (begin or len(fields) not in (1, headerless)):
+            raise FileFormatError(
+                f"{self.path} begins with {len(table[0])} fields, the first of them {table[0][0]!r}; `headerless` is "
+                f"{headerless}: so many numbers on every line, or one. Give another, or leave it out."
+            )
+        if not begin:
+            self._lines_per_row = (headerless or 1) // len(fields) or 1
+            named = self._fields(comments[-1]) if comments and headerless is None else []
+            nameless = [f"c{index + 1}" for index in range(headerless or len(fields))]
+            self._columns = named if len(named) == len(fields) else nameless
         else:
             if begin == len(table):
                 raise FileFormatError(f"{self.path} has a header but no rows.")
