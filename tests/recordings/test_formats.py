@@ -118,6 +118,12 @@ def test_texts_of_other_programs(tmp_path, encoding, head, row, seconds):
     np.testing.assert_array_equal(read["größe"], 0.25)
 
 
+def test_the_last_lines_are_rows_whatever_stands_above(tmp_path):
+    lines = [*["1,2,3"] * 30, "t;q", *["0;5"] * 20, ""]
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    np.testing.assert_array_equal(open_source(tmp_path / "log.csv").read(["q"])["q"], [5.0] * 20)
+
+
 def test_clocks_go_on_over_midnight(tmp_path):
     (tmp_path / "log.csv").write_text("t,q\n23:59:59.5,0\n00:00:00.5,0\n00:00:01.5,0\n")
     np.testing.assert_array_equal(open_source(tmp_path / "log.csv").read(["t"])["t"], 86399.5 + np.arange(3.0))

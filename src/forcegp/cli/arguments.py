@@ -109,11 +109,10 @@ def _checked(name: str, kind: type[Command], words: Sequence[str]) -> list[str]:
         if word == "--":
             return [*joined, *words[place:]]
         flag = "--" + word.partition("=")[0].removeprefix("--").replace("_", "-")
-        if waits and word.startswith(("--", "__")) and flag not in flags:
+        is_value, waits = waits and word.startswith(("--", "__")) and flag not in flags, False
+        if is_value:
             joined[-1] += f"={word}"
-            waits = False
             continue
-        waits = False
         if word.startswith("--"):
             if flag not in flags:
                 close = difflib.get_close_matches(flag, flags, n=1)

@@ -26,7 +26,6 @@ from forcegp.recordings.source import (
     Columns,
     Source,
     arrow_numbers,
-    columns_of,
     element_names,
     reading,
     require_distinct,
@@ -106,7 +105,8 @@ class ArrayFile(Source):
                 f"{self.path}: its arrays have different numbers of rows ({counts}); map those of one."
             )
         tables = {name: content() for name, (_, content) in chosen.items()}
-        return columns_of(tables, {name: self._places[name] for name in names})
+        places = {name: self._places[name] for name in names}
+        return {name: tables[own] if at is None else tables[own][:, at] for name, (own, at) in places.items()}
 
 
 def _by_numbers(name: str) -> list[tuple[int, int, str]]:

@@ -230,12 +230,8 @@ class SideBySide(Source):
     @override
     def vectors(self) -> Mapping[str, tuple[str, ...]]:
         """The vectors of each file, and the stem of each for all of its columns."""
-        found = {}
-        for name, source in self.sources.items():
-            found[name] = tuple(f"{name}:{column}" for column in source.columns())
-            for vector, elements in source.vectors.items():
-                found[f"{name}:{vector}"] = tuple(f"{name}:{element}" for element in elements)
-        return found
+        wholes = {name: [f"{name}:{x}" for x in source.columns()] for name, source in self.sources.items()}
+        return {**super().vectors, **{name: tuple(columns) for name, columns in wholes.items()}}
 
     @override
     def files(self) -> tuple[Path, ...]:
@@ -260,11 +256,7 @@ class SideBySide(Source):
 
 
 TEXT = (".csv", ".tsv", ".txt", ".dat")
-TABLES: dict[str, Callable[[Path], Source]] = {
-    ".bag": RosBag,
-    ".mcap": RosBag,
-    ".db3": RosBag,
-}
+TABLES: dict[str, Callable[[Path], Source]] = {".bag": RosBag, ".mcap": RosBag, ".db3": RosBag}
 """A new format is a subclass of `Source`, and an entry here (or in `ARRAYS`) with its extension."""
 
 READABLE = ", ".join([*(f"{name}[.gz]" for name in TEXT), *TABLES, *ARRAYS]) + ", folders of ROS 2 bags"

@@ -60,12 +60,7 @@ class Recording:
 
 
 def read_recording(
-    source: Source,
-    plan: SignalPlan,
-    label: str,
-    options: Any,
-    robot: forcegp.robots.Robot,
-    believed: Collection[str],
+    source: Source, plan: SignalPlan, label: str, options: Any, robot: forcegp.robots.Robot, believed: Collection[str]
 ) -> Recording:
     """Read a table as the `ImportOptions` say; `believed` joints may turn often.
 

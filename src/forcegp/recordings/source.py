@@ -104,11 +104,6 @@ def as_column(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
-def columns_of(tables: Mapping[str, np.ndarray], places: Mapping[str, tuple[str, int | None]]) -> Columns:
-    """Columns out of tables (rows,) or (rows, k): name of a column -> its table, and where it is in that."""
-    return {name: tables[own] if index is None else tables[own][:, index] for name, (own, index) in places.items()}
-
-
 def arrow_numbers(column: Any) -> np.ndarray:
     """A column of pyarrow; a missing value is NaN."""
     values = column.to_numpy(zero_copy_only=False)
