@@ -73,48 +73,27 @@ class TestHeaderless(TestCsv):
         return {f"c{index + 1}": values for index, values in enumerate(table(motion()).values())}
 
 
-class TestExportOfADrive(Tables):
-    """Preamble, a line of units, decimal commas, letters of Windows."""
-
-    def write(self, folder):
-        names = [f"{name}°" for name in table(motion())]
-        rows = zip(*table(motion()).values(), strict=True)
-        lines = ["\t".join(repr(float(value)) for value in row).replace(".", ",") for row in rows]
-        head = ["Trace 2", "Date\t2024-01-01", "", "\t".join(names), "s\t" + "\t".join(["°"] * 6)]
-        (folder / "log.txt").write_bytes("\r\n".join([*head, *lines]).encode("cp1252"))
-        return folder / "log.txt"
-
-    def truncated(self, path):
-        return None
-
-    def expected(self):
-        return {f"{name}°": values for name, values in table(motion()).items()}
-
-    def test_what_was_taken_for_something_is_said(self, source):
-        assert source.notes() == (
-            "its letters are taken for cp1252",
-            "a line beside the names is left out: s, °",
-        )
-
-
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig", "cp1252"])
 @pytest.mark.parametrize(
-    ("head", "row", "seconds"),
+    ("head", "row", "begin"),
     [
-        ("s;rad\nt;größe", "{0},5;0,25", [0.5, 1.5, 2.5]),
-        ("t,größe", "{0}.5,.25", [0.5, 1.5, 2.5]),
-        ("t größe\n[s] [°]", "  {0}.5   .25 ", [0.5, 1.5, 2.5]),
-        ("t;größe", "{0}.5;.25;", [0.5, 1.5, 2.5]),
-        ("t;größe", "12:00:0{0},5;0,25", [43200.5, 43201.5, 43202.5]),
-        ("t,größe", "1970-01-02T00:00:0{0}.5Z,.25", [86400.5, 86401.5, 86402.5]),
-        ("t;größe", "2.1.1970 00:00:0{0},5;0,25", [86400.5, 86401.5, 86402.5]),
+        ("Trace 2\nDate;2024-01-01\n\ns;rad\nt;größe", "{0},5;0,25", 0.5),
+        ("t,größe", "{0}.5,.25", 0.5),
+        ("t größe\n[s] [°]", "  {0}.5   .25 ", 0.5),
+        ("t;größe", "{0}.5;.25;", 0.5),
+        ("t;größe", "12:00:0{0},5;0,25", 43200.5),
+        ("t,größe", "1970-01-02T00:00:0{0}.5Z,.25", 86400.5),
+        ("t;größe", "2.1.1970 00:00:0{0},5;0,25", 86400.5),
     ],
 )
-def test_texts_of_other_programs(tmp_path, encoding, head, row, seconds):
-    lines = [row.format(second) for second in range(3)]
+def test_texts_of_other_programs(tmp_path, encoding, head, row, begin):
+    lines = [row.format(second) for second in range(8)]
     (tmp_path / "log.txt").write_bytes("\n".join([head, *lines]).encode(encoding))
-    read = open_source(tmp_path / "log.txt").read(["t", "größe"])
-    np.testing.assert_array_equal(read["t"], seconds)
+    source = open_source(tmp_path / "log.txt")
+    read = source.read(["t", "größe"])
+    assert ("its letters are taken for cp1252" in source.notes()) == (encoding == "cp1252")
+    assert ("a line beside the names is left out: s, rad" in source.notes()) == ("s;rad" in head)
+    np.testing.assert_array_equal(read["t"], begin + np.arange(8.0))
     np.testing.assert_array_equal(read["größe"], 0.25)
 
 
