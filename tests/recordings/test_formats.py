@@ -106,6 +106,8 @@ def test_the_last_lines_are_rows_whatever_stands_above(tmp_path):
 def test_clocks_go_on_over_midnight(tmp_path):
     (tmp_path / "log.csv").write_text("t,q\n23:59:59.5,0\n00:00:00.5,0\n00:00:01.5,0\n")
     np.testing.assert_array_equal(open_source(tmp_path / "log.csv").read(["t"])["t"], 86399.5 + np.arange(3.0))
+    (tmp_path / "log.csv").write_text("t,q\n2024-01-02 01:00,0\n2024-01-01 01:00,0\n")
+    assert np.diff(open_source(tmp_path / "log.csv").read(["t"])["t"]) == -86400.0  # no clock, but time that runs back
 
 
 @pytest.mark.parametrize("end", ["7,1", "7,1,-", "7"])

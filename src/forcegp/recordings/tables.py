@@ -142,7 +142,7 @@ class DelimitedText(Source):
             above = list(takewhile(lambda row: len(row) == len(fields), reversed(table[:begin])))[::-1]
             names = max(
                 above or table[begin - 1 : begin],
-                key=lambda row: len({field.strip("[]() ").lower() for field in row} - _UNITS),
+                key=lambda row: len({x.strip("[]() ").lower() for x in row if not _is_number(x)} - _UNITS),
             )
             beside = [", ".join(dict.fromkeys(filter(None, row))) for row in above if row is not names]
             self._notes += [f"a line beside the names is left out: {text:.80}" for text in beside if text]
@@ -282,7 +282,8 @@ def seconds_of(texts: Sequence[str | None]) -> np.ndarray:
             days = date(*(day if day[0] > 31 else reversed(day))).toordinal() - date(1970, 1, 1).toordinal()
             hour, minute, second = f"{found[3] or '0:0'}:0".replace(",", ".").split(":")[:3]
             seconds[row] = 86400.0 * days + 3600 * int(hour) + 60 * int(minute) + float(second)
-    return seconds + 86400.0 * np.cumsum(np.diff(seconds, prepend=seconds[:1]) < -43200.0)
+    midnights = (seconds < 86400.0) & (np.diff(seconds, prepend=seconds[:1]) < -43200.0)
+    return seconds + 86400.0 * np.cumsum(midnights)
 
 
 def _detected_delimiter(lines: Sequence[str]) -> str:
