@@ -186,6 +186,9 @@ def test_names_are_guessed_only_where_nothing_else_can_be_meant(tmp_path):
         guessed_columns("q", JOINTS, source)
     with pytest.raises(InvalidInput, match="time could be time or t"):
         guessed_time(source, [])
+    of_messages = {f"/a:{x}.{joint}": columns["time"] for x in ("state.positions", "position") for joint in JOINTS}
+    source = open_source(write_text(tmp_path / "messages.csv", of_messages))
+    assert guessed_columns("q", JOINTS, source) == ("/a:position.shoulder", "/a:position.elbow")
     source = open_source(write_text(tmp_path / "plot.csv", {"__time": columns["time"], "q_elbow": columns["time"]}))
     assert guessed_time(source, []) == "__time"
 

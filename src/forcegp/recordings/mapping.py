@@ -315,11 +315,10 @@ def guessed_columns(signal: str, joints: Sequence[str], source: Source) -> tuple
             for found in named_after(joint).finditer(column):
                 around = column[: found.start()], column[found.end() :]
                 templates.setdefault(around, {})[joint] = column
-    fitting = [
-        tuple(found[joint] for joint in joints)
-        for around, found in templates.items()
-        if len(found) == len(joints) and _says(signal, around)
-    ]
+    saying = {around: x for around, x in templates.items() if len(x) == len(joints) and _says(signal, around)}
+    depths = [before.partition(":")[2].count(".") for before, _ in saying]  # what a message says itself comes first
+    each = zip(saying.values(), depths, strict=True)
+    fitting = [tuple(found[joint] for joint in joints) for found, depth in each if depth == min(depths)]
     if len(fitting) > 1:
         candidates = " or ".join(", ".join(columns) for columns in fitting)
         raise InvalidInput(f"{source.path}: {signal} could be {candidates}; choose with --{signal}.")
