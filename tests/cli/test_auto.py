@@ -168,7 +168,7 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
     def told(errors, moved=0.01, shares=None, covered=0.94):
         table = {"acceleration": {"nrmse": errors, "coverage_95": [covered] * 3}}
         table |= {"position after 1 s": {"rmse": [moved] * 3}}
-        table |= {"force": {"share": shares}} if shares else {}
+        table |= {"torque": {"share": shares}} if shares else {}
         motions = {"horizons": [1.0], "squared": [[1e-4]]}
         run = {"split": "s", "seed": 0, "error": None, "table": table, "motions": motions, "stretches": {}}
         names = ("hip", "knee", "wrist")

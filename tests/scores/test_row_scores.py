@@ -4,6 +4,7 @@ import dataclasses
 import json
 
 import numpy as np
+import pinocchio
 import pytest
 import torch
 from scipy.stats import multivariate_normal, norm
@@ -11,7 +12,7 @@ from tests.posterior.arm import NOISE, arm_data, arm_model
 from tests.scores.friction import fitted, friction_data
 from tests.scores.moving_arm import given_system, moving_arm
 
-from forcegp import score
+from forcegp import Noise, score
 from forcegp.data.views import BLOCK
 from forcegp.errors import InvalidInput
 from forcegp.fit import fit
@@ -38,6 +39,20 @@ def scored(posterior, data):
 @pytest.fixture(scope="module")
 def scores(posterior, test_data):
     return scored(posterior, test_data)
+
+
+def test_torques_are_those_of_inverse_dynamics_beside_the_recorded_ones():
+    """Of a robot that knows its bodies and damping, by Pinocchio; a share of 1 is the mean of the torque."""
+    model = arm_model().with_contacts([])
+    data = dataclasses.replace(arm_data(40, 3), model=model, truth={})
+    posterior = fit(model.with_forces(Rotor(0.01), noise=Noise(0.1)), data)
+    urdf = pinocchio.buildModelFromXML(model.robot.urdf_text)
+    each = zip(data.q, data.v, data.a, strict=True)
+    needed = np.array([pinocchio.rnea(urdf, urdf.createData(), *row) for row in each]) + 0.01 * data.a
+    error = np.sqrt(np.square(needed - data.u).mean(0))
+    found = scored(posterior, data)
+    np.testing.assert_allclose(found.columns("rmse", "torque"), error, rtol=1e-9)
+    np.testing.assert_allclose(found.columns("share", "torque"), error / data.u.std(0), rtol=1e-9)
 
 
 def test_scores_are_those_of_single_predictions(posterior, test_data, scores):
@@ -69,7 +84,7 @@ def test_learning_helps_and_the_constraint_holds(scores):
 
 def test_without_truth_only_measurements_are_scored_and_the_rest_is_named(posterior, test_data, scores):
     bare = scored(posterior, dataclasses.replace(test_data, truth={}, noise_std=None))
-    assert set(bare.quantities()) == {"acceleration", "all joints", "force", "constraint"}
+    assert set(bare.quantities()) == {"acceleration", "all joints", "force", "constraint", "torque"}
     assert bare.value("mae") == scores.value("mae")
     assert bare.value("mae", "constraint") == scores.value("mae", "constraint")  # of the model's own contact
     with pytest.raises(InvalidInput, match=r"hold no mae of unknown force; they hold .* need their truth in the log"):

@@ -25,10 +25,10 @@ from forcegp.cli.command import CONFIG, LOG, Command, options_of, unless_given
 from forcegp.cli.fit import LAWS, payload_dict, with_payload, write_estimates
 from forcegp.cli.logs import ColumnOptions, FilterOptions, prepared_rows, resolved, stance_text
 from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
-from forcegp.cli.terminal import Terminal, doubts_table, facts
+from forcegp.cli.terminal import Terminal, doubts_table, facts, shown
 from forcegp.doubts import Doubt, Doubts, wrong
 from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUnit, NumericalError
-from forcegp.scores.accuracy import ACCELERATION, FORCE
+from forcegp.scores.accuracy import ACCELERATION, TORQUE
 from forcegp.scores.page import number
 
 MOST_CORRECTIONS = 8
@@ -358,9 +358,9 @@ def left_of_torques(scores: forcegp.scores.Scores, best: str) -> list[tuple[str,
     """The line on what each model leaves of the recorded torques of the joints; none where u has other columns."""
     shares = {}
     for name in dict.fromkeys(("given", "identified", best)):
-        if name in scores.models and "share" in scores.quantities(name).get(FORCE, ()):
-            numbers = scores.columns("share", FORCE, name)
-            shares[short_name(name)] = " ".join("–" if x is None else f"{100.0 * x:.2g}" for x in numbers)
+        if name in scores.models and "share" in scores.quantities(name).get(TORQUE, ()):
+            numbers = scores.columns("share", TORQUE, name)
+            shares[short_name(name)] = " ".join(shown(x, "{:.2g}", 100.0) for x in numbers)
     told = "; ".join(f"{name} {numbers}" for name, numbers in shares.items())
     return [("torque left", f"on unseen time, % of the recorded one of each joint: {told}")] if told else []
 
@@ -374,8 +374,10 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> str:
     """Use it, use it for these joints, or do not use it; what it was measured by, and against the URDF alone."""
     best = scores.recommended
     assert best is not None, "a model was scored"
-    quantity, score = (FORCE, "share") if "share" in scores.quantities(best).get(FORCE, ()) else (ACCELERATION, "nrmse")
-    what = "torque" if quantity == FORCE else "acceleration"
+    quantity, score = (
+        (TORQUE, "share") if "share" in scores.quantities(best).get(TORQUE, ()) else (ACCELERATION, "nrmse")
+    )
+    what = "torque" if quantity == TORQUE else "acceleration"
     left = [math.inf if x is None else x for x in scores.columns(score, quantity, best)]
     good = [name for name, x in zip(scores.joint_names, left, strict=True) if x <= USABLE]
     lost = [f"{name} {100.0 * x:.0f} %" if math.isfinite(x) else f"{name} not known from this log"

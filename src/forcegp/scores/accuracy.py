@@ -35,7 +35,7 @@ Table = dict[str, dict[str, list[float | None]]]
 """Quantity -> score -> one number per column (joint, axis or contact); None for what is not a number."""
 
 ACCELERATION, TRUE_ACCELERATION, ALL_JOINTS = "acceleration", "true acceleration", "all joints"
-FORCE, TRUE_FORCE, UNKNOWN_FORCE = "force", "true force", "unknown force"
+FORCE, TRUE_FORCE, UNKNOWN_FORCE, TORQUE = "force", "true force", "unknown force", "torque"
 CONTACT_FORCE, CONSTRAINT, AT_SENSOR = "contact force", "constraint", "force at"
 
 LEVELS = (0.5, 0.95)  # of the central intervals whose coverage is scored, as `coverage_95`
@@ -155,8 +155,10 @@ def row_scores(
     table[ALL_JOINTS] = {"nlpd": [float(rows.negative_log_density.mean())]}
     measured = table[ACCELERATION]
     measured["nrmse"] = plain(np.array(measured["rmse"], dtype=float) / _spread(test.a))
-    if test.u.shape == test.a.shape:  # what is left of each torque, where 1 is no better than its mean
-        table[FORCE]["share"] = plain(np.array(table[FORCE]["rmse"], dtype=float) / _spread(test.u))
+    if test.u.shape == test.a.shape and not posterior.is_black_box:
+        # of the torques that the model needs for the measured motion; a share of 1 is no better than their mean
+        rms = np.sqrt(np.square(force_errors(rows.mean, test.a, rows.mass)).mean(axis=0))
+        table[TORQUE] = {"rmse": plain(rms), "share": plain(rms / _spread(test.u))}
     density = norm.logpdf(test.a, rows.mean, np.sqrt(rows.measurement_variance))
     measured["nlpd"] = plain(-np.asarray(density).mean(axis=0))
     measured["noise_std"] = plain(posterior.noise_std.detach().cpu().numpy())
