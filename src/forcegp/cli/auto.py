@@ -360,7 +360,9 @@ def left_of_torques(scores: forcegp.scores.Scores, best: str) -> list[tuple[str,
     for name in dict.fromkeys(("given", "identified", best)):
         if name in scores.models and "share" in scores.quantities(name).get(TORQUE, ()):
             numbers = scores.columns("share", TORQUE, name)
-            shares[short_name(name)] = " ".join(shown(x, "{:.2g}", 100.0) for x in numbers)
+            shares[short_name(name)] = " ".join(
+                shown(x, "{:.2g}" if x and x < 0.1 else "{:.0f}", 100.0) for x in numbers
+            )
     told = "; ".join(f"{name} {numbers}" for name, numbers in shares.items())
     return [("torque left", f"on unseen time, % of the recorded one of each joint: {told}")] if told else []
 
@@ -393,8 +395,8 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> str:
     motion, urdf = _motion(scores, best), _motion(scores, "given")
     if motion is not None:
         unit = dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m"
-        against = "they diverge" if urdf is None else f"{urdf:.2g}"
-        against = f", with the URDF alone {against}" if "given" in scores.models and best != "given" else ""
+        against = "they diverge" if urdf is None else f"by {urdf:.2g}"
+        against = f"; with the URDF alone {against}" if "given" in scores.models and best != "given" else ""
         told += f", and positions {scores.horizons[-1]:g} s ahead are wrong by {motion:.2g} {unit}{against}"
     elif scores.horizons:
         told += ", but its motions diverge: do not simulate with it"
