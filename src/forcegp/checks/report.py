@@ -16,8 +16,9 @@ from forcegp.checks.moving_base import (
     unmeasured_base_doubts,
 )
 from forcegp.checks.signals import motion_doubts, sampling_doubts, signal_doubts
-from forcegp.checks.torque_doubts import TOUCHES, corrected, torque_doubts
-from forcegp.checks.torques import Comparison, parameter_doubts
+from forcegp.checks.search import search
+from forcegp.checks.torque_doubts import TOUCHES, torque_doubts
+from forcegp.checks.torques import Comparison
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
@@ -136,13 +137,9 @@ def _doubts(inputs: CheckInput, model: Model) -> tuple[list[Doubt], Comparison |
     if inputs.contacts:
         return [*doubts, TOUCHES], None
     if inputs.log.u.any() and not contacts:
-        comparison, corrections = corrected(inputs)
-        compared = torque_doubts(inputs, comparison)
-        noise = inputs.compared_noise
-        if noise is not None and ("torque unit", "wrong") not in {(each.about, each.level) for each in compared}:
-            numbers = parameter_doubts(comparison.robot, comparison.changed(inputs.rows()), noise)
-            compared = [each for each in compared if not numbers or each.about != "torque unit"] + numbers
-        doubts += [*corrections, *compared]
+        found, said = search(inputs)
+        comparison = found.log
+        doubts += [*said, *torque_doubts(inputs, comparison)]
     return doubts, comparison
 
 

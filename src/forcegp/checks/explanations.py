@@ -1,0 +1,401 @@
+"""What may be wrong between a log and its robot: every cause as the log and robot that it would leave.
+
+Causes of the torques alone (signs, factors) are found joint by joint in `search`; those here change what is needed.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations, permutations
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.optimize import linear_sum_assignment
+
+from forcegp.checks.check_input import DEGREE, CheckInput
+from forcegp.checks.torques import Change, Comparison, needed_torques, with_gravity
+from forcegp.data import Dataset
+from forcegp.doubts import Level
+from forcegp.model import Model
+from forcegp.robots import Robot
+
+SIGN, NUMBER = 0.5, 1.0
+"""What a turned sign, or a free number, must gain at least: it is subtracted from the logarithm of what remains."""
+MOST_ORDERS = 24  # of legs
+SCANNED = 3  # best of the numbers that are scanned, which are looked at in full
+TILTED = np.deg2rad(6.0)  # angle from which a direction of gravity is another
+FACTORS = np.exp(np.linspace(-2.5, 2.5, 251))  # of lengths, its ends left out
+ALL_TRIED = 8  # joints up to which every pair is exchanged; of more, those that fit badly
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Cause:
+    """One cause, as its doubt will say it. `number` tells causes that only fit exactly from mistakes of a kind."""
+
+    about: str
+    what: str
+    do: str = ""
+    joints: tuple[int, ...] = ()
+    numbers: dict[str, Any] = field(default_factory=dict)
+    correction: dict[str, Any] = field(default_factory=dict)
+    cost: float = NUMBER
+    number: bool = False
+    level: Level = "wrong"
+
+
+Candidate = tuple[Cause, Comparison]
+URDF = "Correct the URDF; or let forcegp fit --forces bodies estimate it from this log."
+
+
+def changed(signals: str = "", order: np.ndarray | None = None, factor: np.ndarray | float = 1.0) -> Change:
+    """Every joint's signals from another column, times a factor.
+
+    Without forces, truth and metadata, which belong to the log as it was.
+    """
+
+    def change(dataset: Dataset) -> Dataset:
+        places = np.arange(dataset.nv) if order is None else order
+        columns = {name: getattr(dataset, name)[:, places] * factor for name in signals}
+        return replace(dataset, **columns, model=Model(dataset.model.robot), noise_std=None, truth={}, metadata={})
+
+    return change
+
+
+def candidates(now: Comparison, inputs: CheckInput, bad: np.ndarray, factors: np.ndarray) -> Iterator[Candidate]:
+    """All causes, on top of those that were corrected; `bad` (nv,) are joints that fit badly, `factors` of their u."""
+    alive = np.ptp(now.rows.u, axis=0) > 0.0
+    yield from _units(now, inputs, factors)
+    yield from _delays(now, inputs)
+    if not np.ndim(now.more):
+        yield from _orders(now, inputs, alive)
+        yield from _motions(now, inputs, bad & alive)
+        yield from _scanned(now, inputs)
+    yield from _linear(now, inputs)
+
+
+def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator[Candidate]:
+    """One factor of all torques; positions in degrees or turns; time in other units."""
+    known = factors[np.isfinite(factors) & (factors > 0.0)]
+    if len(known) and known.max() < 2.0 * known.min():
+        common = float(np.exp(np.log(known).mean()))
+        unit, size = next(((u, s) for u, s in UNITS if abs(np.log(common / s)) < np.log(1.5)), ("", common))
+        looks = f": it looks like {unit}" if unit else " (or all masses are)"
+        cause = Cause(
+            about="torque unit",
+            what=f"the measured torque of all joints is {common:.4g} times what the motion needs{looks}",
+            do="Correct the unit or the factor of u." if unit else "Compare masses and torque constants with the data sheet.",
+            joints=tuple(range(now.rows.nv)),
+            numbers={"factor": common},
+            correction={"unit": {"u": (unit,)}} if unit else {},
+            cost=SIGN if unit else NUMBER,
+            number=not unit,
+            level="wrong" if unit else "look",
+        )  # fmt: skip
+        if unit or not 0.8 < common < 1.25:
+            yield cause, now.after(changed("u", factor=1.0 / size))
+    largest, turns = np.abs(now.rows.q * inputs.rotates).max(), inputs.rotates
+    each = [np.arange(len(turns)) == k for k in np.flatnonzero(turns & (np.abs(now.rows.q).max(axis=0) > 7.0))]
+    for own in [turns, *(one for one in each if turns.sum() > 1)] if largest > 1.0 else []:
+        if own.any():
+            what = f"positions reach {largest:.4g}; taken for degrees, they fit the torques far better than for radians"
+            unit = {s: tuple(x.replace("rad", "deg") if d else x for x, d in zip(inputs.unit_of_each(s), own, strict=True))
+                    for s in "qv"}  # fmt: skip
+            cause = Cause(about="degrees", what=what, do="Use np.deg2rad.", joints=_places(own), correction={"unit": unit}, cost=SIGN)
+            yield cause, now.after(changed("qva", factor=np.where(own, DEGREE, 1.0)))
+    if turns.any():
+        what = "positions fit the torques far better taken for turns than for radians"
+        cause = Cause(about="turns", what=what, do="Multiply q and v by 2 pi.", joints=_places(turns), cost=SIGN)
+        yield cause, now.after(changed("qva", factor=np.where(turns, 2.0 * np.pi, 1.0)))
+    for unit, factor in (("ms", 1e3), ("us", 1e6), ("min", 1.0 / 60.0)):
+        what = f"the motion fits the torques far better if time is in {unit}"
+
+        def change(rows: Dataset, factor: float = factor) -> Dataset:
+            return replace(changed()(rows), v=rows.v * factor, a=rows.a * factor**2)
+
+        cause = Cause(about="time unit", what=what, do="Convert the time.", correction={"unit": {"time": (unit,)}})
+        yield cause, now.after(change)
+
+
+UNITS = ("mNm", 1e3), ("kNm", 1e-3)
+
+
+def _delays(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
+    """Torques that are logged later or earlier, so that others need not explain it; `estimate_delay` measures it."""
+    dense = inputs.compared
+    if dense is None or not dense.time_ordered or now.shift:
+        return
+    for seconds in (-0.05, -0.03, -0.015, 0.01, 0.02, 0.03, 0.045, 0.07):
+        yield Cause(about="delay", what="", numbers={"delay": seconds}), now.shifted(dense, seconds)
+
+
+def _orders(now: Comparison, inputs: CheckInput, alive: np.ndarray) -> Iterator[Candidate]:
+    """Torques under other joints; motions or all signals in an order that files have."""
+    places, nv = np.arange(now.rows.nv), now.rows.nv
+    live = places[alive]
+    friction = [np.linalg.qr(np.c_[now.tau[:, [k]] - now.tau[:, k].mean(), now.friction[:, k]])[0] for k in live]
+    u = now.rows.u[:, live] - now.rows.u[:, live].mean(axis=0)
+    power = np.square(u).sum(axis=0)
+    left = np.array([(power - np.square(basis.T @ u).sum(axis=0)) / power for basis in friction])
+    order = places.copy()
+    order[live] = live[linear_sum_assignment(np.log(np.maximum(left, 1e-4)))[1]]
+    tried = [("u", order)]
+    tried += [(signals, other) for other in _usual_orders(now.robot) for signals in ("qv", "qvu", "u")]
+    for signals, other in tried:
+        moved = other != places
+        if moved.any() and alive[moved].all():
+            yield _ordered(now, inputs, signals, other)
+
+
+def _ordered(now: Comparison, inputs: CheckInput, signals: str, order: np.ndarray) -> Candidate:
+    moved = order != np.arange(len(order))
+    joints, owners = inputs.named(np.flatnonzero(moved)), inputs.named(order[moved])
+    kind = {"u": "torques", "qv": "positions and velocities", "qvu": "all signals"}[signals]
+    pairs = ", ".join(f"that of {one} stands under {other}" for one, other in zip(joints, owners, strict=True))
+    cause = Cause(
+        about="joints exchanged",
+        what=f"{kind} stand under wrong joints: {pairs}",
+        do="Correct the order of the columns, or the joint names of the log.",
+        joints=_places(moved),
+        numbers={"order": list(inputs.named(order))},
+        correction={"order": dict.fromkeys(signals, tuple(order.tolist()))},
+        cost=NUMBER + SIGN * (signals != "u"),
+    )
+    return cause, now.after(changed(signals.replace("v", "va"), order))
+
+
+def _usual_orders(robot: Robot) -> list[np.ndarray]:
+    """Reversed, by name, breadth first, and legs in other orders; each and its inverse, once."""
+    parents, names, n = robot.layout.parents, robot.joint_names, len(robot.joint_names)
+    depth, leg = np.zeros(n, int), np.zeros(n, int)
+    if len(parents) == n:
+        for k, parent in enumerate(parents):
+            depth[k], leg[k] = (depth[parent] + 1, leg[parent]) if parent >= 0 else (0, leg.max() + 1)
+    wide, found = np.argsort(depth, kind="stable"), [np.arange(n)[::-1], np.argsort(names)]
+    for legs in list(permutations(np.unique(leg)))[:MOST_ORDERS] if len(np.unique(leg)) > 1 else []:
+        by_leg = np.concatenate([np.flatnonzero(leg == one) for one in legs])
+        found += [by_leg, by_leg[np.argsort(depth[by_leg], kind="stable")]]
+    every = [order for one in (*found, wide) for order in (one, np.argsort(one))]
+    return [np.array(order) for order in dict.fromkeys(tuple(order.tolist()) for order in every)]
+
+
+def _motions(now: Comparison, inputs: CheckInput, bad: np.ndarray) -> Iterator[Candidate]:
+    """A joint in the other direction; two exchanged."""
+    nv, remedy = len(inputs.names), "Turn the joint's axis in the URDF."
+    joints = [k for k in range(nv) if nv <= ALL_TRIED or bad[k]]
+    for joint in joints:
+        name, factor = inputs.names[joint], np.where(np.arange(nv) == joint, -1.0, 1.0)
+        for what, signals in (
+            (f"positions and velocities of {name} have", "qv"),
+            (f"the whole joint {name} (motion and torque) has", "qvu"),
+        ):
+            cause = Cause(
+                about="motion sign",
+                what=f"{what} the opposite sign of the URDF's",
+                do=remedy,
+                joints=(joint,),
+                correction={"sign": dict.fromkeys(signals, tuple(factor))},
+            )
+            yield cause, now.after(changed(f"{signals}a", factor=factor))
+    for pair in combinations([k for k in joints if bad[k]], 2):
+        order = np.arange(nv)
+        order[[*pair]] = order[[*pair[::-1]]]
+        for signals in ("qv", "qvu"):
+            yield _ordered(now, inputs, signals, order)
+
+
+def _waves(x: np.ndarray) -> np.ndarray:
+    return np.stack([x**0, np.cos(x), np.sin(x), np.cos(2 * x), np.sin(2 * x)], axis=1)
+
+
+def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
+    """A joint zero, or a length, that leaves least; the best of all."""
+    robot, rows, names = now.robot, now.rows, now.robot.joint_names
+    zeros, turns = 2.0 * np.pi * np.arange(5) / 5.0, np.linspace(-np.pi, np.pi, 181)
+    waves, parts = _waves(turns) @ np.linalg.inv(_waves(zeros)), np.array([0.5, 1.0, 2.0])
+    parabolas = np.vander(FACTORS, 3) @ np.linalg.inv(np.vander(parts, 3))
+    laws, found = now.tau - needed_torques(robot, rows), list[tuple[float, Cause, Callable[[], Comparison]]]()
+
+    def best(taus: Sequence[np.ndarray], weights: np.ndarray, values: np.ndarray) -> tuple[float, float]:
+        left = _left_of(now, np.stack([now.rows.u, *(laws + tau for tau in taus)]), weights)
+        at = int(np.argmin(left))
+        return (float(left[at]), float(values[at])) if 0 < at < len(values) - 1 else (np.inf, 0.0)
+
+    for joint in np.flatnonzero(inputs.rotates):
+        one = np.eye(rows.nv)[joint]
+        left, x = best([needed_torques(robot, replace(rows, q=rows.q + y * one)) for y in zeros], waves, turns)
+        cause = Cause(
+            about="joint zero",
+            what=f"the torques fit positions of {names[joint]} that are {x:+.3g} rad ({x / DEGREE:+.0f} degrees) from "
+            "the logged ones: its zero is elsewhere",
+            do=URDF,
+            joints=(joint,),
+            numbers={"value": x},
+            cost=NUMBER + 0.3,
+            number=True,
+            level="look",
+        )
+        if abs(x) > 0.05:
+            found.append((left, cause, lambda x=x, one=one: now.after(_offset(x * one))))
+    for body, drive in enumerate(robot.layout.drives):
+        length = float(torch.linalg.vector_norm(robot.tree.rest[body, :3, 3, 0]))
+        if length == 0.0 or robot.layout.parents[body] < 0:
+            continue  # where the whole robot stands changes nothing
+        left, x = best([needed_torques(_with_length(robot, body, y), rows) for y in parts], parabolas, FACTORS)
+        cause = Cause(
+            about="lengths",
+            what=f"the torques fit {x:.3g} times the length from {names[drive.joint]} to the joint before "
+            f"({x * length:.3g} instead of {length:.3g} m)",
+            do=URDF,
+            joints=(drive.joint,),
+            numbers={"value": x},
+            cost=NUMBER + 0.2,
+            number=True,
+            level="look",
+        )
+        if abs(np.log(max(x, 1e-9))) > 0.05:
+            found.append((left, cause, lambda x=x, b=body: now.after(changed(), _with_length(robot, b, x))))
+    for _, cause, made in sorted(found, key=lambda each: each[0])[:SCANNED]:
+        yield cause, made()
+
+
+def _offset(by: np.ndarray) -> Change:
+    return lambda rows: replace(changed()(rows), q=rows.q + by)
+
+
+def _with_length(robot: Robot, body: int, factor: float) -> Robot:
+    rest = robot.tree.rest.clone()
+    rest[body, :3, 3] *= factor
+    return replace(robot, tree=replace(robot.tree, rest=rest))
+
+
+def _left_of(now: Comparison, signals: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, " values"]:
+    """Logarithm of what is left of u, for `weights` (values, k) of torques behind u, over all joints."""
+    factors, total = np.c_[np.ones(len(weights)), -weights], np.zeros(len(weights))
+    for joint in np.flatnonzero(np.ptp(now.rows.u, axis=0) > 0.0):
+        basis = np.linalg.qr(now.friction[:, joint])[0]
+        parts = signals[:, :, joint].T - signals[:, :, joint].mean(axis=1)
+        parts = parts - basis @ (basis.T @ parts)
+        power = np.square(parts[:, 0]).sum() + 1e-300
+        left = np.einsum("xi,ij,xj->x", factors, parts.T @ parts, factors)
+        total += np.log(np.maximum(left / power, 1e-5))
+    return total
+
+
+def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
+    """Numbers of which torques are linear: gravity, a payload, masses, springs."""
+    robot, rows, names, layout = now.robot, now.rows, now.robot.joint_names, now.robot.layout
+    q, tau = torch.tensor(rows.q, device=robot.device), needed_torques(robot, rows)
+    with torch.no_grad():
+        pulls = [with_gravity(robot, axis).gravity_forces(q).cpu().numpy() for axis in np.eye(3)]
+    yield from _gravities(now, np.stack(pulls, axis=-1))
+
+    def of_part(body: int, part: torch.Tensor) -> np.ndarray:
+        inertias = robot.tree.inertias.clone()
+        inertias[body, :, :, 0] += part
+        return needed_torques(replace(robot, tree=replace(robot.tree, inertias=inertias)), rows) - tau
+
+    for body, (joint, drive) in enumerate(zip(layout.bodies, layout.drives, strict=True)):
+        J = robot.tree.inertias[body, :, :, 0]
+        size, where = float(J[3, 3]), {"joints": (drive.joint,), "do": URDF, "number": True, "level": "look"}
+        if body not in layout.parents:
+            unit = size or 1.0
+            columns = np.stack([of_part(body, unit * part) for part in _first_moments(J)], axis=-1)
+            held = solved(now, columns)
+            if held is not None and held[0] > 0.0:
+                offset = np.linalg.inv(layout.child_frames[body])
+                center = offset[:3, :3] @ held[1:] / held[0] + offset[:3, 3]
+                at = ", ".join(f"{1e3 * x:.3g}" for x in center)
+                text = f"the torques fit {unit * held[0]:.3g} kg more at ({at}) mm of {joint.child}: it holds something"
+                numbers = {"mass": unit * float(held[0]), "center_of_mass": center.tolist()}
+                cause = Cause(about="payload", what=text, cost=2.5 * NUMBER, numbers=numbers, **where)
+                yield cause, replace(now, more=now.more + columns @ held)
+        if size <= 0.0:
+            continue
+        center = J[:, 3] / size
+        for part in (J, size * torch.outer(center, center)):  # with its inertia, and the mass alone
+            column = of_part(body, part)
+            one = solved(now, column[..., None])
+            if one is not None and abs(one[0]) > 0.1 and -0.9 < one[0] < 9.0:
+                text = f"the torques fit a mass of {joint.child} of {1.0 + one[0]:.3g} times that of the URDF"
+                cause = Cause(about="masses", what=text, numbers={"value": 1.0 + float(one[0])}, **where)
+                yield cause, replace(now, more=now.more + one[0] * column)
+    for joint in range(rows.nv):
+        only = (rows.q - rows.q.mean(axis=0)) * (np.arange(rows.nv) == joint)
+        found = solved(now, only[..., None])
+        if found is not None and found[0] > 0.0:
+            unit = "Nm/rad" if inputs.rotates[joint] else "N/m"
+            text = f"the torque of {names[joint]} rises with its position by {found[0]:.3g} {unit}, as a spring's"
+            do = "Describe it as `spring` (forcegp fit --forces spring estimates it)."
+            cause = Cause(about="spring", what=text, do=do, joints=(joint,), numbers={"stiffness": float(found[0])},
+                          cost=NUMBER + 0.2, number=True, level="look")  # fmt: skip
+            yield cause, replace(now, more=now.more + found[0] * only)
+
+
+def _first_moments(J: torch.Tensor) -> Iterator[torch.Tensor]:
+    """Pseudo-inertias of 1 kg at the origin, and of 1 kg m along each axis."""
+    for k in (3, 0, 1, 2):
+        part = torch.zeros_like(J)
+        part[k, 3] = part[3, k] = 1.0
+        yield part
+
+
+def solved(now: Comparison, columns: Float[np.ndarray, "rows nv k"]) -> Float[np.ndarray, " k"] | None:
+    """Numbers that leave least of u, every joint by the power that is left of it."""
+    parts = []
+    for joint in np.flatnonzero(np.ptp(now.rows.u, axis=0) > 0.0):
+        basis = np.linalg.qr(now.friction[:, joint])[0]
+        both = np.c_[columns[:, joint], now.rows.u[:, joint] - now.tau[:, joint]]
+        both = both - both.mean(axis=0)
+        both = both - basis @ (basis.T @ both)
+        parts.append((both, np.square(now.rows.u[:, joint] - now.rows.u[:, joint].mean()).sum()))
+    if not parts or not any(np.square(both[:, :-1]).sum() > 0.0 for both, _ in parts):
+        return None
+    number, weights = np.zeros(columns.shape[-1]), [1.0 / (np.square(b[:, -1]).sum() + 1e-9 * p) for b, p in parts]
+    for _ in range(4):
+        normal = sum(w * b.T @ b for w, (b, _) in zip(weights, parts, strict=True))
+        scale = np.sqrt(np.diag(normal)[:-1])
+        scale[scale == 0.0] = 1.0
+        inverse = np.linalg.pinv(normal[:-1, :-1] / np.outer(scale, scale), rcond=1e-8)
+        number = inverse @ (normal[:-1, -1] / scale) / scale
+        left = [np.square(b[:, -1] - b[:, :-1] @ number).sum() for b, _ in parts]
+        weights = [1.0 / (x + 1e-6 * p) for x, (_, p) in zip(left, parts, strict=True)]
+    return number
+
+
+def _gravities(now: Comparison, pulls: Float[np.ndarray, "rows nv 3"]) -> Iterator[Candidate]:
+    """The gravity that the torques show: its direction, its size, or both."""
+    nominal = now.robot.gravity.cpu().numpy()
+    size = float(np.linalg.norm(nominal))
+    found = solved(now, pulls)
+    if found is None:
+        return
+    estimate = nominal + found
+    norm = float(np.linalg.norm(estimate))
+    tried = [(estimate, 2.0 * NUMBER)]
+    if norm > 0.0 and size > 0.0:
+        tried.append((size / norm * estimate, 1.5 * NUMBER))
+    tried += [((size or 9.81) * sign * axis, NUMBER) for axis in np.eye(3) for sign in (1.0, -1.0)]
+    if size > 0.0:
+        tried += [(0.0 * nominal, NUMBER), (nominal * (estimate @ nominal) / size**2, NUMBER)]
+    for gravity, cost in tried:
+        own = float(np.linalg.norm(gravity))
+        angle = float(np.arccos(np.clip(gravity @ nominal / (own * size), -1.0, 1.0))) if own * size > 0.0 else 0.0
+        if angle < TILTED and abs(own - size) < 0.1 * max(size, own):
+            continue
+        text = ", ".join(f"{x + 0.0:.3g}" for x in gravity)
+        away = f", {np.rad2deg(angle):.0f} degrees from the assumed one: the base is mounted another way" if angle else ""
+        cause = Cause(
+            about="gravity",
+            what=f"the torques fit gravity along ({text}) m/s² of the base far better{away}",
+            do=f"Give `gravity`={text.replace(' ', '')}.",
+            numbers={"gravity": gravity.tolist(), "degrees": float(np.rad2deg(angle))},
+            cost=cost,
+            number=True,
+        )
+        yield cause, now.after(changed(), with_gravity(now.robot, gravity))
+
+
+def _places(chosen: np.ndarray) -> tuple[int, ...]:
+    return tuple(np.flatnonzero(chosen).tolist())
+

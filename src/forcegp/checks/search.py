@@ -1,0 +1,270 @@
+"""One search over all causes: which of them, one after the other, leave of the torques what a good log leaves."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from forcegp.checks.check_input import CheckInput
+from forcegp.checks.explanations import NUMBER, SIGN, Cause, candidates, changed
+from forcegp.checks.torques import Comparison, positive_fit, torque_noise
+from forcegp.data.views import white_noise
+from forcegp.doubts import Doubt, listed, look
+
+GAIN = np.log(4.0)  # by which the product over all joints of what remains must fall at least
+LEAST = 1e-4  # shares of a torque's power below this are all the same
+NOISE = 3.0  # how much of the power of the noise is left to every explanation
+BEAM, DEPTH = 4, 3  # explanations that are continued, and causes of one
+BLOCKS = 4  # of the log, each of which is predicted from the others
+FREE = 4.0  # share that an explanation may leave, over what a robot with any masses and any friction would
+GOOD = 0.01  # share that a good log may leave
+EXPLAINED = 0.1  # share that a robot with rough masses leaves
+ROUGH = 2.5  # factor either way that wrong masses make of a torque
+CHOICES = np.array([0.0, SIGN, NUMBER, SIGN + NUMBER])
+"""Cost of a torque as it is, turned, times a factor, and both."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A log after all `causes`, and how it fits; `floor` (nv,) is the share of each torque that is noise."""
+
+    log: Comparison
+    floor: Float[np.ndarray, " nv"]
+    causes: tuple[Cause, ...] = ()
+    turned: tuple[int, ...] = ()
+
+    @cached_property
+    def _fits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Shares (nv, 4) that remain of every choice, NaN for a constant torque, and factors (nv,) of the chosen."""
+        u, tau = (x - x.mean(axis=0) for x in (self.log.rows.u, self.log.tau))
+        power, friction = np.square(u).sum(axis=0), self.log.friction
+        shares, factors = np.full((u.shape[1], 4), np.nan), np.full((u.shape[1], 2), np.nan)
+        for k in np.flatnonzero(np.ptp(self.log.rows.u, axis=0) > 0.0):
+            for turn, sign in enumerate((1.0, -1.0)):
+                shares[k, turn] = positive_fit(friction[:, k], sign * u[:, k] - tau[:, k])[1]
+                found, shares[k, turn + 2] = positive_fit(np.c_[tau[:, k], friction[:, k]], sign * u[:, k])
+                factors[k, turn] = found[0]
+            shares[k] /= power[k]
+        return shares, factors
+
+    @cached_property
+    def chosen(self) -> Int[np.ndarray, " nv"]:
+        """Which of CHOICES explains each torque best."""
+        return np.argmin(np.nan_to_num(self._logarithms() + CHOICES), axis=1)
+
+    def _logarithms(self) -> np.ndarray:
+        return np.log(np.maximum(self._fits[0], np.maximum(LEAST, NOISE * self.floor)[:, None]))
+
+    @cached_property
+    def value(self) -> float:
+        """Logarithm of what remains, over all joints, and the costs of what was assumed."""
+        places = np.arange(len(self.chosen))
+        left = np.nansum((self._logarithms() + CHOICES)[places, self.chosen])
+        return float(left) + sum(cause.cost for cause in self.causes) + SIGN * len(self.turned)
+
+    @property
+    def factors(self) -> Float[np.ndarray, " nv"]:
+        """Of u over what is needed, NaN where nothing is."""
+        shares, factors = self._fits
+        turn = np.nanargmin(np.where(np.isnan(shares[:, 2:]), np.inf, shares[:, 2:]), axis=1)
+        return np.where(shares[:, 2:].min(axis=1) < 0.5, factors[np.arange(len(turn)), turn], np.nan)
+
+    @property
+    def plain(self) -> float:
+        """The same as `value` of a log that nothing is assumed of."""
+        return float(np.nansum(self._logarithms()[:, 0]))
+
+    def with_signs(self) -> "Explanation":
+        """With the torques turned whose other sign fits."""
+        turned = np.flatnonzero(self.chosen % 2)
+        if not len(turned):
+            return self
+        factor = np.ones(len(self.chosen))
+        factor[turned] = -1.0
+        both = tuple(sorted({*self.turned} ^ {*turned.tolist()}))
+        return replace(self, log=self.log.after(changed("u", factor=factor)), turned=both)
+
+    @cached_property
+    def rough(self) -> Float[np.ndarray, " nv"]:
+        """Share that is left of each torque if masses may be roughly wrong; without what is noise."""
+        left = np.array([self._held_out(k, rough=True) for k in range(len(self.floor))])
+        return np.maximum(left - NOISE * self.floor, 0.0)
+
+    @cached_property
+    def exact(self) -> Float[np.ndarray, " nv"]:
+        """Share that is left of each torque by what was assumed."""
+        return np.array([self._held_out(k, rough=False) for k in range(len(self.floor))])
+
+    def _held_out(self, joint: int, rough: bool) -> float:
+        """What friction and tau, as the other blocks have them, leave of every block."""
+        u, tau, friction = self.log.rows.u[:, joint], self.log.tau[:, joint], self.log.friction[:, joint]
+        power, left = np.square(u - u.mean()).sum(), 0.0
+        if not np.ptp(u) > 0.0:
+            return 0.0
+        scaled = rough or self.chosen[joint] >= 2
+        for block in np.array_split(np.arange(len(u)), BLOCKS):
+            rest = np.setdiff1d(np.arange(len(u)), block)
+            middle = [x[rest].mean(axis=0) for x in (u, tau, friction)]
+            factor = 1.0
+            if scaled:
+                found, _ = positive_fit(np.c_[tau[rest] - middle[1], friction[rest] - middle[2]], u[rest] - middle[0])
+                factor = float(np.clip(found[0], 1.0 / ROUGH, ROUGH)) if rough and self.chosen[joint] < 2 else found[0]
+            target = u - middle[0] - factor * (tau - middle[1])
+            number, _ = positive_fit(friction[rest] - middle[2], target[rest])
+            left += np.square(target[block] - (friction[block] - middle[2]) @ number).sum()
+        return float(left / power)
+
+    @cached_property
+    def free(self) -> Float[np.ndarray, " nv"]:
+        """Share that is left of each torque by a robot with any masses and friction."""
+        rows, robot = self.log.rows, self.log.robot
+        q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
+        with torch.no_grad():
+            regressor = robot.kinematics(q, v).torque_regressor(a).flatten(-2).cpu().numpy()
+        left = []
+        for k, u in enumerate(rows.u.T):
+            columns = np.c_[regressor[:, k], self.log.friction[:, k], np.ones(len(u))]
+            size = np.linalg.norm(columns, axis=0)
+            basis, values, _ = np.linalg.svd(columns[:, size > 0.0] / size[size > 0.0], full_matrices=False)
+            basis = basis[:, values > 1e-8 * values[0]]
+            left.append(np.square(u - basis @ (basis.T @ u)).sum() / max(np.square(u - u.mean()).sum(), 1e-300))
+        return np.array(left)
+
+    @property
+    def good(self) -> np.ndarray:
+        """Whether each joint is left with what a good log leaves (nv,)."""
+        return self.exact <= np.maximum(np.minimum(FREE * self.free, EXPLAINED), np.maximum(GOOD, NOISE * self.floor))
+
+    def stands(self, root: "Explanation") -> bool:
+        """Whether all joints are left with what a good log leaves; with rough masses, if mistakes were corrected."""
+        if self.good.all():
+            return True
+        exactly = any(cause.number for cause in self.causes) or (self.chosen >= 2).any()
+        return not exactly and root.rough.max() > EXPLAINED and bool((self.rough <= EXPLAINED).all())
+
+
+def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
+    """The explanation that stands, or the log as it is; and what is to be said of it."""
+    root = _root(inputs)
+    if root.plain <= np.log(np.maximum(LEAST, np.maximum(NOISE * root.floor, GOOD))).sum():
+        return root, []
+    every, frontier = [root.with_signs()], [root.with_signs()]
+    for _ in range(DEPTH):
+        grown: list[Explanation] = []
+        for now in frontier:
+            for cause, log in candidates(now.log, inputs, now._fits[0][:, 0] > GOOD, now.factors):
+                made = Explanation(log, root.floor, (*now.causes, cause), now.turned).with_signs()
+                if made.value < now.value - 0.5 * GAIN:
+                    grown.append(made)
+        if not grown:
+            break
+        every += grown
+        frontier = sorted(grown, key=lambda each: each.value)[:BEAM]
+    every.sort(key=lambda each: each.value)
+    for best in every[: 2 * BEAM]:
+        if root.plain - best.value >= GAIN and best.stands(root):
+            return best, list(_said(best, root, inputs))
+    signs = root.with_signs()
+    sure = [k for k in signs.turned if signs.good[k]]
+    if sure:
+        factor = np.where(np.isin(np.arange(len(root.floor)), sure), -1.0, 1.0)
+        root = replace(root, log=root.log.after(changed("u", factor=factor)), turned=tuple(sure))
+    return root, [*_signs(root, inputs), *_unknown(root, inputs)]
+
+
+def _root(inputs: CheckInput) -> Explanation:
+    log = Comparison(robot=inputs.robot, laws=inputs.laws, rows=inputs.rows()).after(changed())
+    seen = white_noise(inputs.mended, signal="u") if inputs.log.time_ordered else None
+    noise = np.zeros(log.rows.nv) if seen is None else np.nan_to_num(seen)
+    if (cutoff := inputs.cutoff) is not None:
+        noise = noise * np.sqrt(min(1.0, cutoff * float(np.median(np.diff(inputs.even.time)))))
+    of_motion = 0.0 if inputs.compared_noise is None else torque_noise(inputs.robot, log.rows, inputs.compared_noise)
+    power = np.maximum(np.square(log.rows.u - log.rows.u.mean(axis=0)).mean(axis=0), 1e-300)
+    return Explanation(log, (np.square(noise) + np.square(of_motion)) / power)
+
+
+def _said(best: Explanation, root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
+    """A doubt for every cause."""
+    yield from _signs(best, inputs)
+    before, after = (100.0 * float(np.nanmax(each.exact)) for each in (root, best))
+    then = f"; then at most {after:.2g} % of a torque remains unexplained, instead of {before:.3g} %."
+    for cause in best.causes:
+        if cause.about != "delay":
+            told = {"joints": inputs.named(cause.joints), "numbers": cause.numbers, "correction": cause.correction}
+            yield Doubt(level=cause.level, about=cause.about, what=cause.what + then, do=cause.do, **told)
+    yield from _factors(best, inputs)
+
+
+def _signs(best: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
+    if best.turned:
+        joints, nv = inputs.named(best.turned), len(inputs.names)
+        yield Doubt(
+            level="wrong",
+            about="torque sign",
+            what=f"the torque of {'all joints' if len(joints) == nv else listed(joints)} has the opposite sign of what "
+            f"the motion needs (then at most {100.0 * float(best.exact[[*best.turned]].max()):.2g} % of it remains).",
+            do="Turn the joint's whole motion if its axis in the URDF points the other way.",
+            joints=joints,
+            correction={"sign": {"u": tuple(-1.0 if k in best.turned else 1.0 for k in range(nv))}},
+        )
+
+
+FAR, MUCH_MORE = 3.0, 30.0
+"""Factors that wrong masses do not explain: less torque than bodies need cannot be; more may be a rotor's inertia."""
+
+
+def _factors(best: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
+    """Torques that are a multiple of what the motion needs."""
+    off = np.flatnonzero(best.chosen >= 2)
+    if not len(off):
+        return
+    joints, factors = inputs.named(off), best.factors[off]
+    each = ", ".join(f"{name} {value:.4g}" for name, value in zip(joints, factors, strict=True))
+    yield Doubt(
+        level="wrong" if factors.min() < 1.0 / FAR or factors.max() > MUCH_MORE else "look",
+        about="torque constant" if len(off) == 1 else "torque unit",
+        what=f"the measured torque is a multiple of what the motion needs: {each}.",
+        do="Such factors point to torque before the gears (multiply by the gear ratio), motor current (multiply by the "
+        "torque constant), a rotor inertia that is missing, or wrong masses; compare with the data sheet.",
+        joints=joints,
+        numbers={"factor": dict(zip(joints, factors.tolist(), strict=True))},
+    )
+
+
+def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
+    """That something is wrong which is none of the causes, and where it sits."""
+    bad = np.flatnonzero(root.rough > EXPLAINED)
+    if not len(bad):
+        return
+    rows, shares = root.log.rows, ", ".join(f"{inputs.names[k]} {100.0 * root.rough[k]:.0f} %" for k in bad)
+    yield look(
+        about="unknown cause",
+        what="something is wrong that is none of the causes that were tried (signs, units, orders, zeros, gravity, "
+        f"masses, payload, springs, delay): unexplained stay of the torque of {shares}{_where(root, bad, inputs)}.",
+        do="Look at these joints there: contacts, brakes, cables, another robot, or a channel that is not a torque.",
+        joints=inputs.named(bad),
+        numbers={"unexplained": root.rough[bad].tolist(), "rows": len(rows)},
+    )
+
+
+def _where(root: Explanation, bad: np.ndarray, inputs: CheckInput) -> str:
+    """Where in q, v or time more than half of what is left sits, in a quarter of the rows."""
+    worst = int(bad[np.argmax(root.rough[bad])])
+    rows, target = root.log.rows, root.log.rows.u[:, worst] - root.log.tau[:, worst]
+    target = target - target.mean()
+    number, _ = positive_fit(root.log.friction[:, worst], target)
+    left = np.square(target - root.log.friction[:, worst] @ number)
+    best, text = 0.5, ""
+    for name, values, unit in (("q", rows.q[:, worst], inputs.unit_of_each("q")[worst]), ("time", rows.time, "s"),
+                               ("v", rows.v[:, worst], inputs.unit_of_each("v")[worst])):  # fmt: skip
+        order = np.argsort(values, kind="stable")
+        for part in np.array_split(order, 8)[:-1]:
+            first = int(np.searchsorted(values[order], values[part[0]]))
+            own = order[first : first + len(order) // 4]
+            if (share := float(left[own].sum() / left.sum())) > best:
+                ends = f"{values[own[0]]:.3g} and {values[own[-1]]:.3g} {unit}"
+                best, text = share, f"; {100.0 * share:.0f} % of it at {inputs.names[worst]} for {name} between {ends}"
+    return text
