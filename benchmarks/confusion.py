@@ -251,7 +251,7 @@ FAULTS: dict[str, tuple[str, tuple[Fault, ...]]] = {
     "length": ("lengths", (lambda case: setattr(case, "lengths", case.lengths * one(1.5)(case)),)),
     "spring": ("spring", (state(spring=one(3.0, 0.0)),)),
     "saturation": ("saturation", (later(clipped),)),
-    "frozen q": ("frozen channel", (later(held("q")),)),
+    "frozen q": ("frozen channel|velocity", (later(held("q")),)),
     "frozen u": ("frozen channel", (later(held("u")),)),
     "sign, late": ("torque sign|delay", (SIGN, LATE)),
     "sign, mNm": ("torque sign|torque unit", (SIGN, MNM)),

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from forcegp.data import Dataset, Preparation, preparation_report, resample, uniform_step
 from forcegp.data.dataset import ROTATION, TRANSLATION
-from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST
+from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST, motion_spectrum
 from forcegp.data.views import consecutive, move_on, runs, white_noise, whole_windows, window_means
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.forces import JointLaw
@@ -41,7 +41,8 @@ class CheckInput:
     acceleration is not taken for a wrong torque; both None where jumps forbid derivatives. `rotates` (nv,) are joints
     that turn, `wraps` and `jumps` mark where (rows, nv) a position jumps by a turn, or by more than pi otherwise,
     `dropped` where a signal is 0 because it was not measured (interpolated in `mended`). `compared_noise` (nv,) is the
-    standard deviation of the acceleration in `compared`, None where it is not known.
+    standard deviation of the acceleration in `compared`, None where it is not known; `compared_cutoff` is its filter's [Hz],
+    and `sharper` the same behind a higher one, where the spectrum asks for one.
     """
 
     log: Dataset
@@ -58,6 +59,8 @@ class CheckInput:
     dropped: Mapping[str, Bool[np.ndarray, "rows nv"]] = field(default_factory=dict)
     compared_noise: Float[np.ndarray, " nv"] | None = None
     most_rows: int = MOST_ROWS
+    compared_cutoff: float = np.inf
+    sharper: Dataset | None = None
 
     @classmethod
     def as_recorded(cls, dataset: Dataset, model: Model, **more: Any) -> "CheckInput":
@@ -122,10 +125,14 @@ class CheckInput:
             if lower < HIGHEST * 0.5 / uniform_step(even.time[even.episode == even.episode[0]]):
                 with contextlib.suppress(DatasetError):  # too short for that
                     found["compared"] = trimmed(lower).rows(even)
+                    if preparation.cutoff == "auto":  # what wrong torques ask for is too low
+                        seen = float(np.nanmax(motion_spectrum(even, chosen.differentiate).cutoff))
+                        found["sharper"] = trimmed(seen).rows(even) if seen > 1.5 * lower else None
             # white noise as logged, or what the filter left
             left = preparation_report(prepared.metadata).get("acceleration_noise", {}).get("after")
             seen = white_noise(mended) if left is None else np.array(left, float) * HALF_CUTOFF
             found["compared_noise"] = np.zeros(mended.nv) if seen is None else np.nan_to_num(seen)
+            found["compared_cutoff"] = lower
         return cls.as_recorded(dataset, model, **found)
 
     @classmethod

@@ -15,8 +15,14 @@ from forcegp.checks.moving_base import (
     stance_doubts,
     unmeasured_base_doubts,
 )
-from forcegp.checks.signals import motion_doubts, sampling_doubts, signal_doubts
-from forcegp.checks.search import search
+from forcegp.checks.signals import (
+    motion_doubts,
+    sampling_doubts,
+    signal_doubts,
+    target_doubts,
+    without_registers,
+)
+from forcegp.checks.search import UNKNOWN, search
 from forcegp.checks.torque_doubts import TOUCHES, torque_doubts
 from forcegp.checks.torques import Comparison
 from forcegp.data import Dataset, Preparation, contact_doubts
@@ -100,8 +106,10 @@ def check(dataset: Dataset, model: Model | None = None, *, preparation: Preparat
     if robot.layout.groups:  # torques and filters are not looked at
         inputs = CheckInput.as_recorded(dataset, model)
         return CheckReport(doubts=_of_base(dataset, model, preparation), inputs=inputs, comparison=None)
+    dataset, registers = without_registers(dataset)
     inputs = CheckInput.of(dataset, model, preparation)
     doubts, comparison = _doubts(inputs, model)
+    doubts += registers
     if inputs.prepared is not None:
         doubts += [*excitation_doubts(inputs), *noise_doubts(inputs)]
     return CheckReport(doubts=Doubts(doubts), inputs=inputs, comparison=comparison)
@@ -117,7 +125,9 @@ def quick_check(dataset: Dataset, model: Model | None = None) -> Doubts:
     require_rows("dataset", dataset, model.robot.joint_names, model.robot.name)
     if model.robot.layout.groups:
         return Doubts(each for each in _of_base(dataset, model) if each.level != "ok")
+    dataset, registers = without_registers(dataset)
     doubts, _ = _doubts(CheckInput.quick(dataset, model), model)
+    doubts += registers
     said = [each for each in doubts if each.level == "look" and each.about in BEFORE_A_FIT]
     if dataset.nv == 1:  # friction of one joint can look like a delay
         said = [each for each in said if each.about != "delay"]
@@ -136,8 +146,14 @@ def _doubts(inputs: CheckInput, model: Model) -> tuple[list[Doubt], Comparison |
         return doubts, None
     if inputs.contacts:
         return [*doubts, TOUCHES], None
+    if targets := target_doubts(inputs):
+        return [*doubts, *targets], None
     if inputs.log.u.any() and not contacts:
         found, said = search(inputs)
+        if said and said[-1].about == UNKNOWN and inputs.sharper is not None:
+            sharp, heard = search(replace(inputs, compared=inputs.sharper))
+            if not heard or heard[-1].about != UNKNOWN:
+                found, said = sharp, heard
         comparison = found.log
         doubts += [*said, *torque_doubts(inputs, comparison)]
     return doubts, comparison

@@ -14,14 +14,18 @@ from forcegp.checks.torques import Comparison, positive_fit, torque_noise
 from forcegp.data.views import white_noise
 from forcegp.doubts import Doubt, listed, look
 
+UNKNOWN = "unknown cause"
 GAIN = np.log(4.0)  # by which the product over all joints of what remains must fall at least
 LEAST = 1e-4  # shares of a torque's power below this are all the same
 NOISE = 3.0  # how much of the power of the noise is left to every explanation
 BEAM, DEPTH = 4, 3  # explanations that are continued, and causes of one
+WORSE = 1.1  # share from which on predicting nothing is better
 BLOCKS = 4  # of the log, each of which is predicted from the others
 FREE = 4.0  # share that an explanation may leave, over what a robot with any masses and any friction would
-GOOD = 0.01  # share that a good log may leave
+GOOD = 0.03  # share that a good log may leave
+DOUBTFUL = 2e-3  # share above which causes are tried
 EXPLAINED = 0.1  # share that a robot with rough masses leaves
+RESTS = 0.5  # share of what friction leaves that a torque must explain, for a factor of it to mean something
 ROUGH = 2.5  # factor either way that wrong masses make of a torque
 CHOICES = np.array([0.0, SIGN, NUMBER, SIGN + NUMBER])
 """Cost of a torque as it is, turned, times a factor, and both."""
@@ -47,6 +51,8 @@ class Explanation:
                 shares[k, turn] = positive_fit(friction[:, k], sign * u[:, k] - tau[:, k])[1]
                 found, shares[k, turn + 2] = positive_fit(np.c_[tau[:, k], friction[:, k]], sign * u[:, k])
                 factors[k, turn] = found[0]
+            alone = positive_fit(friction[:, k], u[:, k])[1], positive_fit(friction[:, k], -u[:, k])[1]
+            shares[k, 2:] += power[k] * (shares[k, 2:] > (1.0 - RESTS) * np.array(alone))  # not a multiple of tau
             shares[k] /= power[k]
         return shares, factors
 
@@ -64,6 +70,12 @@ class Explanation:
         places = np.arange(len(self.chosen))
         left = np.nansum((self._logarithms() + CHOICES)[places, self.chosen])
         return float(left) + sum(cause.cost for cause in self.causes) + SIGN * len(self.turned)
+
+    @property
+    def unscaled(self) -> float:
+        """The same if no torque is a multiple."""
+        left = (self._logarithms() + CHOICES)[:, :2]
+        return float(np.nansum(left.min(axis=1))) + sum(cause.cost for cause in self.causes) + SIGN * len(self.turned)
 
     @property
     def factors(self) -> Float[np.ndarray, " nv"]:
@@ -91,7 +103,7 @@ class Explanation:
     def rough(self) -> Float[np.ndarray, " nv"]:
         """Share that is left of each torque if masses may be roughly wrong; without what is noise."""
         left = np.array([self._held_out(k, rough=True) for k in range(len(self.floor))])
-        return np.maximum(left - NOISE * self.floor, 0.0)
+        return np.where(left > WORSE, left, np.maximum(left - NOISE * self.floor, 0.0))
 
     @cached_property
     def exact(self) -> Float[np.ndarray, " nv"]:
@@ -149,15 +161,17 @@ class Explanation:
 def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
     """The explanation that stands, or the log as it is; and what is to be said of it."""
     root = _root(inputs)
-    if root.plain <= np.log(np.maximum(LEAST, np.maximum(NOISE * root.floor, GOOD))).sum():
+    if (np.nan_to_num(root._fits[0][:, 0]) <= np.maximum(NOISE * root.floor, DOUBTFUL)).all():
         return root, []
     every, frontier = [root.with_signs()], [root.with_signs()]
     for _ in range(DEPTH):
         grown: list[Explanation] = []
         for now in frontier:
-            for cause, log in candidates(now.log, inputs, now._fits[0][:, 0] > GOOD, now.factors):
-                made = Explanation(log, root.floor, (*now.causes, cause), now.turned).with_signs()
-                if made.value < now.value - 0.5 * GAIN:
+            for cause, log in candidates(now.log, inputs, now._fits[0][:, 0] > DOUBTFUL, now.factors):
+                order = cause.correction.get("order", {}).get("u", range(len(now.chosen)))
+                turned = tuple(k for k, place in enumerate(order) if place in now.turned)
+                made = Explanation(log, root.floor, (*now.causes, cause), turned).with_signs()
+                if made.value < max(now.value, now.unscaled) - 0.5 * GAIN:
                     grown.append(made)
         if not grown:
             break
@@ -179,22 +193,22 @@ def _root(inputs: CheckInput) -> Explanation:
     log = Comparison(robot=inputs.robot, laws=inputs.laws, rows=inputs.rows()).after(changed())
     seen = white_noise(inputs.mended, signal="u") if inputs.log.time_ordered else None
     noise = np.zeros(log.rows.nv) if seen is None else np.nan_to_num(seen)
-    if (cutoff := inputs.cutoff) is not None:
-        noise = noise * np.sqrt(min(1.0, cutoff * float(np.median(np.diff(inputs.even.time)))))
+    if np.isfinite(inputs.compared_cutoff):
+        noise = noise * np.sqrt(min(1.0, 2.0 * inputs.compared_cutoff * float(np.median(np.diff(inputs.even.time)))))
     of_motion = 0.0 if inputs.compared_noise is None else torque_noise(inputs.robot, log.rows, inputs.compared_noise)
     power = np.maximum(np.square(log.rows.u - log.rows.u.mean(axis=0)).mean(axis=0), 1e-300)
     return Explanation(log, (np.square(noise) + np.square(of_motion)) / power)
 
 
 def _said(best: Explanation, root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
-    """A doubt for every cause."""
-    yield from _signs(best, inputs)
+    """A doubt for every cause, in the order in which they are to be corrected."""
     before, after = (100.0 * float(np.nanmax(each.exact)) for each in (root, best))
     then = f"; then at most {after:.2g} % of a torque remains unexplained, instead of {before:.3g} %."
     for cause in best.causes:
         if cause.about != "delay":
             told = {"joints": inputs.named(cause.joints), "numbers": cause.numbers, "correction": cause.correction}
             yield Doubt(level=cause.level, about=cause.about, what=cause.what + then, do=cause.do, **told)
+    yield from _signs(best, inputs)
     yield from _factors(best, inputs)
 
 
@@ -241,7 +255,7 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         return
     rows, shares = root.log.rows, ", ".join(f"{inputs.names[k]} {100.0 * root.rough[k]:.0f} %" for k in bad)
     yield look(
-        about="unknown cause",
+        about=UNKNOWN,
         what="something is wrong that is none of the causes that were tried (signs, units, orders, zeros, gravity, "
         f"masses, payload, springs, delay): unexplained stay of the torque of {shares}{_where(root, bad, inputs)}.",
         do="Look at these joints there: contacts, brakes, cables, another robot, or a channel that is not a torque.",

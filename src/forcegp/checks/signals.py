@@ -1,6 +1,7 @@
 """Does each channel carry a signal, are the rows even in time, and do q, v and a belong to each other."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from forcegp.checks.check_input import DEGREE, GAP, CheckInput
+from forcegp.checks.torques import needed_torques
 from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.delay import lowest
 from forcegp.data.views import consecutive, runs
@@ -19,6 +21,8 @@ ROUNDING = 1e-12  # of the largest value of any joint
 HELD_STEPS = 0.5  # share of equal successive values from which on a signal moves in steps, such as a held command
 FROZEN_SECONDS = 0.1
 FROZEN_ROWS = 10
+STEPS = 2.5  # of its resolution by which a channel in steps changes
+PASSIVE = 0.5  # of the inertial torque: a mechanism that swings by itself needs less
 MOVES = 0.2  # of its root mean square speed, above which a joint moves
 CLIPPED_RATIO = 8.0  # rows at the extreme value over rows in the next thousandth of the range: a smooth peak has 2.4
 CLIPPED_ROWS = 10
@@ -30,6 +34,70 @@ def signal_doubts(inputs: CheckInput) -> list[Doubt]:
     frozen = chain.from_iterable(_frozen(inputs, name, joint) for name in QUANTITY for joint in joints)
     clipped = chain.from_iterable(_clipped(inputs, joint) for joint in joints)
     return [*_leaps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *clipped]
+
+
+FEWEST_VALUES = 20  # on either side of a gap
+CALMER = 0.5  # total variation of decoded registers over that of what was logged
+
+
+def without_registers(log: Dataset) -> tuple[Dataset, list[Doubt]]:
+    """The log with torques as they were before registers without a sign held them, and what is said of registers."""
+    found, u, follows = dict[tuple[str, str], list[str]](), log.u.copy(), consecutive(log)[:-1]
+    for name, joint in ((name, joint) for name in "uq" for joint in range(log.nv)):
+        x = getattr(log, name)[:, joint]
+        levels = np.unique(x)
+        if len(levels) < 2 * FEWEST_VALUES or levels[0] < 0.0:
+            continue
+        steps = np.diff(levels)
+        at, end = int(np.argmax(steps)), levels[-1] + steps.min()
+        if not FEWEST_VALUES <= at + 1 <= len(levels) - FEWEST_VALUES or (name == "q" and abs(end - 2 * np.pi) < 0.5):
+            continue
+        high = x > levels[at]
+        ways = {
+            "sign and magnitude": np.where(high, levels[at + 1] - x, x),
+            "two's complement, read without its sign": np.where(high, x - end, x),
+        }
+        moved = {way: float(np.abs(np.diff(values))[follows].sum()) for way, values in ways.items()}
+        way = min(moved, key=moved.__getitem__)
+        if moved[way] < CALMER * float(np.abs(np.diff(x))[follows].sum()):
+            found.setdefault((name, way), []).append(log.joint_names[joint])
+            if name == "u":
+                u[:, joint] = ways[way]
+    doubts = [
+        wrong(
+            about="registers",
+            what=f"the {QUANTITY[name]} of {listed(joints)} is never negative and jumps over a gap: it is the register as "
+            f"it is stored, {way}.",
+            do="Decode the register before the log is imported.",
+            joints=tuple(joints),
+            numbers={"quantity": name},
+        )
+        for (name, way), joints in found.items()
+    ]
+    return (replace(log, u=u, truth={}) if any(name == "u" for name, _ in found) else log), doubts
+
+
+LONGEST_LAG, SAME_POSITION = 0.5, 0.98  # s, and the share of u that positions explain
+
+
+def target_doubts(inputs: CheckInput) -> list[Doubt]:
+    """Torques that are positions, a little ahead: the targets of a controller."""
+    log, moves = inputs.even, np.ptp(inputs.even.q, axis=0) > 0.0
+    if not inputs.log.time_ordered or not moves.any() or not (np.ptp(log.u, axis=0)[moves] > 0.0).all():
+        return []
+    step, rows = float(np.median(np.diff(log.time))), np.arange(len(log))
+    for lag in np.unique(np.linspace(0.0, LONGEST_LAG / step, 51).astype(int)):
+        own = rows[: len(rows) - lag][log.episode[: len(rows) - lag] == log.episode[lag:]]
+        if len(own) < FROZEN_ROWS:
+            break
+        q, u = (x - x.mean(axis=0) for x in (log.q[own + lag][:, moves], log.u[own][:, moves]))
+        slope = (q * u).sum(axis=0) / np.maximum(np.square(q).sum(axis=0), 1e-300)
+        left = np.square(u - slope * q).sum(axis=0) / np.maximum(np.square(u).sum(axis=0), 1e-300)
+        if (left < 1.0 - SAME_POSITION).all() and any(np.abs(slope / x - 1.0).max() < 0.1 for x in (1.0, 1.0 / DEGREE)):
+            what = f"u is the position {1e3 * lag * step:.0f} ms later: these are targets of a controller, not torques."
+            do = "Give the columns of measured torques or currents; without them masses and friction cannot be found."
+            return [wrong(about="targets", what=what, do=do, joints=inputs.names, numbers={"lag": lag * step})]
+    return []
 
 
 def _leaps(inputs: CheckInput) -> Iterator[Doubt]:
@@ -85,10 +153,21 @@ def _constant(inputs: CheckInput) -> Iterator[Doubt]:
         if name == "u":
             remedy = "Right for a passive mechanism; else the torque columns are missing."
         if passive and all_of_them:
-            seen = "no torque was logged at all (every u is 0)."
-        level: Level = "look" if passive or all_of_them or rests[dead].all() else "wrong"
+            seen = "no torque was measured (every u is 0)."
+        driven = all_of_them and _driven(inputs)
+        calm = (passive or all_of_them) and not driven
+        level: Level = "look" if calm or rests[dead].all() else "wrong"
         told = {"about": "constant channel", "what": seen, "do": remedy, "joints": names}
         yield Doubt(level=level, **told, numbers={"quantity": name})
+
+
+def _driven(inputs: CheckInput) -> bool:
+    """Whether the motion needs torques, unlike that of a mechanism that swings by itself."""
+    if inputs.compared is None or inputs.contacts:
+        return False
+    rows = inputs.rows()
+    needed, fixed = needed_torques(inputs.robot, rows), needed_torques(inputs.robot, replace(rows, a=0.0 * rows.a))
+    return bool((np.std(needed, axis=0) > PASSIVE * np.std(needed - fixed, axis=0)).any())
 
 
 def _still(log: Dataset, name: str) -> np.ndarray:
@@ -117,7 +196,8 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
         if end - begin <= max(length, FROZEN_ROWS - 1) or (end - begin) * step < FROZEN_SECONDS:
             continue
         gone = np.cumsum(speed[begin:end]) * step
-        sticks = name == "q" and end < len(held) and abs(values[end + 1] - values[begin]) < 0.5 * abs(gone[-1])
+        jump = abs(values[end + 1] - values[begin]) if end < len(held) else np.inf
+        sticks = jump < 0.5 * abs(gone[-1]) if name == "q" else jump < STEPS * _resolution(values)
         far = np.ptp(gone) > 0.25 * np.abs(speed[begin:end]).sum() * step
         if moves[begin:end].mean() > 0.5 and far and not sticks:
             start, length = begin, end - begin
@@ -134,6 +214,11 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
     )
 
 
+def _resolution(values: np.ndarray) -> float:
+    """The least step between two values of a channel; what stays within a few of them is not frozen."""
+    return float(np.diff(np.unique(np.round(values / np.ptp(values), 9))).min() * np.ptp(values))
+
+
 def _clipped(inputs: CheckInput, joint: int) -> Iterator[Doubt]:
     """Torque that stays at its extreme while the joint moves: far more rows there than just below."""
     log, every = inputs.log, inputs.log.u[:, joint]
@@ -141,7 +226,7 @@ def _clipped(inputs: CheckInput, joint: int) -> Iterator[Doubt]:
     u = every[speed > MOVES * np.sqrt(np.square(speed).mean())]
     if len(u) < CLIPPED_ROWS or np.ptp(every) == 0.0:
         return
-    same, width = 1e-9 * np.ptp(u), np.ptp(u) / 1000.0
+    same, width = 1e-9 * np.ptp(u), max(np.ptp(u) / 1000.0, 1.5 * _resolution(every))
     for sign, side in ((1.0, "largest"), (-1.0, "smallest")):
         extreme = float((sign * every).max())
         below = extreme - sign * u
