@@ -20,8 +20,8 @@ from forcegp.robots import Robot
 GAP = 5.0  # median steps without a row at which a motion is taken for two
 COMPARED = 0.5  # of the cut-off: where torques are compared
 LONGEST_TRIM = 0.1  # most that is trimmed from either end, as a share of the shortest stretch
-MOST_ROWS = 1000  # rows on which torques are compared: neighbouring rows hold the same information
-QUICK_ROWS = 300  # the same before a fit
+MOST_ROWS = 250  # rows on which torques are compared: neighbouring rows hold the same information
+QUICK_ROWS = 200  # the same before a fit
 HALF_CUTOFF = COMPARED**2.5  # noise of an acceleration that is differenced twice, relative to that at the whole cut-off
 DEGREE = np.pi / 180.0
 FEW_JOINTS = 3  # of more joints, half as many rows
@@ -89,8 +89,7 @@ class CheckInput:
         """Up to `most_rows` rows of `compared`, evenly over the log."""
         assert self.compared is not None
         data = self.compared
-        most = self.most_rows if data.nv <= FEW_JOINTS else self.most_rows // 2
-        return data.rows(slice(None, None, max(1, -(-len(data) // most))))
+        return data.rows(slice(None, None, max(1, -(-len(data) // self.most_rows))))
 
     @property
     def price(self) -> Mapping[str, Any]:

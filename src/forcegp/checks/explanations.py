@@ -93,7 +93,7 @@ def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator
             level="wrong" if unit else "look",
         )  # fmt: skip
         if unit or not 0.8 < common < 1.25:
-            yield cause, now.after(changed("u", factor=1.0 / size))
+            yield cause, now.with_torques(changed("u", factor=1.0 / size))
     largest, turns = np.abs(now.rows.q * inputs.rotates).max(), inputs.rotates
     each = [np.arange(len(turns)) == k for k in np.flatnonzero(turns & (np.abs(now.rows.q).max(axis=0) > 7.0))]
     for own in [turns, *(one for one in each if turns.sum() > 1)] if largest > 1.0 else []:
@@ -161,6 +161,8 @@ def _ordered(now: Comparison, inputs: CheckInput, signals: str, order: np.ndarra
         correction={"order": dict.fromkeys(signals, tuple(order.tolist()))},
         cost=NUMBER + SIGN * (signals != "u"),
     )
+    if signals == "u":
+        return cause, now.with_torques(changed("u", order))
     return cause, now.after(changed(signals.replace("v", "va"), order))
 
 

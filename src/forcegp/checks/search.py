@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from forcegp.checks.check_input import CheckInput
 from forcegp.checks.explanations import NUMBER, SIGN, Cause, candidates, changed
-from forcegp.checks.torques import Comparison, positive_fit, torque_noise
+from forcegp.checks.torques import Comparison, positive_fit, positive_solution, torque_noise
 from forcegp.data.views import white_noise
 from forcegp.doubts import Doubt, listed, look
 
@@ -18,7 +18,7 @@ UNKNOWN = "unknown cause"
 GAIN = np.log(4.0)  # by which the product over all joints of what remains must fall at least
 LEAST = 1e-4  # shares of a torque's power below this are all the same
 NOISE = 3.0  # how much of the power of the noise is left to every explanation
-BEAM, DEPTH = 4, 3  # explanations that are continued, and causes of one
+BEAM, DEPTH = 3, 3  # explanations that are continued, and causes of one
 WORSE = 1.1  # share from which on predicting nothing is better
 BLOCKS = 4  # of the log, each of which is predicted from the others
 FREE = 4.0  # share that an explanation may leave, over what a robot with any masses and any friction would
@@ -44,15 +44,33 @@ class Explanation:
     def _fits(self) -> tuple[np.ndarray, np.ndarray]:
         """Shares (nv, 4) that remain of every choice, NaN for a constant torque, and factors (nv,) of the chosen."""
         u, tau = (x - x.mean(axis=0) for x in (self.log.rows.u, self.log.tau))
-        power, friction = np.square(u).sum(axis=0), self.log.friction
+        power, every = np.square(u).sum(axis=0), np.concatenate([self.log.friction, tau[..., None], u[..., None]], axis=-1)
         shares, factors = np.full((u.shape[1], 4), np.nan), np.full((u.shape[1], 2), np.nan)
+        count = every.shape[-1] - 2
+        plain, last = [*range(count), count + 1], np.eye(count + 1)[[-1]]
+        sides = np.outer(*2 * (np.append(np.ones(count + 1), -1.0),))
         for k in np.flatnonzero(np.ptp(self.log.rows.u, axis=0) > 0.0):
+            products = every[:, k].T @ every[:, k]
+            less = products[plain][:, plain] - products[plain][:, [count]] * last - last.T * products[[count]][:, plain]
+            less[-1, -1] += products[count, count]  # u less what is needed
+            shares[k, 0] = positive_solution(less)[1]
+            shares[k, 1:], size = np.inf, np.sqrt(np.diag(products)) + 1e-300
+            scaled = products / np.outer(size, size)
+            seen = scaled[-1, :-1] @ np.linalg.lstsq(scaled[:-1, :-1], scaled[-1, :-1], rcond=1e-10)[0]
+            bound = power[k] * (1.0 - seen)
+            if bound * np.exp(SIGN) > shares[k, 0] or shares[k, 0] < LEAST * power[k]:
+                shares[k] /= power[k]
+                continue  # neither sign nor factor is worth what it costs
             for turn, sign in enumerate((1.0, -1.0)):
-                shares[k, turn] = positive_fit(friction[:, k], sign * u[:, k] - tau[:, k])[1]
-                found, shares[k, turn + 2] = positive_fit(np.c_[tau[:, k], friction[:, k]], sign * u[:, k])
-                factors[k, turn] = found[0]
-            alone = positive_fit(friction[:, k], u[:, k])[1], positive_fit(friction[:, k], -u[:, k])[1]
-            shares[k, 2:] += power[k] * (shares[k, 2:] > (1.0 - RESTS) * np.array(alone))  # not a multiple of tau
+                turned = products * sides if sign < 0.0 else products
+                alone = positive_solution(turned[plain][:, plain])[1]
+                found, left = positive_solution(turned)
+                factors[k, turn] = found[-1]
+                shares[k, turn + 2] = left + power[k] * (left > (1.0 - RESTS) * alone)  # not a multiple of tau
+                if turn:
+                    less = turned[plain][:, plain] - turned[plain][:, [count]] * last - last.T * turned[[count]][:, plain]
+                    less[-1, -1] += turned[count, count]
+                    shares[k, 1] = positive_solution(less)[1]
             shares[k] /= power[k]
         return shares, factors
 
@@ -70,6 +88,11 @@ class Explanation:
         places = np.arange(len(self.chosen))
         left = np.nansum((self._logarithms() + CHOICES)[places, self.chosen])
         return float(left) + sum(cause.cost for cause in self.causes) + SIGN * len(self.turned)
+
+    @property
+    def shares(self) -> Float[np.ndarray, " nv"]:
+        """What remains of each torque if none is a multiple; 0 of a constant one."""
+        return np.nan_to_num(self._fits[0][:, 0])
 
     @property
     def unscaled(self) -> float:
@@ -97,7 +120,7 @@ class Explanation:
         factor = np.ones(len(self.chosen))
         factor[turned] = -1.0
         both = tuple(sorted({*self.turned} ^ {*turned.tolist()}))
-        return replace(self, log=self.log.after(changed("u", factor=factor)), turned=both)
+        return replace(self, log=self.log.with_torques(changed("u", factor=factor)), turned=both)
 
     @cached_property
     def rough(self) -> Float[np.ndarray, " nv"]:
@@ -161,22 +184,23 @@ class Explanation:
 def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
     """The explanation that stands, or the log as it is; and what is to be said of it."""
     root = _root(inputs)
-    if (np.nan_to_num(root._fits[0][:, 0]) <= np.maximum(NOISE * root.floor, DOUBTFUL)).all():
+    if (root.shares <= np.maximum(NOISE * root.floor, DOUBTFUL)).all():
         return root, []
     every, frontier = [root.with_signs()], [root.with_signs()]
     for _ in range(DEPTH):
         grown: list[Explanation] = []
         for now in frontier:
-            for cause, log in candidates(now.log, inputs, now._fits[0][:, 0] > DOUBTFUL, now.factors):
+            for cause, log in candidates(now.log, inputs, now.shares > DOUBTFUL, now.factors):
                 order = cause.correction.get("order", {}).get("u", range(len(now.chosen)))
                 turned = tuple(k for k, place in enumerate(order) if place in now.turned)
                 made = Explanation(log, root.floor, (*now.causes, cause), turned).with_signs()
-                if made.value < max(now.value, now.unscaled) - 0.5 * GAIN:
+                before = now.value if cause.number else max(now.value, now.unscaled)  # mistakes first, factors then
+                if made.value < before - 0.5 * GAIN:
                     grown.append(made)
-        if not grown:
-            break
         every += grown
         frontier = sorted(grown, key=lambda each: each.value)[:BEAM]
+        if not grown or (frontier[0].shares <= np.maximum(NOISE * root.floor, DOUBTFUL)).all():
+            break
     every.sort(key=lambda each: each.value)
     for best in every[: 2 * BEAM]:
         if root.plain - best.value >= GAIN and best.stands(root):

@@ -4,25 +4,24 @@
 brakes.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from scipy.optimize import nnls
 
-from forcegp.checks.check_input import DEGREE
 from forcegp.data import Dataset
-from forcegp.doubts import Doubt, look
 from forcegp.forces import JointLaw
-from forcegp.forces.joint_laws import law_columns, usual_columns
+from forcegp.forces.joint_laws import law_columns
 from forcegp.robots import Robot
 
 CONSTANT = 1e-24  # variance relative to the square below which a torque is constant: rounding
 RESTS_ON_ROBOT = 0.5
 POOR = 0.2
+RIDGE = 1e-10  # of a column's square sum, in equations that may be singular
 WIDTHS = 0.03, 0.1, 0.3  # of the root mean square velocity: where dry friction turns over
 
 Change = Callable[[Dataset], Dataset]
@@ -72,6 +71,12 @@ class Comparison:
         given, changes = self.rows if self.given is None else self.given, (*self.changes, change)
         return replace(self, robot=robot or self.robot, rows=change(self.rows), changes=changes, given=given)
 
+    def with_torques(self, change: Change) -> "Comparison":
+        """With a change of u alone, which needs the same torques."""
+        new = self.after(change)
+        vars(new).update(tau=self.tau, friction=self.friction)
+        return new
+
     def shifted(self, dense: Dataset, seconds: float) -> "Comparison":
         """With the torques that `dense`, which holds the rows, has some seconds later."""
         u = np.empty_like(self.rows.u)
@@ -79,8 +84,9 @@ class Comparison:
             own, here = dense.episode == number, self.rows.episode == number
             for joint, values in enumerate(dense.u[own].T):
                 u[here, joint] = np.interp(self.rows.time[here] + seconds, dense.time[own], values)
-        rows = self._changed(replace(self.given, u=u))
-        return replace(self, rows=rows, shift=seconds)
+        new = replace(self, rows=self._changed(replace(self.given, u=u)), shift=seconds)
+        vars(new).update(tau=self.tau, friction=self.friction)
+        return new
 
     def changed(self, dataset: Dataset) -> Dataset:
         """Other rows after the same changes, whose u lacks what the known laws need."""
@@ -100,7 +106,9 @@ class Comparison:
     @cached_property
     def friction(self) -> Float[np.ndarray, "rows nv 5"]:
         """What a rotor, viscous friction and dry friction of three widths need, around their means."""
-        columns = np.stack(columns_of(self.robot, self.rows, WIDTHS)[:-1], axis=-1)
+        v = self.rows.v
+        slow = np.sqrt(np.square(v).mean(axis=0)) + 1e-300
+        columns = np.stack([self.rows.a, v, *(np.tanh(v / (width * slow)) for width in WIDTHS)], axis=-1)
         return columns - columns.mean(axis=0)
 
     @cached_property
@@ -108,11 +116,6 @@ class Comparison:
         """Of the measured torques."""
         shares = np.array([_shares(self, k) for k in range(self.rows.nv)])
         return TorqueFit(unexplained=shares[:, 0], plain=shares[:, 1], friction=shares[:, 3], factor=shares[:, 2])
-
-
-def columns_of(robot: Robot, rows: Dataset, widths: Sequence[float]) -> list[np.ndarray]:
-    """Torques (rows, nv) of a rotor, viscous and dry friction, and an offset."""
-    return usual_columns(robot, rows.q, rows.v, rows.u, rows.a, widths)
 
 
 def needed_torques(robot: Robot, rows: Dataset) -> Float[np.ndarray, "rows nv"]:
@@ -143,12 +146,20 @@ def positive_fit(
     columns: Float[np.ndarray, "rows k"], target: Float[np.ndarray, " rows"]
 ) -> tuple[Float[np.ndarray, " k"], float]:
     """Factors of columns, none negative, and the square sum that they leave. Units of the columns do not matter."""
-    size = np.linalg.norm(columns, axis=0)
-    size[size == 0.0] = 1.0
-    basis, triangle = np.linalg.qr(columns / size)
-    right = basis.T @ target
-    factors, left = nnls(triangle, right)
-    return factors / size, float(left**2 + np.square(target - basis @ right).sum())
+    both = np.c_[columns, target]
+    return positive_solution(both.T @ both)
+
+
+def positive_solution(products: Float[np.ndarray, "k1 k1"]) -> tuple[Float[np.ndarray, " k"], float]:
+    """The same of the products of all columns, of which the last is the target."""
+    size = np.sqrt(np.diag(products))
+    size = np.where(size > 0.0, size, 1.0)
+    scaled = products / np.outer(size, size)
+    normal, right = scaled[:-1, :-1] + RIDGE * np.eye(len(size) - 1), scaled[:-1, -1]
+    triangle = np.linalg.cholesky(normal)
+    factors, _ = nnls(triangle.T, np.linalg.solve(triangle, right))
+    left = scaled[-1, -1] - 2.0 * factors @ right + factors @ scaled[:-1, :-1] @ factors
+    return factors / size[:-1] * size[-1], max(float(left), 0.0) * float(size[-1]) ** 2
 
 
 def with_gravity(robot: Robot, gravity: Float[np.ndarray, "3"]) -> Robot:
