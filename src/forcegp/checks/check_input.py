@@ -124,7 +124,7 @@ class CheckInput:
             if lower < HIGHEST * 0.5 / uniform_step(even.time[even.episode == even.episode[0]]):
                 with contextlib.suppress(DatasetError):  # too short for that
                     found["compared"] = trimmed(lower).rows(even)
-                    if preparation.cutoff == "auto":  # what wrong torques ask for is too low
+                    if preparation.cutoff == "auto" and chosen.cutoff is not None:  # what wrong torques ask for is too low
                         seen = float(np.nanmax(motion_spectrum(even, chosen.differentiate).cutoff))
                         found["sharper"] = trimmed(seen).rows(even) if seen > 1.5 * lower else None
             # white noise as logged, or what the filter left

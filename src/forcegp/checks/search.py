@@ -15,6 +15,7 @@ from forcegp.data.views import white_noise
 from forcegp.doubts import Doubt, listed, look
 
 UNKNOWN = "unknown cause"
+FEWEST_ROWS = 30
 GAIN = np.log(4.0)  # by which the product over all joints of what remains must fall at least
 LEAST = 1e-4  # shares of a torque's power below this are all the same
 NOISE = 3.0  # how much of the power of the noise is left to every explanation
@@ -184,7 +185,8 @@ class Explanation:
 def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
     """The explanation that stands, or the log as it is; and what is to be said of it."""
     root = _root(inputs)
-    if (root.shares <= np.maximum(NOISE * root.floor, DOUBTFUL)).all():
+    few = len(root.log.rows) < FEWEST_ROWS
+    if few or (root.shares <= np.maximum(NOISE * root.floor, DOUBTFUL)).all():
         return root, []
     every, frontier = [root.with_signs()], [root.with_signs()]
     for _ in range(DEPTH):
