@@ -41,8 +41,8 @@ class CheckInput:
     acceleration is not taken for a wrong torque; both None where jumps forbid derivatives. `rotates` (nv,) are joints
     that turn, `wraps` and `jumps` mark where (rows, nv) a position jumps by a turn, or by more than pi otherwise,
     `dropped` where a signal is 0 because it was not measured (interpolated in `mended`). `compared_noise` (nv,) is the
-    standard deviation of the acceleration in `compared`, None where it is not known; `compared_cutoff` is its filter's [Hz],
-    and `sharper` the same behind a higher one, where the spectrum asks for one.
+    standard deviation of the acceleration in `compared`, None where it is not known; `compared_cutoff` is that
+    of its filter [Hz], and `sharper` the same behind a higher one, where the spectrum asks for one.
     """
 
     log: Dataset
@@ -124,7 +124,9 @@ class CheckInput:
             if lower < HIGHEST * 0.5 / uniform_step(even.time[even.episode == even.episode[0]]):
                 with contextlib.suppress(DatasetError):  # too short for that
                     found["compared"] = trimmed(lower).rows(even)
-                    if preparation.cutoff == "auto" and chosen.cutoff is not None:  # what wrong torques ask for is too low
+                    if (
+                        preparation.cutoff == "auto" and chosen.cutoff is not None
+                    ):  # what wrong torques ask for is too low
                         seen = float(np.nanmax(motion_spectrum(even, chosen.differentiate).cutoff))
                         found["sharper"] = trimmed(seen).rows(even) if seen > 1.5 * lower else None
             # white noise as logged, or what the filter left

@@ -84,7 +84,7 @@ def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator
         cause = Cause(
             about="torque unit",
             what=f"the measured torque of all joints is {common:.4g} times what the motion needs{looks}",
-            do="Correct the unit or the factor of u." if unit else "Compare masses and torque constants with the data sheet.",
+            do="Correct the unit of u, or masses and torque constants.",
             joints=tuple(range(now.rows.nv)),
             numbers={"factor": common},
             correction={"unit": {"u": (unit,)}} if unit else {},
@@ -98,10 +98,15 @@ def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator
     each = [np.arange(len(turns)) == k for k in np.flatnonzero(turns & (np.abs(now.rows.q).max(axis=0) > 7.0))]
     for own in [turns, *(one for one in each if turns.sum() > 1)] if largest > 1.0 else []:
         if own.any():
-            what = f"positions reach {largest:.4g}; taken for degrees, they fit the torques far better than for radians"
-            unit = {s: tuple(x.replace("rad", "deg") if d else x for x, d in zip(inputs.unit_of_each(s), own, strict=True))
-                    for s in "qv"}  # fmt: skip
-            cause = Cause(about="degrees", what=what, do="Use np.deg2rad.", joints=_places(own), correction={"unit": unit}, cost=SIGN)
+            what = f"positions reach {largest:.4g}; they fit the torques far better as degrees than as radians"
+            unit = {
+                name: tuple(
+                    x.replace("rad", "deg") if k in _places(own) else x for k, x in enumerate(inputs.unit_of_each(name))
+                )
+                for name in "qv"
+            }
+            told = {"joints": _places(own), "correction": {"unit": unit}}
+            cause = Cause(about="degrees", what=what, do="Use np.deg2rad.", cost=SIGN, **told)
             yield cause, now.after(changed("qva", factor=np.where(own, DEGREE, 1.0)))
     if turns.any():
         what = "positions fit the torques far better taken for turns than for radians"
@@ -131,7 +136,7 @@ def _delays(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
 
 def _orders(now: Comparison, inputs: CheckInput, alive: np.ndarray) -> Iterator[Candidate]:
     """Torques under other joints; motions or all signals in an order that files have."""
-    places, nv = np.arange(now.rows.nv), now.rows.nv
+    places = np.arange(now.rows.nv)
     live = places[alive]
     friction = [np.linalg.qr(np.c_[now.tau[:, [k]] - now.tau[:, k].mean(), now.friction[:, k]])[0] for k in live]
     u = now.rows.u[:, live] - now.rows.u[:, live].mean(axis=0)
@@ -386,7 +391,7 @@ def _gravities(now: Comparison, pulls: Float[np.ndarray, "rows nv 3"]) -> Iterat
         if angle < TILTED and abs(own - size) < 0.1 * max(size, own):
             continue
         text = ", ".join(f"{x + 0.0:.3g}" for x in gravity)
-        away = f", {np.rad2deg(angle):.0f} degrees from the assumed one: the base is mounted another way" if angle else ""
+        away = f", {np.rad2deg(angle):.0f} degrees away: the base is mounted another way" if angle else ""
         cause = Cause(
             about="gravity",
             what=f"the torques fit gravity along ({text}) m/s² of the base far better{away}",
@@ -400,4 +405,3 @@ def _gravities(now: Comparison, pulls: Float[np.ndarray, "rows nv 3"]) -> Iterat
 
 def _places(chosen: np.ndarray) -> tuple[int, ...]:
     return tuple(np.flatnonzero(chosen).tolist())
-

@@ -15,6 +15,7 @@ from forcegp.checks.moving_base import (
     stance_doubts,
     unmeasured_base_doubts,
 )
+from forcegp.checks.search import UNKNOWN, search
 from forcegp.checks.signals import (
     motion_doubts,
     sampling_doubts,
@@ -22,7 +23,6 @@ from forcegp.checks.signals import (
     target_doubts,
     without_registers,
 )
-from forcegp.checks.search import UNKNOWN, search
 from forcegp.checks.torque_doubts import TOUCHES, torque_doubts
 from forcegp.checks.torques import Comparison
 from forcegp.data import Dataset, Preparation, contact_doubts

@@ -45,16 +45,21 @@ class Explanation:
     def _fits(self) -> tuple[np.ndarray, np.ndarray]:
         """Shares (nv, 4) that remain of every choice, NaN for a constant torque, and factors (nv,) of the chosen."""
         u, tau = (x - x.mean(axis=0) for x in (self.log.rows.u, self.log.tau))
-        power, every = np.square(u).sum(axis=0), np.concatenate([self.log.friction, tau[..., None], u[..., None]], axis=-1)
+        every = np.concatenate([self.log.friction, tau[..., None], u[..., None]], axis=-1)
+        power = np.square(u).sum(axis=0)
         shares, factors = np.full((u.shape[1], 4), np.nan), np.full((u.shape[1], 2), np.nan)
         count = every.shape[-1] - 2
         plain, last = [*range(count), count + 1], np.eye(count + 1)[[-1]]
         sides = np.outer(*2 * (np.append(np.ones(count + 1), -1.0),))
+
+        def less(products: np.ndarray) -> np.ndarray:
+            """Of friction, and u less what is needed."""
+            cross = products[plain][:, [count]] * last
+            return products[plain][:, plain] - cross - cross.T + products[count, count] * last * last.T
+
         for k in np.flatnonzero(np.ptp(self.log.rows.u, axis=0) > 0.0):
             products = every[:, k].T @ every[:, k]
-            less = products[plain][:, plain] - products[plain][:, [count]] * last - last.T * products[[count]][:, plain]
-            less[-1, -1] += products[count, count]  # u less what is needed
-            shares[k, 0] = positive_solution(less)[1]
+            shares[k, 0] = positive_solution(less(products))[1]
             shares[k, 1:], size = np.inf, np.sqrt(np.diag(products)) + 1e-300
             scaled = products / np.outer(size, size)
             seen = scaled[-1, :-1] @ np.linalg.lstsq(scaled[:-1, :-1], scaled[-1, :-1], rcond=1e-10)[0]
@@ -68,10 +73,7 @@ class Explanation:
                 found, left = positive_solution(turned)
                 factors[k, turn] = found[-1]
                 shares[k, turn + 2] = left + power[k] * (left > (1.0 - RESTS) * alone)  # not a multiple of tau
-                if turn:
-                    less = turned[plain][:, plain] - turned[plain][:, [count]] * last - last.T * turned[[count]][:, plain]
-                    less[-1, -1] += turned[count, count]
-                    shares[k, 1] = positive_solution(less)[1]
+                shares[k, turn] = positive_solution(less(turned))[1]
             shares[k] /= power[k]
         return shares, factors
 

@@ -66,7 +66,7 @@ def without_registers(log: Dataset) -> tuple[Dataset, list[Doubt]]:
     doubts = [
         wrong(
             about="registers",
-            what=f"the {QUANTITY[name]} of {listed(joints)} is never negative and jumps over a gap: it is the register as "
+            what=f"the {QUANTITY[name]} of {listed(joints)} is never negative and jumps over a gap: a register as "
             f"it is stored, {way}.",
             do="Decode the register before the log is imported.",
             joints=tuple(joints),

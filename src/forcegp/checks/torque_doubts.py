@@ -1,4 +1,4 @@
-"""Doubts of the comparison of torques with inverse dynamics: what the search found; dead torques, delay, what is left."""
+"""Doubts of torques beside those of the search: dead channels, what is left, delay."""
 
 from collections.abc import Iterator
 from dataclasses import replace

@@ -46,7 +46,8 @@ from forcegp.cli.robot_options import (
     parse_contacts,
 )
 from forcegp.cli.terminal import Terminal, columns, facts, with_option_names
-from forcegp.errors import ContactError, ContactWarning
+from forcegp.doubts import Doubts
+from forcegp.errors import ContactError, ContactWarning, DatasetError
 from forcegp.summary import listed as in_words
 
 NEARLY_ALL = 0.995
@@ -166,7 +167,7 @@ class Fit(Command):
     def _check(self, terminal: Terminal, dataset: forcegp.Dataset, model: forcegp.Model) -> None:
         """One line on what would spoil the model; contacts are not warned of again by the fit."""
         if self.checks:
-            used = forcegp.checks.quick_check(dataset, model)
+            used = quick_doubts(self.log, dataset, model)
             if used:  # check has no --contact: it would find nothing wrong with the contacts of the data
                 see = f"See {shlex.join(['forcegp', 'check', str(self.log), *self.words(*options_of(RobotOptions))])}"
                 see = used[0].advice.rstrip(".") if self.contact else see
@@ -386,6 +387,8 @@ class Payload(Command):
         """The robot, and rows behind the filter; those of a dataset that was prepared before are as they are."""
         dataset = forcegp.Dataset.load(path)
         model = self.robot.chosen_model(dataset, path)
+        if used := quick_doubts(path, dataset, model).at("wrong"):
+            terminal.warn(f"{path}: {used.in_one_line()}. See forcegp check.")
         if forcegp.data.preparation_report(dataset.metadata):
             return model, dataset
         with terminal.progress(f"preparing {path}"):
@@ -394,6 +397,14 @@ class Payload(Command):
         why = forcegp.data.preparation_report(prepared.metadata)["why"]
         notes += [f"{path}: {name}: {why[name]}" for name in ("cutoff", "delay") if name in why]
         return model, prepared
+
+
+def quick_doubts(log: Path, dataset: forcegp.Dataset, model: forcegp.Model) -> Doubts:
+    """What would spoil a fit. Raises DatasetError for a motion that needs torques, of which none was measured."""
+    used = forcegp.checks.quick_check(dataset, model)
+    for doubt in () if dataset.u.any() else used.of("constant channel").at("wrong"):
+        raise DatasetError(f"{log}: {doubt.what} Masses and friction do not show; give the columns of the torques.")
+    return used
 
 
 def with_payload(
