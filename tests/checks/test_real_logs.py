@@ -34,7 +34,7 @@ def test_a_panda_is_well_but_its_velocities_are_late(panda):
     report = check(panda, preparation=Preparation(cutoff=5.0))  # as `auto` has it, which takes eight seconds
     assert report.doubts.level == "look"
     assert report.comparison is not None
-    assert np.nanmax(report.comparison.fit.unexplained) < 0.06
+    assert np.nanmax(report.comparison.unexplained) < 0.06
     (late,) = report.doubts.of("velocity")
     assert set(late.joints) == set(panda.joint_names)
     assert not report.doubts.of("delay")

@@ -48,6 +48,12 @@ Candidate = tuple[Cause, Comparison]
 URDF = "Correct the URDF; or let forcegp fit --forces bodies estimate it from this log."
 
 
+def number(about: str, what: str, joint: int, value: float, cost: float = NUMBER, **more: Any) -> Cause:
+    """A number of the robot that is another."""
+    told = {"do": URDF, "joints": (joint,), "numbers": {"value": value}, "level": "look"} | more
+    return Cause(about=about, what=what, cost=cost, number=True, **told)
+
+
 def changed(signals: str = "", order: np.ndarray | None = None, factor: np.ndarray | float = 1.0) -> Change:
     """Every joint's signals from another column, times a factor.
 
@@ -228,20 +234,14 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         at = int(np.argmin(left))
         return (float(left[at]), float(values[at])) if 0 < at < len(values) - 1 else (np.inf, 0.0)
 
-    for joint in np.flatnonzero(inputs.rotates):
+    for joint in _places(inputs.rotates):
         one = np.eye(rows.nv)[joint]
         left, x = best([needed_torques(robot, replace(rows, q=rows.q + y * one)) for y in zeros], waves, turns)
-        cause = Cause(
-            about="joint zero",
-            what=f"the torques fit positions of {names[joint]} that are {x:+.3g} rad ({x / DEGREE:+.0f} degrees) from "
-            "the logged ones: its zero is elsewhere",
-            do=URDF,
-            joints=(joint,),
-            numbers={"value": x},
-            cost=NUMBER + 0.3,
-            number=True,
-            level="look",
+        what = (
+            f"the torques fit positions of {names[joint]} that are {x:+.3g} rad ({x / DEGREE:+.0f} degrees) from the "
+            "logged ones: its zero is elsewhere"
         )
+        cause = number("joint zero", what, joint, x, NUMBER + 0.3)
         if abs(x) > 0.05:
             found.append((left, cause, lambda x=x, one=one: now.after(_offset(x * one))))
     for body, drive in enumerate(robot.layout.drives):
@@ -249,17 +249,11 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         if length == 0.0 or robot.layout.parents[body] < 0:
             continue  # where the whole robot stands changes nothing
         left, x = best([needed_torques(_with_length(robot, body, y), rows) for y in parts], parabolas, FACTORS)
-        cause = Cause(
-            about="lengths",
-            what=f"the torques fit {x:.3g} times the length from {names[drive.joint]} to the joint before "
-            f"({x * length:.3g} instead of {length:.3g} m)",
-            do=URDF,
-            joints=(drive.joint,),
-            numbers={"value": x},
-            cost=NUMBER + 0.2,
-            number=True,
-            level="look",
+        what = (
+            f"the torques fit {x:.3g} times the length from {names[drive.joint]} to the joint before "
+            f"({x * length:.3g} instead of {length:.3g} m)"
         )
+        cause = number("lengths", what, drive.joint, x, NUMBER + 0.2)
         if abs(np.log(max(x, 1e-9))) > 0.05:
             found.append((left, cause, lambda x=x, b=body: now.after(changed(), _with_length(robot, b, x))))
     for _, cause, made in sorted(found, key=lambda each: each[0])[:SCANNED]:
@@ -304,7 +298,7 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
 
     for body, (joint, drive) in enumerate(zip(layout.bodies, layout.drives, strict=True)):
         J = robot.tree.inertias[body, :, :, 0]
-        size, where = float(J[3, 3]), {"joints": (drive.joint,), "do": URDF, "number": True, "level": "look"}
+        size = float(J[3, 3])
         if body not in layout.parents:
             unit = size or 1.0
             columns = np.stack([of_part(body, unit * part) for part in _first_moments(J)], axis=-1)
@@ -315,7 +309,7 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
                 at = ", ".join(f"{1e3 * x:.3g}" for x in center)
                 text = f"the torques fit {unit * held[0]:.3g} kg more at ({at}) mm of {joint.child}: it holds something"
                 numbers = {"mass": unit * float(held[0]), "center_of_mass": center.tolist()}
-                cause = Cause(about="payload", what=text, cost=2.5 * NUMBER, numbers=numbers, **where)
+                cause = number("payload", text, drive.joint, 0.0, 2.5 * NUMBER, numbers=numbers)
                 yield cause, replace(now, more=now.more + columns @ held)
         if size <= 0.0:
             continue
@@ -325,7 +319,7 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
             one = solved(now, column[..., None])
             if one is not None and abs(one[0]) > 0.1 and -0.9 < one[0] < 9.0:
                 text = f"the torques fit a mass of {joint.child} of {1.0 + one[0]:.3g} times that of the URDF"
-                cause = Cause(about="masses", what=text, numbers={"value": 1.0 + float(one[0])}, **where)
+                cause = number("masses", text, drive.joint, 1.0 + float(one[0]))
                 yield cause, replace(now, more=now.more + one[0] * column)
     for joint in range(rows.nv):
         only = (rows.q - rows.q.mean(axis=0)) * (np.arange(rows.nv) == joint)
@@ -334,8 +328,7 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
             unit = "Nm/rad" if inputs.rotates[joint] else "N/m"
             text = f"the torque of {names[joint]} rises with its position by {found[0]:.3g} {unit}, as a spring's"
             do = "Describe it as `spring` (forcegp fit --forces spring estimates it)."
-            cause = Cause(about="spring", what=text, do=do, joints=(joint,), numbers={"stiffness": float(found[0])},
-                          cost=NUMBER + 0.2, number=True, level="look")  # fmt: skip
+            cause = number("spring", text, joint, float(found[0]), NUMBER + 0.2, do=do)
             yield cause, replace(now, more=now.more + found[0] * only)
 
 
@@ -358,9 +351,10 @@ def solved(now: Comparison, columns: Float[np.ndarray, "rows nv k"]) -> Float[np
         parts.append((both, np.square(now.rows.u[:, joint] - now.rows.u[:, joint].mean()).sum()))
     if not parts or not any(np.square(both[:, :-1]).sum() > 0.0 for both, _ in parts):
         return None
-    number, weights = np.zeros(columns.shape[-1]), [1.0 / (np.square(b[:, -1]).sum() + 1e-9 * p) for b, p in parts]
+    weights = [1.0 / (np.square(b[:, -1]).sum() + 1e-9 * p) for b, p in parts]
+    number = np.zeros(columns.shape[-1])
     for _ in range(4):
-        normal = sum(w * b.T @ b for w, (b, _) in zip(weights, parts, strict=True))
+        normal = np.sum([w * b.T @ b for w, (b, _) in zip(weights, parts, strict=True)], axis=0)
         scale = np.sqrt(np.diag(normal)[:-1])
         scale[scale == 0.0] = 1.0
         inverse = np.linalg.pinv(normal[:-1, :-1] / np.outer(scale, scale), rcond=1e-8)

@@ -15,7 +15,7 @@ from forcegp.checks.moving_base import (
     stance_doubts,
     unmeasured_base_doubts,
 )
-from forcegp.checks.search import UNKNOWN, search
+from forcegp.checks.search import UNKNOWN, Explanation, search
 from forcegp.checks.signals import (
     motion_doubts,
     sampling_doubts,
@@ -24,7 +24,6 @@ from forcegp.checks.signals import (
     without_registers,
 )
 from forcegp.checks.torque_doubts import TOUCHES, torque_doubts
-from forcegp.checks.torques import Comparison
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
@@ -52,7 +51,7 @@ class CheckReport(Summary):
 
     doubts: Doubts
     inputs: CheckInput
-    comparison: Comparison | None
+    comparison: Explanation | None
 
     def facts(self) -> dict[str, object]:
         """The subjects of the doubts, by level."""
@@ -68,10 +67,9 @@ class CheckReport(Summary):
         names = ("unexplained", "residual", "factor", "noise_before", "noise_after")
         columns = {"joint": list(self.inputs.names), **dict.fromkeys(names, nothing)}
         if self.comparison is not None:
-            fit, spread = self.comparison.fit, np.std(self.comparison.rows.u, axis=0)
-            columns["unexplained"] = plain(fit.unexplained)
-            columns["residual"] = plain(np.sqrt(fit.unexplained) * spread)
-            columns["factor"] = plain(np.where(fit.rests_on_robot, fit.factor, np.nan))
+            left, spread = self.comparison.unexplained, np.std(self.comparison.log.rows.u, axis=0)
+            columns["unexplained"], columns["residual"] = plain(left), plain(np.sqrt(left) * spread)
+            columns["factor"] = plain(self.comparison.factors)
         if (noise := self.inputs.price.get("acceleration_noise")) is not None:
             columns["noise_before"], columns["noise_after"] = noise["before"], noise["after"]
         return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
@@ -134,7 +132,7 @@ def quick_check(dataset: Dataset, model: Model | None = None) -> Doubts:
     return Doubts([*said, *(each for each in doubts if each.level == "wrong")])
 
 
-def _doubts(inputs: CheckInput, model: Model) -> tuple[list[Doubt], Comparison | None]:
+def _doubts(inputs: CheckInput, model: Model) -> tuple[list[Doubt], Explanation | None]:
     """What is looked for in every log, and the comparison of torques, where there is one."""
     doubts = signal_doubts(inputs)
     if inputs.log.time_ordered:
@@ -154,8 +152,7 @@ def _doubts(inputs: CheckInput, model: Model) -> tuple[list[Doubt], Comparison |
             sharp, heard = search(replace(inputs, compared=inputs.sharper))
             if not heard or heard[-1].about != UNKNOWN:
                 found, said = sharp, heard
-        comparison = found.log
-        doubts += [*said, *torque_doubts(inputs, comparison)]
+        doubts, comparison = [*doubts, *said, *torque_doubts(inputs, found)], found
     return doubts, comparison
 
 

@@ -62,8 +62,8 @@ class Explanation:
             shares[k, 0] = positive_solution(less(products))[1]
             shares[k, 1:], size = np.inf, np.sqrt(np.diag(products)) + 1e-300
             scaled = products / np.outer(size, size)
-            seen = scaled[-1, :-1] @ np.linalg.lstsq(scaled[:-1, :-1], scaled[-1, :-1], rcond=1e-10)[0]
-            bound = power[k] * (1.0 - seen)
+            number = np.linalg.lstsq(scaled[:-1, :-1], scaled[-1, :-1], rcond=1e-10)[0]
+            factors[k], bound = number[-1] * size[-1] / size[-2], power[k] * (1.0 - scaled[-1, :-1] @ number)
             if bound * np.exp(SIGN) > shares[k, 0] or shares[k, 0] < LEAST * power[k]:
                 shares[k] /= power[k]
                 continue  # neither sign nor factor is worth what it costs
@@ -98,6 +98,11 @@ class Explanation:
         return np.nan_to_num(self._fits[0][:, 0])
 
     @property
+    def unexplained(self) -> Float[np.ndarray, " nv"]:
+        """What remains of each torque, with a factor where that explains more; NaN of a constant one."""
+        return self._fits[0][:, [0, 2]].min(axis=1)
+
+    @property
     def unscaled(self) -> float:
         """The same if no torque is a multiple."""
         left = (self._logarithms() + CHOICES)[:, :2]
@@ -108,7 +113,7 @@ class Explanation:
         """Of u over what is needed, NaN where nothing is."""
         shares, factors = self._fits
         turn = np.nanargmin(np.where(np.isnan(shares[:, 2:]), np.inf, shares[:, 2:]), axis=1)
-        return np.where(shares[:, 2:].min(axis=1) < 0.5, factors[np.arange(len(turn)), turn], np.nan)
+        return np.where(shares.min(axis=1) < 0.5, factors[np.arange(len(turn)), turn], np.nan)
 
     @property
     def plain(self) -> float:
@@ -218,7 +223,8 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
 
 
 def _root(inputs: CheckInput) -> Explanation:
-    log = Comparison(robot=inputs.robot, laws=inputs.laws, rows=inputs.rows()).after(changed())
+    rows = inputs.rows()
+    log = Comparison(robot=inputs.robot, laws=inputs.laws, rows=rows, given=rows).after(changed())
     seen = white_noise(inputs.mended, signal="u") if inputs.log.time_ordered else None
     noise = np.zeros(log.rows.nv) if seen is None else np.nan_to_num(seen)
     if np.isfinite(inputs.compared_cutoff):

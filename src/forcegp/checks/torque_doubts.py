@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
+from forcegp.checks.search import Explanation
 from forcegp.checks.torques import Comparison
 from forcegp.data import estimate_delay
 from forcegp.doubts import Doubt, ok, wrong
@@ -18,9 +19,9 @@ LEAST_DELAY = 0.75  # time steps below which a delay is not reported
 MUCH = 0.5  # a delay that leaves less of what was unexplained is wrong to leave in
 
 
-def torque_doubts(inputs: CheckInput, log: Comparison) -> list[Doubt]:
+def torque_doubts(inputs: CheckInput, found: Explanation) -> list[Doubt]:
     """Dead torques, what remains unexplained, and delay, of a log whose errors were corrected."""
-    return [doubt for of in (_passive, _unexplained, _delays) for doubt in of(inputs, log)]
+    return [*_passive(inputs, found.log), *_unexplained(inputs, found), *_delays(inputs, found.log)]
 
 
 def _passive(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
@@ -38,9 +39,9 @@ def _passive(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
         )
 
 
-def _unexplained(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
+def _unexplained(inputs: CheckInput, found: Explanation) -> Iterator[Doubt]:
     """How well the torques fit at all."""
-    left = log.fit.unexplained
+    left = found.unexplained
     if not np.isfinite(left).any():
         return
     worst = int(np.nanargmax(left))

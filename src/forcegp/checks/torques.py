@@ -1,4 +1,4 @@
-"""Measured torques against inverse dynamics: how much of each the robot explains, by what factor, with which numbers.
+"""Measured torques beside those that the robot needs.
 
 `u = s tau(q, v, a) + I a + d v + sum c tanh(v / w) + o` with s, I, d, c >= 0 (Lawson & Hanson 1974): friction always
 brakes.
@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.optimize import nnls
 
 from forcegp.data import Dataset
@@ -18,37 +18,10 @@ from forcegp.forces import JointLaw
 from forcegp.forces.joint_laws import law_columns
 from forcegp.robots import Robot
 
-CONSTANT = 1e-24  # variance relative to the square below which a torque is constant: rounding
-RESTS_ON_ROBOT = 0.5
-POOR = 0.2
 RIDGE = 1e-10  # of a column's square sum, in equations that may be singular
 WIDTHS = 0.03, 0.1, 0.3  # of the root mean square velocity: where dry friction turns over
 
 Change = Callable[[Dataset], Dataset]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TorqueFit:
-    """What the robot explains of the torque of each joint, all (nv,).
-
-    `unexplained` is the share of the torque's variance that is left, NaN for a torque that never changes; `friction`
-    that without inverse dynamics and armature, `plain` that without armature, whose s is `factor`: where tau is nearly
-    proportional to a, s and I cannot be separated.
-    """
-
-    unexplained: Float[np.ndarray, " nv"]
-    friction: Float[np.ndarray, " nv"]
-    plain: Float[np.ndarray, " nv"]
-    factor: Float[np.ndarray, " nv"]
-
-    @property
-    def rests_on_robot(self) -> Bool[np.ndarray, " nv"]:
-        """Whether `factor` means something: inverse dynamics explains half of the torque's variance beyond friction.
-
-        And little is left: noise in tau makes the factor of a poor fit too small.
-        """
-        with np.errstate(invalid="ignore"):
-            return (self.friction - self.plain > RESTS_ON_ROBOT) & (self.plain < POOR) & (self.factor > 0.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,14 +35,13 @@ class Comparison:
     laws: tuple[JointLaw, ...]
     rows: Dataset
     changes: tuple[Change, ...] = ()
-    more: Float[np.ndarray, "rows nv"] | float = 0.0
+    more: np.ndarray | float = 0.0
     shift: float = 0.0
-    given: Dataset | None = None
+    given: Dataset
 
     def after(self, change: Change, robot: Robot | None = None) -> "Comparison":
         """With one more change, or under another robot."""
-        given, changes = self.rows if self.given is None else self.given, (*self.changes, change)
-        return replace(self, robot=robot or self.robot, rows=change(self.rows), changes=changes, given=given)
+        return replace(self, robot=robot or self.robot, rows=change(self.rows), changes=(*self.changes, change))
 
     def with_torques(self, change: Change) -> "Comparison":
         """With a change of u alone, which needs the same torques."""
@@ -111,12 +83,6 @@ class Comparison:
         columns = np.stack([self.rows.a, v, *(np.tanh(v / (width * slow)) for width in WIDTHS)], axis=-1)
         return columns - columns.mean(axis=0)
 
-    @cached_property
-    def fit(self) -> TorqueFit:
-        """Of the measured torques."""
-        shares = np.array([_shares(self, k) for k in range(self.rows.nv)])
-        return TorqueFit(unexplained=shares[:, 0], plain=shares[:, 1], friction=shares[:, 3], factor=shares[:, 2])
-
 
 def needed_torques(robot: Robot, rows: Dataset) -> Float[np.ndarray, "rows nv"]:
     """What the rigid bodies need at these rows [Nm or N]."""
@@ -127,19 +93,6 @@ def needed_torques(robot: Robot, rows: Dataset) -> Float[np.ndarray, "rows nv"]:
 
 def _torques_of_laws(log: Comparison, rows: Dataset) -> Float[np.ndarray, "rows nv"]:
     return sum(law_columns(log.laws, log.robot, rows.q, rows.v, rows.u, rows.a), np.zeros_like(rows.v))
-
-
-def _shares(log: Comparison, joint: int) -> tuple[float, float, float, float]:
-    """Shares of a torque that are left with everything, without a rotor, the factor then, and by friction alone."""
-    u, tau = (x[:, joint] - x[:, joint].mean() for x in (log.rows.u, log.tau))
-    friction, spread = log.friction[:, joint], float(np.square(u).sum())
-    if not spread > CONSTANT * max(float(np.square(log.rows.u[:, joint]).sum()), 1e-300):
-        return np.nan, np.nan, 0.0, np.nan
-    (_, every), (factor, plain), (_, alone) = (
-        positive_fit(columns, u)
-        for columns in (np.c_[tau, friction], np.c_[tau, friction[:, 1:]], np.c_[0.0 * tau, friction[:, 1:]])
-    )
-    return every / spread, plain / spread, float(factor[0]), alone / spread
 
 
 def positive_fit(
