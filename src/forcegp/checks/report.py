@@ -106,6 +106,8 @@ def check(dataset: Dataset, model: Model | None = None, *, preparation: Preparat
         return CheckReport(doubts=_of_base(dataset, model, preparation), inputs=inputs, comparison=None)
     dataset, registers = without_registers(dataset)
     inputs = CheckInput.of(dataset, model, preparation)
+    if any(each.numbers["quantity"] == "q" for each in registers):
+        inputs = replace(inputs, compared=None)
     doubts, comparison = _doubts(inputs, model)
     doubts += registers
     if inputs.prepared is not None:

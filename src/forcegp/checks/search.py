@@ -20,7 +20,7 @@ GAIN = np.log(4.0)  # by which the product over all joints of what remains must 
 LEAST = 1e-4  # shares of a torque's power below this are all the same
 NOISE = 3.0  # how much of the power of the noise is left to every explanation
 BEAM, DEPTH = 3, 3  # explanations that are continued, and causes of one
-WORSE = 1.1  # share from which on predicting nothing is better
+WORSE = 1.05  # share from which on predicting nothing is better
 BLOCKS = 4  # of the log, each of which is predicted from the others
 FREE = 4.0  # share that an explanation may leave, over what a robot with any masses and any friction would
 GOOD = 0.03  # share that a good log may leave
@@ -179,7 +179,8 @@ class Explanation:
     @property
     def good(self) -> np.ndarray:
         """Whether each joint is left with what a good log leaves (nv,)."""
-        return self.exact <= np.maximum(np.minimum(FREE * self.free, EXPLAINED), np.maximum(GOOD, NOISE * self.floor))
+        noise = np.minimum(NOISE * self.floor, WORSE)
+        return self.exact <= np.maximum(np.minimum(FREE * self.free, EXPLAINED), np.maximum(GOOD, noise))
 
     def stands(self, root: "Explanation") -> bool:
         """Whether all joints are left with what a good log leaves; with rough masses, if mistakes were corrected."""

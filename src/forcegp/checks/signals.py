@@ -36,8 +36,8 @@ def signal_doubts(inputs: CheckInput) -> list[Doubt]:
     return [*_leaps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *clipped]
 
 
-FEWEST_VALUES = 20  # on either side of a gap
-CALMER = 0.5  # total variation of decoded registers over that of what was logged
+FEWEST_VALUES, GAPS = 20, 8  # on either side of a gap, and how many gaps are looked at
+CALMER = 0.5  # square sum of steps of decoded registers over that of what was logged
 
 
 def without_registers(log: Dataset) -> tuple[Dataset, list[Doubt]]:
@@ -49,17 +49,21 @@ def without_registers(log: Dataset) -> tuple[Dataset, list[Doubt]]:
         if len(levels) < 2 * FEWEST_VALUES or levels[0] < 0.0:
             continue
         steps = np.diff(levels)
-        at, end = int(np.argmax(steps)), levels[-1] + steps.min()
-        if not FEWEST_VALUES <= at + 1 <= len(levels) - FEWEST_VALUES or (name == "q" and abs(end - 2 * np.pi) < 0.5):
+        end, ways = levels[-1] + steps.min(), dict[str, np.ndarray]()
+        if name == "q" and abs(end - 2.0 * np.pi) < 0.5:  # an angle that wraps
             continue
-        high = x > levels[at]
-        ways = {
-            "sign and magnitude": np.where(high, levels[at + 1] - x, x),
-            "two's complement, read without its sign": np.where(high, x - end, x),
-        }
-        moved = {way: float(np.abs(np.diff(values))[follows].sum()) for way, values in ways.items()}
+        gaps = [at for at in np.argsort(-steps)[:GAPS] if FEWEST_VALUES <= at + 1 <= len(levels) - FEWEST_VALUES]
+        for at in gaps:
+            high = x > levels[at]
+            ways[f"{levels[at + 1]:.4g} plus the magnitude where it is negative"] = np.where(
+                high, levels[at + 1] - x, x
+            )
+            ways[f"{end:.4g} too much where it is negative"] = np.where(high, x - end, x)
+        moved = {way: float(np.square(np.diff(values))[follows].sum()) for way, values in ways.items()}
+        if not moved:
+            continue
         way = min(moved, key=moved.__getitem__)
-        if moved[way] < CALMER * float(np.abs(np.diff(x))[follows].sum()):
+        if moved[way] < CALMER * float(np.square(np.diff(x))[follows].sum()):
             found.setdefault((name, way), []).append(log.joint_names[joint])
             if name == "u":
                 u[:, joint] = ways[way]

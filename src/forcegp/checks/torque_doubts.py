@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
-from forcegp.checks.search import Explanation
+from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, Explanation
 from forcegp.checks.torques import Comparison
 from forcegp.data import estimate_delay
-from forcegp.doubts import Doubt, ok, wrong
+from forcegp.doubts import Doubt, look, ok, wrong
 from forcegp.errors import DatasetError
 from forcegp.model import Model
 from forcegp.summary import plain
@@ -21,7 +21,7 @@ MUCH = 0.5  # a delay that leaves less of what was unexplained is wrong to leave
 
 def torque_doubts(inputs: CheckInput, found: Explanation) -> list[Doubt]:
     """Dead torques, what remains unexplained, and delay, of a log whose errors were corrected."""
-    return [*_passive(inputs, found.log), *_unexplained(inputs, found), *_delays(inputs, found.log)]
+    return [*_passive(inputs, found.log), *_unexplained(inputs, found), *_drift(found), *_delays(inputs, found.log)]
 
 
 def _passive(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
@@ -48,6 +48,28 @@ def _unexplained(inputs: CheckInput, found: Explanation) -> Iterator[Doubt]:
     if left[worst] <= UNEXPLAINED:
         seen = f"inverse dynamics with a factor and friction leaves at most {100.0 * left[worst]:.2g} % of the variance"
         yield ok(about="torque", what=f"{seen} of a torque unexplained ({inputs.names[worst]}).")
+
+
+def _drift(found: Explanation) -> Iterator[Doubt]:
+    """Friction that is another at the end of the log than at its beginning."""
+    rows, changed = found.log.rows, dict[str, float]()
+    time = (rows.time - rows.time.mean()) / max(float(np.ptp(rows.time)), 1e-300)
+    for joint in np.flatnonzero((found.chosen == 0) & (found.shares > DOUBTFUL)) if len(time) >= FEWEST_ROWS else ():
+        u, friction = rows.u[:, joint], found.log.friction[:, joint, 1:]
+        target, both = u - found.log.tau[:, joint], np.c_[friction, friction * time[:, None]]
+        target = target - target.mean()
+        left = [np.square(target - x @ np.linalg.lstsq(x, target)[0]).sum() for x in (friction, both)]
+        steady, slope = np.split(np.linalg.lstsq(both, target)[0], 2)
+        begin, end = (float(np.std(friction @ (steady + x * slope))) for x in (-0.5, 0.5))
+        if left[1] < MUCH * left[0] and left[0] > DOUBTFUL * np.square(u - u.mean()).sum():
+            changed[rows.joint_names[joint]] = end / max(begin, 1e-300)
+    if changed:
+        each = ", ".join(f"{name} {ratio:.2g}" for name, ratio in changed.items())
+        what = (
+            f"friction changes with time, with temperature perhaps: at the end it is so many times the first: {each}."
+        )
+        do = "Record the warm robot; updates of a posterior follow the level of friction."
+        yield look(about="drift", what=what, do=do, joints=tuple(changed), numbers={"ratio": changed})
 
 
 def _delays(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
