@@ -106,10 +106,7 @@ def check(dataset: Dataset, model: Model | None = None, *, preparation: Preparat
         return CheckReport(doubts=_of_base(dataset, model, preparation), inputs=inputs, comparison=None)
     dataset, registers = without_registers(dataset)
     inputs = CheckInput.of(dataset, model, preparation)
-    if any(each.numbers["quantity"] == "q" for each in registers):
-        inputs = replace(inputs, compared=None)
-    doubts, comparison = _doubts(inputs, model)
-    doubts += registers
+    doubts, comparison = _doubts(inputs, model, registers)
     if inputs.prepared is not None:
         doubts += [*excitation_doubts(inputs), *noise_doubts(inputs)]
     return CheckReport(doubts=Doubts(doubts), inputs=inputs, comparison=comparison)
@@ -126,23 +123,22 @@ def quick_check(dataset: Dataset, model: Model | None = None) -> Doubts:
     if model.robot.layout.groups:
         return Doubts(each for each in _of_base(dataset, model) if each.level != "ok")
     dataset, registers = without_registers(dataset)
-    doubts, _ = _doubts(CheckInput.quick(dataset, model), model)
-    doubts += registers
+    doubts, _ = _doubts(CheckInput.quick(dataset, model), model, registers)
     said = [each for each in doubts if each.level == "look" and each.about in BEFORE_A_FIT]
     if dataset.nv == 1:  # friction of one joint can look like a delay
         said = [each for each in said if each.about != "delay"]
     return Doubts([*said, *(each for each in doubts if each.level == "wrong")])
 
 
-def _doubts(inputs: CheckInput, model: Model) -> tuple[list[Doubt], Explanation | None]:
+def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[list[Doubt], Explanation | None]:
     """What is looked for in every log, and the comparison of torques, where there is one."""
-    doubts = signal_doubts(inputs)
+    doubts = [*registers, *signal_doubts(inputs)]
     if inputs.log.time_ordered:
         doubts = [*sampling_doubts(inputs), *doubts, *motion_doubts(inputs)]
     contacts = contact_doubts(inputs.mended, model)
     doubts += [*contacts, *stance_doubts(inputs.log, model)]
     comparison = None
-    if inputs.compared is None:
+    if inputs.compared is None or any(each.numbers["quantity"] == "q" for each in registers):
         return doubts, None
     if inputs.contacts:
         return [*doubts, TOUCHES], None
