@@ -60,7 +60,8 @@ class Explanation:
         for k in np.flatnonzero(np.ptp(self.log.rows.u, axis=0) > 0.0):
             products = every[:, k].T @ every[:, k]
             shares[k, 0] = positive_solution(less(products))[1]
-            shares[k, 1:], size = np.inf, np.sqrt(np.diag(products)) + 1e-300
+            shares[k, 1:], size = np.inf, np.sqrt(np.diag(products))
+            size[size == 0.0] = 1.0
             scaled = products / np.outer(size, size)
             number = np.linalg.lstsq(scaled[:-1, :-1], scaled[-1, :-1], rcond=1e-10)[0]
             factors[k], bound = number[-1] * size[-1] / size[-2], power[k] * (1.0 - scaled[-1, :-1] @ number)
