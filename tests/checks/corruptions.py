@@ -25,15 +25,18 @@ def two_links(
     axes: tuple[str, str] = ("0 1 0", "0 1 0"),
     kinds: tuple[str, str] = ("continuous", "continuous"),
     elbow: tuple[float, float] | None = None,
+    size: float = 1.0,
     **options: object,
 ) -> Robot:
-    """Two links that hang down at q = 0, with the centre of mass of each in its middle."""
+    """Two links that hang down at q = 0, with the centre of mass of each in its middle; `size` times as long."""
+    lengths, masses = (lengths[0] * size, lengths[1] * size), (masses[0] * size**3, masses[1] * size**3)
     x, z = (0.0, -lengths[0]) if elbow is None else elbow
     at = f"{x} 0 {z}"
     limits = '<limit lower="-9" upper="9" effort="900" velocity="90"/>'
     links = "".join(
-        f'<link name="link{k + 1}"><inertial><origin xyz="0.01 0 {-length / 2}"/><mass value="{mass}"/>'
-        f'<inertia ixx="{mass * length**2 / 12 + 1e-3}" iyy="{mass * length**2 / 12 + 1e-3}" izz="{mass * 2e-3}"'
+        f'<link name="link{k + 1}"><inertial><origin xyz="{0.01 * size} 0 {-length / 2}"/><mass value="{mass}"/>'
+        f'<inertia ixx="{mass * length**2 / 12 + 1e-3 * size**5}" iyy="{mass * length**2 / 12 + 1e-3 * size**5}" '
+        f'izz="{mass * 2e-3 * size**2}"'
         ' ixy="0" ixz="0" iyz="0"/></inertial></link>'
         for k, (length, mass) in enumerate(zip(lengths, masses, strict=True))
     )
@@ -191,6 +194,10 @@ def dropped(data: Dataset, names: str, share: float, seed: int = 0) -> Dataset:
     return replace(data, **{name: np.where(lost[:, None], 0.0, getattr(data, name)) for name in names})
 
 
+def registers(x: np.ndarray) -> np.ndarray:
+    return np.where(x < 0.0, 1.2 * np.abs(x).max() - x, x)
+
+
 def held(x: np.ndarray) -> np.ndarray:
     rows = np.arange(len(x))
     start, stop = int(0.3 * len(x)), int(0.3 * len(x)) + max(25, len(x) // 25)
@@ -251,6 +258,10 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "encoder zero off by .4": (lambda d: replace(d, q=d.q + np.array([0.0, 0.4])), "zero"),
     "frozen torque": (lambda d: column(d, "u", 0, held), "frozen"),
     "torque channel dead": (lambda d: column(d, "u", 1, lambda x: 0 * x), "dead torque|constant"),
+    "registers of sign and magnitude": (lambda d: column(d, "u", 0, registers), "register"),
+    "targets of the controller": (lambda d: replace(d, u=np.roll(d.q, -9, axis=0)), "targets"),
+    "no torque": (lambda d: replace(d, u=0.0 * d.u), "no torque was measured"),
+    "turns": (lambda d: at(d, "qva", [0.5 / np.pi] * 2), "turns"),
     "time in ms": (lambda d: replace(d, time=1000 * d.time), "velocity|acceleration|sampling"),
 }
 UNSEEN: Mapping[str, tuple[str, ...]] = {

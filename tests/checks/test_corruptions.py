@@ -14,6 +14,7 @@ from tests.checks.corruptions import (
     clean,
     invented,
     named,
+    recorded_under,
     said_by_check,
     said_by_fit,
     scaled,
@@ -78,6 +79,58 @@ def test_noise_of_the_acceleration_is_no_cause():
     stated = CheckInput.quick(replace(noisy, noise_std=noise, time_ordered=False), data.model)
     assert search(stated)[1] == []
     assert search(replace(stated, compared_noise=np.zeros(2)))[1] != []
+
+
+def first(data):
+    """What is said first of the torques, and what would correct it."""
+    return next((each for each in check(data).doubts if each.level != "ok"), None)
+
+
+@pytest.mark.parametrize("size", [3e-3, 30.0])
+def test_units_of_mass_and_length_change_nothing(size):
+    data = clean(two_links(size=size), 1, noise="qvu")
+    assert first(data) is None
+    assert first(replace(data, u=data.u * np.array([1.0, -1.0]))).about == "torque sign"
+
+
+def test_two_mistakes_are_both_named():
+    data = clean(two_links(), 1, noise="qvu")
+    found = check(replace(data, u=1e3 * data.u * np.array([-1.0, 1.0]))).doubts.at("wrong")
+    assert {each.about for each in found} == {"torque sign", "torque unit"}
+    assert found.of("torque sign")[0].joints == ("joint1",)
+    assert found.of("torque unit")[0].correction == {"unit": {"u": ("mNm",)}}
+
+
+@pytest.mark.parametrize("degrees", [10.0, 40.0])
+def test_the_gravity_of_a_tilted_base_is_right(degrees):
+    angle = np.deg2rad(degrees)
+    true = 9.81 * np.array([np.sin(angle) * 0.6, np.sin(angle) * 0.8, -np.cos(angle)])
+    data = recorded_under(clean(ROBOTS["spatial"](), 3, noise="qvu"), tuple(true))
+    gravity = np.array(first(data).numbers["gravity"])
+    assert np.rad2deg(np.arccos(gravity @ true / np.linalg.norm(gravity) / 9.81)) < 2.0
+
+
+def test_what_no_cause_explains_is_said_with_its_place_and_without_a_remedy():
+    data = clean(two_links(), 4, noise="qvu")
+    pushed = 3.0 * np.std(data.u[:, 1]) * np.sin(9.0 * data.time) * (np.abs(data.time - 4.0) < 0.7)
+    found = check(replace(data, u=data.u + np.stack([0.0 * pushed, pushed], axis=1))).doubts
+    assert [each.about for each in found if each.level != "ok"] == ["unknown cause"]
+    assert found[0].joints == ("joint2",)
+    assert "for time between" in found[0].what
+    assert not found[0].correction
+    stiff = replace(data, u=data.u + 2.0 * np.std(data.u[:, 1]) * data.q * np.array([0.0, 1.0]))
+    assert first(stiff).about == "spring"
+    assert first(stiff).numbers["value"] == pytest.approx(2.0 * np.std(data.u[:, 1]), rel=0.05)
+
+
+def test_torques_in_steps_are_right_and_friction_that_fades_is_named():
+    data = clean(two_links(), 5, noise="qvu")
+    step = np.ptp(data.u) / 100.0
+    assert not check(replace(data, u=step * np.round(data.u / step))).doubts.at("wrong")
+    dry = np.std(data.u, axis=0) * np.tanh(data.v / 0.05)
+    warm = replace(data, u=data.u + 0.5 * dry * np.exp(-data.time / 4.0)[:, None])
+    assert check(warm).doubts.of("drift")[0].joints == ("joint1", "joint2")
+    assert not check(replace(data, u=data.u + 0.5 * dry)).doubts.of("drift")
 
 
 def test_short_and_unordered_logs_are_looked_at_too():

@@ -30,6 +30,7 @@ SMOOTH_SECONDS, SMOOTH_ROWS = 0.03, 15  # of the running mean before a fit: SciP
 JUMP = 10.0  # steps that nine of ten rows stay below, by which a signal that is not measured jumps to 0
 LEAST_JUMP = 0.02  # and by more than this share of its range
 FEWEST_DROPS = 2
+STEPS = 2.5  # of its resolution by which a channel in steps changes from row to row
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -183,8 +184,9 @@ def _drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
         x = values[:, joint]
         steps = np.abs(np.diff(x))
         usual = max(
-            JUMP * float(np.quantile(steps, 0.9)), LEAST_JUMP * float(np.ptp(x)), 1e-9 * float(np.abs(values).max())
-        )
+            JUMP * float(np.quantile(steps, 0.9)), LEAST_JUMP * float(np.ptp(x)), 1e-9 * float(np.abs(values).max()),
+            STEPS * resolution(x),
+        )  # fmt: skip
         zeros = runs(x == 0.0)
         zeros = zeros[(zeros[:, 0] > 0) & (zeros[:, 1] <= len(steps))]
         into, out = zeros.T - 1  # the steps that lead into a run of zeros, and out of it
@@ -192,6 +194,11 @@ def _drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
         for start, stop in zeros[sudden] if sudden.sum() >= FEWEST_DROPS else []:
             lost[start:stop, joint] = True
     return lost
+
+
+def resolution(values: Float[np.ndarray, " rows"]) -> float:
+    """The least step between two values of a channel that is not constant."""
+    return float(np.diff(np.unique(np.round(values / np.ptp(values), 9))).min() * np.ptp(values))
 
 
 def _earlier(dataset: Dataset) -> Mapping[str, Any]:

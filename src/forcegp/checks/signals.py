@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from forcegp.checks.check_input import DEGREE, GAP, CheckInput
+from forcegp.checks.check_input import DEGREE, GAP, STEPS, CheckInput, resolution
 from forcegp.checks.torques import needed_torques
 from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.delay import lowest
@@ -21,7 +21,6 @@ ROUNDING = 1e-12  # of the largest value of any joint
 HELD_STEPS = 0.5  # share of equal successive values from which on a signal moves in steps, such as a held command
 FROZEN_SECONDS = 0.1
 FROZEN_ROWS = 10
-STEPS = 2.5  # of its resolution by which a channel in steps changes
 PASSIVE = 0.5  # of the inertial torque: a mechanism that swings by itself needs less
 MOVES = 0.2  # of its root mean square speed, above which a joint moves
 CLIPPED_RATIO = 8.0  # rows at the extreme value over rows in the next thousandth of the range: a smooth peak has 2.4
@@ -201,7 +200,7 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
             continue
         gone = np.cumsum(speed[begin:end]) * step
         jump = abs(values[end + 1] - values[begin]) if end < len(held) else np.inf
-        sticks = jump < 0.5 * abs(gone[-1]) if name == "q" else jump < STEPS * _resolution(values)
+        sticks = jump < 0.5 * abs(gone[-1]) if name == "q" else jump < STEPS * resolution(values)
         far = np.ptp(gone) > 0.25 * np.abs(speed[begin:end]).sum() * step
         if moves[begin:end].mean() > 0.5 and far and not sticks:
             start, length = begin, end - begin
@@ -218,11 +217,6 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
     )
 
 
-def _resolution(values: np.ndarray) -> float:
-    """The least step between two values of a channel; what stays within a few of them is not frozen."""
-    return float(np.diff(np.unique(np.round(values / np.ptp(values), 9))).min() * np.ptp(values))
-
-
 def _clipped(inputs: CheckInput, joint: int) -> Iterator[Doubt]:
     """Torque that stays at its extreme while the joint moves: far more rows there than just below."""
     log, every = inputs.log, inputs.log.u[:, joint]
@@ -230,7 +224,7 @@ def _clipped(inputs: CheckInput, joint: int) -> Iterator[Doubt]:
     u = every[speed > MOVES * np.sqrt(np.square(speed).mean())]
     if len(u) < CLIPPED_ROWS or np.ptp(every) == 0.0:
         return
-    same, width = 1e-9 * np.ptp(u), max(np.ptp(u) / 1000.0, 1.5 * _resolution(every))
+    same, width = 1e-9 * np.ptp(u), max(np.ptp(u) / 1000.0, 1.5 * resolution(every))
     for sign, side in ((1.0, "largest"), (-1.0, "smallest")):
         extreme = float((sign * every).max())
         below = extreme - sign * u
