@@ -185,6 +185,11 @@ class Explanation:
 
     def stands(self, root: "Explanation") -> bool:
         """Whether all joints are left with what a good log leaves; with rough masses, if mistakes were corrected."""
+        far = {
+            *np.flatnonzero((self.chosen >= 2) & (np.abs(np.log(np.abs(self.factors) + 1e-300)) > np.log(MUCH_MORE)))
+        }
+        if far & {*self.turned, *(k for cause in self.causes for k in cause.joints)}:
+            return False  # nothing else is known of a torque in unknown units
         if self.good.all():
             return True
         exactly = any(cause.number for cause in self.causes) or (self.chosen >= 2).any()
@@ -213,8 +218,9 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
         if not grown or (frontier[0].shares <= np.maximum(NOISE * root.floor, DOUBTFUL)).all():
             break
     every.sort(key=lambda each: each.value)
-    for best in every[: 2 * BEAM]:
-        if root.plain - best.value >= GAIN and best.stands(root):
+    for best in every:
+        near = best.value < every[0].value + 2.0 * GAIN
+        if near and root.plain - best.value >= GAIN and best.stands(root):
             return best, list(_said(best, root, inputs))
     signs = root.with_signs()
     sure = [k for k in signs.turned if signs.good[k]]
