@@ -25,6 +25,7 @@ SIGN, NUMBER = 0.5, 1.0
 MOST_ORDERS = 24  # of legs
 SCANNED = 3  # best of the numbers that are scanned, which are looked at in full
 TILTED = np.deg2rad(6.0)  # angle from which a direction of gravity is another
+HEAVIEST = 1.3  # times the assumed gravity, beyond which it is something else
 FACTORS = np.exp(np.linspace(-2.5, 2.5, 251))  # of lengths, its ends left out
 ALL_TRIED = 8  # joints up to which every pair is exchanged; of more, those that fit badly
 
@@ -68,14 +69,20 @@ def changed(signals: str = "", order: np.ndarray | None = None, factor: np.ndarr
     return change
 
 
-def candidates(now: Comparison, inputs: CheckInput, bad: np.ndarray, factors: np.ndarray) -> Iterator[Candidate]:
-    """All causes, on top of those that were corrected; `bad` (nv,) are joints that fit badly, `factors` of their u."""
+def candidates(
+    now: Comparison, inputs: CheckInput, bad: np.ndarray, factors: np.ndarray, first: bool
+) -> Iterator[Candidate]:
+    """All causes, on top of those that were corrected; `bad` (nv,) are joints that fit badly, `factors` of their u.
+
+    Of many joints, orders and directions are tried as the `first` cause alone.
+    """
     alive = np.ptp(now.rows.u, axis=0) > 0.0
     yield from _units(now, inputs, factors)
     yield from _delays(now, inputs)
     if not np.ndim(now.more):
-        yield from _orders(now, inputs, alive)
-        yield from _motions(now, inputs, bad & alive)
+        if first or now.rows.nv <= ALL_TRIED:
+            yield from _orders(now, inputs, alive)
+            yield from _motions(now, inputs, bad & alive)
         yield from _scanned(now, inputs)
     yield from _linear(now, inputs)
 
@@ -382,7 +389,8 @@ def _gravities(now: Comparison, pulls: Float[np.ndarray, "rows nv 3"]) -> Iterat
     for gravity, cost in tried:
         own = float(np.linalg.norm(gravity))
         angle = float(np.arccos(np.clip(gravity @ nominal / (own * size), -1.0, 1.0))) if own * size > 0.0 else 0.0
-        if angle < TILTED and abs(own - size) < 0.1 * max(size, own):
+        usual = own / (size or 9.81)
+        if (angle < TILTED and abs(own - size) < 0.1 * max(size, own)) or usual > HEAVIEST:
             continue
         text = ", ".join(f"{x + 0.0:.3g}" for x in gravity)
         away = f", {np.rad2deg(angle):.0f} degrees away: the base is mounted another way" if angle else ""

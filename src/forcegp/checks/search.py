@@ -206,7 +206,7 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
     for _ in range(DEPTH):
         grown: list[Explanation] = []
         for now in frontier:
-            for cause, log in candidates(now.log, inputs, now.shares > DOUBTFUL, now.factors):
+            for cause, log in candidates(now.log, inputs, now.shares > DOUBTFUL, now.factors, not now.causes):
                 order = cause.correction.get("order", {}).get("u", range(len(now.chosen)))
                 turned = tuple(k for k, place in enumerate(order) if place in now.turned)
                 made = Explanation(log, root.floor, (*now.causes, cause), turned).with_signs()
@@ -220,7 +220,8 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
     every.sort(key=lambda each: each.value)
     for best in every:
         near = best.value < every[0].value + 2.0 * GAIN
-        if near and root.plain - best.value >= GAIN and best.stands(root):
+        clear = (np.log(np.maximum(root.exact, LEAST) / np.maximum(best.exact, LEAST)) >= GAIN).any()
+        if near and clear and root.plain - best.value >= GAIN and best.stands(root):
             return best, list(_said(best, root, inputs))
     signs = root.with_signs()
     sure = [k for k in signs.turned if signs.good[k]]
