@@ -220,7 +220,7 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
     every.sort(key=lambda each: each.value)
     for best in every:
         near = best.value < every[0].value + 2.0 * GAIN
-        clear = (np.log(np.maximum(root.exact, LEAST) / np.maximum(best.exact, LEAST)) >= GAIN).any()
+        clear = (np.log(np.maximum(root.shares, LEAST) / np.maximum(best.exact, LEAST)) >= GAIN).any()
         if near and clear and root.plain - best.value >= GAIN and best.stands(root):
             return best, list(_said(best, root, inputs))
     signs = root.with_signs()
