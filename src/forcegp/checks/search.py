@@ -135,7 +135,8 @@ class Explanation:
     def rough(self) -> Float[np.ndarray, " nv"]:
         """Share that is left of each torque if masses may be roughly wrong; without what is noise."""
         left = np.array([self._held_out(k, rough=True) for k in range(len(self.floor))])
-        return np.where(left > WORSE, left, np.maximum(left - NOISE * self.floor, 0.0))
+        needless = (left > 1.0 - EXPLAINED) & (self.shares > WORSE)  # noise where the motion needs a torque
+        return np.where(needless, left, np.maximum(left - NOISE * self.floor, 0.0))
 
     @cached_property
     def exact(self) -> Float[np.ndarray, " nv"]:
