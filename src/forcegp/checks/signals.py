@@ -57,7 +57,7 @@ def without_registers(log: Dataset) -> tuple[Dataset, list[Doubt]]:
             ways[f"{levels[at + 1]:.4g} plus the magnitude where it is negative"] = np.where(
                 high, levels[at + 1] - x, x
             )
-            ways[f"{end:.4g} too much where it is negative"] = np.where(high, x - end, x)
+            ways.setdefault(f"{end:.4g} too much where it is negative", np.where(high, x - end, x))  # the widest gap
         moved = {way: float(np.square(np.diff(values))[follows].sum()) for way, values in ways.items()}
         if not moved:
             continue
