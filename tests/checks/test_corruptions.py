@@ -86,6 +86,7 @@ def said(data):
     return [each for each in check(data).doubts if each.level != "ok"]
 
 
+@pytest.mark.filterwarnings("ignore:.*are lengths in metres")
 @pytest.mark.parametrize("size", [3e-3, 30.0])
 def test_units_of_mass_and_length_change_nothing(size):
     data = clean(two_links(size=size), 1, noise="qvu")
