@@ -24,7 +24,7 @@ from forcegp.scores.page import number
 
 @dataclass(frozen=True, kw_only=True)
 class AlarmOptions:
-    """When a monitor says that something touches the robot."""
+    """When a monitor reports that something touches the robot."""
 
     false_alarms: Annotated[float, arg(metavar="N")] = 0.1
     """Accepted false alarms per hour."""
