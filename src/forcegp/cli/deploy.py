@@ -37,8 +37,8 @@ class Export(Command):
     """Write a fitted model as a program that needs no Python.
 
     c: C99 with the weights inside and <math.h> only, a header, an example, a self-test, a CMakeLists.txt, and forms
-    for CasADi's external and acados' generic functions. Accelerations, the torques for a wanted motion, every force by
-    itself, what friction remembers. It is compiled and compared with the model before it is there.
+    for CasADi's external and acados' generic functions. It computes accelerations, the torques for a wanted motion,
+    every force by itself, and what friction remembers. It is compiled and compared with the model before it is there.
     casadi: CasADi functions with all derivatives, for casadi.Function.load (pip install 'forcegp[casadi]').
 
     For example:
@@ -65,8 +65,8 @@ class Export(Command):
     unchecked: bool = False
     """Do not compile the program and compare it with the model."""
     free: Annotated[str | None, unless_given("FREE.h5", "no monitor", str)] = None
-    """With a monitor of contacts, calibrated by a log of 40 s or more of free motion that was not used for training, at
-    whose rate it is to be called."""
+    """With a monitor of contacts, to be called at the rate of this log. It holds 40 s or more of free motion that the
+    model did not learn from."""
     alarms: AlarmOptions = AlarmOptions()
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
