@@ -20,7 +20,8 @@ from forcegp.fit.friction_choice import (
     friction_in_words,
 )
 from forcegp.fit.transmission_choice import SHARE, _clearly
-from forcegp.forces import Actuation, Coulomb, DirectionalFriction, GearFriction, Rotor, Viscous
+from forcegp.forces import Actuation, Coulomb, DirectionalFriction, GearFriction, JointFriction, Rotor, Viscous
+from forcegp.inference import OptimizerOptions
 from forcegp.noise import Noise
 
 LEVEL = np.array([0.8, 0.5, 0.3])
@@ -61,6 +62,20 @@ def test_what_is_there_is_found_and_memory_is_not(friction, expected):
     assert sum(each >= expected for each in names) >= 2, found  # one joint may show too little of it
     if not expected:  # one joint in three may have a little of something, since widths are tried on a grid
         assert sum(map(bool, names)) <= 1
+
+
+def test_all_points_are_all_rows_whose_past_is_known():
+    """Rows in which a joint has not moved yet are left out, also where all of the log were asked for."""
+    time, q, v, a = motion(200, 0)
+    for x, still in ((q, q[0]), (v, 0.0), (a, 0.0)):
+        x[:4] = still
+    u = arm_model(0).robot.inverse_dynamics(*map(torch.tensor, (q, v, a))).numpy() + LEVEL * sign(v)
+    log = log_of(q, v, a, u, time)
+    forces = Coulomb(LEVEL, sigma=3000.0, memory=True), JointFriction()
+    options = OptimizerOptions(iterations=3)
+    model = arm_model(0).with_forces(*forces, noise=Noise(0.1))
+    posterior = fit(model, log, points=len(log), restarts=1, options=options)
+    assert 150 < len(posterior.training) < len(log)
 
 
 COUPLED = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 1.0]])

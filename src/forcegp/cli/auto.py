@@ -391,7 +391,8 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> str:
             f"{', '.join(lost)}. Forces, flags of stance, units or the robot's file are wrong, or it hardly moves."
         )
     finite = [x for x in left if x <= USABLE]
-    told = f"on unseen time it leaves {100.0 * min(finite):.2g} to {100.0 * max(finite):.2g} % of each {what}"
+    ends = dict.fromkeys(f"{100.0 * x:.2g}" for x in (min(finite), max(finite)))
+    told = f"on unseen time it leaves {' to '.join(ends)} % of each {what}"
     motion, urdf = _motion(scores, best), _motion(scores, "given")
     if motion is not None:
         unit = dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m"

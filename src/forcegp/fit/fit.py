@@ -144,6 +144,7 @@ def fit(
     known = past_known(dataset, model)
     doubts = list(doubts_of_past(model, dataset, known))
     known = known | (known.mean() < 1.0 - LEFT_OUT)
+    points = int(known.sum()) if points == len(dataset) else points  # all of them are all that are left
     dataset = dataset if known.all() else dataset.rows(np.flatnonzero(known))
     touches = model.contacts and not model.carries_known_forces
     unseen = Unseen.of(model, dataset, typical_sizes(model, [dataset])["force"]) if touches else None

@@ -155,10 +155,10 @@ def row_scores(
     table[ALL_JOINTS] = {"nlpd": [float(rows.negative_log_density.mean())]}
     measured = table[ACCELERATION]
     measured["nrmse"] = plain(np.array(measured["rmse"], dtype=float) / _spread(test.a))
-    if test.u.shape == test.a.shape and not posterior.is_black_box:
+    if len(test.model.actuators) == test.nv and not posterior.is_black_box:
         # of the torques that the model needs for the measured motion; a share of 1 is no better than their mean
         rms = np.sqrt(np.square(force_errors(rows.mean, test.a, rows.mass)).mean(axis=0))
-        table[TORQUE] = {"rmse": plain(rms), "share": plain(rms / _spread(test.u))}
+        table[TORQUE] = {"rmse": plain(rms), "share": plain(rms / _spread(test.u[:, : test.nv]))}
     density = norm.logpdf(test.a, rows.mean, np.sqrt(rows.measurement_variance))
     measured["nlpd"] = plain(-np.asarray(density).mean(axis=0))
     measured["noise_std"] = plain(posterior.noise_std.detach().cpu().numpy())
