@@ -185,8 +185,10 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
     whole = told([0.1, 0.16, 2.8], shares=[0.02, 0.03, 0.05])
     assert whole == (
         "Use “the URDF”: on unseen time it leaves 2 to 5 % of each torque, "
-        "and positions 1 s ahead are wrong by 0.01 rad."
+        "but it is for torques: do not predict motions, positions 1 s ahead are wrong by 0.01 rad."
     )
+    whole = told([0.1, 0.16, 2.6], shares=[0.02, 0.03, 0.05])
+    assert whole.endswith("of each torque, and positions 1 s ahead are wrong by 0.01 rad.")
     assert "wrist 51 %" in told([0.1] * 3, shares=[0.02, 0.03, 0.51])
     assert told([0.1] * 3, None).endswith("but its motions diverge: do not simulate with it.")
     assert told([0.1] * 3, covered=0.57).endswith("Do not trust its intervals: those of 95 % hold 57 %.")

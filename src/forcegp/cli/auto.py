@@ -398,7 +398,9 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> str:
         unit = dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m"
         against = "they diverge" if urdf is None else f"by {urdf:.2g}"
         against = f"; with the URDF alone {against}" if "given" in scores.models and best != "given" else ""
-        told += f", and positions {scores.horizons[-1]:g} s ahead are wrong by {motion:.2g} {unit}{against}"
+        ahead = f"positions {scores.horizons[-1]:g} s ahead are wrong by {motion:.2g} {unit}{against}"
+        lost_there = (_acceleration(scores, best) or 0.0) >= 1.0  # no better than a = 0, as of light wrists
+        told += f", but it is for torques: do not predict motions, {ahead}" if lost_there else f", and {ahead}"
     elif scores.horizons:
         told += ", but its motions diverge: do not simulate with it"
     covered = scores.value("coverage_95", model=best)
