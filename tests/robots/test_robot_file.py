@@ -209,7 +209,7 @@ def test_written_files_have_the_limits_without_which_others_refuse_them(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("place", "mass", "named"), [("0 0 9", 2e-9, False), ("0 0 11", 1.0, True), ("0 0 1", 5e-10, True)]
+    ("place", "mass", "named"), [("0 0 9", 1.5e-9, False), ("0 0 11", 1.0, True), ("0 0 1", 5e-10, True)]
 )
 def test_lengths_in_millimetres_and_bodies_without_weight_are_named(place, mass, named, recwarn):
     inertia = '<inertia ixx="1e-9" iyy="1e-9" izz="1e-9" ixy="0" ixz="0" iyz="0"/>'

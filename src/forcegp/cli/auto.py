@@ -332,6 +332,8 @@ def answer_lines(
         f"{short_name(name)} {number(_motion(scores, name))} / {number(_acceleration(scores, name))}"
         for name in scores.models
     )
+    unit = "rad or m" if moving else q
+    ahead = f" after {scores.horizons[-1]:g} s" if scores.horizons else ""
     covered = scores.value("coverage_95", model=best)
     intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered:.0f} % of unseen rows"
     weak = ", ".join(list(values.by_body or {})[:3])
@@ -345,8 +347,7 @@ def answer_lines(
         *of_joints,
         *([("whole mass", f"{mass:.4g} ± {1.96 * error:.1g} kg{by}")] if moving else []),
         ("payload", held + by),
-        ("models", f"error of q after 1 s [{'rad or m' if moving else q}] / nRMSE of the acceleration, on unseen time: "
-                   f"{errors}"),
+        ("models", f"error of q{ahead} [{unit}] / nRMSE of the acceleration, on unseen time: {errors}"),
         *left_of_torques(scores, best),
         ("best", f"{short_name(best)}{intervals}"),
         ("record next", command + (f" (least is known of {weak})" if weak else "")),
