@@ -39,7 +39,7 @@ PACKAGES |= {
     "evidence": MODEL | {"data", "inference"},
     "posterior": MODEL | {"atomic_files", "codegen", "data", "inference", "integration", "evidence"},
     "fit": MODEL | {"parallel", "data", "inference", "integration", "evidence", "posterior"},
-    "checks": MODEL | {"data", "evidence"},
+    "checks": MODEL | {"data", "evidence", "fit"},
     "control": MODEL | {"atomic_files", "codegen", "data", "inference", "integration", "evidence", "posterior"},
     "simulation": {"errors", "robots", "mechanics", "forces", "model", "data"},
 }

@@ -20,10 +20,15 @@ from tests.checks.corruptions import (
     scaled,
     two_links,
 )
+from tests.checks.logs import clean as filtered_log
+from tests.posterior.arm import arm_model
 
 from forcegp.checks import check, quick_check
 from forcegp.checks.check_input import CheckInput
 from forcegp.checks.search import search
+from forcegp.data import Dataset
+from forcegp.model import Model
+from forcegp.robots import Robot
 
 
 def log_of(place: int):
@@ -172,3 +177,44 @@ def test_clean_logs_raise_no_alarm(seed):
     for name, data in clean_logs(seed):
         assert not [each for each in check_if_long(data) if each.level == "wrong"], name
         assert quick_check(data) == (), name
+
+
+LEG = """<robot name="leg"><link name="rail"/>
+<joint name="z" type="prismatic"><parent link="rail"/><child link="body"/><axis xyz="0 0 1"/></joint>
+<link name="body"><inertial><mass value="2"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="hip" type="continuous"><parent link="body"/><child link="thigh"/><axis xyz="0 1 0"/></joint>
+<link name="thigh"><inertial><origin xyz="0 0 -0.1"/><mass value="0.3"/><inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="knee" type="continuous"><parent link="thigh"/><child link="shank"/><axis xyz="0 1 0"/><origin xyz="0 0 -0.2"/></joint>
+<link name="shank"><inertial><origin xyz="0 0 -0.1"/><mass value="0.2"/><inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="ankle" type="fixed"><parent link="shank"/><child link="foot"/><origin xyz="0 0 -0.2"/></joint><link name="foot"/></robot>"""  # noqa: E501
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_a_foot_that_stays_is_no_wrong_sign_or_unit(held):
+    robot, time = Robot.from_urdf_text(LEG), np.arange(0.0, 8.0, 0.005)
+    hip = 0.6 + 0.2 * np.sin(2.0 * time) + 0.1 * np.sin(3.3 * time + 1.0)
+    q = np.stack([0.4 * np.cos(hip), hip, -2.0 * hip], axis=1)  # the foot stays 0.4 m below the hip's lowest place
+    v, a = (np.gradient(q, time, axis=0), np.gradient(np.gradient(q, time, axis=0), time, axis=0))
+    kinematics = robot.kinematics(torch.tensor(q))
+    assert float(kinematics.frame_pose("foot")[:, :3, 3].std(0).max()) < 1e-12
+    u = robot.inverse_dynamics(*(torch.tensor(x) for x in (q, v, a)))
+    push = torch.tensor(np.stack([2.0 * np.cos(time), 0.0 * time, 25.0 + 12.0 * np.sin(1.7 * time)], axis=1))
+    u = u - float(held) * (kinematics.frame_jacobian("foot")[:, :3].mT @ push[..., None])[..., 0]
+    noise = 1e-3 * np.random.default_rng(0).normal(size=q.shape)
+    found = said(Dataset(q=q, v=v, u=u.numpy() + noise, a=a, time=time, model=Model(robot)))
+    assert [each.about for each in found if each.level == "wrong"] == (["contact"] if held else [])
+    if held:
+        assert "--contact foot:held" in found[0].do
+        assert found[0].joints == ("z", "hip", "knee")
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_turned_torques_are_named_though_all_masses_are_wrong(sign):
+    data = filtered_log(5, arm_model(contacts=0))
+    robot = data.model.robot
+    for link, mass, along in (("upper", 3.0, -0.3), ("fore", 0.3, 0.4), ("hand", 4.0, -0.2)):
+        robot = robot.with_link(link, mass=mass, center_of_mass=(0.1, along, along), inertia=0.05 * np.eye(3))
+    wrong_masses = replace(data, u=sign * data.u, model=Model(robot))
+    found = [each for each in said(wrong_masses) if each.about == "torque sign"]
+    assert len(found) == (sign < 0.0)
+    assert all(each.correction == {"sign": {"u": (-1.0, -1.0, -1.0)}} for each in found)

@@ -3,13 +3,15 @@
 import json
 import re
 import shlex
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.checks.logs import clean, pendulum
 
-from forcegp import Dataset, Robot, load_posterior
-from forcegp.cli.auto import verdict
+from forcegp import Coulomb, Dataset, Noise, Robot, Viscous, fit, load_posterior
+from forcegp.cli.auto import default_models, verdict
 from forcegp.cli.logs import prepared_rows
 from forcegp.cli.main import parse_arguments
 from forcegp.cli.terminal import Terminal
@@ -193,3 +195,11 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
     assert told([0.1] * 3, None).endswith("but its motions diverge: do not simulate with it.")
     assert told([0.1] * 3, covered=0.57).endswith("Do not trust its intervals: those of 95 % hold 57 %.")
     assert "intervals" not in told([0.1] * 3, covered=0.81)
+
+
+def test_accelerations_are_learned_from_where_torques_make_them_predictable():
+    data = clean(0, pendulum(), noise=0.0)
+    known = fit(data.model.with_forces(Viscous(0.1), Coulomb(0.2), noise=Noise(1.0)), data)
+    assert default_models(data.model, known, data)[-1] == "identified@accelerations"
+    loud = replace(data, u=data.u + 3.0 * np.random.default_rng(0).normal(size=data.u.shape))
+    assert default_models(data.model, known, loud)[-1] == "identified+gp:joint-friction"

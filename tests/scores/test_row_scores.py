@@ -55,6 +55,14 @@ def test_torques_are_those_of_inverse_dynamics_beside_the_recorded_ones():
     np.testing.assert_allclose(found.columns("share", "torque"), error / data.u.std(0), rtol=1e-9)
 
 
+def test_errors_of_a_slow_stretch_relate_to_the_whole_recording(posterior, test_data):
+    slow = test_data.rows(np.abs(test_data.a).sum(1) < np.median(np.abs(test_data.a).sum(1)))
+    alone, related = (row_scores(posterior, slow, whole=each)[0]["acceleration"] for each in (None, test_data))
+    ratio = np.array(alone["nrmse"]) / np.array(related["nrmse"])
+    np.testing.assert_allclose(ratio, test_data.a.std(0) / slow.a.std(0), rtol=1e-9)
+    assert alone["rmse"] == related["rmse"]
+
+
 def test_scores_are_those_of_single_predictions(posterior, test_data, scores):
     errors, densities, inside, inside_noise_free = [], [], [], []
     for row in range(len(test_data)):

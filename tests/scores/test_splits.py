@@ -81,7 +81,12 @@ def test_splits_by_name():
     assert split_named(data, "episodes:0,2")[0].held_out == ((0, -np.inf, np.inf), (2, -np.inf, np.inf))
     assert len(split_named(data, "leave-one-out")) == 3
     assert len(split_named(data, "auto")[0].held_out) == 1
+    many = recording(70, 7)
+    groups = [split.apply(many)[1].episodes for split in split_named(many, "folds")]
+    assert len(groups) == 4
+    assert sorted(number for group in groups for number in group) == list(range(7))
     one = recording(60, 1)
+    assert split_named(one, "folds") == split_named(one, "auto")
     (split,) = split_named(one, "auto", guard=0.1)
     assert (len(split.held_out), split.guard) == (2, 0.1)
     assert "5 consecutive blocks of equal duration, blocks 3 and 5 held out" in split.words
@@ -91,9 +96,9 @@ def test_splits_by_name():
 WRONG = [
     ("episodes:7", r"held-out episodes are \[7\]; name some of \[0, 1, 2\]"),
     ("episodes:0,1,2", "leave one to learn from"),
-    ("episodes:", "give auto, episodes:N"),
+    ("episodes:", "give auto, folds, episodes:N"),
     ("blocks:5:6", r"name some of \[1, 2, 3, 4, 5\]"),
-    ("thirds", "give auto, episodes:N"),
+    ("thirds", "give auto, folds, episodes:N"),
 ]
 
 

@@ -23,7 +23,7 @@ from forcegp.checks.signals import (
     target_doubts,
     without_registers,
 )
-from forcegp.checks.torque_doubts import TOUCHES, torque_doubts
+from forcegp.checks.torque_doubts import TOUCHES, held_points, torque_doubts
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
@@ -146,6 +146,8 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
         return [*doubts, *targets], None
     if inputs.log.u.any() and not contacts:
         found, said = search(inputs)
+        if said and (held := held_points(inputs)):
+            return [*doubts, *held], None
         if said and said[-1].about == UNKNOWN and inputs.sharper is not None:
             sharp, heard = search(replace(inputs, compared=inputs.sharper))
             if not heard or heard[-1].about != UNKNOWN:

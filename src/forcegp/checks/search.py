@@ -1,5 +1,6 @@
 """One search over all causes: which of them, one after the other, leave of the torques what a good log leaves."""
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,7 +13,11 @@ from forcegp.checks.check_input import CheckInput
 from forcegp.checks.explanations import NUMBER, SIGN, Cause, candidates, changed
 from forcegp.checks.torques import Comparison, positive_fit, positive_solution, torque_noise
 from forcegp.data.views import white_noise
-from forcegp.doubts import Doubt, listed, look
+from forcegp.doubts import Doubt, listed, look, wrong
+from forcegp.evidence import Torques, motion_residuals
+from forcegp.fit import fit
+from forcegp.forces import Actuation, Coulomb, Offset, RigidBodies, Rotor, Viscous
+from forcegp.model import Model
 
 UNKNOWN = "unknown cause"
 FEWEST_ROWS = 30
@@ -229,7 +234,41 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
     if sure:
         factor = np.where(np.isin(np.arange(len(root.floor)), sure), -1.0, 1.0)
         root = replace(root, log=root.log.after(changed("u", factor=factor)), turned=tuple(sure))
-    return root, [*_signs(root, inputs), *_unknown(root, inputs)]
+    said = [*_signs(root, inputs), *_unknown(root, inputs)]
+    if said and not sure and (turned := _all_turned(root, inputs)):
+        return turned
+    return root, said
+
+
+def _all_turned(root: Explanation, inputs: CheckInput) -> tuple[Explanation, list[Doubt]] | None:
+    """Every torque turned, where bodies and friction that can exist then leave far less; None where they do not.
+
+    Masses of a robot's file may be too wrong for any single cause. Friction brakes and inertia resists in any robot.
+    """
+    log, left = root.log, list[np.ndarray]()
+    moving = np.ptp(log.rows.u, axis=0) > 0.0
+    laws = Actuation(), RigidBodies("all"), *(Law() for Law in (Viscous, Coulomb, Offset, Rotor))
+    for sign in (1.0, -1.0):
+        rows = replace(log.rows, u=sign * log.rows.u, model=Model(log.robot, (), laws))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of numbers that these rows do not show
+            found = fit(rows.model, rows, Torques())
+        residual = motion_residuals(rows, found.model)[0][:, moving]
+        left.append(residual.var(axis=0) / rows.u[:, moving].var(axis=0))
+    if np.log(left[0] / left[1]).sum() < GAIN + SIGN * moving.sum() or left[1].mean() > RESTS:
+        return None
+    before, after = (100.0 * each.mean() for each in left)
+    doubt = wrong(
+        about="torque sign",
+        what="the torques of all joints have the opposite sign of what any robot of these lengths needs: bodies and "
+        f"friction that can exist leave {before:.2g} % of a torque, and {after:.2g} % of the turned one (mean of "
+        "joints). Masses of the robot's file are wrong as well.",
+        do="Turn u; forcegp fit --forces bodies finds the masses.",
+        joints=inputs.names,
+        correction={"sign": {"u": (-1.0,) * log.rows.nv}},
+    )
+    turned = log.with_torques(changed("u", factor=-1.0))
+    return replace(root, log=turned, turned=tuple(range(log.rows.nv))), [doubt]
 
 
 def _root(inputs: CheckInput) -> Explanation:

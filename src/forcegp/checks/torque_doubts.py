@@ -4,12 +4,13 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
 from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, Explanation
 from forcegp.checks.torques import Comparison
 from forcegp.data import estimate_delay
-from forcegp.doubts import Doubt, look, ok, wrong
+from forcegp.doubts import Doubt, listed, look, ok, wrong
 from forcegp.errors import DatasetError
 from forcegp.model import Model
 from forcegp.summary import plain
@@ -17,6 +18,7 @@ from forcegp.summary import plain
 UNEXPLAINED = 0.5
 LEAST_DELAY = 0.75  # time steps below which a delay is not reported
 MUCH = 0.5  # a delay that leaves less of what was unexplained is wrong to leave in
+RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
 
 
 def torque_doubts(inputs: CheckInput, found: Explanation) -> list[Doubt]:
@@ -92,6 +94,35 @@ def _delays(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
             joints=inputs.names,
             numbers={"delay": seconds, "std": delay.common_std, "remains": remains, "per_joint": plain(delay.seconds)},
         )
+
+
+def held_points(inputs: CheckInput) -> list[Doubt]:
+    """The link that stays where it is although joints move that carry it: something holds it, and no model says so."""
+    rows, robot = inputs.rows(), inputs.robot
+    q, moved = torch.tensor(rows.q, device=robot.device), rows.q - rows.q.mean(axis=0)
+    kinematics, found = robot.kinematics(q), list[tuple[float, str, np.ndarray]]()
+    for link in robot.layout.links:
+        position = kinematics.frame_pose(link)[:, :3, 3].cpu().numpy()
+        J = kinematics.frame_jacobian(link)[:, :3].cpu().numpy()
+        alone = np.sqrt(np.square(J * moved[:, None]).sum(axis=1).mean(axis=0))  # m, what each joint would move it by
+        carried = float(np.sqrt(np.square(alone).sum()))
+        if (alone > MUCH * alone.max()).sum() > 1 and carried > 0.0:
+            found.append((float(np.sqrt(position.var(axis=0).sum())) / carried, link, alone))
+    share, link, alone = min(found, key=lambda each: each[0], default=(np.inf, "", np.zeros(0)))
+    if share > RESTS:
+        return []
+    joints = inputs.named(np.flatnonzero(alone > MUCH * alone.max()))
+    return [
+        wrong(
+            about="contact",
+            what=f"{link} stays where it is, within {1e3 * share * np.sqrt(np.square(alone).sum()):.2g} mm, although "
+            f"{listed(joints)} would move it by up to {1e3 * alone.max():.3g} mm each: something holds it, and "
+            "its force is missing beside the torques.",
+            do=f"State it: --contact {link}:held; a force sensor there by --force {link}=fx,fy,fz.",
+            joints=joints,
+            numbers={"share": share},
+        )
+    ]
 
 
 TOUCHES = ok(

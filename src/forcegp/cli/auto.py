@@ -22,7 +22,7 @@ import forcegp.report
 import forcegp.scores
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json
 from forcegp.cli.command import CONFIG, LOG, Command, options_of, unless_given
-from forcegp.cli.fit import LAWS, payload_dict, with_payload, write_estimates
+from forcegp.cli.fit import LAWS, payload_dict, payload_text, with_payload, write_estimates
 from forcegp.cli.logs import ColumnOptions, FilterOptions, prepared_rows, resolved, stance_text
 from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal, doubts_table, facts, shown
@@ -123,7 +123,7 @@ class Auto(Command):
                 payload, held = payload_dict(found, False), payload_text(found)
             except DatasetError as error:
                 held = f"not estimated: {error}"
-        scores, posterior = self._scored(terminal, rows, recording, model)
+        scores, posterior = self._scored(terminal, rows, recording, model, identified)
         content: dict[str, Any] = {
             "out": str(self.out),
             "seconds": sum(each["seconds"] for each in done["recordings"]),
@@ -200,15 +200,20 @@ class Auto(Command):
         return rows, recording
 
     def _scored(
-        self, terminal: Terminal, rows: forcegp.Dataset, recording: forcegp.Dataset, model: forcegp.Model
+        self,
+        terminal: Terminal,
+        rows: forcegp.Dataset,
+        recording: forcegp.Dataset,
+        model: forcegp.Model,
+        identified: forcegp.Posterior,
     ) -> tuple[forcegp.scores.Scores, forcegp.posterior.Posterior]:
         """The scores of the models, and the recommended one, learned from all rows and stored."""
         how: dict[str, Any] = {"model": model, "recording": recording, "identification": identification(model)}
         how |= {"points": min(100, len(rows) // 4), "restarts": 1}
-        models = self.models.names() or default_models(model)
+        models = self.models.names() or default_models(model, identified, rows)
         with terminal.progress("scoring"):
             folder = self.out / "validation"
-            scores = forcegp.score(models, rows, split="auto", seeds=1, folder=folder, overwrite=self.overwrite, **how)
+            scores = forcegp.score(models, rows, split="folds", seeds=1, folder=folder, overwrite=self.overwrite, **how)
         for failure in scores.failures:
             terminal.warn(failure)
         with terminal.progress("learning from all rows"):
@@ -260,14 +265,12 @@ class Auto(Command):
         return str(self.out / "c")
 
 
-SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
-
-
 def short_name(name: str) -> str:
     """What a model is called in the answer."""
     laws, air = "gp:joint-friction" in name, "gp:aerodynamic" in name
     learned = " and ".join(what for what, has in (("friction", laws), ("air forces", air)) if has)
-    return f"{learned} learned" if learned else {"given": "the URDF"}.get(name, name)
+    plain = {"given": "the URDF", "identified@accelerations": "identified by accelerations"}
+    return f"{learned} learned" if learned else plain.get(name, name)
 
 
 def identification(model: forcegp.Model) -> str:
@@ -276,12 +279,20 @@ def identification(model: forcegp.Model) -> str:
     return f"bodies{laws}@{'torques' if model.robot.space.is_vector_space else 'torques:both'}"
 
 
-def default_models(model: forcegp.Model) -> tuple[str, ...]:
-    """What is compared: what thrusters fly through shows in no regression, so it is learned on the robot as given."""
+def default_models(model: forcegp.Model, identified: forcegp.Posterior, rows: forcegp.Dataset) -> tuple[str, ...]:
+    """What is compared: what thrusters fly through shows in no regression, so it is learned on the robot as given.
+
+    Accelerations are learned from as well where torques have made them predictable, unlike those of light wrists.
+    """
     friction = bool(model.robot.single_joint_names)
     if forcegp.data.thruster_columns(model):
         return "given", "identified", "gp:joint-friction+gp:aerodynamic" if friction else "gp:aerodynamic"
-    return "given", "identified", *(["identified+gp:joint-friction"] if friction else [])
+    models = ["given", "identified", *(["identified+gp:joint-friction"] if friction else [])]
+    if model.robot.space.is_vector_space and not model.contacts:
+        missed = forcegp.evidence.motion_residuals(rows, identified.model)[1].std(axis=0)
+        if (missed < rows.a.std(axis=0)).mean() > 0.5:
+            models.append("identified@accelerations")
+    return tuple(models)
 
 
 def answer_lines(
@@ -427,15 +438,3 @@ def _acceleration(scores: forcegp.scores.Scores, model: str) -> float | None:
 def _known(scores: forcegp.scores.Scores, score: str, quantity: str, model: str) -> float | None:
     there = model in scores.models and quantity in scores.quantities(model)
     return scores.value(score, quantity, model) if there else None
-
-
-def payload_text(found: Any) -> str:
-    """Mass with its 95 % interval and place; or that there is none."""
-    parts = {name: found.estimates[f"payload.{name}"] for name in ("mass", *(f"center_of_mass.{x}" for x in "xyz"))}
-    mass, *center = parts.values()
-    error = 0.5 * (mass.interval[1] - mass.interval[0])
-    if mass.value < max(SURE * mass.std, LEAST_PAYLOAD):
-        return f"none ({mass.value:.2g} ± {error:.1g} kg)"
-    place = ", ".join(f"{1e3 * each.value:.0f}" for each in center)
-    [held] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
-    return f"{mass.value:.3g} ± {error:.1g} kg at ({place}) mm of {held.link}, if the URDF's links are right"

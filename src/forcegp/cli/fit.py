@@ -422,3 +422,18 @@ def payload_dict(found: Any, baseline: bool) -> dict[str, Any]:
     """Payload and other numbers as plain JSON values, with the link that carries it."""
     [payload] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
     return {"link": payload.link, "baseline": baseline, **found.estimates.to_dict()}
+
+
+SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
+
+
+def payload_text(found: Any) -> str:
+    """Mass with its 95 % interval and place; or that there is none."""
+    parts = {name: found.estimates[f"payload.{name}"] for name in ("mass", *(f"center_of_mass.{x}" for x in "xyz"))}
+    mass, *center = parts.values()
+    error = 0.5 * (mass.interval[1] - mass.interval[0])
+    if mass.value < max(SURE * mass.std, LEAST_PAYLOAD):
+        return f"none ({mass.value:.2g} ± {error:.1g} kg)"
+    place = ", ".join(f"{1e3 * each.value:.0f}" for each in center)
+    [held] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
+    return f"{mass.value:.3g} ± {error:.1g} kg at ({place}) mm of {held.link}, if the URDF's links are right"

@@ -136,7 +136,7 @@ def negative_log_density(
 
 
 def row_scores(
-    posterior: Posterior, test: Dataset, mass: Matrices | None = None
+    posterior: Posterior, test: Dataset, mass: Matrices | None = None, whole: Dataset | None = None
 ) -> tuple[Table, dict[str, list[float | None]]]:
     """The table, and errors in about `STRETCHES` stretches of time, over all joints, where lower is better.
 
@@ -145,8 +145,9 @@ def row_scores(
     is with the noise of the model, or of the Dataset where that is larger. Accelerations also have the mean negative
     log density `nlpd` [nats], `known_physics_mae` of the known forces alone, and as measured `nrmse` over their
     standard deviation, `noise_std` of the model, and `noise_floor`, the `mae` of a perfect prediction. All joints
-    together have one `nlpd`. `mass` (rows of kg m^2, kg m or kg) turns errors of accelerations into those of forces; it
-    is the same for every model that is compared, None takes the model's own.
+    together have one `nlpd`. `whole` is the recording to whose deviations errors are related, so that a slow stretch is
+    no fault; None takes `test`. `mass` (rows of kg m^2, kg m or kg) turns errors of accelerations into those of forces;
+    it is the same for every model that is compared, None takes the model's own.
     """
     rows = predict_rows(posterior, test)
     mass = rows.mass if mass is None else mass
@@ -154,11 +155,12 @@ def row_scores(
     table = {name: metrics(*each) for name, each in pairs.items() if each[0].shape == each[2].shape and each[2].size}
     table[ALL_JOINTS] = {"nlpd": [float(rows.negative_log_density.mean())]}
     measured = table[ACCELERATION]
-    measured["nrmse"] = plain(np.array(measured["rmse"], dtype=float) / _spread(test.a))
+    whole = test if whole is None else whole
+    measured["nrmse"] = plain(np.array(measured["rmse"], dtype=float) / _spread(whole.a))
     if len(test.model.actuators) == test.nv and not posterior.is_black_box:
         # of the torques that the model needs for the measured motion; a share of 1 is no better than their mean
         rms = np.sqrt(np.square(force_errors(rows.mean, test.a, rows.mass)).mean(axis=0))
-        table[TORQUE] = {"rmse": plain(rms), "share": plain(rms / _spread(test.u[:, : test.nv]))}
+        table[TORQUE] = {"rmse": plain(rms), "share": plain(rms / _spread(whole.u[:, : test.nv]))}
     density = norm.logpdf(test.a, rows.mean, np.sqrt(rows.measurement_variance))
     measured["nlpd"] = plain(-np.asarray(density).mean(axis=0))
     measured["noise_std"] = plain(posterior.noise_std.detach().cpu().numpy())
@@ -166,7 +168,7 @@ def row_scores(
         measured["noise_floor"] = plain(test.noise_std * np.sqrt(2.0 / np.pi))
     for name in {ACCELERATION, TRUE_ACCELERATION} & set(table):
         table[name]["known_physics_mae"] = plain(np.abs(rows.known_physics - pairs[name][2]).mean(axis=0))
-    return table, _by_stretch(rows, test, force_errors(rows.mean, test.a, mass))
+    return table, _by_stretch(rows, test, force_errors(rows.mean, test.a, mass), _spread(whole.a))
 
 
 Pair = tuple[np.ndarray, np.ndarray | None, np.ndarray]
@@ -267,11 +269,12 @@ def _spread(a: Rows) -> Float[np.ndarray, " nv"]:
     return np.where(spread > CONSTANT * spread.max(initial=0.0), spread, np.nan)
 
 
-def _by_stretch(predicted: PredictedRows, test: Dataset, forces: Rows) -> dict[str, list[float | None]]:
+def _by_stretch(
+    predicted: PredictedRows, test: Dataset, forces: Rows, spread: np.ndarray
+) -> dict[str, list[float | None]]:
     """By criterion: squared errors of accelerations over their variance, of forces, and densities in nats."""
     lasting = sum(float(np.ptp(test.time[test.episode == episode])) for episode in test.episodes)
     seconds = lasting / STRETCHES if lasting > 0.0 else 1.0
-    spread = _spread(test.a)
     relative = (((predicted.mean - test.a) / spread) ** 2)[:, np.isfinite(spread)]
     blocks = [list(block) for block in time_blocks(test.time, test.episode, seconds)]
     found: dict[str, Any] = {"force": forces**2, "acceleration": relative, "density": predicted.negative_log_density}

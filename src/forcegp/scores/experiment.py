@@ -235,7 +235,8 @@ def _score(
         whose = f"the model as given, because its identification failed ({model.rstrip('.')})"
     mass = mass_matrices(test, experiment.model if isinstance(model, str) else model)
     known = isinstance(work.given, Posterior)
-    found = scored(posterior, test, experiment.motions(split), experiment.integrator, mass, fitted_here=not known)
+    how: dict[str, Any] = {"fitted_here": not known, "whole": experiment.rows}
+    found = scored(posterior, test, experiment.motions(split), experiment.integrator, mass, **how)
     return {"cpu_seconds": seconds, "mass_matrix": whose, "training_rows": experiment.points, **found}
 
 
@@ -255,12 +256,13 @@ def scored(
     mass: Matrices | None = None,
     *,
     fitted_here: bool = False,
+    whole: Dataset | None = None,
 ) -> dict[str, Any]:
     """One model on one log as JSON: table, errors, warnings; also of shared rows unless `fitted_here`."""
     alone, recorded = posterior, test
     if test.time_ordered:
         posterior, test = observing(posterior, test, whole=True)
-    table, stretches = row_scores(posterior, test, mass)
+    table, stretches = row_scores(posterior, test, mass, whole)
     moving, facts = motion_scores(alone, motions, integrator)
     doubts = [] if fitted_here else [*overlaps(alone, recorded), *contact_doubts(test, posterior.model)]
     doubts += [*unfinished_search(posterior), *rows_outside(posterior, test), *poor_scores(posterior, test, table)]

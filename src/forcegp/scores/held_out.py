@@ -22,7 +22,8 @@ from forcegp.robots.arguments import whole_number
 from forcegp.scores.accuracy import Table
 from forcegp.summary import plain
 
-FORMS, DEFAULT_BLOCKS = "episodes:N,N..., leave-one-out or blocks:N:K,K...", "blocks:5:3,5"
+FORMS, DEFAULT_BLOCKS = "folds, episodes:N,N..., leave-one-out or blocks:N:K,K...", "blocks:5:3,5"
+FOLDS = 4
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,7 @@ def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split
     """The splits of a text, as `forcegp score --split` takes it: several for leave-one-out, else one.
 
     auto: a quarter of the episodes, drawn at random, or with one episode blocks 3 and 5 of five.
+    folds: the episodes in up to four groups, drawn at random, each held out in turn; with one episode as auto.
     episodes:N,N...: whole episodes.
     leave-one-out: every episode once.
     blocks:N:K,K...: every episode is cut into N blocks of equal duration; those of these numbers, from 1, are held out,
@@ -99,12 +101,15 @@ def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split
     """
     require_type("dataset", dataset, Dataset)
     known, alone = [int(each) for each in dataset.episodes], len(dataset.episodes) == 1
-    kind, *parts = (DEFAULT_BLOCKS if text == "auto" and alone else text).split(":")
+    kind, *parts = (DEFAULT_BLOCKS if text in ("auto", "folds") and alone else text).split(":")
     try:
         match kind, [[int(word) for word in part.split(",")] for part in parts]:
             case "auto", []:
                 drawn = np.random.default_rng(0).choice(known, size=max(round(0.25 * len(known)), 1), replace=False)
                 return (_episodes_apart(known, sorted(drawn.tolist())),)
+            case "folds", []:
+                groups = np.array_split(np.random.default_rng(0).permutation(known), min(FOLDS, len(known)))
+                return tuple(_episodes_apart(known, sorted(group.tolist())) for group in groups)
             case "leave-one-out", []:
                 return tuple(_episodes_apart(known, [number]) for number in known)
             case "episodes", [chosen]:
