@@ -8,12 +8,13 @@ import numpy as np
 import pinocchio
 import pytest
 import torch
+from scipy.stats import norm
 from tests.control.test_tracking import ROBOT, TRUE, URDF, URDF_ALONE, VISCOUS
 from tests.posterior.arm import arm_model
 
 from forcegp import ContactMonitor, Dataset, JointFriction, fit, save_posterior
 from forcegp.cli.main import main
-from forcegp.control.monitor import contact_points
+from forcegp.control.monitor import contact_points, errors_near_rest
 from forcegp.errors import DatasetError, InvalidInput
 
 DT = 0.01
@@ -86,9 +87,38 @@ def test_distances_are_mahalanobis_of_a_covariance_that_moves_with_the_inertia(m
     q, v, u = motion(1.0, 4)
     state, row = monitor.run(q, v, u), 50
     M = ROBOT.mass_matrix(torch.from_numpy(0.5 * (q[row] + q[row - 1]))).numpy()
+    slow, speed = np.zeros(2), 0.5 * np.abs(v[1 : row + 1] + v[:row])
+    for each in speed:
+        slow = monitor.keep * slow + (1.0 - monitor.keep) * np.exp(-each / monitor.near_rest[1])
     S = M @ np.diag(monitor.noise.acceleration**2) @ M + np.diag(monitor.noise.force**2)
+    S += np.diag((monitor.near_rest[0] * slow) ** 2)
     tau = state.torque[row].numpy()
     assert float(state.distance[row]) == pytest.approx(tau @ np.linalg.solve(S, tau), rel=1e-9)
+
+
+def test_errors_near_rest_are_found_by_their_likelihood():
+    rng, rows = np.random.default_rng(0), 4000
+    known, slow = rng.uniform(0.01, 0.02, rows), rng.uniform(size=rows) ** 4
+    tau = rng.standard_normal(rows) * np.sqrt(known + 0.2**2 + (0.7 * slow) ** 2)
+    cost, force, at_rest = errors_near_rest(tau, known, slow)
+    assert force == pytest.approx(0.2, rel=0.05)
+    assert at_rest == pytest.approx(0.7, rel=0.1)
+    S = known + force**2 + (at_rest * slow) ** 2
+    assert cost + 0.5 * math.log(2.0 * math.pi) == pytest.approx(-norm.logpdf(tau, 0.0, np.sqrt(S)).mean(), rel=1e-6)
+
+
+def test_a_joint_that_creeps_is_no_contact_where_its_reversals_showed_how_wrong_friction_is():
+    def missed(v):
+        return 1.5 * np.tanh(v / 0.002) * np.exp(-np.abs(v) / 0.05)
+
+    free = motion(120.0, 1)
+    observer = ContactMonitor(TRUE, dt=DT).calibrate([(*free[:2], free[2] + missed(free[1]))])
+    assert observer.near_rest[0].min() > 0.5
+    v = np.full((600, 2), 0.01)  # rad/s for six seconds
+    q = np.cumsum(v * DT, axis=0)
+    held = ROBOT.inverse_dynamics(*(torch.from_numpy(x) for x in (q, v, 0.0 * v))).numpy() + VISCOUS * v
+    assert not observer.run(q, v, held + missed(v)).alarm[200:].any()
+    assert observer.run(q, v, held + missed(v) - 8.0).alarm[200:].all()
 
 
 def test_free_motion_raises_as_many_alarms_as_asked_for():

@@ -125,7 +125,11 @@ def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator
         what = "positions fit the torques far better taken for turns than for radians"
         cause = Cause(about="turns", what=what, do="Multiply q and v by 2 pi.", joints=_places(turns), cost=SIGN)
         yield cause, now.after(changed("qva", factor=np.where(turns, 2.0 * np.pi, 1.0)))
+    steps = np.diff(inputs.log.time)[np.diff(inputs.log.episode) == 0]
+    rate = 1.0 / float(np.median(steps)) if inputs.log.time_ordered and len(steps) else SLOWEST
     for unit, factor in (("ms", 1e3), ("us", 1e6), ("min", 1.0 / 60.0)):
+        if SLOWEST <= rate <= FASTEST or not SLOWEST <= rate * factor <= FASTEST:
+            continue  # slow enough, any motion needs no more than gravity
         what = f"the motion fits the torques far better if time is in {unit}"
 
         def change(rows: Dataset, factor: float = factor) -> Dataset:
@@ -136,6 +140,8 @@ def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator
 
 
 UNITS = ("mNm", 1e3), ("kNm", 1e-3)
+SLOWEST, FASTEST = 1.0, 5500.0
+"""Rates of logs [Hz] that need no other unit of time."""
 
 
 def _delays(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:

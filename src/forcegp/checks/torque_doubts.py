@@ -118,7 +118,8 @@ def held_points(inputs: CheckInput) -> list[Doubt]:
             what=f"{link} stays where it is, within {1e3 * share * np.sqrt(np.square(alone).sum()):.2g} mm, although "
             f"{listed(joints)} would move it by up to {1e3 * alone.max():.3g} mm each: something holds it, and "
             "its force is missing beside the torques.",
-            do=f"State it: --contact {link}:held; a force sensor there by --force {link}=fx,fy,fz.",
+            do=f"Free motion needs no contact. Of this log: forcegp fit --contact {link}:held, with columns of a force "
+            f"sensor there by forcegp import --force {link}=fx,fy,fz.",
             joints=joints,
             numbers={"share": share},
         )

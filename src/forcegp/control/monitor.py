@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.optimize import minimize
 from scipy.signal import lfilter
 from scipy.stats import chi2, gumbel_r
 from torch import Tensor
@@ -26,6 +27,9 @@ Motion = tuple[Any, Any, Any]
 BLOCK = 2.0
 """Seconds of free motion of which the largest distance counts once: what follows upon it resembles it."""
 LEAST_BLOCKS = 20
+SLOW = tuple(np.geomspace(0.01, 0.5, 8).tolist())
+"""Of the root mean square velocity, over what errors of friction near rest may fade: Stribeck's velocity, or a part."""
+MOST_ROWS = 5000  # that these errors are found from: filtered, neighbours tell the same
 PLACES = 5  # points along each link where a contact is tried
 EXPLAINED = float(chi2.ppf(0.95, 1))  # links whose misfit is larger by less explain a torque as well as the best
 
@@ -59,8 +63,11 @@ class ContactMonitor:
     """A momentum observer around a model of the forces: what moves the robot beyond it is a contact.
 
     tau = M a - Q_K - Q_U in the middle of a step of `dt` s, filtered to first order with `bandwidth` Hz (De Luca &
-    Mattone 2005), with the covariance S = M D_a M + D_f of free motion (`calibrate`), to which the spread of learned
-    forces adds where `model`, `posterior.predictor()` or a `Model`, has one. An alarm is raised where tau^T S^-1 tau
+    Mattone 2005), with the covariance S = M D_a M + D_f + D_s of free motion (`calibrate`), to which the spread of
+    learned forces adds where `model`, `posterior.predictor()` or a `Model`, has one. D_s are errors of friction near
+    rest, of the size s exp(-|v| / v_s), filtered as tau is: reversals show how large they are, and a joint that creeps
+    has them for long. Where M a of a joint goes beyond what free motion has shown, its errors grow in proportion. An
+    alarm is raised where tau^T S^-1 tau
     exceeds a threshold that free motion reaches as often as stated. Raises InvalidInput for arguments that do not fit
     and a monitor that was not calibrated, DatasetError for free motion that is too short.
     """
@@ -81,20 +88,26 @@ class ContactMonitor:
         self.dt, self.bandwidth = float(dt), float(bandwidth)
         self.keep = math.exp(-2.0 * math.pi * bandwidth * dt)
         self.noise: NoiseLevels | None = None
+        self.near_rest = np.zeros(self.robot.nv), np.ones(self.robot.nv)
+        """Standard deviations (nv,) of errors of friction at rest [Nm or N], and velocities v_s (nv,)."""
+        self.largest = torch.full((self.robot.nv,), math.inf, dtype=torch.float64)
+        """Of |M a| (nv,) in free motion [Nm or N], filtered."""
+        self._usual = torch.zeros(self.robot.nv, dtype=torch.float64)
         self.threshold = math.inf
         self._maxima = (0.0, 1.0)
         self.restart()
 
     def restart(self) -> None:
         """Forget earlier calls, as at the beginning of a recording."""
-        self._torque, self.past = torch.zeros(self.robot.nv, dtype=torch.float64), Past(model_of(self.model))
+        self._torque = self._slow = self._inertial = torch.zeros(self.robot.nv, dtype=torch.float64)
+        self.past = Past(model_of(self.model))
         self._before: tuple[Tensor, Tensor, Tensor] | None = None
 
     def calibrate(self, free: Sequence[Motion], *, false_alarms_per_hour: float = 0.1) -> "ContactMonitor":
         """Learn the noise and the threshold from recordings (T, nv) of free motion; returns the monitor.
 
-        The largest distances of stretches of 2 s follow a Gumbel distribution (Fisher, Tippett 1928), whose quantile is
-        the threshold. Take another motion than the model learned from, as varied as those to come.
+        Roots of the largest distances of stretches of 2 s follow a Gumbel distribution (Fisher, Tippett 1928), whose
+        quantile is the threshold. Take another motion than the model learned from, as varied as those to come.
         """
         rate, words = false_alarms_per_hour, f"give a number above 0 and below {3600 / BLOCK:g}"
         require_number("false_alarms_per_hour", rate, words, below=3600 / BLOCK)
@@ -106,12 +119,26 @@ class ContactMonitor:
                 f"free motion of {seconds:.3g} s is too short for a threshold; give at least "
                 f"{LEAST_BLOCKS * BLOCK:g} s in stretches of {BLOCK:g} s or more."
             )
-        tau, M = torch.cat([each[0] for each in found]), torch.cat([each[1] for each in found])
+        tau, M, v = (torch.cat([each[k] for each in found]) for k in (0, 1, 3))
+        self.largest = torch.cat([each[4] for each in found]).abs().amax(0)
         self.noise = NoiseLevels.of(torch.linalg.solve(M, tau[..., None])[..., 0].numpy(), M.numpy())
-        distances = [self._distance(tau, self._covariance(M, extra)) for tau, M, extra in found]
+        speed = np.maximum(v.square().mean(0).sqrt().numpy(), 1e-12)
+        slow = [np.concatenate([self._near_rest(each[3], share * speed)[settle:] for each in found]) for share in SLOW]
+        some = slice(None, None, max(1, len(tau) // MOST_ROWS))
+        known = (M[some].square() @ torch.as_tensor(self.noise.acceleration).square()).numpy()
+        best = [
+            min((*errors_near_rest(tau[some, j].numpy(), known[:, j], each[some, j]), share)
+                for share, each in zip(SLOW, slow, strict=True))
+            for j in range(self.robot.nv)
+        ]  # fmt: skip
+        _, force, at_rest, share = np.array(best).T
+        self.noise, self.near_rest = NoiseLevels(self.noise.acceleration, force), (at_rest, share * speed)
+        fades = np.concatenate([self._near_rest(each[3], share * speed)[settle:] for each in found])
+        self._usual = torch.from_numpy(fades).square().mean(0).sqrt()
+        distances = [self._distances(*each) for each in found]
         largest = torch.cat([d[: len(d) // block * block].view(-1, block).amax(1) for d in distances])
-        self._maxima = gumbel_r.fit(largest.numpy())
-        self.threshold = float(gumbel_r.isf(rate * BLOCK / 3600.0, *self._maxima))
+        self._maxima = gumbel_r.fit(largest.sqrt().numpy())
+        self.threshold = float(gumbel_r.isf(rate * BLOCK / 3600.0, *self._maxima)) ** 2
         return self
 
     def __call__(self, q: Any, v: Any, u: Any) -> ContactState:
@@ -123,13 +150,18 @@ class ContactMonitor:
         middle = 0.5 * (before[0] + sample[0]), 0.5 * (before[1] + sample[1])
         step = (*middle, before[2], (sample[1] - before[1]) / self.dt)
         tau, M, extra = self._torques(*(x[None] for x in step))
+        fades = torch.exp(-middle[1].abs() / torch.as_tensor(self.near_rest[1]))
         self._torque = self._torque + (1.0 - self.keep) * (tau[0] - self._torque)
-        return self._state(self._torque, self._distance(self._torque[None], self._covariance(M, extra))[0])
+        self._slow = self._slow + (1.0 - self.keep) * (fades - self._slow)
+        self._inertial = self._inertial + (1.0 - self.keep) * (M[0] @ step[3] - self._inertial)
+        covariance = self._covariance(M, extra, self._slow, self._inertial)
+        return self._state(self._torque, self._distance(self._torque[None], covariance)[0])
 
     def run(self, q: Any, v: Any, u: Any) -> ContactState:
         """The same of a whole recording (T, nv); nothing is known at its first row."""
-        tau, M, extra = self._residuals(q, v, u)
-        distance, none = self._distance(tau, self._covariance(M, extra)), tau.new_zeros(1, tau.shape[1])
+        found = self._residuals(q, v, u)
+        tau, distance = found[0], self._distances(*found)
+        none = tau.new_zeros(1, tau.shape[1])
         return self._state(torch.cat([none, tau]), torch.cat([none[:, 0], distance]))
 
     def place(self, q: Any, torque: Any) -> ContactPlace:
@@ -139,7 +171,9 @@ class ContactMonitor:
         force.
         """
         q, tau = (torch.as_tensor(finite_vector(n, x, self.robot.nv)) for n, x in (("q", q), ("torque", torque)))
-        white = torch.linalg.inv(torch.linalg.cholesky(self._covariance(self.robot.mass_matrix(q), None)))
+        white = torch.linalg.inv(
+            torch.linalg.cholesky(self._covariance(self.robot.mass_matrix(q), None, self._usual, 0.0 * tau))
+        )
         kinematics, found = self.robot.kinematics(q), []
         for link, point in contact_points(self.robot):
             J = white @ kinematics.frame_jacobian(link, point)[:3].mT
@@ -154,12 +188,18 @@ class ContactMonitor:
         x, y, z = (tuple(each.tolist()) for each in (point, force, stds))
         return ContactPlace(link, x, y, z, tuple(also))
 
-    def _covariance(self, M: Tensor, extra: Tensor | None) -> Tensor:
-        """S (..., nv, nv) of filtered torques where the mass matrix is M, with what the posterior leaves open."""
+    def _covariance(self, M: Tensor, extra: Tensor | None, slow: Tensor, inertial: Tensor) -> Tensor:
+        """S (..., nv, nv) of filtered torques where the mass matrix is M, with what the posterior leaves open.
+
+        `slow` (..., nv) is how much of the time of the filter joints were near rest, `inertial` (..., nv) M a.
+        """
         if self.noise is None:
             raise InvalidInput("this monitor is not calibrated: call calibrate([(q, v, u)]) with free motion first.")
         acceleration, force = (torch.as_tensor(x).square() for x in (self.noise.acceleration, self.noise.force))
-        S = (M * acceleration) @ M + force.diag()
+        at_rest = (torch.as_tensor(self.near_rest[0]) * slow).square()
+        S = (M * acceleration) @ M + (force + at_rest).diag_embed()
+        beyond = (inertial.abs() / self.largest).clamp_min(1.0)
+        S = beyond[..., :, None] * S * beyond[..., None, :]
         return S if extra is None else S + extra
 
     def _motion(self, q: Any, v: Any, u: Any) -> tuple[Tensor, Tensor, Tensor]:
@@ -174,8 +214,21 @@ class ContactMonitor:
             )
         return found[0], found[1], found[2]
 
-    def _residuals(self, q: Any, v: Any, u: Any, settle: int = 0) -> tuple[Tensor, Tensor, Tensor | None]:
-        """As `_torques`, filtered (T - 1 - settle, nv)."""
+    def _near_rest(self, v: Tensor, fade: np.ndarray) -> np.ndarray:
+        """exp(-|v| / fade) (T, nv), filtered as torques are."""
+        return self._low_passed(np.exp(-np.abs(v.numpy()) / fade))
+
+    def _distances(
+        self, tau: Tensor, M: Tensor, extra: Tensor | None, v: Tensor, inertial: Tensor
+    ) -> Float[Tensor, " rows"]:
+        """Of what `_residuals` returns."""
+        slow = torch.from_numpy(self._near_rest(v, self.near_rest[1]))[len(v) - len(tau) :]
+        return self._distance(tau, self._covariance(M, extra, slow, inertial))
+
+    def _residuals(
+        self, q: Any, v: Any, u: Any, settle: int = 0
+    ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor]:
+        """As `_torques`, filtered (T - 1 - settle, nv), the velocities in the middle of all steps, and M a, filtered."""
         q, v, u = self._motion(q, v, u)
         if q.dim() != 2 or len(q) < 2:
             raise InvalidInput(
@@ -183,9 +236,15 @@ class ContactMonitor:
             )
         self.past = Past(model_of(self.model))
         middle = 0.5 * (q[1:] + q[:-1]), 0.5 * (v[1:] + v[:-1])
-        tau, M, extra = self._torques(*middle, u[:-1], (v[1:] - v[:-1]) / self.dt)
-        filtered = lfilter([1.0 - self.keep], [1.0, -self.keep], tau.numpy(), axis=0)
-        return torch.from_numpy(filtered)[settle:], M[settle:], None if extra is None else extra[settle:]
+        a = (v[1:] - v[:-1]) / self.dt
+        tau, M, extra = self._torques(*middle, u[:-1], a)
+        both = np.stack([tau.numpy(), (M @ a[..., None])[..., 0].numpy()])
+        filtered, inertial = torch.from_numpy(self._low_passed(both, axis=1))
+        extra = None if extra is None else extra[settle:]
+        return filtered[settle:], M[settle:], extra, middle[1], inertial[settle:]
+
+    def _low_passed(self, values: np.ndarray, axis: int = 0) -> np.ndarray:
+        return lfilter([1.0 - self.keep], [1.0, -self.keep], values, axis=axis)
 
     def _torques(self, q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """M a - Q_K - Q_U at rows, M, and M Cov(a) M of what the posterior leaves open."""
@@ -206,8 +265,25 @@ class ContactMonitor:
         return (tau * torch.linalg.solve(S, tau[..., None])[..., 0]).sum(-1)
 
     def _state(self, tau: Tensor, distance: Tensor) -> ContactState:
-        probability = torch.from_numpy(np.asarray(gumbel_r.cdf(distance.numpy(), *self._maxima)))
+        probability = torch.from_numpy(np.asarray(gumbel_r.cdf(distance.sqrt().numpy(), *self._maxima)))
         return ContactState(tau.clone(), distance, probability, distance > self.threshold)
+
+
+def errors_near_rest(
+    tau: Float[np.ndarray, " rows"], known: Float[np.ndarray, " rows"], slow: Float[np.ndarray, " rows"]
+) -> tuple[float, float, float]:
+    """Standard deviations f and s by which tau ~ N(0, known + f^2 + (s slow)^2) is most likely.
+
+    The first number is minus the mean logarithm of the likelihood, less a constant.
+    """
+
+    def cost(x: np.ndarray) -> float:
+        S = known + np.exp(2.0 * x[0]) + np.exp(2.0 * x[1]) * slow**2
+        return float(np.mean(np.log(S) + tau**2 / S)) / 2.0
+
+    size = np.log(max(float(tau.std()), 1e-12))
+    found = minimize(cost, [size, size], method="Nelder-Mead")
+    return (float(found.fun), *np.exp(found.x).tolist())
 
 
 def contact_points(robot: Robot) -> list[tuple[str, Float[Tensor, "3"]]]:

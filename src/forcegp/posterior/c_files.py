@@ -151,6 +151,7 @@ class CFiles:
         words |= {"REMEMBER": program["monitor_memory"] if self.posterior.model.memory.names else ""}
         words |= {"OPEN": program["monitor_open"] if "covariance" in self.kinds else ""}
         noise = {"ACCELERATIONS": monitor.noise.acceleration, "FORCES": monitor.noise.force}
+        noise |= dict(zip(("AT_REST", "FADES", "LARGEST"), (*monitor.near_rest, monitor.largest), strict=True))
         return words | {word: ", ".join(map(repr, x.tolist())) for word, x in noise.items()}
 
     def _program(self) -> Iterator[str]:

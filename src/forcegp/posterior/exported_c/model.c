@@ -121,6 +121,8 @@ int @NAME@_monitor_step(@NAME@_monitor_state *state, const double q[@NQ@], const
                       double torque[@NV@], double *distance, int *alarm) {
   enum {N = @NV@, NU = @NU@, K = @MEMORY@, AT = @COLUMN@, M = @CONTACTS@};
   static const double accelerations[] = {@ACCELERATIONS@}, forces[] = {@FORCES@};
+  static const double at_rest[] = {@AT_REST@}, fades[] = {@FADES@}; /* errors of friction near rest */
+  static const double largest[] = {@LARGEST@}; /* |M a| of free motion, beyond which errors grow in proportion */
   double x[@ALL@], y[N + N * NU + N * N + M * N + M], S[N][N + 1], C[N * N], MC[N * N], d = 0.0;
   const double *mass = y + N + N * NU;
   int found = stored(q, x, N) | stored(v, x + N, N) | stored(u, x + 2 * N, N), begun = state->begun;
@@ -140,15 +142,19 @@ int @NAME@_monitor_step(@NAME@_monitor_state *state, const double q[@NQ@], const
     @REMEMBER@
     forces_at(tables, 1, x, y);
     for (int i = 0; i < N; i++) {
-      double tau = -y[i];
-      for (int j = 0; j < N; j++) tau += mass[N * i + j] * C[j];
-      state->torque[i] += @SHARE@ * (tau - state->torque[i]);
+      double inertial = 0.0;
+      for (int j = 0; j < N; j++) inertial += mass[N * i + j] * C[j];
+      state->torque[i] += @SHARE@ * (inertial - y[i] - state->torque[i]);
+      state->inertial[i] += @SHARE@ * (inertial - state->inertial[i]);
+      state->slow[i] += @SHARE@ * (exp(-fabs(x[N + i]) / fades[i]) - state->slow[i]);
     }
     for (int i = 0; i < N; i++) for (int j = 0; j <= i; j++) {
-      S[i][j] = i == j ? forces[i] * forces[i] : 0.0;
+      S[i][j] = i == j ? forces[i] * forces[i] + at_rest[i] * at_rest[i] * state->slow[i] * state->slow[i] : 0.0;
       for (int k = 0; k < N; k++)
         S[i][j] += mass[N * i + k] * accelerations[k] * accelerations[k] * mass[N * k + j];
     }
+    for (int i = 0; i < N; i++) for (int j = 0; j <= i; j++)
+      S[i][j] *= fmax(1.0, fabs(state->inertial[i]) / largest[i]) * fmax(1.0, fabs(state->inertial[j]) / largest[j]);
     @OPEN@
     for (int j = 0; j < N; j++) for (int i = j; i < N; i++) { /* S = L L^T; the distance is |L^-1 torque|^2 */
       for (int k = 0; k < j; k++) S[i][j] -= S[i][k] * S[j][k];
@@ -322,7 +328,7 @@ int @NAME@_step_jacobian(const double q[@NQ@], const double v[@NV@], const doubl
 
 //// monitor_state
 typedef struct { /* of one robot, zeros at first */
-  double q[@NQ@], v[@NV@], u[@NV@], torque[@NV@], middle[@NQ@], memory[@MEMORY@ + 1];
+  double q[@NQ@], v[@NV@], u[@NV@], torque[@NV@], slow[@NV@], inertial[@NV@], middle[@NQ@], memory[@MEMORY@ + 1];
   int begun, moved;
 } @NAME@_monitor_state;
 
