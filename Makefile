@@ -58,15 +58,15 @@ help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 18
 
 # A larger installation contains the smaller ones, so it stamps them too.
-$(VENV)/.demo: EXTRAS := sim,view
+$(VENV)/.demo: EXTRAS := view
 $(VENV)/.demo: STAMPS := $(VENV)/.demo
-$(VENV)/.test: EXTRAS := sim,test,logs
+$(VENV)/.test: EXTRAS := test,logs
 $(VENV)/.test: STAMPS := $(VENV)/.demo $(VENV)/.test
-$(VENV)/.check: EXTRAS := sim,test,logs,dev
+$(VENV)/.check: EXTRAS := test,logs,dev
 $(VENV)/.check: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.check
-$(VENV)/.browser: EXTRAS := sim,test,logs,browser
+$(VENV)/.browser: EXTRAS := test,logs,browser
 $(VENV)/.browser: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.browser
-$(VENV)/.docs: EXTRAS := sim,test,logs,docs
+$(VENV)/.docs: EXTRAS := test,logs,docs
 $(VENV)/.docs: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.docs
 
 # torch first and alone, because only torch may come from TORCH_INDEX; where that index is out of reach, pip goes on without it.

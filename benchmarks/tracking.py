@@ -29,7 +29,7 @@ from forcegp.data import farthest_rows
 from forcegp.evidence import Accelerations
 from forcegp.forces import GearFriction, Offset, RigidBodies, Rotor
 from forcegp.posterior import Posterior
-from forcegp.simulation.kuka_surface import kuka_urdf
+from forcegp.simulation.kuka_surface import kuka_robot
 
 SEEDS = (1, 2, 3, 4, 5)
 RATE, FINE, NOISE, ROWS = 240, 4, 0.1, 100
@@ -40,14 +40,15 @@ MIDDLE = np.array([0.0, 0.5, 0.0, -1.3, 0.0, 0.9, 0.0])
 
 def robot_of(payload: float = 0.0, inertia: float = 1.0) -> Robot:
     """The arm; `inertia` scales all masses and inertias, `payload` kg are added to the last link."""
-    text = kuka_urdf(replace(CONFIG, tool_mass=CONFIG.tool_mass + payload))
-    robot = Robot.from_urdf_text(text, gravity=(0.0, 0.0, -CONFIG.gravity))
+    robot = kuka_robot(replace(CONFIG, tool_mass=CONFIG.tool_mass + payload))
     if inertia == 1.0:
         return robot
     import re
 
     scaled = re.sub(
-        r'(mass value|i[xyz]{2})="([^"]+)"', lambda found: f'{found[1]}="{inertia * float(found[2])!r}"', text
+        r'(mass value|i[xyz]{2})="([^"]+)"',
+        lambda found: f'{found[1]}="{inertia * float(found[2])!r}"',
+        robot.urdf_text,
     )
     return Robot.from_urdf_text(scaled, gravity=(0.0, 0.0, -CONFIG.gravity))
 

@@ -1,7 +1,4 @@
-"""A first model: joint friction of a KUKA iiwa, learned from 100 rows. Draws friction.png.
-
-Needs `pip install 'forcegp[sim]'`.
-"""
+"""A first model: joint friction of a KUKA iiwa, learned from 100 rows. Draws friction.png."""
 
 from forcegp import JointFriction, KukaSurfaceConfig, fit, score, simulate_kuka_surface
 from forcegp.scores import friction_curves_figure, save_figure

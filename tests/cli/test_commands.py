@@ -79,7 +79,6 @@ def test_score_shows_a_line_per_joint_and_draws(workshop, forcegp, tmp_path):
 
 
 def test_the_demo_tells_the_whole_story(forcegp, tmp_path, monkeypatch, capfd):
-    pytest.importorskip("pybullet")
     small = ("demo", "--seconds", "1", "--points", "12", "--iterations", "3", "--overwrite")
     monkeypatch.setattr("forcegp.report.page.model_pictures", lambda *_: ([], []))  # as drawn for a score
     done = forcegp(*small, folder=tmp_path)
@@ -116,7 +115,6 @@ def interruptible():
 
 @pytest.mark.nightly
 def test_ctrl_c_ends_in_one_line_and_leaves_nothing_behind(executable, tmp_path):
-    pytest.importorskip("pybullet")
     screen, terminal = pty.openpty()
     command = [executable, "simulate", "kuka-surface", "--seconds", "5000", "--out", "long.h5"]
     to = {"stdout": subprocess.DEVNULL, "stderr": terminal, "preexec_fn": interruptible}

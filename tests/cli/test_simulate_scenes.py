@@ -1,18 +1,15 @@
 """`forcegp simulate` with other friction, surfaces and contacts."""
 
 import json
-from importlib.util import find_spec
 
 import pytest
 
 from forcegp import Dataset
 from forcegp.mechanics import Sphere
 
-SURFACES = pytest.mark.skipif(find_spec("pybullet") is None, reason="pip install 'forcegp[sim]'")
-
 
 @pytest.mark.parametrize("arm", ["ur5-free", "double-pendulum"])
-def test_free_arms_need_no_other_library(forcegp, tmp_path, arm):
+def test_free_arms_have_no_tool(forcegp, tmp_path, arm):
     made = forcegp("simulate", arm, "--seconds", 0.5, "--seed", 3, "--out", "log.h5", "--json", folder=tmp_path)
     assert made.returncode == 0, made.stderr
     data, config = Dataset.load(tmp_path / "log.h5"), json.loads(made.stdout)["config"]
@@ -48,7 +45,6 @@ def test_a_quadruped_moves_on_a_floating_base(forcegp, tmp_path):
     assert (flags == 1.0).all()
 
 
-@SURFACES
 @pytest.mark.parametrize(
     ("options", "expected"),
     [

@@ -14,7 +14,6 @@ from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 
 def simulated(seed: int, surface: str = "plane", noise: float = 0.1, seconds: float = 10.0) -> Dataset:
-    pytest.importorskip("pybullet")
     from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
     return simulate_kuka_surface(KukaSurfaceConfig(seconds=seconds, seed=seed, surface=surface, noise=noise))

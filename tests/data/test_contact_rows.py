@@ -9,8 +9,6 @@ from forcegp.errors import ContactError
 from forcegp.mechanics import Contact, Plane
 from forcegp.simulation import KukaSurfaceConfig, QuadrupedConfig, simulate_kuka_surface, simulate_quadruped
 
-pytest.importorskip("pybullet")
-
 
 @pytest.fixture(scope="module")
 def hopping() -> Dataset:

@@ -9,8 +9,6 @@ from forcegp.errors import InvalidInput, SimulationError
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 from forcegp.simulation.kuka_surface import PointFriction, joint_friction_of
 
-pytest.importorskip("pybullet")
-
 SCENES = {
     "stribeck": {"friction": "stribeck", "joint_friction": "stribeck"},
     "tilted": {"surface": "tilted", "friction": "stribeck"},

@@ -116,7 +116,7 @@ def test_the_law_is_the_published_one_with_the_pseudo_inverse():
         q, v, J, bias = rng.normal(size=7), rng.normal(size=7), rng.normal(size=(6, 7)), rng.normal(size=6)
         position, aim = rng.normal(size=3), tuple(rng.normal(size=(3, 3)))
         present = (values := rng.normal(size=4)) / np.linalg.norm(values)
-        state = ArmState(q, v, np.eye(7), np.zeros(7), position, present, J, bias)
+        state = ArmState(q, v, np.eye(7), np.zeros(7), position, turned(present), J, bias)
         found = joint_acceleration(KukaSurfaceConfig(), state, aim)
 
         velocity = J @ v

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import time
@@ -37,9 +36,9 @@ class Simulate(Command):
     """Simulate a robot and write what it measured, with the ground truth, to one file.
 
     kuka-surface: a KUKA iiwa slides its tool on a surface with unmodelled friction, as in Rath, Geist, Trimpe (2021).
-    ur5-free, double-pendulum: arms that touch nothing, with dry friction in every joint, without PyBullet. quadruped: a
-    robot on a floating base that shifts its weight and lifts its feet, with an unknown load of 2 kg. quadrotor: a drone
-    on a path in wind, with late rotors. Equal seeds give equal motions; train and test need different ones.
+    ur5-free, double-pendulum: arms that touch nothing, with dry friction in every joint. quadruped: a robot on a
+    floating base that shifts its weight and lifts its feet, with an unknown load of 2 kg. quadrotor: a drone on a path
+    in wind, with late rotors. Equal seeds give equal motions; train and test need different ones.
 
     For example:
       forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5
@@ -110,24 +109,9 @@ class Simulate(Command):
 
 
 def simulate_with_progress(terminal: Terminal, scenario: str, **options: Any) -> forcegp.Dataset:
-    """Run a scenario with a progress bar. Raises InvalidInput for bad options, MissingExtra without PyBullet."""
-    if scenario == "kuka-surface":
-        _import_silently("pybullet")
+    """Run a scenario with a progress bar. Raises InvalidInput for bad options."""
     with terminal.progress(f"simulating seed {options['seed']}"):
         return forcegp.simulation.simulate(scenario, **options)
-
-
-def _import_silently(name: str) -> None:
-    """PyBullet announces the time of its build on the process's stderr, which would stand between our own lines."""
-    stderr = os.dup(2)
-    with open(os.devnull, "wb") as nothing:  # noqa: PTH123  # a device, not a path
-        os.dup2(nothing.fileno(), 2)
-    try:
-        with contextlib.suppress(ImportError):  # the error of the simulation names what to install
-            __import__(name)
-    finally:
-        os.dup2(stderr, 2)
-        os.close(stderr)
 
 
 NOISE = 0.1  # rad/s^2, as in the paper

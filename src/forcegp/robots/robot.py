@@ -331,7 +331,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         return self.space.normalized(q).to(self.device)
 
     @override
-    def _dynamics(self, function: str, *arguments: Tensor) -> Any:
+    def _dynamics(self, function: str, *arguments: Any) -> Any:
         q, *others = arguments
         if len(others) == 2 and len({getattr(x, "shape", ())[:-1] for x in arguments}) > 1:
             names = "q", "v", "tau" if function == "forward_dynamics" else "a"

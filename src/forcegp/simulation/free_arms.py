@@ -19,7 +19,7 @@ from forcegp.model import Model
 from forcegp.progress import tell
 from forcegp.robots import Robot
 from forcegp.simulation.scenarios import FreeArmConfig
-from forcegp.simulation.trajectory import RATE, recorded
+from forcegp.simulation.trajectory import RATE, compiled_plant, recorded
 
 Numbers = Mapping[str, Any]
 """Coefficients by name, one number or one per joint; "velocity" stands for velocities that have no number here."""
@@ -86,7 +86,7 @@ def simulate_free_arm(config: FreeArmConfig) -> Dataset:
     robot = Robot.from_urdf(Path(__file__).parent / file)
     most = np.array([joint.effort_limit for joint in robot.joints])
     robot = robot.with_armature(rotors * most)
-    plant = robot.compile()
+    plant = compiled_plant(robot)
     numbers = {"damping": VISCOUS * most, "level": COULOMB * most, "breakaway": BREAKAWAY * most}
     friction = LawsOfJoints.named(
         str(config.joint_friction), robot, {**numbers, "velocity_scale": SMOOTH, "velocity": FALLING}

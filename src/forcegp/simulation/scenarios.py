@@ -100,7 +100,6 @@ class KukaSurfaceConfig(CommonConfig):
 
     # The constants of the scene, which nobody has to choose.
     gravity: ClassVar[float] = 9.8  # along -z
-    base_height: ClassVar[float] = 0.05  # of the robot above the origin
     tool_point: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.1)  # that touches the surface, in the link-7 frame
     tool_center_of_mass: ClassVar[Numbers] = (0.0, 0.0, 0.02)  # of link 7
     tool_inertia: ClassVar[Numbers] = (0.005, 0.0036, 0.0047)  # its principal moments about that
@@ -245,8 +244,7 @@ SCENARIOS: Mapping[str, tuple[type, str]] = MappingProxyType(
 def simulate(scenario: str, **numbers: Any) -> forcegp.data.Dataset:
     """Run a scenario by name with these fields of its config.
 
-    Libraries are imported here, so that listing scenarios is quick. Raises InvalidInput for numbers out of range, and
-    MissingExtra without a library of the scenario.
+    Libraries are imported here, so that listing scenarios is quick. Raises InvalidInput for numbers out of range.
     """
     require_known("scenario", scenario, "forcegp simulate", SCENARIOS)
     config, function = SCENARIOS[scenario]
