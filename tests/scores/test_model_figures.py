@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tests.simulation.pendulum import double_pendulum
 
 from forcegp import Dataset, JointFriction, Viscous, fit
 from forcegp.inference import OptimizerOptions
@@ -9,14 +10,13 @@ from forcegp.posterior import Posterior
 from forcegp.progress import watched
 from forcegp.scores import model_pictures
 from forcegp.scores.figures.model import curve_panels, friction_curves_figure, prediction_figure
-from forcegp.simulation import FreeArmConfig, simulate_free_arm
 
 QUICK = OptimizerOptions(iterations=10)
 
 
 @pytest.fixture(scope="module")
 def swinging() -> Dataset:
-    return simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=4.0, seed=1))
+    return double_pendulum(4.0, seed=1)
 
 
 @pytest.fixture(scope="module")

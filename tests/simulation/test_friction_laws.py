@@ -14,7 +14,6 @@ from forcegp.forces.force import Coefficient
 from forcegp.forces.joint_law import JointLaw
 from forcegp.forces.registry import FORCES
 from forcegp.simulation import KukaSurfaceConfig
-from forcegp.simulation.free_arms import LawsOfJoints
 from forcegp.simulation.kuka_surface import PointFriction, multiplier_with_friction
 
 STRIBECK = PointFriction(coulomb=0.3, static=0.5, breakaway_velocity=0.1, smoothing=1e-6)
@@ -91,8 +90,6 @@ def test_a_law_of_ones_own_acts_in_plants(monkeypatch):
     np.testing.assert_allclose(joint_law("quadratic").step(v, U, INERTIA, 0.0), -0.3 * np.abs(v) * v - D * v)
     twice = joint_law("quadratic:drag=0.6,viscous:0")
     np.testing.assert_allclose(twice.step(v, U, INERTIA, 0.0), -0.6 * np.abs(v) * v, atol=1e-14)
-    free = LawsOfJoints.named("quadratic", ROBOT, {"damping": 0.0})
-    np.testing.assert_allclose(free.slope(v), 0.6 * np.abs(v), atol=1e-5)
     with pytest.raises(InvalidInput, match="joint_friction is 'payload:l7'; give one of none"):
         joint_law("payload:l7")
 

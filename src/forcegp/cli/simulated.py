@@ -25,9 +25,9 @@ from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 from forcegp.parallel import checked_jobs
 
-Scenario = Literal["kuka-surface", "ur5-free", "double-pendulum", "quadruped", "quadrotor"]
+Scenario = Literal["kuka-surface", "quadruped", "quadrotor"]
 TOOL_FRICTION = arg(metavar="LAW[:COEFFICIENT]", help_behavior_hint="(default: viscous)")
-JOINT_FRICTION = arg(metavar="LAW,...", help_behavior_hint="(default: none; dry with more near rest for free arms)")
+JOINT_FRICTION = arg(metavar="LAW,...", help_behavior_hint="(default: none; of quadruped stribeck)")
 OF_THE_TOOL = ("tool_friction", "surface")  # options of the scenario that has a tool
 
 
@@ -35,20 +35,20 @@ OF_THE_TOOL = ("tool_friction", "surface")  # options of the scenario that has a
 class Simulate(Command):
     """Simulate a robot and write what it measured, with the ground truth, to one file.
 
-    kuka-surface: a KUKA iiwa slides its tool on a surface with unmodelled friction, as in Rath, Geist, Trimpe (2021).
-    ur5-free, double-pendulum: arms that touch nothing, with dry friction in every joint. quadruped: a robot on a
-    floating base that shifts its weight and lifts its feet, with an unknown load of 2 kg. quadrotor: a drone on a path
-    in wind, with late rotors. Equal seeds give equal motions; train and test need different ones.
+    kuka-surface: a KUKA iiwa slides its tool on a surface with unmodelled friction, as in Rath, Geist, Trimpe (2021),
+    or moves above it. quadruped: a robot on a floating base that shifts its weight and lifts its feet, with an unknown
+    load of 2 kg. quadrotor: a drone on a path in wind, with late rotors. Equal seeds give equal motions; train and test
+    need different ones.
 
     For example:
       forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5
       forcegp simulate kuka-surface --tool-friction coulomb:.2 --joint-friction coulomb --out rough.h5
-      forcegp simulate double-pendulum --seconds 60 --joint-friction coulomb --out pendulum.h5
+      forcegp simulate kuka-surface --surface none --joint-friction stribeck --out free.h5
       forcegp simulate quadrotor --seconds 60 --seed 1 --wind 4 --out drone.h5
     """
 
     scenario: Annotated[Positional[Scenario], arg(metavar="SCENARIO")]
-    """What to simulate: kuka-surface, ur5-free, double-pendulum, quadruped or quadrotor."""
+    """What to simulate: kuka-surface, quadruped or quadrotor."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write (HDF5)."""
     seconds: Annotated[float, arg(metavar="S")] = 200.0
@@ -62,8 +62,8 @@ class Simulate(Command):
     of the normal force while it slides."""
     joint_friction: Annotated[str | None, JOINT_FRICTION] = None
     """Unmodelled friction of the joints: none, or viscous and laws by name, as for --forces."""
-    surface: Literal["plane", "tilted", "sphere", "none"] = "plane"
-    """What the tool slides on: a plane, one tilted by 10 degrees, the top of a sphere of 1.2 m, or nothing."""
+    surface: Literal["plane", "tilted", "none"] = "plane"
+    """What the tool slides on: a plane, one tilted by 10 degrees, or nothing."""
     wind: Annotated[float | None, unless_given("M/S", "4; only of quadrotor", float)] = None
     """Mean wind of a quadrotor in m/s, from a random side, with gusts."""
 

@@ -18,16 +18,17 @@ from forcegp.model import Model
 from forcegp.progress import part, tell
 from forcegp.robots import Robot
 from forcegp.robots.structure import RigidBodyDynamics
-from forcegp.simulation.free_arms import LawsOfJoints
+from forcegp.simulation.joint_friction import LawsOfJoints
 from forcegp.simulation.scenarios import KukaSurfaceConfig
 from forcegp.simulation.trajectory import (
     ArmState,
     compiled_plant,
     joint_acceleration,
+    middle_of,
     over_table,
     random_path,
     recorded,
-    table_height,
+    slope_of,
     table_of,
 )
 
@@ -180,7 +181,7 @@ def simulate_episode(config: KukaSurfaceConfig, robot: Robot, plant: RigidBodyDy
     law = None if config.surface == "none" else tool_friction_of(config)
     contact = IdealContact(table, law, config.baumgarte_omega, config.baumgarte_zeta)
     tool, duration = ArmState.of(plant, TOOL_LINK, config.tool_point, q, v).position, steps * config.time_step
-    flat = tool - [0.0, 0.0, table_height(config, tool[None, :2])[0][0]]
+    flat = tool - [0.0, 0.0, (tool - middle_of(config))[:2] @ slope_of(config)]
     path = random_path(config, flat, duration, np.random.default_rng([config.seed, episode, 0]))
     reference = over_table(config, path.sample(config.time_step * np.arange(steps)))
     for step in range(steps):

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from forcegp import __version__
 from forcegp.data import Dataset
 from forcegp.errors import CompilerError, NumericalWarning
-from forcegp.mechanics import Plane, Sphere
+from forcegp.mechanics import Plane
 from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.robots.structure import RigidBodyDynamics
@@ -39,7 +39,7 @@ class ArmState:
     @staticmethod
     def of(plant: RigidBodyDynamics, link: str, point: tuple[float, ...], q: np.ndarray, v: np.ndarray) -> "ArmState":
         """That of a plant whose tool is a point of a link [m]."""
-        at = torch.from_numpy(q), torch.from_numpy(v)
+        at = torch.tensor(q), torch.tensor(v)
         mass, bias = (x.numpy() for x in plant.mass_matrix_and_bias(*at))
         pose, jacobian, drift = (x.numpy() for x in plant.frame_motion(*at, link, point))
         return ArmState(q, v, mass, bias, pose[:3, :3] @ point + pose[:3, 3], pose[:3, :3], jacobian, drift)
@@ -56,39 +56,28 @@ def compiled_plant(robot: Robot) -> RigidBodyDynamics:
     return plant
 
 
-Heights = tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"], Float[np.ndarray, "times 2 2"]]
 Aim = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 Motions = tuple[Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"]]
 
 
-def table_of(config: KukaSurfaceConfig) -> Plane | Sphere:
+def middle_of(config: KukaSurfaceConfig) -> Float[np.ndarray, "3"]:
+    """Of the region of way-points, on the table [m]."""
+    return np.array([np.mean(config.waypoint_x), np.mean(config.waypoint_y), config.surface_height])
+
+
+def table_of(config: KukaSurfaceConfig) -> Plane:
     """The table of a scenario; for `surface="none"` the plane that way-points keep above."""
-    middle = np.array([np.mean(config.waypoint_x), np.mean(config.waypoint_y), config.surface_height])
-    if config.surface == "sphere":
-        x, y, z = (middle - (0.0, 0.0, config.sphere_radius)).tolist()
-        return Sphere((x, y, z), config.sphere_radius)
-    upward = np.array([0.0, 0.0, 1.0])
-    if config.surface == "tilted":
-        angle, (x, y) = np.deg2rad(config.tilt_degrees), np.array(config.tilt_axis) / np.hypot(*config.tilt_axis)
-        # Rodrigues' formula for the vertical unit vector about the horizontal axis (x, y, 0).
-        upward = np.array([y * np.sin(angle), -x * np.sin(angle), np.cos(angle)])
-    x, y, z = upward.tolist()
-    return Plane((x, y, z), float(upward @ middle))
+    angle = np.deg2rad(config.tilt_degrees) if config.surface == "tilted" else 0.0
+    x, y = np.array(config.tilt_axis) / np.hypot(*config.tilt_axis)
+    # Rodrigues' formula for the vertical unit vector about the horizontal axis (x, y, 0).
+    upward = np.array([y * np.sin(angle), -x * np.sin(angle), np.cos(angle)])
+    return Plane(tuple(upward.tolist()), float(upward @ middle_of(config)))
 
 
-def table_height(config: KukaSurfaceConfig, xy: Float[np.ndarray, "times 2"]) -> Heights:
-    """Height [m] of the table above its middle, its gradient and its Hessian [1/m] in x and y."""
-    table = table_of(config)
-    if isinstance(table, Plane):
-        *normal, upwards = table.normal
-        slope = -np.array(normal) / upwards
-        height = table.offset / upwards + xy @ slope
-        return height - config.surface_height, np.broadcast_to(slope, xy.shape), np.zeros((len(xy), 2, 2))
-    ray = xy - table.center[:2]
-    rise = np.sqrt(table.radius**2 - (ray**2).sum(axis=1))
-    gradient = -ray / rise[:, None]
-    hessian = -(np.eye(2) + gradient[:, :, None] * gradient[:, None, :]) / rise[:, None, None]
-    return rise - table.radius, gradient, hessian
+def slope_of(config: KukaSurfaceConfig) -> Float[np.ndarray, "2"]:
+    """How the height of the table rises along x and y."""
+    *normal, upwards = table_of(config).normal
+    return -np.array(normal) / upwards
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,15 +126,10 @@ class SegmentPath:
 
 
 def over_table(config: KukaSurfaceConfig, motions: Motions) -> Motions:
-    """Motions over a horizontal table, bent to follow its true height `h(x, y)`: z and h by the chain rule."""
-    position, velocity, acceleration = motions
-    height, gradient, hessian = table_height(config, position[:, :2])
-    rate = np.einsum("ti,ti->t", gradient, velocity[:, :2])
-    bend = np.einsum("ti,tij,tj->t", velocity[:, :2], hessian, velocity[:, :2])
-    position[:, 2] += height
-    velocity[:, 2] += rate
-    acceleration[:, 2] += np.einsum("ti,ti->t", gradient, acceleration[:, :2]) + bend
-    return position, velocity, acceleration
+    """Motions over a horizontal table, moved up and down to follow its true height."""
+    for values, middle in zip(motions, (middle_of(config)[:2], 0.0, 0.0), strict=True):
+        values[:, 2] += (values[:, :2] - middle) @ slope_of(config)
+    return motions
 
 
 def random_path(
