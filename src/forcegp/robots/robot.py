@@ -42,7 +42,6 @@ from forcegp.robots.urdf_file import (
     with_chosen_inertias,
     with_joint_values,
     with_limits,
-    with_note,
     write_text,
 )
 
@@ -249,10 +248,6 @@ class Robot(RobotStructure, RigidBodyDynamics):
         values = {"damping": damping, "friction": friction}
         given = {name: value.tolist() for name, value in values.items() if value is not None}
         return self.with_text(with_joint_values(self.urdf_text, self.layout, given, source=self.source))
-
-    def with_note(self, note: str) -> "Robot":
-        """The same robot, whose URDF text ends with this comment."""
-        return self.with_text(with_note(self.urdf_text, note))
 
     def to_urdf(self, path: str | Path | None = None) -> str:
         """The URDF text, written to ``path`` if given, with a RobotFileWarning about rotor inertias.
