@@ -24,6 +24,7 @@ import sysconfig
 import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin

@@ -174,8 +174,7 @@ def simulate_episode(config: KukaSurfaceConfig, robot: Robot, plant: RigidBodyDy
     """
     settle, steps = config.settle_steps, config.settle_steps + config.rows_per_episode
     limits, table = np.array(config.torque_limits), table_of(config)
-    laws, own = joint_friction_of(config, robot), config.own_laws.get(config.joint_friction)
-    own_law = own and own(config, robot)
+    laws = joint_friction_of(config, robot)
     columns: dict[str, np.ndarray] = {}
     q, v = np.deg2rad(config.start_degrees), np.zeros(robot.nv)
     law = None if config.surface == "none" else tool_friction_of(config)
@@ -199,7 +198,7 @@ def simulate_episode(config: KukaSurfaceConfig, robot: Robot, plant: RigidBodyDy
             normal = table.gradient(torch.from_numpy(state.position)).numpy()
             asked = asked - config.pressing_force * (normal @ state.jacobian[:3])
         u = np.clip(asked, -limits, limits) - config.joint_damping * v
-        joint_torques = own_law(v, u, state.mass, step * config.time_step) if own_law else laws(v, u)
+        joint_torques = laws(v, u)
         forces = contact.forces(state, u + joint_torques)
         a = np.linalg.solve(state.mass, u + joint_torques + forces.push - state.bias)
         row = {"q": q, "v": v, "u": u, "a": a, "joint_torques": joint_torques, **forces._asdict()}
@@ -233,11 +232,10 @@ def tool_friction_of(config: KukaSurfaceConfig) -> PointFriction:
 
 def joint_friction_of(config: KukaSurfaceConfig, robot: Robot) -> LawsOfJoints:
     """The laws that `joint_friction` names, with the numbers of the scenario where it gives none."""
-    name = "none" if config.joint_friction in config.own_laws else config.joint_friction
     more = tuple(near - level for near, level in zip(config.joint_static, config.joint_coulomb, strict=True))
     numbers: dict[str, Any] = {"damping": config.joint_viscous, "level": config.joint_coulomb, "breakaway": more}
     numbers |= {"velocity_scale": config.joint_smoothing, "velocity": config.joint_breakaway_velocity}
-    return LawsOfJoints.named(name, robot, numbers)
+    return LawsOfJoints.named(config.joint_friction, robot, numbers)
 
 
 def _require_bounded(config: KukaSurfaceConfig, v: Float[np.ndarray, " nv"], episode: int, step: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from types import MappingProxyType
@@ -22,15 +22,15 @@ POSITIVE: Range = ("finite and > 0", 1e-12, 1e9)
 NOT_NEGATIVE: Range = ("finite and >= 0", 0.0, 1e9)
 
 
-def require_joint_friction(name: Any, more: Sequence[str] = ()) -> None:
-    """Raise InvalidInput for what is neither none, nor one of these, nor laws of joints."""
-    if name in ("none", *more):
+def require_joint_friction(name: Any) -> None:
+    """Raise InvalidInput for what is neither none nor laws of joints."""
+    if name == "none":
         return
     from forcegp.forces.joint_law import JointLaw  # torch, which lists of options do without
     from forcegp.forces.registry import FORCES, force_class, parse_forces
 
     laws = [each for each in FORCES if issubclass(force_class(each), JointLaw)]
-    allowed = f"joint_friction is {name!r}; give one of {', '.join(('none', *more, *laws))}"
+    allowed = f"joint_friction is {name!r}; give one of {', '.join(('none', *laws))}"
     try:
         known = isinstance(name, str) and all(isinstance(law, JointLaw) for law in parse_forces(name))
     except InvalidInput as error:
@@ -110,7 +110,6 @@ class KukaSurfaceConfig(CommonConfig):
     joint_coulomb: ClassVar[Numbers] = (2.0, 2.0, 1.3, 1.3, 0.12, 0.12, 0.05)  # small where explicit steps oscillate
     joint_static: ClassVar[Numbers] = (3.0, 3.0, 2.0, 2.0, 0.2, 0.2, 0.08)  # near rest
     joint_viscous: ClassVar[Numbers] = (1.0, 1.0, 0.5, 0.5, 0.05, 0.05, 0.02)  # beyond `joint_damping`
-    own_laws: ClassVar[Mapping[str, Any]] = {}  # of subclasses: (config, robot) -> torques of (v, u, M, time)
     baumgarte_omega: ClassVar[float] = 10.0
     baumgarte_zeta: ClassVar[float] = 1.0
     start_degrees: ClassVar[Numbers] = (85, 50, -10, -100, -170, -25, -100)  # also the posture of the null space
@@ -135,7 +134,7 @@ class KukaSurfaceConfig(CommonConfig):
             from forcegp.forces.registry import dry_laws
 
             require_known("friction", self.friction, "the tool", ("viscous", *dry_laws()))
-        require_joint_friction(self.joint_friction, (*self.own_laws,))
+        require_joint_friction(self.joint_friction)
 
     @property
     def pressing_force(self) -> float:
