@@ -17,12 +17,12 @@ import time
 import numpy as np
 import torch
 
-from benchmarks.plants import JointFrictionLaw
 from benchmarks.tracking import CONFIG, FINE, GAINS, RATE, Reference, excitation, fits, followed, robot_of, rows_of
 from forcegp import ContactMonitor, Model, Robot, Viscous
 from forcegp.control import PDGravity
 from forcegp.control.monitor import ContactState
 from forcegp.forces import Stribeck
+from forcegp.simulation.kuka_surface import joint_friction_of
 
 SEEDS = (1, 2, 3, 4, 5)
 ELBOW, PUSHES, EVERY, LASTING = "lbr_iiwa_link_4", 100, 2.0, 0.5
@@ -31,7 +31,7 @@ NOISE_V, NOISE_U = 0.002, 0.05
 
 def moved(robot: Robot, seed: int, seconds: float, newton: float = 0.0) -> dict[str, np.ndarray]:
     """q, v, u (T, 7) as measured, and the joint torques of the pushes."""
-    plant, law, reference = robot.compile(), JointFrictionLaw(CONFIG, robot), Reference.random(seed, 0.4, 3.5)
+    plant, law, reference = robot.compile(), joint_friction_of(CONFIG, robot), Reference.random(seed, 0.4, 3.5)
     control, rng, force = PDGravity(plant, **GAINS), np.random.default_rng(seed), np.zeros(3)
     (q, v, _), rows, push = reference(0.0), [], np.zeros(7)
     for k in range(round(seconds * RATE)):
@@ -49,7 +49,7 @@ def moved(robot: Robot, seed: int, seconds: float, newton: float = 0.0) -> dict[
         u = control(q, v, *reference(k / RATE)).numpy()
         rows.append((q, v, u, push))
         for _ in range(FINE):
-            at = [torch.from_numpy(x) for x in (q, v, u + push - law.curve(v))]
+            at = [torch.from_numpy(x) for x in (q, v, u + push + law(v))]
             v = v + plant.forward_dynamics(*at).numpy() / (RATE * FINE)
             q = q + v / (RATE * FINE)
     found = {name: np.array(x) for name, x in zip(("q", "v", "u", "push"), zip(*rows, strict=True), strict=True)}

@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from benchmarks.contact_monitor import EVERY, LASTING, monitors, qvu, recordings
-from benchmarks.plants import JointFrictionLaw
 from benchmarks.tracking import (
     CONFIG,
     GAINS,
@@ -48,6 +47,7 @@ from forcegp.scores.figures.style import (
     quiet,
     save_figure,
 )
+from forcegp.simulation.kuka_surface import joint_friction_of
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "how-to" / "control"
 SEED, SECONDS, FRAMES_PER_SECOND = 1, 10.0, 12
@@ -165,9 +165,7 @@ def draw_friction(
     mean, half = curve.mean.numpy(), QUANTILE * curve.std.numpy()
     law = np.zeros((len(v), robot.nv))
     law[:, joint] = v
-    axes.plot(
-        v, JointFrictionLaw(CONFIG, robot).curve(law)[:, joint], color=TRUTH, linewidth=3.5, alpha=0.3, label="true"
-    )
+    axes.plot(v, -joint_friction_of(CONFIG, robot)(law)[:, joint], color=TRUTH, linewidth=3.5, alpha=0.3, label="true")
     draw_band(axes, v, mean, half, alpha=0.4, label="95 % interval")
     axes.plot(v, mean, color=PREDICTION, linewidth=1.2, label="learned friction (green on the arm)")
     (dot,) = axes.plot(velocity[:1], now[:1], "o", color=IDENTIFIED, markersize=6.0, zorder=5)

@@ -25,7 +25,6 @@ import numpy as np
 import torch
 from scipy.stats import spearmanr
 
-from benchmarks.plants import JointFrictionLaw
 from benchmarks.tracking import (
     CONFIG,
     GAINS,
@@ -43,6 +42,7 @@ from forcegp import ComputedTorque, Dataset, JointFriction, Model, excitation, f
 from forcegp.control import PDGravity
 from forcegp.control.informative_motions import Excitation, LearnedForces, Motion
 from forcegp.errors import ContactWarning
+from forcegp.simulation.kuka_surface import joint_friction_of
 
 SECONDS, SERIES, SPLINES = 10.0, 9, 5
 LIMITS = {"position": 1.0, "velocity": 1.5, "acceleration": 6.0}
@@ -93,7 +93,7 @@ class Learner:
 
     def __init__(self, seed: int) -> None:
         self.seed, self.robot = seed, robot_of()
-        self.given, self.law = Model(self.robot), JointFrictionLaw(CONFIG, self.robot)
+        self.given, self.law = Model(self.robot), joint_friction_of(CONFIG, self.robot)
         pd = PDGravity(self.robot.compile(), **GAINS)
         slow = followed(self.robot, Reference.random(seed + 300, 0.1, 1.5), pd, SECONDS)
         self.rows = rows_of(slow, self.given, seed, FEW)
@@ -105,7 +105,7 @@ class Learner:
     def error(self, posterior) -> float:
         """Root mean square error of the acceleration in rad/s^2 along the task."""
         q, v, a = self.states
-        u = self.robot.inverse_dynamics(q, v, a) + torch.from_numpy(self.law.curve(v.numpy()))
+        u = self.robot.inverse_dynamics(q, v, a) - torch.from_numpy(self.law(v.numpy()))
         return float((posterior.predict(q, v, u).mean - a).square().mean().sqrt())
 
     def after(self, motion, number: int = 0) -> float:

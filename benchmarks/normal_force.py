@@ -1,6 +1,6 @@
 """A tool pressed onto a plane without a force sensor: `HybridForce` on the URDF, on laws and on learned friction.
 
-`kuka-surface` with Stribeck friction at the tool, in proportion to the load (PyBullet at 240 Hz, ideal contact). The
+`kuka-surface` with Stribeck friction at the tool, in proportion to the load (240 Hz, ideal contact). The
 tool follows the motion of another recording of the scenario for 8 s and presses with 15 N; gains omega = 10. Errors
 after the first second: root mean square of the normal force, and of the tool's distance to its path. The model learns
 from 100 rows of 40 s of the scenario's own motion (`load-friction`, analytical mean); of the same rows least squares
@@ -23,8 +23,8 @@ from forcegp import Dataset, HybridForce, KukaSurfaceConfig, fit, simulate_kuka_
 from forcegp.data import farthest_rows
 from forcegp.forces import parse_forces
 from forcegp.posterior.predictor import Predictor
-from forcegp.simulation.kuka_surface import IdealContact, kuka_urdf, tool_friction_of
-from forcegp.simulation.trajectory import ArmState, BulletArm, table_of
+from forcegp.simulation.kuka_surface import IdealContact, tool_friction_of
+from forcegp.simulation.trajectory import ArmState, compiled_plant, table_of
 
 SEEDS = (1, 2, 3, 4, 5)
 ROWS, SECONDS, WANTED = 100, 8.0, 15.0
@@ -83,21 +83,22 @@ def played(control: HybridForce, task: Dataset, seed: int = 0, noise: float = 0.
     rng = np.random.default_rng(seed)
     forces, places = [], []
     contact = task.model.contacts[0]
-    with BulletArm(
-        kuka_urdf(CONFIG), gravity=CONFIG.gravity, time_step=CONFIG.time_step, tool_point=CONFIG.tool_point
-    ) as arm:
-        arm.reset(task.q[0], task.v[0])
-        surface = IdealContact(
-            table_of(CONFIG), tool_friction_of(CONFIG), CONFIG.baumgarte_omega, CONFIG.baumgarte_zeta, touched=True
-        )
-        low, high = ([getattr(joint, end) for joint in task.model.robot.joints] for end in ("lower", "upper"))
-        reference = np.clip(task.q, low, high)  # the scenario begins on the limit of a joint
-        for q_d, v_d, a_d in zip(reference, task.v, task.truth["a"], strict=True):
-            state = ArmState.of(arm, *arm.state())
-            q, v = (x + noise * std * rng.standard_normal(7) for x, std in ((state.q, NOISE_Q), (state.v, NOISE_V)))
-            u = control(q, v, q_d, v_d, a_d, WANTED).numpy()
-            forces.append(surface.step(arm, state, u).multiplier - WANTED)
-            places.append(state.position)
+    plant = compiled_plant(task.model.robot)
+    surface = IdealContact(
+        table_of(CONFIG), tool_friction_of(CONFIG), CONFIG.baumgarte_omega, CONFIG.baumgarte_zeta, touched=True
+    )
+    low, high = ([getattr(joint, end) for joint in task.model.robot.joints] for end in ("lower", "upper"))
+    reference = np.clip(task.q, low, high)  # the scenario begins on the limit of a joint
+    q, v = task.q[0], task.v[0]
+    for q_d, v_d, a_d in zip(reference, task.v, task.truth["a"], strict=True):
+        state = ArmState.of(plant, contact.frame, CONFIG.tool_point, q, v)
+        read = (x + noise * std * rng.standard_normal(7) for x, std in ((q, NOISE_Q), (v, NOISE_V)))
+        u = control(*read, q_d, v_d, a_d, WANTED).numpy()
+        found = surface.forces(state, u)
+        v = v + CONFIG.time_step * np.linalg.solve(state.mass, u + found.push - state.bias)
+        q = q + CONFIG.time_step * v
+        forces.append(found.multiplier - WANTED)
+        places.append(state.position)
     wanted = contact.position(task.model.robot.kinematics(torch.tensor(task.q))).numpy()
     off = np.linalg.norm(np.array(places) - wanted, axis=1)
     first = round(1.0 / CONFIG.time_step)

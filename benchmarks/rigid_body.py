@@ -28,15 +28,15 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-import pybullet_data
 import torch
 from threadpoolctl import threadpool_limits
 
 from forcegp.robots import Robot
 from forcegp.robots.compiled import CompiledRobot
+from forcegp.simulation import kuka_file
 
 BATCH, REPETITIONS = 1000, 200
-URDF = Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"
+URDF = kuka_file()
 
 SOURCE = """
 #include <boost/python.hpp>

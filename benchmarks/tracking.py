@@ -22,14 +22,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from benchmarks.plants import JointFrictionLaw
 from forcegp import ComputedTorque, Coulomb, Dataset, JointFriction, KukaSurfaceConfig, Model, Robot, Viscous, fit
 from forcegp.control import PDGravity
 from forcegp.data import farthest_rows
 from forcegp.evidence import Accelerations
 from forcegp.forces import GearFriction, Offset, RigidBodies, Rotor
 from forcegp.posterior import Posterior
-from forcegp.simulation.kuka_surface import kuka_urdf
+from forcegp.simulation.kuka_surface import joint_friction_of, kuka_robot
 
 SEEDS = (1, 2, 3, 4, 5)
 RATE, FINE, NOISE, ROWS = 240, 4, 0.1, 100
@@ -40,14 +39,15 @@ MIDDLE = np.array([0.0, 0.5, 0.0, -1.3, 0.0, 0.9, 0.0])
 
 def robot_of(payload: float = 0.0, inertia: float = 1.0) -> Robot:
     """The arm; `inertia` scales all masses and inertias, `payload` kg are added to the last link."""
-    text = kuka_urdf(replace(CONFIG, tool_mass=CONFIG.tool_mass + payload))
-    robot = Robot.from_urdf_text(text, gravity=(0.0, 0.0, -CONFIG.gravity))
+    robot = kuka_robot(replace(CONFIG, tool_mass=CONFIG.tool_mass + payload))
     if inertia == 1.0:
         return robot
     import re
 
     scaled = re.sub(
-        r'(mass value|i[xyz]{2})="([^"]+)"', lambda found: f'{found[1]}="{inertia * float(found[2])!r}"', text
+        r'(mass value|i[xyz]{2})="([^"]+)"',
+        lambda found: f'{found[1]}="{inertia * float(found[2])!r}"',
+        robot.urdf_text,
     )
     return Robot.from_urdf_text(scaled, gravity=(0.0, 0.0, -CONFIG.gravity))
 
@@ -76,14 +76,14 @@ def followed(
     robot: Robot, reference: Reference, control: Callable[..., torch.Tensor], seconds: float
 ) -> dict[str, np.ndarray]:
     """q, v, u at the beginning of every period of the controller, and the error there."""
-    plant, law = robot.compile(), JointFrictionLaw(CONFIG, robot)
+    plant, law = robot.compile(), joint_friction_of(CONFIG, robot)
     (q, v, _), rows = reference(0.0), []
     for k in range(round(seconds * RATE)):
         q_d, v_d, a_d = reference(k / RATE)
         u = control(q, v, q_d, v_d, a_d).numpy()
         rows.append((q, v, u, q_d - q))
         for _ in range(FINE):
-            at = [torch.from_numpy(x) for x in (q, v, u - law.curve(v))]
+            at = [torch.from_numpy(x) for x in (q, v, u + law(v))]
             v = v + plant.forward_dynamics(*at).numpy() / (RATE * FINE)
             q = q + v / (RATE * FINE)
     return {name: np.array(x) for name, x in zip(("q", "v", "u", "e"), zip(*rows, strict=True), strict=True)}
@@ -131,11 +131,11 @@ class TrueModel(ComputedTorque):
 
     def __init__(self, robot: Robot) -> None:
         super().__init__(Model(robot), **GAINS)
-        self.plant, self.law = robot.compile(), JointFrictionLaw(CONFIG, robot)
+        self.plant, self.law = robot.compile(), joint_friction_of(CONFIG, robot)
 
     def _torques(self, q, v, v_d, a_d, e, e_v):
         return self.plant.inverse_dynamics(q, v_d, a_d + self.feedback(e, e_v)) + torch.from_numpy(
-            self.law.curve(v_d.numpy())
+            -self.law(v_d.numpy())
         )
 
 

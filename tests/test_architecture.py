@@ -60,7 +60,7 @@ IMPORTED_WHERE_USED = {
     "jinja2": ("forcegp.report.page",),
     "gymnasium": ("forcegp.control.environments",),
     "mujoco": ("forcegp.control.mujoco_forces",),
-    "pybullet": (),
+    "pybullet_data": (),
     "matplotlib": ("forcegp.scores.figures", "forcegp.report"),
     "joblib": (),
     "rosbags": (),
@@ -262,12 +262,12 @@ def test_help_and_usage_errors_need_neither_torch_nor_numpy(words):
         "import contextlib; from forcegp.cli.main import main\n"
         f"with contextlib.suppress(SystemExit): main({words.split()})"
     )
-    assert not loaded & {"torch", "gpytorch", "numpy", "scipy", "h5py", "pybullet", "matplotlib"}
+    assert not loaded & {"torch", "gpytorch", "numpy", "scipy", "h5py", "matplotlib"}
 
 
 def test_a_missing_input_is_refused_before_anything_slow_is_imported():
     loaded = modules_loaded_by("from forcegp.cli.main import main; assert main(['score', 'nope', 'test.h5']) == 2")
-    assert not loaded & {"torch", "gpytorch", "numpy", "scipy", "h5py", "pybullet", "matplotlib"}
+    assert not loaded & {"torch", "gpytorch", "numpy", "scipy", "h5py", "matplotlib"}
 
 
 @pytest.mark.parametrize("module", MODULES)

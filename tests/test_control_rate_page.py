@@ -14,8 +14,8 @@ def test_the_page_on_control_rates_runs(repository: Path, tmp_path: Path):
     found, excess = re.fullmatch(r"rank (\d+), standard deviations at most (\S+)% too large", rank).groups()
     assert 1 < int(found) <= 300
     assert 0.0 < float(excess) <= 1.0
-    assert one == "torch.Size([2]) torch.Size([2, 2])"
-    assert linear == "torch.Size([2, 2]) torch.Size([2, 2]) torch.Size([2, 2])"
-    assert step == "torch.Size([4, 4]) torch.Size([4, 2]) torch.Size([4])"
+    assert one == "torch.Size([7]) torch.Size([7, 7])"
+    assert linear == "torch.Size([7, 7]) torch.Size([7, 7]) torch.Size([7, 7])"
+    assert step == "torch.Size([14, 14]) torch.Size([14, 7]) torch.Size([14])"
     assert inverse == one
-    assert (many, gradient) == ("torch.Size([1000, 2])", "torch.Size([2])")
+    assert (many, gradient) == ("torch.Size([1000, 7])", "torch.Size([7])")

@@ -132,7 +132,7 @@ SIZES = {"q": "nq", "v": "nv", "a": "nv", "u": "nu"}
 ARMS = {
     "control/informative_motions",
     "forces/columns",
-    "simulation/free_arms",
+    "simulation/joint_friction",
     "simulation/trajectory",
     "simulation/kuka_motion",
 }

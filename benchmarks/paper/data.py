@@ -4,11 +4,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.plants import PlantConfig
 from forcegp.data import Dataset, farthest_rows
 from forcegp.errors import InvalidInput
 from forcegp.jobs import JobStore
-from forcegp.simulation import simulate_kuka_surface
+from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 TRAIN, TEST = "train.h5", "test.h5"
 TEST_SEED = 1000  # the test trajectory of seed k has seed k + 1000: other way-points, another noise
@@ -16,7 +15,7 @@ TEST_SEED = 1000  # the test trajectory of seed k has seed k + 1000: other way-p
 
 def simulated(seed: int, seconds: float, **scenario: Any) -> Dataset:
     """One trajectory of `kuka-surface`."""
-    return simulate_kuka_surface(PlantConfig(seconds=seconds, seed=seed, **scenario))
+    return simulate_kuka_surface(KukaSurfaceConfig(seconds=seconds, seed=seed, **scenario))
 
 
 def farthest(usable: Dataset, rows: int, seconds: float) -> Dataset:

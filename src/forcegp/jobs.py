@@ -32,7 +32,7 @@ CODE = (".py", ".c", ".h", ".jinja")
 """Endings of the files that decide what a package computes."""
 DESCRIPTION, JOBS, LOCK = "jobs.json", "jobs", ".lock"
 RESULT_FILE = "job.json"
-LIBRARIES = ("torch", "gpytorch", "scipy", "numpy", "pybullet")
+LIBRARIES = ("torch", "gpytorch", "scipy", "numpy")
 
 
 @cache

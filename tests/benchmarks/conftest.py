@@ -9,7 +9,6 @@ from forcegp.jobs import JobStore
 @pytest.fixture(scope="session")
 def motion():
     """480 rows, 2 s, in the order of time, with noise-free accelerations among the truth."""
-    pytest.importorskip("pybullet")
     from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
     return simulate_kuka_surface(KukaSurfaceConfig(seconds=2, seed=1))

@@ -13,8 +13,6 @@ from forcegp.inference.memory import gib
 
 @pytest.fixture(scope="module")
 def run(repository):
-    pytest.importorskip("pybullet")
-
     def run(*words):
         command = [sys.executable, "-m", "benchmarks.gpu", *words]
         return subprocess.run(command, cwd=repository, capture_output=True, text=True, check=False)
@@ -45,7 +43,6 @@ def test_without_a_gpu_it_says_in_one_line_what_it_needs(run):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="this machine has no GPU")
 def test_a_gpu_computes_the_same_numbers(tmp_path, monkeypatch):
-    pytest.importorskip("pybullet")
     monkeypatch.setattr(gpu, "RESULTS", tmp_path / "gpu_results.json")
     assert gpu.main(["--small"]) == 0
     found = json.loads(gpu.RESULTS.read_text())["results"]["cuda"]

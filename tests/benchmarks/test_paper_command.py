@@ -9,8 +9,6 @@ from benchmarks.paper.__main__ import main
 
 from forcegp.cli.main import main as forcegp
 
-pytest.importorskip("pybullet")
-
 FIGURES = ("fig2b", "fig2c", "fig3", "fig4")
 
 

@@ -53,7 +53,6 @@ def forcegp() -> Forcegp:
 @pytest.fixture(scope="session")
 def workshop(forcegp, tmp_path_factory) -> Path:
     """A folder with train.h5, test.h5 (2 s each) and the model `run` fitted to 15 points."""
-    pytest.importorskip("pybullet")
     folder = tmp_path_factory.mktemp("workshop")
     for name, seed in (("train", 1), ("test", 2)):
         made = forcegp(

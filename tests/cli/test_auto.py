@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from tests.checks.logs import clean, pendulum
+from tests.simulation.pendulum import double_pendulum
 
 from forcegp import Coulomb, Dataset, Noise, Robot, Viscous, fit, load_posterior
 from forcegp.cli.auto import default_models, verdict
@@ -18,8 +19,6 @@ from forcegp.cli.terminal import Terminal
 from forcegp.data import Preparation
 from forcegp.evidence import motion_residuals
 from forcegp.scores import Scores
-from forcegp.simulation import FreeArmConfig
-from forcegp.simulation.free_arms import simulate_free_arm
 
 COLUMNS = [
     "--time",
@@ -39,7 +38,7 @@ COLUMNS = [
 def folder(tmp_path_factory):
     """A log of a double pendulum in ms, degrees and degrees per second, with one torque turned, and its URDF."""
     place = tmp_path_factory.mktemp("auto")
-    data = simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=8.0, seed=1, noise=0.0))
+    data = double_pendulum(8.0, seed=1, noise=0.0)
     (place / "arm.urdf").write_text(data.model.robot.urdf_text)
     rng = np.random.default_rng(0)
     q = data.q + 1e-5 * rng.standard_normal(data.q.shape)
@@ -73,7 +72,7 @@ def answered(folder, forcegp):
 def test_the_corrected_command_gives_a_model_that_works(folder, answered):
     _, content = answered
     assert content["mistakes"] == []
-    test = simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=3.0, seed=2, noise=0.0))
+    test = double_pendulum(3.0, seed=2, noise=0.0)
     model = load_posterior(folder / "answer" / "model")
     error = np.abs(model.predict(test.q, test.v, test.u).mean.numpy() - test.a).mean()
     assert error < 0.1 * np.abs(motion_residuals(test, test.model)[1]).mean()  # of the URDF
@@ -129,7 +128,7 @@ def test_the_printed_command_keeps_every_option():
 
 
 def test_a_log_that_needs_no_filter_says_so():
-    data = simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=8.0, seed=1, noise=0.0))
+    data = double_pendulum(8.0, seed=1, noise=0.0)
     found = Preparation(cutoff="auto").resolved(data)
     assert found.changes_nothing
     rows, same = prepared_rows(Terminal(json=True), found, data, thin=True)

@@ -71,22 +71,18 @@ def test_score_shows_a_line_per_joint_and_draws(workshop, forcegp, tmp_path):
     assert len(lines) == 7
     assert len({len(line.split()) for line in lines}) == 1
     assert re.search(r"contact force +\S+ +\S+ +\S+ +– +\S+ %", done.stdout)
-    assert "contact normal rest on the prior alone" in " ".join(done.stderr.split())
-    for name in ("prediction.png", "normal_force.png"):
-        assert (tmp_path / "out" / name).read_bytes().startswith(PNG)
+    assert (tmp_path / "out" / "normal_force.png").read_bytes().startswith(PNG)
     assert json.loads((tmp_path / "out" / "results.json").read_text())["rows"] == 60
     assert "95 % intervals contain" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_the_demo_tells_the_whole_story(forcegp, tmp_path, monkeypatch, capfd):
-    pytest.importorskip("pybullet")
     small = ("demo", "--seconds", "1", "--points", "12", "--iterations", "3", "--overwrite")
     monkeypatch.setattr("forcegp.report.page.model_pictures", lambda *_: ([], []))  # as drawn for a score
     done = forcegp(*small, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     for row in ("S-GP ", "S-GP + analytical mean"):
         assert re.search(rf"^\s*{re.escape(row)}.*\d\.\d{{4}}", done.stdout, re.M), done.stdout
-    assert "rest on the prior alone" in " ".join(done.stderr.split())
     results = json.loads((tmp_path / "demo" / "results.json").read_text())
     assert results["seeds"] == {"train": 21, "test": 22}
     models = results["models"]
@@ -116,7 +112,6 @@ def interruptible():
 
 @pytest.mark.nightly
 def test_ctrl_c_ends_in_one_line_and_leaves_nothing_behind(executable, tmp_path):
-    pytest.importorskip("pybullet")
     screen, terminal = pty.openpty()
     command = [executable, "simulate", "kuka-surface", "--seconds", "5000", "--out", "long.h5"]
     to = {"stdout": subprocess.DEVNULL, "stderr": terminal, "preexec_fn": interruptible}

@@ -10,13 +10,12 @@ import torch
 from tests.cli.one_line import assert_refused
 from tests.fit.test_motion_fit import line, recording
 from tests.posterior.arm import arm_data
+from tests.simulation.pendulum import double_pendulum
 
 from forcegp import Dataset, JointFriction, Model, Robot, Viscous, load_posterior
 from forcegp.cli.fit import estimates_table
 from forcegp.evidence import motion_residuals
 from forcegp.posterior import Estimate
-from forcegp.simulation import FreeArmConfig
-from forcegp.simulation.free_arms import simulate_free_arm
 
 JOINTS = ("upper_hinge", "lower_hinge")
 QUICK = ("--points", 12, "--iterations", 5, "--restarts", 1)
@@ -27,7 +26,7 @@ def folder(tmp_path_factory):
     """pendulum.h5 and test.h5 with dry friction of 0.4 Nm and viscous friction of 0.2 Nms; arm.h5."""
     place = tmp_path_factory.mktemp("fit")
     for name, seed, seconds in (("pendulum", 1, 10.0), ("test", 2, 3.0)):
-        data = simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=seconds, seed=seed, noise=0.05))
+        data = double_pendulum(seconds, seed, noise=0.05)
         data.rows(slice(None, None, 4)).save(place / f"{name}.h5")
     arm_data(40, seed=0).save(place / "arm.h5")
     return place

@@ -1,29 +1,20 @@
 """`forcegp simulate` with other friction, surfaces and contacts."""
 
 import json
-from importlib.util import find_spec
 
 import pytest
 
 from forcegp import Dataset
-from forcegp.mechanics import Sphere
-
-SURFACES = pytest.mark.skipif(find_spec("pybullet") is None, reason="pip install 'forcegp[sim]'")
 
 
-@pytest.mark.parametrize("arm", ["ur5-free", "double-pendulum"])
-def test_free_arms_need_no_other_library(forcegp, tmp_path, arm):
-    made = forcegp("simulate", arm, "--seconds", 0.5, "--seed", 3, "--out", "log.h5", "--json", folder=tmp_path)
-    assert made.returncode == 0, made.stderr
-    data, config = Dataset.load(tmp_path / "log.h5"), json.loads(made.stdout)["config"]
-    assert (len(data), config["arm"], config["seed"], config["joint_friction"]) == (120, arm, 3, "stribeck")
-    assert data.metadata["scenario"] == arm
-    refused = forcegp("simulate", arm, "--surface", "sphere", "--out", "no.h5", folder=tmp_path)
-    assert refused.returncode == 2
-    assert f"--surface means nothing to {arm}" in refused.stderr
-    refused = forcegp("simulate", arm, "--joint-friction", "lugre", "--out", "no.h5", folder=tmp_path)
-    assert refused.returncode == 2
-    assert "lugre" in refused.stderr
+def test_options_of_other_scenarios_are_refused(forcegp, tmp_path):
+    for words, message in (
+        (("quadruped", "--surface", "tilted"), "--surface means nothing to quadruped"),
+        (("quadruped", "--joint-friction", "lugre"), "lugre"),
+    ):
+        refused = forcegp("simulate", *words, "--out", "no.h5", folder=tmp_path)
+        assert refused.returncode == 2
+        assert message in refused.stderr
 
 
 @pytest.mark.nightly
@@ -48,14 +39,13 @@ def test_a_quadruped_moves_on_a_floating_base(forcegp, tmp_path):
     assert (flags == 1.0).all()
 
 
-@SURFACES
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
         ("--tool-friction viscous:2.5", {"friction": "viscous", "viscous_coefficient": 2.5}),
         (
-            "--tool-friction stribeck:0.2 --surface sphere --joint-friction stribeck",
-            {"friction": "stribeck", "coulomb_coefficient": 0.2, "surface": "sphere"},
+            "--tool-friction stribeck:0.2 --surface tilted --joint-friction stribeck",
+            {"friction": "stribeck", "coulomb_coefficient": 0.2, "surface": "tilted"},
         ),
     ],
 )
@@ -68,4 +58,4 @@ def test_options_reach_the_dataset(forcegp, tmp_path, options, expected):
     assert expected.items() <= summary["config"].items()
     assert expected.items() <= data.metadata["config"].items()
     assert ("Q_U.joint-friction" in data.truth) == ("--joint-friction" in options)
-    assert isinstance(data.model.contacts[0].surface, Sphere) == ("sphere" in options)
+    assert (data.model.contacts[0].surface.normal[2] < 1.0) == ("tilted" in options)

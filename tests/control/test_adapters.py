@@ -15,7 +15,6 @@ def examples() -> list[str]:
 
 @pytest.mark.nightly
 def test_the_examples_run(examples, tmp_path):
-    pytest.importorskip("pybullet")
     pytest.importorskip("gymnasium")
     pytest.importorskip("mujoco")
     printed = run_example("".join(examples[:5]), tmp_path).splitlines()

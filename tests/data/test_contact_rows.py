@@ -9,8 +9,6 @@ from forcegp.errors import ContactError
 from forcegp.mechanics import Contact, Plane
 from forcegp.simulation import KukaSurfaceConfig, QuadrupedConfig, simulate_kuka_surface, simulate_quadruped
 
-pytest.importorskip("pybullet")
-
 
 @pytest.fixture(scope="module")
 def hopping() -> Dataset:
@@ -45,7 +43,7 @@ def test_flags_decide_where_a_contact_has_a_switch():
     assert contact_rows(noisy).all()
 
 
-@pytest.mark.parametrize("surface", ["plane", "sphere"])
+@pytest.mark.parametrize("surface", ["plane", "tilted"])
 def test_an_ideal_contact_keeps_its_rows(surface):
     data = simulate_kuka_surface(KukaSurfaceConfig(seconds=4.0, seed=6, surface=surface))
     assert contact_rows(data).mean() > 0.999

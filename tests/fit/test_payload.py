@@ -2,6 +2,7 @@
 
 from contextlib import nullcontext
 from dataclasses import replace
+from importlib.resources import files
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,10 +23,9 @@ from forcegp.model import Model
 from forcegp.posterior import Estimates
 from forcegp.robots import Robot
 from forcegp.robots.urdf_file import replace_inertial
-from forcegp.simulation import FreeArmConfig
-from forcegp.simulation.free_arms import ARMS, simulate_free_arm
 
-TEXT = simulate_free_arm(FreeArmConfig(arm="ur5-free", seconds=0.1)).model.robot.with_armature([0.0] * 6).urdf_text
+TEXT = files("forcegp.simulation").joinpath("ur5.urdf").read_text()
+MIDDLE = np.array([0.0, -1.2, 1.4, -0.8, -1.5, 0.0])
 ROBOT = Robot.from_urdf_text(TEXT)
 MASS, CENTER, INERTIA = 1.3, np.array([0.03, -0.02, 0.06]), np.diag([2e-3, 3e-3, 1e-3])
 ROTORS = 0.01 * np.array([joint.effort_limit for joint in ROBOT.joints])
@@ -36,7 +36,7 @@ def log(text, seed, *, seconds=30.0, noise=0.0, friction=1.0):
     rng, time = np.random.default_rng(seed), np.arange(0.0, seconds, 0.02)
     size, w, phase = rng.uniform(0.2, 0.5, (3, 6)), rng.uniform(0.5, 3.0, (3, 6)), rng.uniform(0, 6.3, (3, 6))
     at = w * time[:, None, None] + phase
-    q = np.array(ARMS["ur5-free"][1]) + (size * np.sin(at)).sum(1)
+    q = MIDDLE + (size * np.sin(at)).sum(1)
     v, a = (size * w * np.cos(at)).sum(1), -(size * w**2 * np.sin(at)).sum(1)
     oracle = Oracle(text, ROBOT)
     dry = 2.0 * ROTORS * (1.0 + 0.5 * np.exp(-((v / 0.1) ** 2))) * np.tanh(v / 0.02)
@@ -76,7 +76,7 @@ def postures(seed, count, rows=100):
     """Rests of two seconds, in which gears bear up to their breakaway, as they came: the same while they stand."""
     rng, text = np.random.default_rng(seed), loaded()
     oracle, rest, time = Oracle(text, ROBOT), np.repeat(np.arange(count), rows), 0.02 * np.arange(count * rows)
-    at = np.array(ARMS["ur5-free"][1]) + rng.uniform(-1.0, 1.0, (count, 6))
+    at = MIDDLE + rng.uniform(-1.0, 1.0, (count, 6))
     stuck = 2.0 * ROTORS * rng.choice([-1.0, 1.0], (count, 6)) * rng.uniform(0.7, 1.0, (count, 6))
     none = np.zeros(6)
     u = np.array([oracle.inverse_dynamics(q, none, none) for q in at]) + stuck

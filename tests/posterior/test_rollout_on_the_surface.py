@@ -15,7 +15,6 @@ DT, STARTS = 1 / 240, (0, 100, 200, 300)
 
 @pytest.fixture(scope="module")
 def posterior():
-    pytest.importorskip("pybullet")
     train = simulate_kuka_surface(KukaSurfaceConfig(seconds=8, seed=31))
     return fit(
         train.model.with_forces(JointForces()), train, points=60, restarts=1, options=OptimizerOptions(iterations=30)

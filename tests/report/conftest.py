@@ -2,18 +2,18 @@
 
 import pytest
 from tests.posterior.arm import arm_data, arm_model
+from tests.simulation.pendulum import double_pendulum
 
 from forcegp import JointForces, JointFriction, Viscous, fit, score
 from forcegp.inference import OptimizerOptions
 from forcegp.report import model_page, scores_sentence, scores_table
-from forcegp.simulation import FreeArmConfig, simulate_free_arm
 
 QUICK = OptimizerOptions(iterations=10)
 
 
 @pytest.fixture(scope="session")
 def swinging():
-    return simulate_free_arm(FreeArmConfig(arm="double-pendulum", seconds=4.0, seed=1))
+    return double_pendulum(4.0, seed=1)
 
 
 @pytest.fixture(scope="session")

@@ -1,12 +1,10 @@
 """URDFs that between them hold every kind of joint and link, for tests of any package."""
 
-from pathlib import Path
-
 import numpy as np
-import pytest
 
 from forcegp.robots import Robot
 from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia
+from forcegp.simulation import kuka_file
 
 # Branches at two depths, joints scattered over the file, names not in alphabetical order, links fixed to moving links
 # with inertias at turned origins, massless frames, a base that is offset from the root link.
@@ -83,9 +81,8 @@ CHAIN = """<robot name="chain">
 
 
 def iiwa() -> str:
-    """The KUKA LBR iiwa of `pybullet_data`; skips the test where PyBullet is not installed."""
-    data = pytest.importorskip("pybullet_data")
-    return (Path(data.getDataPath()) / "kuka_iiwa" / "model.urdf").read_text(encoding="utf-8")
+    """The KUKA LBR iiwa with meshes."""
+    return kuka_file().read_text(encoding="utf-8")
 
 
 MODELS = {"iiwa": iiwa, "tree": lambda: TREE, "chain": lambda: CHAIN}

@@ -56,6 +56,14 @@ def test_values_equal_those_of_the_robot(robot, compiled, method):
     torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("shape", [(3,), (5, 6, 3)])
+def test_motions_of_a_point_equal_those_of_the_robot(robot, compiled, shape):
+    state = random(*shape), random(*shape, seed=1)
+    for frame, point in (("a_foot", (0.1, 0.0, 0.2)), ("a_foot", (0.1, 0.0, 0.3)), ("a_thigh", (0.1, 0.0, 0.2))):
+        ours, theirs = (of.frame_motion(*state, frame, point) for of in (compiled, robot))
+        torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-12)
+
+
 @pytest.mark.parametrize(("lanes", "statements"), [(1, 500), (2, 500), (8, 500), (4, 40), (4, 10**6)])
 def test_other_widths_of_vector_registers_and_parts(robot, tmp_path, lanes, statements):
     """What is written for other processors runs here, too, only slower; parts of any length do the same."""

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.image import imread
 
 from forcegp.errors import InvalidInput
-from forcegp.scores import prediction_figure, save_figure
+from forcegp.scores import normal_force_figure, save_figure
 from forcegp.scores.figures.style import new_figure, plain_ticks, short_joint_names, window
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -15,8 +15,8 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 def test_a_file_is_a_picture_and_no_global_state_of_pyplot_is_touched(posterior, test_data, tmp_path):
     sys.modules.pop("matplotlib.pyplot", None)  # examples that ran before in this process may have imported it
-    path = tmp_path / "prediction.png"
-    save_figure(prediction_figure(posterior, test_data), path)
+    path = tmp_path / "force.png"
+    save_figure(normal_force_figure(posterior, test_data), path)
     assert path.read_bytes().startswith(PNG)
     picture = imread(path)
     assert min(picture.shape[:2]) > 300

@@ -16,14 +16,13 @@ from forcegp import Noise, score
 from forcegp.data.views import BLOCK
 from forcegp.errors import InvalidInput
 from forcegp.fit import fit
-from forcegp.forces import ContactFriction, JointForces, JointFriction, Rotor, ToolForces
+from forcegp.forces import ContactFriction, JointFriction, Rotor
 from forcegp.model import Model
 from forcegp.progress import watched
 from forcegp.scores.accuracy import (
     LEVELS,
     force_errors,
     mass_matrices,
-    normal_force_rests_on_prior,
     predict_rows,
     row_scores,
 )
@@ -209,29 +208,3 @@ def data():
 @pytest.fixture(scope="module")
 def friction():
     return fitted(JointFriction(), ContactFriction(kernel="linear"))
-
-
-@pytest.mark.parametrize(
-    ("forces", "rests"),
-    [
-        ((JointForces(), JointFriction()), True),
-        ((ToolForces(frame="hand", point=(0.0, 0.0, 0.2), axes="world"),), True),
-        ((ToolForces(),), False),
-        ((JointFriction(), ContactFriction()), False),
-        ((), False),
-    ],
-    ids=str,
-)
-def test_only_a_force_that_is_free_along_the_normal_rests_on_the_prior(forces, rests):
-    assert normal_force_rests_on_prior(fitted(*forces, points=15, iterations=1)) is rests
-
-
-def test_a_force_that_rests_on_the_prior_may_be_anything_and_accelerations_stay(data, without_contact):
-    """The criterion against its meaning: add a function times A^T to the joint forces, and only lambda changes."""
-    states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
-    dynamics = data.model.dynamics(*states)
-    pressing = 7.0 * torch.cos(states[0][:, :1]) * dynamics.A[:, 0]
-    zero = torch.zeros_like(pressing)
-    torch.testing.assert_close(dynamics.acceleration(pressing), dynamics.acceleration(zero), rtol=0.0, atol=1e-9)
-    assert (dynamics.multiplier(pressing) - dynamics.multiplier(zero)).abs().min() > 1.0
-    assert not normal_force_rests_on_prior(without_contact), "without contacts there is none"

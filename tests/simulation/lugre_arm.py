@@ -6,16 +6,15 @@ torques are logged a little before they act.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import mujoco
 import numpy as np
-import pybullet_data
 from scipy.interpolate import CubicSpline
 
 from forcegp import Dataset, Model, Robot
+from forcegp.simulation import kuka_file
 
-URDF = Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"
+URDF = kuka_file()
 STEP, SUBSTEPS = 1e-3, 4
 MIDDLE = np.array([0.0, 0.3, 0.0, -0.9, 0.0, 0.6, 0.0])
 REACH = 0.6 * np.array([2.2, 1.6, 2.2, 1.6, 2.2, 1.6, 2.2])

@@ -3,7 +3,6 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from benchmarks.plants import OF_PLANTS, JointFrictionLaw, PlantConfig
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
@@ -14,8 +13,7 @@ from forcegp.forces.force import Coefficient
 from forcegp.forces.joint_law import JointLaw
 from forcegp.forces.registry import FORCES
 from forcegp.simulation import KukaSurfaceConfig
-from forcegp.simulation.free_arms import LawsOfJoints
-from forcegp.simulation.kuka_surface import PointFriction, multiplier_with_friction
+from forcegp.simulation.kuka_surface import PointFriction, joint_friction_of, multiplier_with_friction
 
 STRIBECK = PointFriction(coulomb=0.3, static=0.5, breakaway_velocity=0.1, smoothing=1e-6)
 ROBOT = Robot.from_urdf_text(
@@ -43,11 +41,8 @@ def test_dry_friction_at_speeds_known_by_hand():
 
 def test_joint_friction_at_values_known_by_hand():
     law = joint_law("stribeck", joint_smoothing=1e-6)
-    np.testing.assert_allclose(law.curve(v := np.full(7, 0.2)), C + (S - C) / np.e + D * v, atol=1e-12)
-    np.testing.assert_allclose(law.curve(np.full((1, 7), -10.0)), [-C - 10.0 * D], atol=1e-12)
-    np.testing.assert_array_equal(law.step(v, U, INERTIA, 3.0), -law.curve(v))
-    law = joint_law("exponential", joint_smoothing=1e-6, joint_breakaway_velocity=0.5)
-    np.testing.assert_allclose(law.curve(np.full(7, -1.0)), -(C + (S - C) * np.exp(-2.0) + D), atol=1e-12)
+    np.testing.assert_allclose(law(v := np.full(7, 0.2)), -(C + (S - C) / np.e + D * v), atol=1e-12)
+    np.testing.assert_allclose(law(np.full((1, 7), -10.0)), [C + 10.0 * D], atol=1e-12)
 
 
 @given(velocity=vectors, normal=vectors, smoothing=st.floats(1e-3, 1.0))
@@ -62,16 +57,15 @@ def test_friction_takes_energy_and_dry_friction_is_tangential_with_its_coefficie
     speed = np.linalg.norm(velocity - (velocity @ normal) * normal)
     assert np.linalg.norm(force) == pytest.approx(float(dry.coefficient(np.array(speed))), abs=1e-11)
     v = np.resize(velocity, 7)
-    for name in ("coulomb", "stribeck", *OF_PLANTS[:3], "drift"):
-        assert (joint_law(name, joint_smoothing=smoothing).step(v, U, INERTIA, 1.0) * v <= 0.0).all()
+    for name in ("coulomb", "stribeck"):
+        assert (joint_law(name, joint_smoothing=smoothing)(v) * v <= 0.0).all()
 
 
-def joint_law(name: str, **changes) -> JointFrictionLaw:
-    return JointFrictionLaw(PlantConfig(joint_friction=name, **changes), ROBOT)
+def joint_law(name: str, **changes):
+    return joint_friction_of(KukaSurfaceConfig(joint_friction=name, **changes), ROBOT)
 
 
 C, S, D = (np.array(getattr(KukaSurfaceConfig(), f"joint_{name}")) for name in ("coulomb", "static", "viscous"))
-U, INERTIA, DT = np.linspace(-30.0, 40.0, 7), np.diag(np.linspace(2.0, 0.1, 7)), KukaSurfaceConfig().time_step
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,11 +82,9 @@ class Quadratic(JointLaw):
 def test_a_law_of_ones_own_acts_in_plants(monkeypatch):
     monkeypatch.setitem(FORCES, "quadratic", Quadratic)
     v = np.linspace(-1.0, 1.0, 7)
-    np.testing.assert_allclose(joint_law("quadratic").step(v, U, INERTIA, 0.0), -0.3 * np.abs(v) * v - D * v)
+    np.testing.assert_allclose(joint_law("quadratic")(v), -0.3 * np.abs(v) * v - D * v)
     twice = joint_law("quadratic:drag=0.6,viscous:0")
-    np.testing.assert_allclose(twice.step(v, U, INERTIA, 0.0), -0.6 * np.abs(v) * v, atol=1e-14)
-    free = LawsOfJoints.named("quadratic", ROBOT, {"damping": 0.0})
-    np.testing.assert_allclose(free.slope(v), 0.6 * np.abs(v), atol=1e-5)
+    np.testing.assert_allclose(twice(v), -0.6 * np.abs(v) * v, atol=1e-14)
     with pytest.raises(InvalidInput, match="joint_friction is 'payload:l7'; give one of none"):
         joint_law("payload:l7")
 

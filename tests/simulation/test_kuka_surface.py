@@ -3,6 +3,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pinocchio as pin
 import pytest
 import torch
 from tests.data.samples import assert_equal
@@ -12,9 +13,7 @@ from forcegp.errors import InvalidInput, SimulationError
 from forcegp.mechanics import Plane
 from forcegp.robots import Robot
 from forcegp.simulation import KukaSurfaceConfig, simulate, simulate_kuka_surface
-from forcegp.simulation.kuka_surface import TOOL_LINK, kuka_urdf
-
-pytest.importorskip("pybullet")
+from forcegp.simulation.kuka_surface import TOOL_LINK, kuka_file, kuka_robot
 
 SHORT = KukaSurfaceConfig(seconds=1.0, settle_seconds=1.0, seed=5)
 """Long enough to touch the surface, short enough to repeat."""
@@ -72,6 +71,29 @@ def test_rows_follow_each_other_by_symplectic_euler(data):
 def test_limits_of_torque_are_kept(data):
     limits = np.array([320, 320, 176, 176, 110, 40, 40])
     assert (np.abs(data.u + 0.5 * data.v) <= limits).all()
+
+
+def test_a_step_is_the_acceleration_of_pinocchio(data):
+    model = pin.buildModelFromXML(data.model.robot.urdf_text)
+    model.gravity.linear = np.array([0.0, 0.0, -9.8])
+    q, v, u, a, unknown, multiplier = tensors(data, "q", "v", "u", "a", "Q_U", "lambda")
+    forces = (u + unknown + (data.model.dynamics(q, v, u).A.mT @ multiplier[..., None])[..., 0]).numpy()
+    for row in range(0, len(data), 60):
+        expected = pin.aba(model, model.createData(), data.q[row], data.v[row], forces[row])
+        np.testing.assert_allclose(a[row], expected, rtol=1e-9, atol=1e-8)
+
+
+def test_the_robot_is_the_original_with_another_tool_and_no_files():
+    original, changed = Robot.from_urdf(kuka_file()), kuka_robot(KukaSurfaceConfig(tool_mass=3.5))
+    assert changed.joints == original.joints
+    kept = [f"lbr_iiwa_link_{number}" for number in range(1, 7)]
+    assert all(changed.link(name) == original.link(name) for name in kept)
+    tool = changed.link(TOOL_LINK)
+    assert (tool.mass, tool.center_of_mass) == (3.5, (0.0, 0.0, 0.02))
+    np.testing.assert_allclose(tool.inertia, np.diag([0.005, 0.0036, 0.0047]))
+    assert "mesh" not in changed.urdf_text.partition("<robot")[2]
+    for text in (changed.urdf_text, kuka_file().read_text()):
+        assert "THIS SOFTWARE IS PROVIDED BY THE COPYRIGHT HOLDERS" in text
 
 
 # ---------------------------------------------------------------- the Dataset
@@ -180,7 +202,7 @@ def test_listing_scenarios_and_their_options_loads_no_library():
         "print(*{name.partition('.')[0] for name in sys.modules})"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not {"numpy", "torch", "h5py", "pybullet"} & set(run.stdout.split())
+    assert not {"numpy", "torch", "h5py"} & set(run.stdout.split())
 
 
 # ---------------------------------------------------------------- the paper's data
@@ -193,7 +215,7 @@ def paper(shared) -> dict[str, np.ndarray]:
 
 
 def test_the_robot_of_the_scenario_is_the_papers(paper, data):
-    robot = Robot.from_urdf_text(kuka_urdf(KukaSurfaceConfig()), gravity=(0.0, 0.0, -9.8))
+    robot = kuka_robot(KukaSurfaceConfig())
     q, v, u = (torch.tensor(paper[f"test_{name}"]) for name in "qvu")
     np.testing.assert_allclose(robot.mass_matrix(q), paper["test_M"], atol=1e-9)
     np.testing.assert_allclose(robot.bias_forces(q, v), -paper["test_f"] - paper["test_g"], atol=1e-9)

@@ -210,10 +210,6 @@ def write_estimates(folder: Path, posterior: Any, name: str = "identified") -> N
     estimates, known = posterior.estimates, identified_system(posterior.model)
     write_json(folder / "estimates.json", estimates.to_dict())
     write_text(folder / SYSTEM_FILE, known.to_json() + "\n")
-    if estimates.by_body:  # a URDF has no place for intervals
-        held = "; ".join(f"{link}: {count}" for link, count in estimates.by_body.items())
-        note = f"of each body's ten inertial directions the log holds nothing of: {held}"
-        known = known.with_robot(known.robot.with_note(note))
     known.to_urdf(folder / f"{name}.urdf")
 
 

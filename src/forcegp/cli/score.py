@@ -61,7 +61,7 @@ class Score(Command):
     starts: Annotated[int, arg(metavar="N")] = 10
     """Motions from every held-out stretch of time."""
     integrator: Annotated[str, arg(metavar="NAME")] = "rk4"
-    """How motions are predicted: rk4, symplectic-euler (as PyBullet), implicit-midpoint (stiff friction)."""
+    """How motions are predicted: rk4, symplectic-euler (as kuka-surface), implicit-midpoint (stiff friction)."""
     observe: Annotated[float, arg(metavar="S")] = 0.0
     """Seconds at the beginning of LOG that a RUN learns from, as a robot at work could; the rest is scored."""
     system: Literal["model", "data"] = "model"

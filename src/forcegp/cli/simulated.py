@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import time
@@ -26,9 +25,9 @@ from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 from forcegp.parallel import checked_jobs
 
-Scenario = Literal["kuka-surface", "ur5-free", "double-pendulum", "quadruped", "quadrotor"]
+Scenario = Literal["kuka-surface", "quadruped", "quadrotor"]
 TOOL_FRICTION = arg(metavar="LAW[:COEFFICIENT]", help_behavior_hint="(default: viscous)")
-JOINT_FRICTION = arg(metavar="LAW,...", help_behavior_hint="(default: none; dry with more near rest for free arms)")
+JOINT_FRICTION = arg(metavar="LAW,...", help_behavior_hint="(default: none; of quadruped stribeck)")
 OF_THE_TOOL = ("tool_friction", "surface")  # options of the scenario that has a tool
 
 
@@ -36,20 +35,20 @@ OF_THE_TOOL = ("tool_friction", "surface")  # options of the scenario that has a
 class Simulate(Command):
     """Simulate a robot and write what it measured, with the ground truth, to one file.
 
-    kuka-surface: a KUKA iiwa slides its tool on a surface with unmodelled friction, as in Rath, Geist, Trimpe (2021).
-    ur5-free, double-pendulum: arms that touch nothing, with dry friction in every joint, without PyBullet. quadruped: a
-    robot on a floating base that shifts its weight and lifts its feet, with an unknown load of 2 kg. quadrotor: a drone
-    on a path in wind, with late rotors. Equal seeds give equal motions; train and test need different ones.
+    kuka-surface: a KUKA iiwa slides its tool on a surface with unmodelled friction, as in Rath, Geist, Trimpe (2021),
+    or moves above it. quadruped: a robot on a floating base that shifts its weight and lifts its feet, with an unknown
+    load of 2 kg. quadrotor: a drone on a path in wind, with late rotors. Equal seeds give equal motions; train and test
+    need different ones.
 
     For example:
       forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5
       forcegp simulate kuka-surface --tool-friction coulomb:.2 --joint-friction coulomb --out rough.h5
-      forcegp simulate double-pendulum --seconds 60 --joint-friction coulomb --out pendulum.h5
+      forcegp simulate kuka-surface --surface none --joint-friction stribeck --out free.h5
       forcegp simulate quadrotor --seconds 60 --seed 1 --wind 4 --out drone.h5
     """
 
     scenario: Annotated[Positional[Scenario], arg(metavar="SCENARIO")]
-    """What to simulate: kuka-surface, ur5-free, double-pendulum, quadruped or quadrotor."""
+    """What to simulate: kuka-surface, quadruped or quadrotor."""
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write (HDF5)."""
     seconds: Annotated[float, arg(metavar="S")] = 200.0
@@ -63,8 +62,8 @@ class Simulate(Command):
     of the normal force while it slides."""
     joint_friction: Annotated[str | None, JOINT_FRICTION] = None
     """Unmodelled friction of the joints: none, or viscous and laws by name, as for --forces."""
-    surface: Literal["plane", "tilted", "sphere", "none"] = "plane"
-    """What the tool slides on: a plane, one tilted by 10 degrees, the top of a sphere of 1.2 m, or nothing."""
+    surface: Literal["plane", "tilted", "none"] = "plane"
+    """What the tool slides on: a plane, one tilted by 10 degrees, or nothing."""
     wind: Annotated[float | None, unless_given("M/S", "4; only of quadrotor", float)] = None
     """Mean wind of a quadrotor in m/s, from a random side, with gusts."""
 
@@ -110,24 +109,9 @@ class Simulate(Command):
 
 
 def simulate_with_progress(terminal: Terminal, scenario: str, **options: Any) -> forcegp.Dataset:
-    """Run a scenario with a progress bar. Raises InvalidInput for bad options, MissingExtra without PyBullet."""
-    if scenario == "kuka-surface":
-        _import_silently("pybullet")
+    """Run a scenario with a progress bar. Raises InvalidInput for bad options."""
     with terminal.progress(f"simulating seed {options['seed']}"):
         return forcegp.simulation.simulate(scenario, **options)
-
-
-def _import_silently(name: str) -> None:
-    """PyBullet announces the time of its build on the process's stderr, which would stand between our own lines."""
-    stderr = os.dup(2)
-    with open(os.devnull, "wb") as nothing:  # noqa: PTH123  # a device, not a path
-        os.dup2(nothing.fileno(), 2)
-    try:
-        with contextlib.suppress(ImportError):  # the error of the simulation names what to install
-            __import__(name)
-    finally:
-        os.dup2(stderr, 2)
-        os.close(stderr)
 
 
 NOISE = 0.1  # rad/s^2, as in the paper

@@ -228,7 +228,7 @@ class ContactMonitor:
     def _residuals(
         self, q: Any, v: Any, u: Any, settle: int = 0
     ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor]:
-        """As `_torques`, filtered (T - 1 - settle, nv), the velocities in the middle of all steps, and M a, filtered."""
+        """As `_torques`, filtered (T - 1 - settle, nv); velocities in the middle of all steps; and M a, filtered."""
         q, v, u = self._motion(q, v, u)
         if q.dim() != 2 or len(q) < 2:
             raise InvalidInput(

@@ -237,10 +237,6 @@ class Read:
                       axis=0)  # fmt: skip
 
 
-MOST_WHOLE = 0.5
-"""Of the rows of a table: where more have all columns, the others were lost, and no topics stand side by side."""
-
-
 def read_on_one_clock(source: Source, plan: SignalPlan) -> Read:
     """The columns of a plan, all at the messages of the topic of its time; of a sparse table, of its positions.
 

@@ -1,5 +1,6 @@
 """The dynamics of one robot as machine code: what torch computes, traced into scalars, and `CompiledRobot`."""
 
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from forcegp.robots.kinematics import NOT_POSITIVE_DEFINITE, Kinematics
 from forcegp.robots.structure import RigidBodyDynamics, RobotStructure
 
 INSTEAD = "use the robot itself (compiled.robot), whose results are the same"
-# Arguments of each function, and the shapes of its results in joints.
+# Arguments of each function, and the shapes of its results, of which that of none is (nv,).
 ARGUMENTS = {
     "mass_matrix": ("q",),
     "bias_forces": ("q", "v"),
@@ -24,12 +25,18 @@ ARGUMENTS = {
     "gravity_forces": ("q",),
     "inverse_dynamics": ("q", "v", "a"),
     "forward_dynamics": ("q", "v", "tau"),
+    "frame_motion": ("q", "v"),
 }
-DIMENSIONS = {"mass_matrix": (2,), "mass_matrix_and_bias": (2, 1)}
 
 
-def trace_dynamics(robot: RobotStructure, function: str) -> Program:
-    """Write a function of the robot down."""
+def shapes_of(function: str, nv: int) -> tuple[tuple[int, ...], ...]:
+    """Of the results of a function at one state."""
+    held = {"mass_matrix": ((nv, nv),), "mass_matrix_and_bias": ((nv, nv), (nv,))}
+    return {**held, "frame_motion": ((4, 4), (6, nv), (6,))}.get(function, ((nv,),))
+
+
+def trace_dynamics(robot: RobotStructure, function: str, *place: Any) -> Program:
+    """Write a function of the robot down, that of a frame at its `place`: a name and a point."""
     sizes = {name: robot.nq if name == "q" else robot.nv for name in ARGUMENTS[function]}
 
     def results(q: Tensor, *others: Tensor) -> list[Tensor]:
@@ -41,7 +48,7 @@ def trace_dynamics(robot: RobotStructure, function: str) -> Program:
             x = torch.linalg.solve_triangular(L, net[..., None], upper=False)
             x = torch.linalg.solve_triangular(L.mT.flip(-1, -2), x.flip(-2), upper=False)
             return [x, L.diagonal(dim1=-2, dim2=-1)]
-        found = at.inverse_dynamics(others[1]) if len(others) > 1 else getattr(at, function)()
+        found = at.inverse_dynamics(others[1]) if len(others) > 1 else getattr(at, function)(*place)
         return [*found] if isinstance(found, tuple) else [found]
 
     examples = [torch.full((1, size), 0.5, dtype=torch.float64) for size in sizes.values()]
@@ -69,7 +76,7 @@ class CompiledRobot(RigidBodyDynamics):
         self.robot = robot
         self.folder = default_folder() if folder is None else Path(folder).expanduser()
         self._nv, self._space = robot.nv, robot.space
-        self._programs: dict[str, RowFunction] = {}
+        self._programs: dict[tuple[Any, ...], RowFunction] = {}
 
     def __reduce__(self) -> "tuple[type[CompiledRobot], tuple[RobotStructure, Path]]":
         return CompiledRobot, (self.robot, self.folder)
@@ -77,24 +84,26 @@ class CompiledRobot(RigidBodyDynamics):
     def __repr__(self) -> str:
         return f"CompiledRobot({self.robot!r}, folder={str(self.folder)!r})"
 
-    def program(self, function: str) -> RowFunction:
-        """The machine code of a function."""
-        if function not in self._programs:
+    def program(self, function: str, *place: Any) -> RowFunction:
+        """The machine code of a function, or of one of a frame."""
+        if (function, *place) not in self._programs:
             robot = self.robot
 
             def write(lanes: int) -> str:
-                return write_program(trace_dynamics(robot, function), lanes)
+                return write_program(trace_dynamics(robot, function, *place), lanes)
 
             constants = [x.tolist() if isinstance(x, Tensor) else x for x in vars(robot.tree).values()]
             name = f"{robot.name[:40]}-{function}"
-            library = load_library(name, f"{constants!r}\0{function}", write, folder=self.folder)
-            outputs = [self._nv**d for d in DIMENSIONS.get(function, (1,))]
-            self._programs[function] = RowFunction(library, len(ARGUMENTS[function]), outputs)
-        return self._programs[function]
+            constants += [(body, offset.tolist()) for body, offset in map(robot.frame, place[:1])]
+            library = load_library(name, f"{constants!r}{place[1:]}\0{function}", write, folder=self.folder)
+            outputs = [prod(shape) for shape in shapes_of(function, self._nv)]
+            self._programs[function, *place] = RowFunction(library, len(ARGUMENTS[function]), outputs)
+        return self._programs[function, *place]
 
     @override
-    def _dynamics(self, function: str, *arguments: Tensor) -> Any:
-        nv, space, given, names = self._nv, self._space, list(arguments), ARGUMENTS[function]
+    def _dynamics(self, function: str, *arguments: Any) -> Any:
+        nv, space, names = self._nv, self._space, ARGUMENTS[function]
+        given, place = list(arguments[: len(names)]), arguments[len(names) :]
         plain = not space.groups and are_plain(given, nv)
         if space.groups and are_plain(given[:1], space.nq) and are_plain(given[1:], nv):  # q has entries of its own
             plain = all(x.shape[:-1] == given[0].shape[:-1] for x in given)
@@ -104,7 +113,7 @@ class CompiledRobot(RigidBodyDynamics):
             if torch.is_grad_enabled() and any(value.requires_grad for value in given):
                 raise InvalidInput(f"compiled dynamics has no derivatives; {INSTEAD}.")
         require_plain(given, "compiled dynamics", INSTEAD)
-        batch, program = given[0].shape[:-1], self.program(function)
+        batch, program = given[0].shape[:-1], self.program(function, *place)
         if plain and not batch:
             bits, results = program.single(*given)
         else:
@@ -115,6 +124,6 @@ class CompiledRobot(RigidBodyDynamics):
             bits = program.rows(batch.numel(), given, results)
         if bits & NOT_POSITIVE:
             raise NumericalError(NOT_POSITIVE_DEFINITE)
-        made = zip(results, DIMENSIONS.get(function, (1,)), strict=True)
-        found = [x if d == len(batch) == 1 else x.view(*batch, *(nv,) * d) for x, d in made]
+        made = zip(results, shapes_of(function, nv), strict=True)
+        found = [x if len(shape) == len(batch) == 1 else x.view(*batch, *shape) for x, shape in made]
         return found[0] if len(found) == 1 else tuple(found)

@@ -243,6 +243,10 @@ class Kinematics:
         angular = 0.5 * (self.robot.tree.twist_basis[:, :3].mT @ accelerations[body].flatten(0, 1))
         return self._rows(torch.cat([linear, angular]).mT)
 
+    def frame_motion(self, frame: str, point: Vector) -> tuple[Tensor, Tensor, Tensor]:
+        """Pose of a frame, and Jacobian and bias acceleration of a point of it."""
+        return self.frame_pose(frame), self.frame_jacobian(frame, point), self.frame_bias_acceleration(frame, point)
+
     def _rows(self, values: Tensor) -> Tensor:
         """Give values (batch, ...) their batch dimensions back."""
         return values.reshape(*self.batch_shape, *values.shape[1:])

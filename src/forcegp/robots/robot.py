@@ -42,7 +42,6 @@ from forcegp.robots.urdf_file import (
     with_chosen_inertias,
     with_joint_values,
     with_limits,
-    with_note,
     write_text,
 )
 
@@ -250,10 +249,6 @@ class Robot(RobotStructure, RigidBodyDynamics):
         given = {name: value.tolist() for name, value in values.items() if value is not None}
         return self.with_text(with_joint_values(self.urdf_text, self.layout, given, source=self.source))
 
-    def with_note(self, note: str) -> "Robot":
-        """The same robot, whose URDF text ends with this comment."""
-        return self.with_text(with_note(self.urdf_text, note))
-
     def to_urdf(self, path: str | Path | None = None) -> str:
         """The URDF text, written to ``path`` if given, with a RobotFileWarning about rotor inertias.
 
@@ -331,7 +326,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         return self.space.normalized(q).to(self.device)
 
     @override
-    def _dynamics(self, function: str, *arguments: Tensor) -> Any:
+    def _dynamics(self, function: str, *arguments: Any) -> Any:
         q, *others = arguments
         if len(others) == 2 and len({getattr(x, "shape", ())[:-1] for x in arguments}) > 1:
             names = "q", "v", "tau" if function == "forward_dynamics" else "a"

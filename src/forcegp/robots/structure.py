@@ -12,7 +12,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, NonPhysicalInertia, RobotModelError, UnknownName, require_known
-from forcegp.robots.arguments import JointValues, Positions, checked_tensor, usable_device
+from forcegp.robots.arguments import JointValues, Positions, Vector, checked_tensor, usable_device
 from forcegp.robots.inertia import axis_inertia_vanishes, pseudo_inertia, skew, turns_with_inertia
 from forcegp.robots.layout import BASE, WORLD, BaseChoice, Layout
 from forcegp.robots.manifold import ConfigurationSpace, Group, pose
@@ -148,7 +148,7 @@ class RigidBodyDynamics(ABC):
     """The dynamics of a robot, however they are computed."""
 
     @abstractmethod
-    def _dynamics(self, function: str, *arguments: Tensor) -> Any:
+    def _dynamics(self, function: str, *arguments: Any) -> Any:
         """What the method of that name returns."""
 
     def mass_matrix(self, q: Positions) -> Float[Tensor, "... nv nv"]:
@@ -176,6 +176,12 @@ class RigidBodyDynamics(ABC):
     def forward_dynamics(self, q: Positions, v: JointValues, tau: JointValues) -> Float[Tensor, "... nv"]:
         """Accelerations (..., nv) ``M^-1 (tau - bias)``. Raises NumericalError where M is not positive definite."""
         return self._dynamics("forward_dynamics", q, v, tau)
+
+    def frame_motion(
+        self, q: Positions, v: JointValues, frame: str, point: Vector
+    ) -> tuple[Float[Tensor, "... 4 4"], Float[Tensor, "... 6 nv"], Float[Tensor, "... 6"]]:
+        """Pose of a ``frame``, and Jacobian and ``Jdot v`` of a ``point`` (3,) fixed in it (m), as of `Kinematics`."""
+        return self._dynamics("frame_motion", q, v, frame, point)
 
 
 @dataclass(frozen=True)

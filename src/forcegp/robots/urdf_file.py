@@ -144,13 +144,6 @@ def with_limits(text: str) -> str:
     return _written(document) if lacking else text
 
 
-def with_note(text: str, note: str) -> str:
-    """URDF text with a comment before its last tag."""
-    document = _document(text)
-    document.documentElement.appendChild(document.createComment(f" {note.replace('--', '- -')} "))
-    return _written(document)
-
-
 def _document(text: str) -> Any:
     return minidom.parseString(with_prefixes(text))
 

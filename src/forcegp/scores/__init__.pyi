@@ -2,7 +2,7 @@ from .accuracy import unfinished_search as unfinished_search
 from .figures.model import (
     contacts_figure as contacts_figure, curve_panels as curve_panels, friction_curves_figure as friction_curves_figure,
     model_pictures as model_pictures, normal_force_figure as normal_force_figure,
-    prediction_figure as prediction_figure, scores_pictures as scores_pictures,
+    scores_pictures as scores_pictures,
 )
 from .figures.style import Picture as Picture, save_figure as save_figure
 from .models import (

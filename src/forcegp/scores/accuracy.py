@@ -363,38 +363,6 @@ def poor_scores(posterior: Posterior, dataset: Dataset, table: Table) -> Iterato
         )
 
 
-STATES = 20  # training states that are looked at; each alone decides
-INVISIBLE = 1e-7
-"""Singular values of H B below this, relative to the largest one, are zero: accelerations show nothing there."""
-
-
-def normal_force_rests_on_prior(posterior: Posterior) -> bool:
-    """Whether processes of the model can press on a contact together without moving the robot.
-
-    True where, at some training state, processes of the same inputs have a combination f with H B f = 0 that changes
-    lambda: any function of those inputs may then be added to the normal force, and accelerations show nothing of it.
-    So it is for a free force at every joint, not for friction curves that each have an input of their own.
-    """
-    if not posterior.trained.contacts:
-        return False
-    training = posterior.training
-    q, v, u = (x[:STATES] for x in (training.q, training.v, training.u))
-    with torch.no_grad():
-        dynamics = posterior.trained.dynamics(q, v, u)
-        forces = posterior.trained.unknown
-        B, features = forces.direction(dynamics), forces.features(dynamics)
-        moving, pressing = dynamics.H @ B, dynamics.multiplier_map().matrix @ B
-        for z in features:
-            alike = [k for k, other in enumerate(features) if torch.equal(z, other)]
-            if (z == z[:1]).all():  # constant, also without any feature
-                alike = alike[:1]
-            here, there = moving[..., alike], pressing[..., alike]
-            unseen = torch.eye(len(alike)).to(B) - torch.linalg.pinv(here, rtol=INVISIBLE) @ here
-            if ((there @ unseen).abs().amax((-2, -1)) > INVISIBLE * there.abs().amax((-2, -1))).any():
-                return True
-    return False
-
-
 def overlaps(posterior: Posterior, dataset: Dataset) -> Iterator[Doubt]:
     """Rows that training and test share, and contacts that differ."""
     repeated = repeated_rows(tuple(getattr(posterior.training, name).cpu().numpy() for name in "qvu"), dataset)

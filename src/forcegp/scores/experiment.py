@@ -27,10 +27,8 @@ from forcegp.noise import Noise
 from forcegp.posterior import observing
 from forcegp.posterior.posterior import Posterior
 from forcegp.scores.accuracy import (
-    CONTACT_FORCE,
     Matrices,
     mass_matrices,
-    normal_force_rests_on_prior,
     overlaps,
     poor_scores,
     row_scores,
@@ -50,7 +48,6 @@ from forcegp.scores.models import (
 SHARE = 2 / 3  # of the training rows among which the points of one seed are chosen
 IDENTIFICATION, MODEL = "identification", "model"
 OBSERVED = "wind, and the force that stays unexplained, were observed from the rows before each."
-NORMAL_FORCES = "forces along the contact normal rest on the prior alone, since accelerations do not show them"
 
 
 def training_subset(train: Dataset, points: int, seed: int) -> Dataset:
@@ -267,5 +264,4 @@ def scored(
     doubts = [] if fitted_here else [*overlaps(alone, recorded), *contact_doubts(test, posterior.model)]
     doubts += [*unfinished_search(posterior), *rows_outside(posterior, test), *poor_scores(posterior, test, table)]
     told = [*map(str, doubts), *([] if posterior is alone else [OBSERVED])]
-    told += [NORMAL_FORCES] if CONTACT_FORCE in table and normal_force_rests_on_prior(alone) else []
     return {"table": table | moving, "stretches": stretches, "motions": facts, "warnings": told, "test_rows": len(test)}

@@ -1,9 +1,7 @@
 from .moving_bases import simulate_quadrotor as simulate_quadrotor, simulate_quadruped as simulate_quadruped
-from .free_arms import simulate_free_arm as simulate_free_arm
 from .kuka_surface import kuka_file as kuka_file
 from .kuka_surface import simulate_kuka_surface as simulate_kuka_surface
 from .scenarios import (
-    FreeArmConfig as FreeArmConfig,
     KukaSurfaceConfig as KukaSurfaceConfig,
     QuadrotorConfig as QuadrotorConfig,
     QuadrupedConfig as QuadrupedConfig,

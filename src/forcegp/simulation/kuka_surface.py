@@ -3,7 +3,6 @@
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +10,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from forcegp import __version__
 from forcegp.data import Dataset
 from forcegp.errors import MissingExtra, RobotModelError, SimulationError
 from forcegp.forces import Actuation, RigidBodies
@@ -20,22 +18,25 @@ from forcegp.mechanics import Baumgarte, Contact, Surface
 from forcegp.model import Model
 from forcegp.progress import part, tell
 from forcegp.robots import Robot
+from forcegp.robots.structure import RigidBodyDynamics
 from forcegp.robots.urdf import numbers
-from forcegp.simulation.free_arms import LawsOfJoints
+from forcegp.simulation.joint_friction import LawsOfJoints
 from forcegp.simulation.scenarios import KukaSurfaceConfig
 from forcegp.simulation.trajectory import (
     ArmState,
-    BulletArm,
+    compiled_plant,
     joint_acceleration,
+    middle_of,
     over_table,
     random_path,
     recorded,
-    table_height,
+    slope_of,
     table_of,
 )
 
 TOOL_LINK = "lbr_iiwa_link_7"
 BASE_LINK = "lbr_iiwa_link_0"
+BASE_HEIGHT = 0.05  # m, of the robot above the origin
 
 
 def kuka_file() -> Path:
@@ -74,7 +75,7 @@ def kuka_urdf(config: KukaSurfaceConfig) -> str:
     _write_inertial(base, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     joint = (
         f'<joint name="world_joint" type="fixed"><parent link="world"/><child link="{BASE_LINK}"/>'
-        f'<origin rpy="0 0 0" xyz="{numbers((0.0, 0.0, config.base_height))}"/></joint>'
+        f'<origin rpy="0 0 0" xyz="{numbers((0.0, 0.0, BASE_HEIGHT))}"/></joint>'
     )
     root[:0] = [ElementTree.Element("link", name="world"), ElementTree.fromstring(joint)]
     ElementTree.indent(root)
@@ -91,6 +92,12 @@ def _write_inertial(
         f'<inertial><origin rpy="0 0 0" xyz="{numbers(center_of_mass)}"/><mass value="{float(mass)}"/>'
         f'<inertia ixy="0" ixz="0" iyz="0" ixx="{ixx}" iyy="{iyy}" izz="{izz}"/></inertial>'
     )
+
+
+def kuka_robot(config: KukaSurfaceConfig) -> Robot:
+    """The arm on its base, with the tool of a scenario."""
+    down = (0.0, 0.0, -config.gravity)
+    return Robot.from_urdf_text(kuka_urdf(config), source="kuka-surface", gravity=down)
 
 
 @dataclass(frozen=True)
@@ -125,12 +132,16 @@ class PointFriction:
 
 
 class ContactForces(NamedTuple):
-    """What acted at the tool during a step: normal force [N], friction (3,) [N, world axes] and its joint torques."""
+    """What acts at the tool during a step: normal force [N], friction (3,) [N, world axes] and its joint torques.
+
+    `push` are the joint torques of all of it.
+    """
 
     multiplier: float
     tool_force: Float[np.ndarray, "3"]
     tool_torques: Float[np.ndarray, " nv"]
     in_contact: bool
+    push: Float[np.ndarray, " nv"]
 
 
 @dataclass
@@ -148,8 +159,8 @@ class IdealContact:
     zeta: float
     touched: bool = False
 
-    def step(self, arm: BulletArm, state: ArmState, applied: Float[np.ndarray, " nv"]) -> ContactForces:
-        """Advance the arm by one step under the torques of actuators and joint friction [Nm] and those of the table.
+    def forces(self, state: ArmState, applied: Float[np.ndarray, " nv"]) -> ContactForces:
+        """Those under the torques of actuators and joint friction [Nm].
 
         Raises SimulationError where friction is so strong that the normal force is not determined.
         """
@@ -157,8 +168,7 @@ class IdealContact:
         distance = float(self.table.value(point))
         self.touched = self.touched or distance <= 0.0
         if not self.touched or self.friction is None:
-            arm.step(applied)
-            return ContactForces(0.0, np.zeros(3), np.zeros_like(applied), False)
+            return ContactForces(0.0, np.zeros(3), np.zeros_like(applied), False, np.zeros_like(applied))
         normal = self.table.gradient(point).numpy()
         jacobian = state.jacobian[:3]
         velocity = jacobian @ state.v
@@ -171,8 +181,7 @@ class IdealContact:
         torques, per_load = jacobian.T @ viscous, jacobian.T @ per_newton
         multiplier = multiplier_with_friction(state.mass, applied - state.bias + torques, row, per_load, float(b))
         friction, torques = viscous + abs(multiplier) * per_newton, torques + abs(multiplier) * per_load
-        arm.step(applied + torques + multiplier * row)
-        return ContactForces(multiplier, friction, torques, True)
+        return ContactForces(multiplier, friction, torques, True, torques + multiplier * row)
 
 
 def multiplier_with_friction(
@@ -209,61 +218,56 @@ Motion = dict[str, np.ndarray]
 multiplier), and in_contact."""
 
 
-def simulate_episode(config: KukaSurfaceConfig, robot: Robot, urdf: str, episode: int) -> Motion:
-    """One continuous motion of the arm.
+def simulate_episode(config: KukaSurfaceConfig, robot: Robot, plant: RigidBodyDynamics, episode: int) -> Motion:
+    """One continuous motion of the arm: v' = v + dt M^-1 (tau - h), q' = q + dt v', without limits of its joints.
 
     Raises SimulationError if the motion diverges, never touches the surface, or meets a singular posture.
     """
     settle, steps = config.settle_steps, config.settle_steps + config.rows_per_episode
     limits, table = np.array(config.torque_limits), table_of(config)
-    laws, own = joint_friction_of(config, robot), config.own_laws.get(config.joint_friction)
-    own_law = own and own(config, robot)
+    laws = joint_friction_of(config, robot)
     columns: dict[str, np.ndarray] = {}
-    with BulletArm(urdf, gravity=config.gravity, time_step=config.time_step, tool_point=config.tool_point) as arm:
-        arm.reset(np.deg2rad(config.start_degrees), np.zeros(7))
-        law = None if config.surface == "none" else tool_friction_of(config)
-        contact = IdealContact(table, law, config.baumgarte_omega, config.baumgarte_zeta)
-        tool, duration = arm.tool(np.zeros(7))[0], steps * config.time_step
-        flat = tool - [0.0, 0.0, table_height(config, tool[None, :2])[0][0]]
-        path = random_path(config, flat, duration, np.random.default_rng([config.seed, episode, 0]))
-        reference = over_table(config, path.sample(config.time_step * np.arange(steps)))
-        for step in range(steps):
-            aim = reference[0][step], reference[1][step], reference[2][step]
-            q, v = arm.state()
-            _require_bounded(config, v, episode, step)
-            state = ArmState.of(arm, q, v)
-            try:
-                wanted = joint_acceleration(config, state, aim)
-            except np.linalg.LinAlgError as error:
-                raise SimulationError(
-                    f"episode {episode}: the arm is in a singular posture at {step * config.time_step:.3g} s. "
-                    "Start from another posture (start_degrees) or keep the way-points nearer."
-                ) from error
-            asked = state.mass @ wanted + state.bias + config.joint_damping * v
-            if config.pressing_force:
-                normal = table.gradient(torch.from_numpy(state.position)).numpy()
-                asked = asked - config.pressing_force * (normal @ state.jacobian[:3])
-            commanded = np.clip(asked, -limits, limits)
-            u = commanded - config.joint_damping * v
-            now = step * config.time_step
-            joint_torques = own_law(v, u, state.mass, now) if own_law else laws(v, u)
-            forces = contact.step(arm, state, u + joint_torques)
-            row = {"q": state.q, "v": v, "u": u, "joint_torques": joint_torques, **forces._asdict()}
-            if step == 0:
-                columns = {name: np.zeros((steps, *np.shape(x)), np.asarray(x).dtype) for name, x in row.items()}
-            for name, value in row.items():
-                columns[name][step] = value
-            if (step + 1) % STEPS_PER_REPORT == 0 or step + 1 == steps:
-                tell(step + 1, steps)
-        last_v = arm.state()[1]
-        _require_bounded(config, last_v, episode, steps)
+    q, v = np.deg2rad(config.start_degrees), np.zeros(robot.nv)
+    law = None if config.surface == "none" else tool_friction_of(config)
+    contact = IdealContact(table, law, config.baumgarte_omega, config.baumgarte_zeta)
+    tool, duration = ArmState.of(plant, TOOL_LINK, config.tool_point, q, v).position, steps * config.time_step
+    flat = tool - [0.0, 0.0, (tool - middle_of(config))[:2] @ slope_of(config)]
+    path = random_path(config, flat, duration, np.random.default_rng([config.seed, episode, 0]))
+    reference = over_table(config, path.sample(config.time_step * np.arange(steps)))
+    for step in range(steps):
+        aim = reference[0][step], reference[1][step], reference[2][step]
+        state = ArmState.of(plant, TOOL_LINK, config.tool_point, q, v)
+        try:
+            wanted = joint_acceleration(config, state, aim)
+        except np.linalg.LinAlgError as error:
+            raise SimulationError(
+                f"episode {episode}: the arm is in a singular posture at {step * config.time_step:.3g} s. "
+                "Start from another posture (start_degrees) or keep the way-points nearer."
+            ) from error
+        asked = state.mass @ wanted + state.bias + config.joint_damping * v
+        if config.pressing_force:
+            normal = table.gradient(torch.from_numpy(state.position)).numpy()
+            asked = asked - config.pressing_force * (normal @ state.jacobian[:3])
+        u = np.clip(asked, -limits, limits) - config.joint_damping * v
+        joint_torques = laws(v, u)
+        forces = contact.forces(state, u + joint_torques)
+        a = np.linalg.solve(state.mass, u + joint_torques + forces.push - state.bias)
+        row = {"q": q, "v": v, "u": u, "a": a, "joint_torques": joint_torques, **forces._asdict()}
+        if step == 0:
+            columns = {name: np.zeros((steps, *np.shape(x)), np.asarray(x).dtype) for name, x in row.items()}
+        for name, value in row.items():
+            columns[name][step] = value
+        v = v + config.time_step * a
+        q = q + config.time_step * v
+        _require_bounded(config, v, episode, step + 1)
+        if (step + 1) % STEPS_PER_REPORT == 0 or step + 1 == steps:
+            tell(step + 1, steps)
 
     if config.surface != "none" and not columns["in_contact"][: settle + 1].any():
         raise SimulationError(
             f"episode {episode}: no contact within settle_seconds = {config.settle_seconds:.3g} s. "
             "Give it more time, or a start posture nearer to the surface."
         )
-    columns["a"] = np.diff(columns["v"], axis=0, append=last_v[None]) / config.time_step
     columns["time"] = config.time_step * np.arange(steps)
     return {name: values[settle:] for name, values in columns.items()}
 
@@ -279,11 +283,10 @@ def tool_friction_of(config: KukaSurfaceConfig) -> PointFriction:
 
 def joint_friction_of(config: KukaSurfaceConfig, robot: Robot) -> LawsOfJoints:
     """The laws that `joint_friction` names, with the numbers of the scenario where it gives none."""
-    name = "none" if config.joint_friction in config.own_laws else config.joint_friction
     more = tuple(near - level for near, level in zip(config.joint_static, config.joint_coulomb, strict=True))
     numbers: dict[str, Any] = {"damping": config.joint_viscous, "level": config.joint_coulomb, "breakaway": more}
     numbers |= {"velocity_scale": config.joint_smoothing, "velocity": config.joint_breakaway_velocity}
-    return LawsOfJoints.named(name, robot, numbers)
+    return LawsOfJoints.named(config.joint_friction, robot, numbers)
 
 
 def _require_bounded(config: KukaSurfaceConfig, v: Float[np.ndarray, " nv"], episode: int, step: int) -> None:
@@ -300,15 +303,13 @@ def simulate_kuka_surface(config: KukaSurfaceConfig) -> Dataset:
     Row k holds the state `(q, v)` before step k, the torque `u` during it (commanded minus joint damping), and the
     acceleration of the step. So with the true "a", "lambda" and "Q_U", `M(q) a + bias(q, v) = u + Q_U + A^T lambda` and
     `A a = b` in every row. The approach (`settle_seconds`) is left out. Equal `seed` and episode number give equal
-    motion, whatever `noise`, `seconds` and `episodes` are. Raises MissingExtra without PyBullet, and SimulationError as
-    `simulate_episode`.
+    motion, whatever `noise`, `seconds` and `episodes` are. Raises SimulationError as `simulate_episode`.
     """
-    urdf = kuka_urdf(config)
-    robot = Robot.from_urdf_text(urdf, source="kuka-surface", gravity=(0.0, 0.0, -config.gravity))
-    motions = []
+    robot, motions = kuka_robot(config), []
+    plant = compiled_plant(robot)
     for episode in range(config.episodes):
         with part(episode, config.episodes):
-            motions.append(simulate_episode(config, robot, urdf, episode))
+            motions.append(simulate_episode(config, robot, plant, episode))
     return _dataset(config, robot, motions)
 
 
@@ -337,6 +338,5 @@ def _dataset(config: KukaSurfaceConfig, robot: Robot, motions: list[Motion]) -> 
         return np.concatenate([motion[name] for motion in motions])
 
     signals = {name: column(name) for name in ("q", "v", "u", "a", "time")}
-    versions = {"forcegp": __version__, "pybullet": version("pybullet"), "numpy": np.__version__}
-    more = {"u": "commanded torque minus joint damping", "versions": versions}
+    more = {"u": "commanded torque minus joint damping"}
     return recorded("kuka-surface", config, _model(config, robot), signals, _truth(config, column), more)

@@ -21,7 +21,7 @@ from forcegp.model import Model
 from forcegp.progress import tell
 from forcegp.robots import Robot
 from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia
-from forcegp.simulation.free_arms import LawsOfJoints
+from forcegp.simulation.joint_friction import LawsOfJoints
 from forcegp.simulation.scenarios import QuadrotorConfig, QuadrupedConfig
 from forcegp.simulation.trajectory import RATE, recorded
 

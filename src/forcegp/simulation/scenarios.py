@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from types import MappingProxyType
@@ -22,15 +22,15 @@ POSITIVE: Range = ("finite and > 0", 1e-12, 1e9)
 NOT_NEGATIVE: Range = ("finite and >= 0", 0.0, 1e9)
 
 
-def require_joint_friction(name: Any, more: Sequence[str] = ()) -> None:
-    """Raise InvalidInput for what is neither none, nor one of these, nor laws of joints."""
-    if name in ("none", *more):
+def require_joint_friction(name: Any) -> None:
+    """Raise InvalidInput for what is neither none nor laws of joints."""
+    if name == "none":
         return
     from forcegp.forces.joint_law import JointLaw  # torch, which lists of options do without
     from forcegp.forces.registry import FORCES, force_class, parse_forces
 
     laws = [each for each in FORCES if issubclass(force_class(each), JointLaw)]
-    allowed = f"joint_friction is {name!r}; give one of {', '.join(('none', *more, *laws))}"
+    allowed = f"joint_friction is {name!r}; give one of {', '.join(('none', *laws))}"
     try:
         known = isinstance(name, str) and all(isinstance(law, JointLaw) for law in parse_forces(name))
     except InvalidInput as error:
@@ -39,7 +39,7 @@ def require_joint_friction(name: Any, more: Sequence[str] = ()) -> None:
         raise InvalidInput(f"{allowed}.")
 
 
-Surface = Literal["plane", "tilted", "sphere", "none"]
+Surface = Literal["plane", "tilted", "none"]
 
 PRESS_FOR_DRY_FRICTION = 15.0  # N
 
@@ -79,8 +79,8 @@ class KukaSurfaceConfig(CommonConfig):
     time_step: float = 1.0 / 240.0  # s, of simulation, control and recording
     settle_seconds: float = 1000.0 / 240.0  # approach and first contact, left out as in the paper (its first 1000 rows)
     tool_mass: float = 2.0  # kg, of link 7 with its tool
-    # the plane z = surface_height; it tilted about the middle of the way-points' region; the top of a big sphere that
-    # touches it there; or none: free motion above. The contact is a bilateral constraint from the first touch on
+    # the plane z = surface_height; it tilted about the middle of the way-points' region; or none: free motion above.
+    # The contact is a bilateral constraint from the first touch on
     surface: Surface = "plane"
     # of the tool on the surface, the force that no model contains: viscous; or a law of dry friction of
     # `forcegp.forces` by name, which grows with the normal force, and near rest where it has a breakaway
@@ -100,7 +100,6 @@ class KukaSurfaceConfig(CommonConfig):
 
     # The constants of the scene, which nobody has to choose.
     gravity: ClassVar[float] = 9.8  # along -z
-    base_height: ClassVar[float] = 0.05  # of the robot above the origin
     tool_point: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.1)  # that touches the surface, in the link-7 frame
     tool_center_of_mass: ClassVar[Numbers] = (0.0, 0.0, 0.02)  # of link 7
     tool_inertia: ClassVar[Numbers] = (0.005, 0.0036, 0.0047)  # its principal moments about that
@@ -108,11 +107,9 @@ class KukaSurfaceConfig(CommonConfig):
     surface_height: ClassVar[float] = 0.055  # in the middle of the way-points' region
     tilt_degrees: ClassVar[float] = 10.0  # of the tilted plane, about a horizontal axis (x, y)
     tilt_axis: ClassVar[tuple[float, float]] = (0.0, 1.0)
-    sphere_radius: ClassVar[float] = 1.2
     joint_coulomb: ClassVar[Numbers] = (2.0, 2.0, 1.3, 1.3, 0.12, 0.12, 0.05)  # small where explicit steps oscillate
     joint_static: ClassVar[Numbers] = (3.0, 3.0, 2.0, 2.0, 0.2, 0.2, 0.08)  # near rest
     joint_viscous: ClassVar[Numbers] = (1.0, 1.0, 0.5, 0.5, 0.05, 0.05, 0.02)  # beyond `joint_damping`
-    own_laws: ClassVar[Mapping[str, Any]] = {}  # of subclasses: (config, robot) -> torques of (v, u, M, time)
     baumgarte_omega: ClassVar[float] = 10.0
     baumgarte_zeta: ClassVar[float] = 1.0
     start_degrees: ClassVar[Numbers] = (85, 50, -10, -100, -170, -25, -100)  # also the posture of the null space
@@ -137,7 +134,7 @@ class KukaSurfaceConfig(CommonConfig):
             from forcegp.forces.registry import dry_laws
 
             require_known("friction", self.friction, "the tool", ("viscous", *dry_laws()))
-        require_joint_friction(self.joint_friction, (*self.own_laws,))
+        require_joint_friction(self.joint_friction)
 
     @property
     def pressing_force(self) -> float:
@@ -176,29 +173,11 @@ _RANGES: dict[str, Range] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class FreeArmConfig(CommonConfig):
-    """PD control with gravity compensation along sines of random size and rate, two per joint, about a posture.
-
-    `joint_friction` names laws of `forcegp.forces`, or "none"; viscous friction comes with them. Numbers that the name
-    does not give are in proportion to the largest torque of a joint. `noise` in rad/s^2. Raises InvalidInput naming the
-    field and its range.
-    """
-
-    arm: Literal["ur5-free", "double-pendulum"]
-    joint_friction: str = "stribeck"
-
-    @usable_arguments("FreeArmConfig")
-    def __post_init__(self) -> None:
-        self._check()
-        require_joint_friction(self.joint_friction)
-        require_known("arm", self.arm, "forcegp simulate", ("ur5-free", "double-pendulum"))
-
-
-@dataclass(frozen=True, kw_only=True)
 class QuadrupedConfig(CommonConfig):
     """A robot that stands, shifts its weight and lifts its feet; `payload` in kg on its trunk is in no robot file.
 
-    With `lift` each foot in turn leaves the ground for a second. Friction as in `FreeArmConfig`, equal in all joints.
+    With `lift` each foot in turn leaves the ground for a second. `joint_friction` names laws of `forcegp.forces`, or
+    "none", equal in all joints; viscous friction comes with them.
     `noise` in rad/s^2 and m/s^2. Raises InvalidInput naming the field and its range.
     """
 
@@ -229,12 +208,9 @@ class QuadrotorConfig(CommonConfig):
         self._check(wind=("from 0 to 15 m/s", 0.0, 15.0), lag=("from 0.005 to 0.2 s", 0.005, 0.2))
 
 
-FREE_ARM = FreeArmConfig, "free_arms:simulate_free_arm"
 SCENARIOS: Mapping[str, tuple[type, str]] = MappingProxyType(
     {
         "kuka-surface": (KukaSurfaceConfig, "kuka_surface:simulate_kuka_surface"),
-        "ur5-free": FREE_ARM,
-        "double-pendulum": FREE_ARM,
         "quadruped": (QuadrupedConfig, "moving_bases:simulate_quadruped"),
         "quadrotor": (QuadrotorConfig, "moving_bases:simulate_quadrotor"),
     }
@@ -245,11 +221,9 @@ SCENARIOS: Mapping[str, tuple[type, str]] = MappingProxyType(
 def simulate(scenario: str, **numbers: Any) -> forcegp.data.Dataset:
     """Run a scenario by name with these fields of its config.
 
-    Libraries are imported here, so that listing scenarios is quick. Raises InvalidInput for numbers out of range, and
-    MissingExtra without a library of the scenario.
+    Libraries are imported here, so that listing scenarios is quick. Raises InvalidInput for numbers out of range.
     """
     require_known("scenario", scenario, "forcegp simulate", SCENARIOS)
     config, function = SCENARIOS[scenario]
-    numbers |= {"arm": scenario} if config is FreeArmConfig else {}
     module, _, name = function.partition(":")
     return getattr(import_module(f"forcegp.simulation.{module}"), name)(config(**numbers))

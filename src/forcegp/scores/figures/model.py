@@ -1,4 +1,4 @@
-"""Plots of one model on a recording (curves, accelerations, normal forces), of contacts, and of scores."""
+"""Plots of one model on a recording (curves, normal forces), of contacts, and of scores."""
 
 import math
 import re
@@ -20,7 +20,7 @@ from forcegp.mechanics import Contact, Held, LoopClosure
 from forcegp.model import Model
 from forcegp.posterior.posterior import Posterior
 from forcegp.progress import part
-from forcegp.scores.accuracy import ACCELERATION, predict_rows
+from forcegp.scores.accuracy import ACCELERATION
 from forcegp.scores.figures import style
 from forcegp.scores.page import unit_of
 from forcegp.scores.scores import Scores
@@ -177,44 +177,6 @@ def model_pictures(posterior: Posterior, dataset: Dataset) -> tuple[list[style.P
     return pictures, missing
 
 
-def prediction_figure(posterior: Posterior, dataset: Dataset, *, start: float = 0.0, seconds: float = 4.0) -> Figure:
-    """One row per joint: acceleration on the left, errors on the right, over `seconds` of the first episode.
-
-    The dark band is 2 sigma of the acceleration, the light one adds the measurement noise.
-    """
-    rows = style.window(dataset, start, seconds)
-    predicted, true = predict_rows(posterior, rows), rows.truth.get("a")
-    inner, outer = 2.0 * np.sqrt(predicted.variance), 2.0 * np.sqrt(predicted.measurement_variance)
-    figure = style.new_figure(11.0, 1.0 + 1.35 * rows.nv)
-    grid = figure.subplots(rows.nv, 2, sharex=True, squeeze=False, width_ratios=(1.25, 1.0))
-    names, units = style.short_joint_names(rows.joint_names), style.joint_units(rows, "a")
-    dots = {"color": style.MEASUREMENT, "markersize": 1.8, "alpha": 0.7}
-    for joint, (left, right) in enumerate(grid):
-        mean, measured = predicted.mean[:, joint], rows.a[:, joint]
-        left.plot(rows.time, measured, ".", label="measured", **dots)
-        style.draw_band(left, rows.time, mean, inner[:, joint], alpha=0.35, label="2σ")
-        style.draw_band(right, rows.time, 0.0 * mean, outer[:, joint], alpha=0.13, label="2σ of a measurement")
-        style.draw_band(right, rows.time, 0.0 * mean, inner[:, joint], alpha=0.35)
-        right.plot(rows.time, mean - measured, ".", **dots)
-        if true is not None:
-            style.draw_line(left, rows.time, true[:, joint], style.TRUTH, 1.0, "true")
-            style.draw_line(right, rows.time, mean - true[:, joint], style.TRUTH, 1.0)
-        style.draw_line(left, rows.time, mean, style.PREDICTION, 1.3, "predicted", linestyle=style.DASHED)
-        right.axhline(0.0, color=style.PREDICTION, linewidth=0.8, linestyle=style.DASHED)
-        limit, largest = 2.0 * float(np.median(outer[:, joint])), float(np.abs(mean - measured).max())
-        if largest < 1.5 * limit:  # equal scales where the model is right
-            right.set_ylim(-max(limit, 1.05 * largest), max(limit, 1.05 * largest))
-        last = "time [s]" if joint == rows.nv - 1 else ""
-        for axes, label in ((left, f"{names[joint]}\n{units[joint]}"), (right, units[joint])):
-            axes.margins(x=0)
-            style.quiet(axes, y=label, x=last)
-    titles = "Acceleration", "Error: prediction minus measurement (dots) or truth (line)"
-    for axes, title in zip(grid[0], titles, strict=True):
-        axes.set_title(title, fontsize=style.NORMAL, loc="left")
-    style.legend_above(figure, f"Prediction after {len(posterior.training)} training points", *grid[0], markerscale=4)
-    return figure
-
-
 def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float = 0.0, seconds: float = 4.0) -> Figure:
     """Forces of contacts in N over `seconds` of the first episode, and the truth where the Dataset holds "lambda".
 
@@ -307,7 +269,6 @@ PICTURES: dict[str, tuple[Callable[[Posterior, Dataset], Figure], str]] = {
         "Ticks are the velocities of the training data.",
     ),
     "normal_force": (normal_force_figure, "The forces of contacts, and what sensors measured of them."),
-    "prediction": (prediction_figure, "Accelerations over time, and their errors on the right."),
 }
 """By name, how each is drawn, and what is to be seen."""
 

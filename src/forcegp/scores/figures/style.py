@@ -161,10 +161,3 @@ def short_joint_names(names: Sequence[str]) -> list[str]:
     shared = shared[: max(shared.rfind(mark) for mark in "_-/. ") + 1]
     ends = [name[len(shared) :] for name in names]
     return [f"joint {end}" if end.isdigit() else end for end in ends]
-
-
-def joint_units(dataset: Dataset, quantity: str) -> list[str]:
-    """Unit of every joint's `quantity` as a plot shows it: rad/s² for "rad/s^2"."""
-    units = dataset.units[quantity]
-    each = [units] * dataset.nv if isinstance(units, str) else list(units)
-    return [unit.replace("^2", "²") for unit in each]

@@ -1,0 +1,58 @@
+"""Friction of joints by name, of all plants."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from forcegp.forces.force import Law
+from forcegp.forces.joint_law import JointLaw
+from forcegp.forces.joint_laws import LazyState, Viscous
+from forcegp.forces.registry import parse_forces
+from forcegp.robots import Robot
+
+Numbers = Mapping[str, Any]
+"""Coefficients by name, one number or one per joint; "velocity" stands for velocities that have no number here."""
+
+
+def joint_laws(expression: str, robot: Robot, numbers: Numbers) -> tuple[Law, ...]:
+    """The laws of this expression (`parse_forces`), with viscous friction, bound to the robot.
+
+    Coefficients that it does not give have these numbers, or their defaults.
+    """
+    forces = parse_forces(expression)
+    laws = forces if any(isinstance(force, Viscous) for force in forces) else (Viscous(), *forces)
+    out = []
+    for law in laws:
+        assert isinstance(law, JointLaw), "`require_joint_friction` sees to it"
+        found = {}
+        for name, coefficient in law.coefficients.items():
+            given = getattr(law, name)
+            number = numbers.get(name, numbers["velocity"] if coefficient.unit == "velocity" else coefficient.default)
+            found[name] = number if given is None else given
+        out.append(law.with_values(found).bound_to(robot))
+    return tuple(out)
+
+
+@dataclass(frozen=True, eq=False)
+class LawsOfJoints:
+    """What laws make of velocities, step by step."""
+
+    robot: Robot
+    laws: tuple[Law, ...]
+
+    @classmethod
+    def named(cls, expression: str, robot: Robot, numbers: Numbers) -> "LawsOfJoints":
+        """`joint_laws`; none for "none"."""
+        return cls(robot, () if expression == "none" else joint_laws(expression, robot, numbers))
+
+    def __call__(
+        self, v: Float[np.ndarray, "*batch nv"], u: np.ndarray | None = None
+    ) -> Float[np.ndarray, "*batch nv"]:
+        """Joint forces [Nm or N] with the sign that accelerates; u [Nm or N] is that of the actuators."""
+        at = torch.tensor(v)
+        state = LazyState(self.robot, torch.zeros_like(at), at, torch.zeros_like(at) if u is None else torch.tensor(u))
+        return sum((law.force(state).numpy() for law in self.laws), np.zeros_like(v))
