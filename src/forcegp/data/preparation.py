@@ -24,11 +24,12 @@ from forcegp.data.spectrum import FEWEST_ROWS, held_out_cutoff, motion_spectrum
 from forcegp.data.stance import estimate_stance
 from forcegp.data.strokes import with_strokes
 from forcegp.data.views import at_rest, postures
-from forcegp.data.wind import thruster_columns
+from forcegp.data.wind import estimate_thruster_lag, thruster_columns
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.robots.arguments import whole_number
 from forcegp.summary import plain
 
+LATE: tuple[Literal["delay"], Literal["lag"]] = "delay", "lag"
 FEW = 2_000  # rows of a whole log
 FAR_ABOVE = 100.0  # a cut-off: where the memory of a filter does not depend on the rate
 SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
@@ -42,7 +43,8 @@ class Preparation:
         which v and a are computed anew; "auto" as `motion_spectrum` and `held_out_cutoff` find it, None for none.
     delay: how much later than it acts u was logged [s]: `u(t) := u_logged(t + delay)`; "auto": `estimate_delay`, 0
         where u does not hold the torques of all joints, or something is touched.
-    lag: time constant of the actuators [s], of thrusters where a base has them: T u_a' + u_a = u.
+    lag: time constant of the actuators [s], of thrusters where a base has them: T u_a' + u_a = u; "auto":
+        `estimate_thruster_lag`, 0 where that finds none.
     every: keep every so many rows.
     trim: seconds to drop at both ends of each episode, where a filter has samples of one side only.
     differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities.
@@ -55,7 +57,7 @@ class Preparation:
 
     cutoff: float | Literal["auto"] | None = None
     delay: float | Literal["auto"] = 0.0
-    lag: float = 0.0
+    lag: float | Literal["auto"] = 0.0
     every: int = 1
     trim: float = 0.0
     differentiate: Literal["q", "v"] = "q"
@@ -68,9 +70,9 @@ class Preparation:
             raise InvalidInput(f"cutoff is {self.cutoff!r}; give a frequency > 0 in Hz, 'auto', or None for no filter.")
         for name, least in (("delay", -np.inf), ("lag", 0.0), ("trim", 0.0)):
             given = getattr(self, name)
-            if not (_finite(given) and given >= least) and not (name == "delay" and given == "auto"):
-                limit = "or auto" if name == "delay" else "at least 0"
-                raise InvalidInput(f"{name} is {given!r}; give seconds, {limit}.")
+            if not (_finite(given) and given >= least) and not (name in LATE and given == "auto"):
+                limit = "" if name == "delay" else ", at least 0"
+                raise InvalidInput(f"{name} is {given!r}; give seconds{limit}{', or auto' if name in LATE else ''}.")
         whole_number("every", self.every, 1)
         for name, allowed in (("differentiate", ("q", "v")), ("stance", ("log", "auto"))):
             if getattr(self, name) not in allowed:
@@ -94,6 +96,17 @@ class Preparation:
         if self.cutoff == "auto":
             cutoff, reasons["cutoff"] = _cutoff(dataset, self.differentiate)
             chosen = replace(chosen, cutoff=cutoff)
+        if self.lag == "auto":
+            chosen, reasons["lag"] = replace(chosen, lag=0.0), "u drives no thrusters"
+            if thruster_columns(dataset.model):
+                try:
+                    seconds, std = estimate_thruster_lag(_filtered(replace(chosen, delay=0.0), dataset))
+                    chosen, reasons["lag"] = (
+                        replace(chosen, lag=seconds),
+                        f"{1e3 * seconds:.1f} ms ± {1e3 * std:.1f} ms",
+                    )
+                except (DatasetError, InvalidInput) as error:
+                    reasons["lag"] = f"rotors are taken to follow at once: {error}"
         if self.delay == "auto":
             chosen = replace(chosen, delay=0.0)
             try:
@@ -176,14 +189,14 @@ def _filtered(chosen: Preparation, dataset: Dataset) -> Dataset:
     if not chosen.delay and not chosen.lag:
         return dataset
     pushing = [*thruster_columns(dataset.model)]  # joints beside them do not follow so
-    return shifted(dataset, float(chosen.delay), chosen.lag, pushing or None)
+    return shifted(dataset, float(chosen.delay), float(chosen.lag), pushing or None)
 
 
 def _kept(chosen: Preparation, dataset: Dataset) -> np.ndarray:
     """Row numbers that stay: not trimmed, with a torque at their shifted time, every so many."""
     if chosen.changes_nothing:
         return np.arange(len(dataset))
-    early = max(chosen.trim, -float(chosen.delay), SETTLED * chosen.lag)
+    early = max(chosen.trim, -float(chosen.delay), SETTLED * float(chosen.lag))
     late, kept = max(chosen.trim, float(chosen.delay)), []
     for number, rows, label in episodes_in_order(dataset):
         step = uniform_step(rows.time, label) if len(rows) > 1 else 0.0
