@@ -19,7 +19,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset, with_memory
 from forcegp.data.dataset import FORCE
-from forcegp.errors import InvalidInput, NumericalError, require_type
+from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence.bodies import standard_parameters
 from forcegp.evidence.least_squares import NoiseLevels, orthonormal_columns, without
 from forcegp.evidence.parameter_space import ParameterSpace
@@ -234,18 +234,9 @@ class RecordedRows:
         M, bias = (part.cpu().numpy() for part in parts)
         M = M + self.inertia + self.space.added_inertia(x)
         torque, _ = self._terms(x, np.zeros_like(self.v))
-        A, idle = self.held, np.logical_not(self.held.any(axis=-1))
-        try:
-            H = np.linalg.inv(M)
-            through = A @ H
-            among = through @ A.swapaxes(1, 2) + idle[:, :, None] * np.eye(A.shape[1])
-            lifted = np.linalg.solve(among, np.concatenate([through, self.right[..., None]], axis=-1))
-        except np.linalg.LinAlgError:
-            singular = "the mass matrix of the estimates is singular at a row; check the robot's file."
-            raise NumericalError(singular) from None
-        acceleration = (through.swapaxes(1, 2) @ lifted[..., -1:])[..., 0]
-        H = H - through.swapaxes(1, 2) @ lifted[..., :-1]
-        return acceleration + (H @ (self.force - bias - torque)[..., None])[..., 0], M, H
+        parts = (M, self.held, self.right, np.zeros((*self.right.shape, 3)), self.force - bias - torque)
+        dynamics = ConstrainedDynamics(self.state, *(torch.as_tensor(part) for part in parts))
+        return dynamics.acceleration_map().offset.numpy(), M, dynamics.H.numpy()
 
     def in_acceleration(self, x: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Residual a - a^ and its derivatives, as `in_torque`; then those of what force sensors at contacts measured.

@@ -88,9 +88,8 @@ class JointLaw(PerJointLaw):
         if self.transmission is None:
             return state
         own = copy(state)
-        for name, value in (("v", self.turning(state.v)), ("positions", self.turning(state.positions))):
-            object.__setattr__(own, name, value)
-        object.__setattr__(own, "delivered_by", lambda _: self.at_motors(state.delivered))
+        turned = {"v": self.turning(state.v), "positions": self.turning(state.positions)}
+        vars(own).update(turned, delivered_by=lambda _: self.at_motors(state.delivered), kinematics=state.kinematics)
         return own
 
     @override

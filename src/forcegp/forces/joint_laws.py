@@ -3,7 +3,6 @@
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -17,7 +16,7 @@ from forcegp.forces.force import Coefficient, Law, Number
 from forcegp.forces.joint_law import JointLaw
 from forcegp.forces.presliding import after_step, after_strokes
 from forcegp.mechanics.gauss_principle import State
-from forcegp.robots import Kinematics, Robot
+from forcegp.robots import Robot
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,35 +293,12 @@ Values = Float[np.ndarray, "rows nv"]
 Inputs = Float[np.ndarray, "rows nu"]
 
 
-class LazyState(State):
-    """A state, unchecked, whose kinematics are computed where a law asks for them: most laws of joints do not."""
-
-    def __init__(self, robot: Robot, q: Tensor, v: Tensor, u: Tensor) -> None:
-        given = {
-            "q": q,
-            "v": v,
-            "u": u,
-            "robot": robot,
-            "bodies": None,
-            "inputs": (),
-            "delivered_by": None,
-            "strokes": None,
-        }
-        for name, value in given.items():
-            object.__setattr__(self, name, value)
-
-    @cached_property
-    def kinematics(self) -> Kinematics:  # type: ignore[override]  # a field of a `State`
-        """Of all bodies."""
-        return self.robot.kinematics(self.q, self.v)
-
-
 def law_columns(laws: Iterable[Law], robot: Robot, q: np.ndarray, v: Values, u: Inputs, a: Values) -> list[Values]:
     """The torque [Nm or N] that each law of joints needs at these states, of numbers that it is given.
 
     Laws without numbers count as 1: of a law that is linear in its first coefficient the column is the regressor.
     """
-    state = LazyState(robot, *(torch.tensor(np.array(x), device=robot.device) for x in (q, v, u)))
+    state = State(*(torch.tensor(np.array(x), device=robot.device) for x in (q, v, u)), robot)
     out = []
     for law in laws:
         if not isinstance(law, JointLaw):

@@ -157,11 +157,15 @@ class State:
     v: Float[Tensor, "*batch nv"]
     u: Float[Tensor, "*batch nu"]
     robot: Robot
-    kinematics: Kinematics
     bodies: Float[Tensor, "bodies 10"] | None = None
     inputs: tuple[str, ...] = ()
     delivered_by: "Callable[[State], Tensor] | None" = None
     strokes: Float[Tensor, "*batch nv strokes"] | None = None
+
+    @cached_property
+    def kinematics(self) -> Kinematics:
+        """Of all bodies; most laws of joints do not need it."""
+        return Kinematics.of(self.robot, self.q, self.v)
 
     @cached_property
     def positions(self) -> Float[Tensor, "*batch nv"]:
@@ -213,7 +217,7 @@ class State:
             u = checked_tensor("u", u, len(inputs), f"one value per input: {', '.join(inputs)}", robot.device)
         batch = broadcast_batch({"q": q.shape[:-1], "v": v.shape[:-1], "u": u.shape[:-1]})
         q, v, u = (value.expand(*batch, -1) for value in (q, v, u))
-        return cls(q, v, u, robot, robot.kinematics(q, v), bodies, inputs, delivered_by)
+        return cls(q, v, u, robot, bodies, inputs, delivered_by)
 
 
 REDUNDANCY_TOLERANCE = 1e-9

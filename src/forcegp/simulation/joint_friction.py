@@ -10,8 +10,9 @@ from jaxtyping import Float
 
 from forcegp.forces.force import Law
 from forcegp.forces.joint_law import JointLaw
-from forcegp.forces.joint_laws import LazyState, Viscous
+from forcegp.forces.joint_laws import Viscous
 from forcegp.forces.registry import parse_forces
+from forcegp.mechanics.gauss_principle import State
 from forcegp.robots import Robot
 
 Numbers = Mapping[str, Any]
@@ -54,5 +55,5 @@ class LawsOfJoints:
     ) -> Float[np.ndarray, "*batch nv"]:
         """Joint forces [Nm or N] with the sign that accelerates; u [Nm or N] is that of the actuators."""
         at = torch.tensor(v)
-        state = LazyState(self.robot, torch.zeros_like(at), at, torch.zeros_like(at) if u is None else torch.tensor(u))
+        state = State(torch.zeros_like(at), at, torch.zeros_like(at) if u is None else torch.tensor(u), self.robot)
         return sum((law.force(state).numpy() for law in self.laws), np.zeros_like(v))
