@@ -1,6 +1,4 @@
-"""A satellite with an arm, whose joint has friction that no law describes; and its recording in turned axes."""
-
-from dataclasses import replace
+"""A satellite with an arm, whose joint has friction that no law describes; and its recording."""
 
 import numpy as np
 import torch
@@ -8,7 +6,6 @@ import torch
 from forcegp import Dataset, Model, Robot
 from forcegp.forces import Actuation, Coulomb, RigidBodies, Thrusters, Viscous
 from forcegp.integration import integrate, integrator_named
-from forcegp.robots.manifold import pose, quaternion_product
 
 URDF = """<robot name="satellite"><link name="hull"><inertial><origin xyz="0.02 0 0.01"/><mass value="8"/>
 <inertia ixx="0.3" iyy="0.4" izz="0.5" ixy="0.02" ixz="0" iyz="0.01"/></inertial></link>
@@ -33,12 +30,6 @@ def satellite(viscous: float = 0.2, dry: float = 0.3, mass: float = 8.0, switch:
     return Model(robot, (), (Actuation(), thrusters, RigidBodies(), *friction))
 
 
-def falling() -> Model:
-    """The same in the field of the earth."""
-    model = satellite()
-    return model.with_robot(Robot.from_urdf_text(URDF, base="floating"))
-
-
 def recording(seed: int, seconds: float, given: Model, bump: float = 1.0) -> Dataset:
     """Rows of the satellite with friction .2 Nms, .3 Nm and a bump at .5 rad/s, for a model that is `given`."""
     generator, rows = np.random.default_rng(seed), round(seconds / DT)
@@ -59,14 +50,3 @@ def recording(seed: int, seconds: float, given: Model, bump: float = 1.0) -> Dat
     q, v = moved.q[:-1, 0].numpy(), moved.v[:-1, 0].numpy()
     a = moved.a[:, 0].numpy() + 0.05 * generator.standard_normal(v.shape)
     return Dataset(q=q, v=v, u=u.numpy(), a=a, time=time, model=given, noise_std=[0.05] * 7)
-
-
-def turned(dataset: Dataset) -> Dataset:
-    """The same motion, written in other axes of the world, with quaternions of the other sign."""
-    turn = torch.tensor([0.5, -0.3, 0.4, 0.7], dtype=torch.float64)
-    turn = turn / torch.linalg.vector_norm(turn)
-    q = torch.tensor(dataset.q)
-    rotation, _ = pose(torch.cat([torch.zeros(3).double(), turn]))
-    position = q[:, :3] @ rotation.mT + torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
-    q = torch.cat([position, -quaternion_product(turn.expand(len(q), -1), q[:, 3:7]), q[:, 7:]], 1)
-    return replace(dataset, q=q.numpy())

@@ -28,9 +28,7 @@ from forcegp.integration.midpoint_sensitivities import Accelerations, Linear, Wi
 from forcegp.model import Model
 from forcegp.posterior import Posterior
 from forcegp.posterior.fitted import Estimates
-from forcegp.posterior.observed_wrench import in_own_air, require_unobserved, unobserved
 from forcegp.progress import tell
-from forcegp.robots.manifold import ConfigurationSpace
 
 STEP = 0.005
 """Longest step in s: shorter where the recording has shorter ones, of which several make a step."""
@@ -89,18 +87,12 @@ class Unknowns:
 
     def accelerations(self, x: Tensor) -> Accelerations:
         """The mean acceleration and its derivatives, in x as well."""
-        posterior, numbers = self.posterior(x), x.numpy()
+        posterior, numbers, bodies = self.posterior(x), x.numpy(), self.space.bodies
         mean, nv = posterior.accelerations(None), posterior.model.robot.nv
-        space, bodies = posterior.model.robot.space, self.space.bodies
         carriers = [each.body for each in self.space.carried]
 
         def at(q: Tensor, v: Tensor, u: Tensor, parameters: bool) -> Linear:
-            def moved(z: Tensor) -> Tensor:
-                step, speed = z.split(nv, dim=-1)
-                return mean(step if space.is_vector_space else space.integrate(q, step), speed, u)
-
-            origin = q if space.is_vector_space else torch.zeros_like(v)
-            a, slopes = rows_jacobian(moved, torch.cat([origin, v], dim=-1))
+            a, slopes = rows_jacobian(lambda z: mean(*z.split(nv, dim=-1), u), torch.cat([q, v], dim=-1))
             a_q, a_v = slopes.split(nv, dim=-1)
             if not parameters:
                 return Linear(a, a_q, a_v)
@@ -114,7 +106,7 @@ class Unknowns:
                 columns.append(-torch.as_tensor(added))
                 return Linear(a, a_q, a_v, dynamics.H @ torch.cat(columns, dim=-1))
 
-        return Accelerations(mean, at, space)
+        return Accelerations(mean, at)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +133,7 @@ class MotionFit:
         return self.stride * self.recorded.dt
 
     @cached_property
-    def q(self) -> Float[Tensor, "K rows nq"]:
+    def q(self) -> Float[Tensor, "K rows nv"]:
         """Recorded positions at the ends of the steps."""
         return torch.as_tensor(self.recorded.q[:, :: self.stride].copy())
 
@@ -152,18 +144,12 @@ class MotionFit:
 
     @cached_property
     def start(self) -> Float[Tensor, "K state"]:
-        """Recorded initial states; where a base moves, the step 0 from the recorded position stands for that."""
-        q, v = self.recorded.q[:, 0], self.recorded.v[:, 0]
-        return torch.as_tensor(np.concatenate([q if self.space.is_vector_space else np.zeros_like(v), v], axis=-1))
-
-    @cached_property
-    def space(self) -> ConfigurationSpace:
-        """Of positions."""
-        return self.unknowns.start.model.robot.space
+        """Recorded initial states."""
+        return torch.as_tensor(np.concatenate([self.recorded.q[:, 0], self.recorded.v[:, 0]], axis=-1))
 
     def residual(self, motions: WindowMotions) -> Float[Tensor, "K rows nv"]:
-        """Steps that lead from the recorded positions to those of the motions."""
-        return self.space.difference(self.q, motions.q)
+        """From the recorded positions to those of the motions."""
+        return motions.q - self.q
 
     def spread(self, sigma: Tensor) -> Float[Tensor, " state"]:
         """Standard deviations of initial states about the recorded ones."""
@@ -172,22 +158,19 @@ class MotionFit:
 
     def at(self, x: Tensor, states: Tensor, noise: Tensor, sigma: Tensor, near: WindowMotions | None) -> _Point:
         """The point, its motions sought from those of another; infinitely bad where there are none."""
-        q, space = self.q, self.space
-        steps = space.difference(q[:, :-1], q[:, 1:])
-        guess = space.integrate(q[:, :-1], 0.5 * steps), steps / self.h
+        q, steps = self.q, self.q.diff(dim=1)
+        guess = q[:, :-1] + 0.5 * steps, steps / self.h
         if near is not None:
             guess = near.middle_q, near.middle_v
         q0, v0 = states.split(steps.shape[-1], dim=-1)
-        if not space.is_vector_space:
-            q0 = space.integrate(q[:, 0], q0)
         try:
             accelerations = self.unknowns.accelerations(x)
             # a trial step that leads to motions so far from these is too long, whatever they are
             patient = near is None
             motions = window_motions(accelerations, q0, v0, self.u, self.h, guess, patient=patient)
         except (NumericalError, NonPhysicalInertia):  # a step that went too far
-            nowhere_q, nowhere_v = (q.new_full(x.shape, math.nan) for x in (q, self.recorded.v))
-            motions = WindowMotions(nowhere_q, nowhere_v, *guess, torch.zeros(len(q), dtype=torch.bool))
+            nowhere = torch.full_like(q, math.nan)
+            motions = WindowMotions(nowhere, nowhere, *guess, torch.zeros(len(q), dtype=torch.bool))
         residual = self.residual(motions) / noise
         away = (states - self.start) / self.spread(sigma)
         from_prior, _ = self.unknowns.prior(x)
@@ -197,14 +180,8 @@ class MotionFit:
 
     def whitened(self, here: _Point, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Residuals of the windows (K, n) and their Jacobians in states (K, n, 2 nv) and unknowns (K, n, P)."""
-        motions, r = here.motions, self.residual(here.motions)
-        in_start, in_parameters = motions.in_start, motions.in_parameters
-        if not self.space.is_vector_space and in_start is not None and in_parameters is not None:
-            # steps from the motions change those from the recording, and steps of the start those from its motion
-            turned, start, nv = self.space.chart_matrix(r), in_start.clone(), r.shape[-1]
-            start[..., :nv] @= torch.linalg.inv(self.space.chart_matrix(here.states[:, :nv]))[:, None]
-            in_start, in_parameters = turned @ start, turned @ in_parameters
-        parts = r[..., None], in_start, in_parameters
+        motions = here.motions
+        parts = self.residual(motions)[..., None], motions.in_start, motions.in_parameters
         r, A, B = ((part / noise[:, None]).flatten(1, 2) for part in parts if part is not None)
         return r[..., 0], A, B
 
@@ -275,7 +252,7 @@ class MotionFit:
 
         Raises NumericalError where no motion is found near the recorded one.
         """
-        one = torch.ones(self.space.nv, dtype=x.dtype)
+        one = torch.ones(self.q.shape[-1], dtype=x.dtype)
         here, damping = self.at(x, self.start, one, one, None), 1e-3
         if not math.isfinite(here.cost):
             raise NumericalError(
@@ -307,15 +284,12 @@ def refine_on_motions(
     """Known laws and bodies fitted to the recorded positions, beginning from this posterior.
 
     Numbers that the laws of `stated` know by a standard deviation of 0 stay.
-    Raises InvalidInput for models without physics, windows that no episode has room for and uneven steps,
-    NumericalError where no motion is found near the recorded one.
+    Raises InvalidInput for bases that move, windows that no episode has room for and uneven steps, NumericalError where
+    no motion is found near the recorded one.
     """
-    require_unobserved(posterior, "refinements on motions")
-    seen = in_own_air(posterior, dataset)
-    if seen is not dataset:
-        posterior = posterior.with_model(seen.model)
-    recorded, stride = all_motions(seen, seconds, STEP)
-    fit = MotionFit(recorded, stride, Unknowns.of(posterior, seen, bodies, stated))
+    posterior.model.robot.require_vectors("refinements on motions")
+    recorded, stride = all_motions(dataset, seconds, STEP)
+    fit = MotionFit(recorded, stride, Unknowns.of(posterior, dataset, bodies, stated))
     here, noise, sigma = fit.solved(torch.as_tensor(fit.unknowns.space.start))
     found, estimates, space = fit.unknowns.posterior(here.x), posterior.estimates, fit.unknowns.space
     told = {"seconds": seconds, "bodies": bodies, "windows": len(recorded.rows), "step": fit.h, "rms": sigma.tolist()}
@@ -326,5 +300,4 @@ def refine_on_motions(
             space.parameters, space.numbers(x), space.number_slopes(x), covariance, prior,
             evidence=f"motions of {seconds:g} s", rows=recorded.q.shape[0] * recorded.q.shape[1],
         )  # fmt: skip
-    found = replace(found, estimates=estimates).with_settings(motions=told)
-    return found if seen is dataset else replace(found, target=unobserved(found.model))
+    return replace(found, estimates=estimates).with_settings(motions=told)

@@ -114,7 +114,7 @@ def find_roots(residual: Rows, x: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "
     return x, found
 
 
-def rows_jacobian(function: Rows, x: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m k"]]:
+def rows_jacobian(function: Rows, x: Float[Tensor, "*n k"]) -> tuple[Float[Tensor, "*n m"], Float[Tensor, "*n m k"]]:
     """The value and the Jacobian of a function of rows, by one backward pass for each entry of the value."""
     with torch.enable_grad():
         x = x.detach().requires_grad_()

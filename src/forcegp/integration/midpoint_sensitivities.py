@@ -1,8 +1,7 @@
 """Motions by the implicit midpoint rule, of many windows at once, with derivatives in start and parameters.
 
 Linearised at a guess of the middle of every step, the rule is one affine recursion along each window; repeated, this is
-Newton's method on all steps at once (lifted: Bock & Plitt 1984; Albersmeyer & Diehl 2010). Where a base moves, the
-recursion runs over steps from the guessed path, in body axes.
+Newton's method on all steps at once (lifted: Bock & Plitt 1984; Albersmeyer & Diehl 2010).
 """
 
 from collections.abc import Callable
@@ -13,7 +12,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from forcegp.integration.integrators import VECTORS, implicit_midpoint
-from forcegp.robots.manifold import ConfigurationSpace
 
 MOST_PASSES = 20
 TOLERANCE = 1e-9
@@ -22,7 +20,7 @@ TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """Accelerations (n, nv), and derivatives in q, or a step from there, v (n, nv, nv) and parameters (n, nv, P)."""
+    """Accelerations (n, nv), and derivatives in q, v (n, nv, nv) and parameters (n, nv, P)."""
 
     a: Float[Tensor, "*n nv"]
     a_q: Float[Tensor, "*n nv nv"]
@@ -36,19 +34,18 @@ class Accelerations:
 
     mean: Callable[[Tensor, Tensor, Tensor], Tensor]
     linear: Callable[[Tensor, Tensor, Tensor, bool], Linear]
-    space: ConfigurationSpace = VECTORS
 
 
 @dataclass(frozen=True, eq=False)
 class WindowMotions:
     """Motions of K windows of T steps: states, the middles of the steps, whether Newton's method found them.
 
-    `in_start` and `in_parameters` are derivatives of q, or of steps from it, in (q_0, v_0) and in p.
+    `in_start` and `in_parameters` are derivatives of q in (q_0, v_0) and in p.
     """
 
-    q: Float[Tensor, "K rows nq"]
+    q: Float[Tensor, "K rows nv"]
     v: Float[Tensor, "K rows nv"]
-    middle_q: Float[Tensor, "K T nq"]
+    middle_q: Float[Tensor, "K T nv"]
     middle_v: Float[Tensor, "K T nv"]
     found: Bool[Tensor, " K"]
     in_start: Float[Tensor, "K rows nv 2*nv"] | None = None
@@ -57,11 +54,11 @@ class WindowMotions:
 
 def window_motions(
     accelerations: Accelerations,
-    q0: Float[Tensor, "K nq"],
+    q0: Float[Tensor, "K nv"],
     v0: Float[Tensor, "K nv"],
     u: Float[Tensor, "K T nu"],
     h: float,
-    guess: tuple[Float[Tensor, "K T nq"], Float[Tensor, "K T nv"]],
+    guess: tuple[Float[Tensor, "K T nv"], Float[Tensor, "K T nv"]],
     *,
     patient: bool = True,
 ) -> WindowMotions:
@@ -92,18 +89,16 @@ def window_motions(
 
 def _step_by_step(
     accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, h: float
-) -> tuple[Float[Tensor, "K T nq"], Float[Tensor, "K T nv"], Bool[Tensor, " K"]]:
+) -> tuple[Float[Tensor, "K T nv"], Float[Tensor, "K T nv"], Bool[Tensor, " K"]]:
     """The middles of motions, by Newton's method with shorter steps, and which of them have an end."""
     positions, velocities, ended = [], [], torch.ones(len(q), dtype=torch.bool, device=q.device)
-    space = accelerations.space
     for force in u.unbind(1):
-        moved = implicit_midpoint(space, lambda q, v, u=force: accelerations.mean(q, v, u), q, v, h)
+        moved = implicit_midpoint(VECTORS, lambda q, v, u=force: accelerations.mean(q, v, u), q, v, h)
         ended &= moved.found
         middle = torch.where(ended[:, None], 0.5 * (v + moved.v), v)  # the others only stay finite
-        step = h * middle
-        positions.append(space.integrate(q, 0.5 * step))
+        positions.append(q + 0.5 * h * middle)
         velocities.append(middle)
-        q, v = space.integrate(q, step), 2.0 * middle - v
+        q, v = q + h * middle, 2.0 * middle - v
         if not bool(ended.any()):
             return q[:, None], v[:, None], ended
     return torch.stack(positions, dim=1), torch.stack(velocities, dim=1), ended
@@ -116,40 +111,6 @@ def _at(accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, parameter
     return Linear(a, a_q, a_v, None if found.a_p is None else found.a_p.unflatten(0, q.shape[:2]))
 
 
-def _along(
-    accelerations: Accelerations, q0: Tensor, u: Tensor, w: Tensor, h: float, parameters: bool
-) -> tuple[Tensor, Tensor, Linear, Tensor, Tensor]:
-    """Positions (K, T+1, nq) along middle velocities w, those between, accelerations, X and Y (K, T, ...).
-
-    Derivatives of these accelerations are in the step from where a step begins and in its w.
-    """
-    space, nv, path = accelerations.space, w.shape[-1], [q0]
-    for at in w.unbind(1):
-        path.append(space.integrate(path[-1], h * at))
-    q = torch.stack(path, dim=1)
-    start, end, middle = q[:, :-1], q[:, 1:], space.integrate(q[:, :-1], 0.5 * h * w)
-
-    def moved(z: Tensor) -> Tensor:
-        at, step = space.integrate(start, z[..., :nv]), h * (w + z[..., nv:])
-        halfway = space.difference(middle, space.integrate(at, 0.5 * step))
-        return torch.cat([halfway, space.difference(end, space.integrate(at, step))], dim=-1)
-
-    _, slopes = _jacobian(moved, w.new_zeros(*w.shape[:2], 2 * nv), 2 * nv)
-    half, whole = slopes.split(nv, dim=-2)
-    at = _at(accelerations, middle, w, u, parameters)
-    a_q, a_w = (at.a_q @ part for part in half.split(nv, dim=-1))
-    return q, middle, Linear(at.a, a_q, a_w + at.a_v, at.a_p), whole[..., :nv], whole[..., nv:]
-
-
-def _jacobian(function: Callable[[Tensor], Tensor], x: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """As `rows_jacobian`, of any batch and in one backward pass of all `size` entries: quick functions are called."""
-    with torch.enable_grad():
-        copies = x.detach().expand(size, *x.shape).clone().requires_grad_()
-        y = function(copies)
-        (slopes,) = torch.autograd.grad(y.diagonal(dim1=0, dim2=-1).sum(), copies)
-    return y[0].detach(), slopes.movedim(0, -2)
-
-
 def _pass(
     accelerations: Accelerations,
     q0: Tensor,
@@ -160,21 +121,14 @@ def _pass(
     parameters: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """q, v (K, T+1, nv) of the linearised steps, their middles, and the derivatives of q (K, T+1, nv, 2 nv + P)."""
-    nv, half, space = v0.shape[-1], 0.5 * h, accelerations.space
+    nv, half = v0.shape[-1], 0.5 * h
     identity = torch.eye(nv, dtype=q0.dtype, device=q0.device)
     middle_q, middle_v = middles
-    path, ends = None, None
-    if space.is_vector_space:
-        at = _at(accelerations, middle_q, middle_v, u, parameters)
-        slope, q = at.a_v + half * at.a_q, q0[..., None]
-        constant = half * (at.a - (at.a_q @ middle_q[..., None] + at.a_v @ middle_v[..., None])[..., 0])
-    else:  # q is the step from the path, and the middle velocity what is added to that of the guess
-        path, middle_q, at, *moves = _along(accelerations, q0, u, middle_v, h, parameters)
-        ends = list(zip(*(x.unbind(1) for x in (*moves, middle_v)), strict=True))
-        slope, q, constant = at.a_v, torch.zeros_like(v0)[..., None], half * at.a - middle_v
-    inverse = torch.linalg.inv(identity - half * slope)
+    at = _at(accelerations, middle_q, middle_v, u, parameters)
+    constant = half * (at.a - (at.a_q @ middle_q[..., None] + at.a_v @ middle_v[..., None])[..., 0])
+    inverse = torch.linalg.inv(identity - half * (at.a_v + half * at.a_q))
     # columns: the state, and where parameters are asked for its derivatives in q0, v0 and p
-    v, inputs = v0[..., None], constant[..., None]
+    q, v, inputs = q0[..., None], v0[..., None], constant[..., None]
     if at.a_p is not None:
         nothing = q0.new_zeros(len(q0), nv, at.a_p.shape[-1])
         eye, zero = identity.expand(len(q0), nv, nv), q0.new_zeros(len(q0), nv, nv)
@@ -183,21 +137,12 @@ def _pass(
         inputs = torch.cat([inputs, wide, half * at.a_p], dim=-1)
     # v_m = Z (v + h/2 a_q q + inputs): products that do not depend on the state first, for all steps at once
     of_q, of_inputs = half * inverse @ at.a_q, inverse @ inputs
-    rows_q, rows_v, added = [q], [v[..., 0]], []
-    for k, (Z, Z_q, given) in enumerate(zip(inverse.unbind(1), of_q.unbind(1), of_inputs.unbind(1), strict=True)):
+    rows_q, rows_v = [q], [v[..., 0]]
+    for Z, Z_q, given in zip(inverse.unbind(1), of_q.unbind(1), of_inputs.unbind(1), strict=True):
         middle = Z @ v + Z_q @ q + given
-        v = 2.0 * middle - v
-        if ends is None:
-            q = q + h * middle
-        else:
-            X, Y, guessed = ends[k]
-            q = X @ q + Y @ middle
-            v[..., 0] += 2.0 * guessed
-            added.append(middle[..., 0])
+        q, v = q + h * middle, 2.0 * middle - v
         rows_q.append(q)
         rows_v.append(v[..., 0])
     all_q, all_v = torch.stack(rows_q, dim=1), torch.stack(rows_v, dim=1)
-    q, slopes = all_q[..., 0], all_q[..., 1:]
-    if path is None:
-        return q, all_v, (q[:, 1:] + q[:, :-1]) / 2.0, (q[:, 1:] - q[:, :-1]) / h, slopes
-    return space.integrate(path, q), all_v, middle_q, middle_v + torch.stack(added, dim=1), slopes
+    q = all_q[..., 0]
+    return q, all_v, (q[:, 1:] + q[:, :-1]) / 2.0, (q[:, 1:] - q[:, :-1]) / h, all_q[..., 1:]
