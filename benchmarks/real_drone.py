@@ -76,15 +76,13 @@ def scores(posterior: Posterior, dataset: Dataset) -> tuple[float, float]:
 
 
 def compared(model: Model, train: Dataset, test: Dataset, points: int) -> dict[str, tuple[float, float]]:
-    linear = model.with_forces(AerodynamicForce(kernel="linear", observe=0.0))
-    usual = model.with_forces(AerodynamicForce(kernel="linear"))
-    parametric, own = (fit(each, train, points=min(1000, len(train)), restarts=1) for each in (linear, usual))
+    linear = model.with_forces(AerodynamicForce(observe=0.0))
+    parametric = fit(linear, train, points=min(1000, len(train)), restarts=1)
     seconds = min(TIMES, key=lambda each: training_error(parametric, train, each))
     force = fit(model.with_forces(AerodynamicForce()), train, points=min(points, len(train)), restarts=1)
     independent = fit(model.black_box(), train, points=min(points, len(train)), restarts=1)
     return {
         "force prior": scores(*observing(force, test)),
-        "parametric with our observers": scores(*observing(own, test)),
         "parametric": scores(*observing(parametric, test, seconds=seconds)),
         "parametric, unobserved": scores(parametric, test),
         "independent GP": scores(independent, test),

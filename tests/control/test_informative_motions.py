@@ -108,7 +108,7 @@ def test_what_is_expected_is_what_an_update_gives_whatever_is_measured(posterior
 def test_torques_are_those_of_the_learned_friction(posterior, chosen):
     motion = chosen.motion
     v = motion.v[::20]
-    friction = posterior.components(motion.q[::20], v, motion.u[::20]).total.mean.numpy()
+    friction = posterior.predict(motion.q[::20], v, motion.u[::20]).unknown_force.mean.numpy()
     np.testing.assert_allclose(motion.u[::20], rnea(motion.q[::20], v, motion.a[::20]) - friction, atol=1e-6)
 
 

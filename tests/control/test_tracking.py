@@ -121,7 +121,9 @@ def test_joint_forces_are_those_of_predict_and_of_torch(touching):
     found, expected, dynamics = compiled.joint_forces(q, v, u), plain.joint_forces(q, v, u), touching.dynamics(q, v, u)
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-10)
-    torch.testing.assert_close(found.Q, dynamics.Q_K + touching.components(q, v, u).total.mean, rtol=1e-8, atol=1e-10)
+    torch.testing.assert_close(
+        found.Q, dynamics.Q_K + touching.predict(q, v, u).unknown_force.mean, rtol=1e-8, atol=1e-10
+    )
     step = 1e-5 * torch.eye(3, dtype=torch.float64)
     ahead, back = ([plain.joint_forces(q, v, u + sign * row).Q for row in step] for sign in (1.0, -1.0))
     difference = (torch.stack(ahead, -1) - torch.stack(back, -1)) / 2e-5

@@ -28,7 +28,6 @@ class KernelConformance:
 
     expression: str
     dimensions: tuple[int, ...] = (1, 3)
-    share_at_the_start = 1.0  # of the asked variance
     variance_at_the_start = True  # k averages to the asked variance at standardised points
 
     @pytest.fixture(params=[0, 1], ids=["fewest features", "most features"])
@@ -131,7 +130,7 @@ class KernelConformance:
         z = (z - z.mean(0)) / z.std(0, correction=0)
         with torch.no_grad():
             mean = float(kernel_diagonal(kernel_of(self.expression, dimension, torch.tensor(2.5).double()), z).mean())
-        assert mean == pytest.approx(2.5 * self.share_at_the_start, rel=1e-10 if self.variance_at_the_start else 0.1)
+        assert mean == pytest.approx(2.5, rel=1e-10 if self.variance_at_the_start else 0.1)
 
     def test_every_start_of_a_search_can_be_evaluated(self, dimension):
         """With a value and a slope that lead somewhere."""

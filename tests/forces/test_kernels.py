@@ -44,11 +44,6 @@ class TestFriction(KernelConformance):
     variance_at_the_start = False  # tanh^2 is a little below 1
 
 
-class TestDeviation(KernelConformance):
-    expression = "deviation"
-    share_at_the_start = 1e-4
-
-
 class TestSum(KernelConformance):
     expression = "linear + squared-exponential + constant"
 
@@ -156,7 +151,7 @@ def test_terms_add_up():
         ("linear +", "no kernel '' in 'linear \\+'"),
         ("liner", "no kernel 'liner' in the registry; did you mean 'linear'"),
         ("constant + lienar", "no kernel 'lienar' in 'constant \\+ lienar'; did you mean 'linear'"),
-        ("matern", "Valid kernels: constant, deviation, friction, linear, matern-1/2"),
+        ("matern", "Valid kernels: constant, friction, linear, matern-1/2"),
     ],
 )
 def test_wrong_expressions_say_what_is_allowed(expression, message):
@@ -187,7 +182,6 @@ def test_a_kernel_of_ones_own(monkeypatch):
         ("matern-5/2", "base_kernel.raw_lengthscale", 0.5 * math.log(2.0) + 3.0, 2.0),
         ("linear", "raw_variance", math.log(0.6 / 2), 2.0),
         ("constant", "raw_constant", math.log(0.6), 2.0),
-        ("deviation", "raw_outputscale", math.log(0.6e-4), 2.0),
     ],
 )
 def test_hyperpriors_are_normal_in_the_logarithm(expression, part, center, spread):

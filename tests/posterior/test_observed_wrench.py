@@ -11,7 +11,7 @@ from forcegp.posterior.observed_wrench import _with_past, in_air
 
 def test_wind_is_sought_where_inputs_are_those_of_the_model():
     rows = flight([(3.0, -2.0, 0.0)])
-    model = rows.model.with_forces(AerodynamicForce(kernel="linear"))
+    model = rows.model.with_forces(AerodynamicForce())
     settings, seen = in_air(model, rows)
     np.testing.assert_allclose(settings["air"]["wind"], (3.0, -2.0, 0.0), atol=1e-5)
     assert len(seen.model.inputs) == len(model.inputs) + 3

@@ -46,7 +46,7 @@ def test_joint_arrows_are_laws_and_learned_part_together(swinging, friction):
     (arrows,) = scene.arrows
     rows = [int(np.flatnonzero((swinging.q == q).all(1))[0]) for q in scene.q]
     q, v, u = (torch.tensor(x[rows]) for x in (swinging.q, swinging.v, swinging.u))
-    total = friction.components(q, v, u).total
+    total = friction.predict(q, v, u).unknown_force
     np.testing.assert_allclose(arrows.mean, (total.mean - 0.1 * v).numpy(), atol=1e-10)
     np.testing.assert_allclose(arrows.half, 1.959963984540054 * total.std.numpy(), rtol=1e-9)
     robot = swinging.model.robot

@@ -133,7 +133,7 @@ def test_what_lasts_is_foreseen_from_the_past():
 def test_what_cannot_be_observed_is_refused(posterior, test):
     with pytest.raises(InvalidInput, match="looks back"):
         observing(posterior, acting(test), seconds=-1.0)
-    calm = test.model.with_forces(AerodynamicForce(observe=0.0, kernel="linear"))
+    calm = test.model.with_forces(AerodynamicForce(observe=0.0))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         fitted = fit(calm, acting(test), points=30, restarts=1)

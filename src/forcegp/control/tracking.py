@@ -207,7 +207,7 @@ class Past:
 
     def __init__(self, model: Model, least: float = 0.0) -> None:
         self.memory, self.column, self.least = model.memory, model.memory_column, least
-        self.z = self.memory.start if self.memory.names else torch.zeros(0, dtype=torch.float64)
+        self.z = torch.zeros(len(self.memory.names), dtype=torch.float64)
         self._last: Tensor | None = None
 
     def see(self, q: Float[Tensor, " nq"]) -> None:

@@ -130,17 +130,9 @@ def with_memory(dataset: Dataset, model: Model) -> Dataset:
         raise InvalidInput(
             f"{', '.join(memory.titles)} remembers, and the rows are not in order of time; give the whole log."
         )
-    assert dataset.strokes is not None, "it knows them"
-    remembered = np.isin(dataset.model.inputs, own)
-    bare, stated = (dataset.u[:, ~remembered], dataset.u[:, remembered]) if own else (dataset.u, None)
-    stated = stated if own == memory.names else None
-    columns = np.zeros((len(dataset), len(memory.names)))
-    for episode in dataset.episodes:
-        rows = np.flatnonzero(dataset.episode == episode)
-        each = (dataset.q, dataset.time, dataset.strokes)
-        q, time, own_past = (torch.as_tensor(np.array(x[rows]), device=model.robot.device) for x in each)
-        known = None if stated is None else torch.as_tensor(np.array(stated[rows]), device=model.robot.device)
-        columns[rows] = memory.along(q, time, own_past, known).cpu().numpy()
+    bare = dataset.u[:, ~np.isin(dataset.model.inputs, own)]
+    past = torch.as_tensor(np.array(dataset.strokes), device=model.robot.device)
+    columns = memory.past_of(past).cpu().numpy()
     first = model.memory_column
     u = np.concatenate([bare[:, :first], columns, bare[:, first:]], axis=1)
     return replace(dataset, u=u, model=replace(dataset.model, forces=model.laws))

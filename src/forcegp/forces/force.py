@@ -258,19 +258,15 @@ class Law(Force):
         first = state.inputs.index(names[0])
         return state.u[..., first : first + len(names)]
 
-    def memory_start(self, robot: Robot) -> Float[Tensor, " m"]:
-        """What it remembers before anything has moved."""
-        return torch.zeros(len(self.memory_names(robot)), dtype=torch.float64, device=robot.device)
-
     def remember(
         self, memory: Float[Tensor, "*batch m"], step: Tensor, dt: float | Tensor
     ) -> Float[Tensor, "*batch m"]:
         """The memory after the joints have moved by `step` (..., nv) in dt: exact and differentiable."""
         return memory
 
-    def past_of(self, strokes: Float[Tensor, "*batch nv strokes"]) -> Float[Tensor, "*batch m"] | None:
-        """The memory after displacements of the joints, the last one first; None where these do not tell it."""
-        return None
+    def past_of(self, strokes: Float[Tensor, "*batch nv strokes"]) -> Float[Tensor, "*batch m"]:
+        """The memory after displacements of the joints, the last one first."""
+        raise NotImplementedError(f"{type(self).__name__} remembers, and has no `past_of`")
 
     @property
     def values(self) -> dict[str, Tensor]:
@@ -359,11 +355,6 @@ class Memory:
         """Of the motors whose strokes they remember; None: joints."""
         return next((law.transmission for law, _ in self._laws), None)
 
-    @property
-    def start(self) -> Float[Tensor, " m"]:
-        """Before anything has moved."""
-        return torch.cat([law.memory_start(self.robot) for law, _ in self._laws])
-
     def likely(
         self, v: Float[Tensor, "n nv"], seen: Float[Tensor, "N m"], seen_v: Float[Tensor, "N nv"]
     ) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
@@ -386,23 +377,6 @@ class Memory:
         parts = memory.split([size for _, size in self._laws], dim=-1)
         return torch.cat([law.remember(x, step, dt) for (law, _), x in zip(self._laws, parts, strict=True)], dim=-1)
 
-    def along(
-        self,
-        q: Float[Tensor, "T nq"],
-        time: Float[Tensor, " T"],
-        strokes: Float[Tensor, "T nv strokes"],
-        stated: Float[Tensor, "T m"] | None,
-    ) -> Float[Tensor, "T m"]:
-        """The memory at every row of one episode: from its strokes, as `stated`, or by a scan from `memory_start`."""
-        parts = [None] * len(self._laws) if stated is None else stated.split([size for _, size in self._laws], dim=-1)
-        found = [self._of(law, q, time, strokes, part) for (law, _), part in zip(self._laws, parts, strict=True)]
-        return torch.cat(found, dim=-1)
-
-    def _of(self, law: Law, q: Tensor, time: Tensor, strokes: Tensor, stated: Tensor | None) -> Tensor:
-        past = law.past_of(strokes)
-        if past is not None or stated is not None:
-            return stated if past is None else past  # type: ignore[return-value]  # one of them is not None
-        rows = [law.memory_start(self.robot)]
-        for step, dt in zip(self.robot.difference(q[:-1], q[1:]), time.diff().tolist(), strict=True):
-            rows.append(law.remember(rows[-1], step, dt))
-        return torch.stack(rows)
+    def past_of(self, strokes: Float[Tensor, "*batch nv strokes"]) -> Float[Tensor, "*batch m"]:
+        """The memory after these displacements of the joints, the last one first."""
+        return torch.cat([law.past_of(strokes) for law, _ in self._laws], dim=-1)

@@ -62,9 +62,6 @@ LOG_LENGTHSCALE_SPREAD = 2.0
 PERIOD_SPREAD = 0.02
 """Standard deviation of the prior on the logarithm of a period: likelihoods of periods have many narrow optima."""
 
-DEVIATION = 1e-4
-"""Of the variance, what a kernel beside a linear law is expected to have."""
-
 
 def squared_exponential(dimension: int, variance: float | Tensor) -> ScaleKernel:
     """k = variance exp(-r^2 / 2), r^2 = sum_d (z_d - z'_d)^2 / l_d^2; smooth forces. Starts at l = sqrt(dimension).
@@ -82,17 +79,6 @@ def matern(dimension: int, variance: float | Tensor, *, smoothness: float) -> Sc
     """
     base = MaternKernel(smoothness, ard_num_dims=dimension, lengthscale_constraint=log_scale())
     return _scaled(base, variance)
-
-
-def deviation(dimension: int, variance: float | Tensor) -> ScaleKernel:
-    """The squared exponential with `DEVIATION` of the variance, for what a linear law beside it leaves.
-
-    With an equal part it takes over what the law describes, and gives it up beyond the data: positions of a drone in
-    new wind were off by 7-15 % more after .5 s (`python -m benchmarks.quadrotor`).
-    """
-    kernel = squared_exponential(dimension, DEVIATION * float64(variance))
-    register_log_normal_prior(kernel, "outputscale", DEVIATION * float64(variance), LOG_VARIANCE_SPREAD)
-    return kernel
 
 
 def periodic(variance: float | Tensor, period: float) -> ScaleKernel:
@@ -292,7 +278,6 @@ KERNELS: dict[str, KernelFactory] = {
     "constant": constant,
     "linear": linear,
     "friction": friction,
-    "deviation": deviation,
 }
 """Kernels that an expression can name: name -> factory(dimension, variance). Add your own, `KERNELS["mine"] = factory`;
 a name may hold anything but "+"."""

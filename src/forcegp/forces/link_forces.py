@@ -330,15 +330,14 @@ class BaseWrench(SharedInputs):
 class AerodynamicForce(BaseWrench):
     """What air does to a body that flies: drag, changes of thrust with the flow and near the ground, and wind.
 
-    A linear kernel of the inputs holds the usual laws (Faessler, Franchi & Scaramuzza, IEEE RA-L 2018); "deviation"
-    beside it is what they leave. Velocities are those against the air: the fit finds the wind of its rows, and where u
-    has no columns of an `ObservedWind`, it is `wind` [m/s, world]. `observe` is the time in s that the observer of the
-    force that stays unexplained looks back (`forcegp.posterior.observing`); None follows the recording, 0 observes
-    nothing.
+    A linear kernel of the inputs holds the usual laws (Faessler, Franchi & Scaramuzza, IEEE RA-L 2018). Velocities are
+    those against the air: the fit finds the wind of its rows, and where u has no columns of an `ObservedWind`, it is
+    `wind` [m/s, world]. `observe` is the time in s that the observer of the force that stays unexplained looks back
+    (`forcegp.posterior.observing`); None follows the recording, 0 observes nothing.
     """
 
     inputs: tuple[str, ...] = ("velocity", "drag", "rotor-drag", "angular-velocity", "thrust", "height", "attitude")
-    kernel: str = "linear + deviation"
+    kernel: str = "linear"
     observe: float | None = None
     wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.inference.dense_kernels import DenseKernel, LatentKernels
-from forcegp.inference.likelihood import CholeskyFactor, Terms, deflate, factorize, whiten
+from forcegp.inference.likelihood import CholeskyFactor, Terms, factorize, whiten
 from forcegp.inference.posterior import BLOCK_BYTES, LatentPosterior
 
 ROUNDING = 1e-13
@@ -220,18 +220,14 @@ def inducing_pivots(
     ]
 
 
-def collapsed_bound(
-    terms: Terms, kernels: LatentKernels, points: Sequence[Float[Tensor, "_ _"]], k: float = 1.0
-) -> float:
+def collapsed_bound(terms: Terms, space: WeightSpace, k: float = 1.0) -> float:
     """An upper bound of `negative_log_likelihood` through inducing points, in nats; time O(N P^2).
 
-    Where k rows count as one, the noise of `terms` is k times that of a row, and densities have the power 1/k. Raises
-    NumericalError when a covariance cannot be factorised.
+    `space` is conditioned on these rows. Where k rows count as one, the noise of `terms` is k times that of a row, and
+    densities have the power 1/k.
     """
     with torch.no_grad():
-        W_white, y, log_noise = whiten(terms.W, terms.residual, terms.noise)
-        deflation = deflate(W_white, y)
-        space = WeightSpace.of(kernels, terms.features, points, deflation.C, deflation.t)
+        _, y, log_noise = whiten(terms.W, terms.residual, terms.noise)
         explained = (space.precision.lower.tril().mT @ space.mean).square().sum()
         quadratic = y.square().sum() - explained + space.precision.log_determinant() + len(y) * space.left_out
         return float(0.5 * quadratic + (log_noise + 0.5 * y.numel() * math.log(2.0 * math.pi / k)) / k)

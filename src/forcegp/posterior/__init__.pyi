@@ -1,6 +1,6 @@
 from .c_export import CExport as CExport, export_c as export_c
 from .casadi_export import casadi_function as casadi_function, export_casadi as export_casadi
-from .prediction import Components as Components, Curve as Curve, ForceComponent as ForceComponent
+from .prediction import Curve as Curve, ForceComponent as ForceComponent
 from .fitted import (
     HORIZONS as HORIZONS, Estimate as Estimate, Estimates as Estimates, MotionIntervals as MotionIntervals,
 )

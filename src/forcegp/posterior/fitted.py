@@ -376,8 +376,8 @@ class Fitted(Summary):
         """-log p(a | q, v, u) of the training data in nats, without hyperpriors; of inducing points the bound."""
         with torch.no_grad():
             if isinstance(self.latent, InducingPosterior):
-                terms, kernels = self.likelihood.terms(self.hyperparameters), self.kernels.at(self.hyperparameters)
-                return collapsed_bound(terms, kernels, self.latent.features, self.training.correlated_rows)
+                terms = self.likelihood.terms(self.hyperparameters)
+                return collapsed_bound(terms, self.latent.space, self.training.correlated_rows)
             return float(self.likelihood(self.kernels, self.hyperparameters))
 
     @override

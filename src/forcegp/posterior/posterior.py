@@ -29,8 +29,8 @@ from forcegp.posterior.observed_wrench import rows_of_own_system
 from forcegp.posterior.prediction import (
     ROWS_PER_BLOCK,
     Array,
-    Components,
     Curve,
+    ForceComponent,
     Gaussian,
     Inputs,
     Positions,
@@ -193,8 +193,8 @@ class Posterior(Fitted):
             spread = self.widening**2 * self.latent.covariance(features).reshape(*batch, latents, latents)
         return Gaussian(mean, spread)
 
-    def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> Components:
-        """Every force by itself: each term of the prior, their sum and the normal forces, from this one fit.
+    def components(self, q: Array, v: Array, u: Array, *, covariance: bool = True) -> dict[str, ForceComponent]:
+        """Every force by itself: each term of the prior, from this one fit; `predict` has their sum.
 
         `components(q, v, u)["joint-friction"].joint_force` is a `Gaussian` (..., nv) in Nm or N. Raises as `predict`.
         """

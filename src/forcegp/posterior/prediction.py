@@ -1,7 +1,7 @@
 """Predictions as values: of accelerations, of every force by itself, and of the u that makes an acceleration."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, NumericalError, UnknownName, require_known
+from forcegp.errors import InvalidInput, NumericalError, require_known
 from forcegp.evidence import Accelerations, ContactForces
 from forcegp.forces import Actuation, UnknownForces
 from forcegp.integration.integrators import find_roots, rows_jacobian
@@ -200,7 +200,7 @@ def state_tensor(name: str, values: Array, size: int, device: torch.device) -> T
 
 @dataclass(frozen=True, eq=False)
 class ForceComponent:
-    """One of the forces that add up to the unknown force, at a batch of states.
+    """One of the forces that add up to the unknown force, at a batch of states, as accelerations tell them apart.
 
     `joint_force` (..., nv) in Nm or N; `latents` (..., C) in `latent_units`; `point_force` (..., 3) in N, world axes,
     of forces at a point; `acceleration` (..., nv) is what it adds under the constraint, in rad/s^2 or m/s^2.
@@ -215,33 +215,7 @@ class ForceComponent:
     point_force: Gaussian | None
 
 
-@dataclass(frozen=True, eq=False)
-class Components(Mapping[str, ForceComponent]):
-    """The components by name; their sum `total` (..., nv) in Nm or N; the constraint's answer with known forces.
-
-    `multiplier` is lambda (..., m), `contact_force` the world force of every contact on the robot (..., 3 m), in N.
-    """
-
-    total: Gaussian
-    multiplier: Gaussian
-    contact_force: Gaussian
-    parts: Mapping[str, ForceComponent] = field(default_factory=dict)
-
-    @override
-    def __getitem__(self, name: str) -> ForceComponent:
-        require_known("component", name, "this model", self.parts, UnknownName)
-        return self.parts[name]
-
-    @override
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.parts)
-
-    @override
-    def __len__(self) -> int:
-        return len(self.parts)
-
-
-def components_of(prior: UnknownForces, dynamics: ConstrainedDynamics, latents: Gaussian) -> Components:
+def components_of(prior: UnknownForces, dynamics: ConstrainedDynamics, latents: Gaussian) -> dict[str, ForceComponent]:
     """All components of Q_U = B f at the states of `dynamics`."""
     robot = dynamics.state.robot
     B = prior.direction(dynamics)
@@ -258,12 +232,7 @@ def components_of(prior: UnknownForces, dynamics: ConstrainedDynamics, latents: 
             acceleration=own.through(dynamics.H @ mixing),
             point_force=None if point is None else own.through(point),
         )
-
-    def constraint(affine: tuple[Tensor, Tensor]) -> Gaussian:
-        return latents.through(affine[1] @ B, affine[0])
-
-    multiplier, contact_force = dynamics.multiplier_map(), dynamics.contact_force_map()
-    return Components(latents.through(B), constraint(multiplier), constraint(contact_force), parts)
+    return parts
 
 
 @dataclass(frozen=True, eq=False)
