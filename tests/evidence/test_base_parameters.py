@@ -7,13 +7,13 @@ from tests.posterior.arm import URDF
 from tests.robots.robot_models import TREE
 
 from forcegp.errors import InvalidInput
-from forcegp.evidence import BaseParameters, base_parameters, standard_parameters, torque_regressor
+from forcegp.evidence import BaseParameters, base_parameters, parameter_names, torque_regressor
 from forcegp.evidence.bodies import excitation
 from forcegp.robots import Robot
 
 
 @pytest.mark.parametrize("text", [URDF, TREE], ids=["arm", "tree"])
-def test_rank_and_regrouped_torques(text):
+def test_rank_and_columns(text):
     robot = Robot.from_urdf_text(text)
     base = base_parameters(robot)
     q, v, a = torch.tensor(np.random.default_rng(1).normal(size=(3, 40 * robot.nv, robot.nv)))
@@ -22,9 +22,7 @@ def test_rank_and_regrouped_torques(text):
     seen = norms > 1e-9 * norms.max()  # the others are zero up to rounding
     values = np.linalg.svd(Y[:, seen] / norms[seen], compute_uv=False)
     assert base.rank == (values > 1e-9 * values[0]).sum()
-    pi = standard_parameters(robot).numpy()
-    np.testing.assert_allclose(Y[:, list(base.independent)] @ base.values(pi), Y @ pi, atol=1e-9)
-    assert sorted((*base.independent, *base.dependent, *base.unseen)) == list(range(10 * robot.nv))
+    assert np.linalg.matrix_rank(Y[:, list(base.independent)], tol=1e-8) == base.rank
 
 
 def test_an_arm_of_three_turning_joints_has_fifteen():
@@ -32,10 +30,10 @@ def test_an_arm_of_three_turning_joints_has_fifteen():
 
     A joint about the direction of gravity shows one inertia, each joint that is not parallel to the one before seven.
     """
-    base = base_parameters(Robot.from_urdf_text(URDF))
+    robot = Robot.from_urdf_text(URDF)
+    base = base_parameters(robot)
     assert base.rank == 15
-    assert "upper.m" in {base.names[k] for k in base.unseen}  # it is never lifted
-    assert any("+" in expression for expression in base.expressions)
+    assert parameter_names(robot).index("upper.m") not in base.independent  # it is never lifted
 
 
 def test_a_motion_of_one_joint_excites_less():
@@ -50,13 +48,11 @@ def test_a_motion_of_one_joint_excites_less():
     assert rich.rank == 15
     scaled = torque_regressor(robot, *torch.tensor(generator.normal(size=(3, 50, 3)))).flatten(0, 1).numpy()
     chosen = scaled[:, list(rich.independent)]
-    assert BaseParameters.of(chosen, tuple("abcdefghijklmno")).condition == pytest.approx(
-        np.linalg.cond(chosen / np.linalg.norm(chosen, axis=0))
-    )
+    assert BaseParameters.of(chosen).condition == pytest.approx(np.linalg.cond(chosen / np.linalg.norm(chosen, axis=0)))
 
 
 def test_regressors_that_say_nothing():
     with pytest.raises(InvalidInput, match="nothing moves"):
-        BaseParameters.of(np.zeros((4, 2)), ("a", "b"))
+        BaseParameters.of(np.zeros((4, 2)))
     with pytest.raises(InvalidInput, match="not finite"):
-        BaseParameters.of(np.full((4, 2), np.nan), ("a", "b"))
+        BaseParameters.of(np.full((4, 2), np.nan))

@@ -12,7 +12,7 @@ from tests.robots.robot_models import loaded
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, RobotFileWarning
-from forcegp.evidence import Accelerations, Torques, base_parameters, motion_residuals, standard_parameters
+from forcegp.evidence import Accelerations, Torques, motion_residuals
 from forcegp.evidence.least_squares import Fit
 from forcegp.fit import fit
 from forcegp.fit.physical import _with_noise_in_both
@@ -80,11 +80,6 @@ def test_exact_data_give_the_truth(evidence):
     force, acceleration = motion_residuals(test, found.model)
     assert abs(force).max() < 5e-3 * abs(test.u).max()
     assert abs(acceleration).max() < 5e-3 * abs(test.a).max()
-    base = base_parameters(found.model.robot)
-    truth, ours = (standard_parameters(model.robot).numpy() for model in (test.model, found.model))
-    # rotor inertias stand in for an inertia about each axis, so only the others have one value
-    clear = [k for k, expression in enumerate(base.expressions) if "zz" not in expression and "yy" not in expression]
-    np.testing.assert_allclose(base.values(ours)[clear], base.values(truth)[clear], atol=1e-2)
     for name, value in (
         ("viscous.pan", 0.3),
         ("coulomb.level.lift", 0.5),
@@ -139,7 +134,6 @@ def test_what_the_log_does_not_show_is_said():
     assert told["parameters"]["viscous.pan"]["unit"] == "Nm s/rad"
     assert found.parameters.by_body["upper"] == 10
     assert found.parameters.base.rank < 15
-    assert found.parameters.open_directions
 
 
 def test_progress_and_a_limit_on_rows():

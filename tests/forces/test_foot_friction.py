@@ -3,7 +3,7 @@
 import torch
 
 from forcegp import Contact, Model, Plane, Robot
-from forcegp.forces import foot_friction
+from forcegp.forces import ContactFriction
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 
@@ -21,7 +21,7 @@ def test_feet_that_stand_resist_their_own_sliding_and_no_other():
     u = torch.zeros(3, 14, dtype=torch.float64)
     u[:, 12:] = torch.tensor([[1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
     dynamics = model.dynamics(q, v, u)
-    feet_forces = foot_friction((0, 1))
+    feet_forces = [ContactFriction(contact=k, load=True) for k in (0, 1)]
     for force in feet_forces:
         force.check(model.robot, model.contacts)
     mixing = torch.cat([force.direction(dynamics) for force in feet_forces], dim=-1)

@@ -48,7 +48,6 @@ from forcegp.cli.robot_options import (
 from forcegp.cli.terminal import Terminal, columns, facts, with_option_names
 from forcegp.doubts import Doubts
 from forcegp.errors import ContactError, ContactWarning, DatasetError
-from forcegp.summary import listed as in_words
 
 NEARLY_ALL = 0.995
 """Share of rows in contact from which on the contacts count as closed all the time (impacts and noise take a few)."""
@@ -303,9 +302,6 @@ def owner_and_part(name: str) -> tuple[str, str]:
 def what_is_open(estimates: forcegp.posterior.Estimates) -> list[str]:
     """Sentences about what the prior decides, and what was changed."""
     lines, bodies = [], estimates.by_body or {}
-    if estimates.open_directions:
-        told = in_words(estimates.open_directions, most=5)
-        lines.append(f"Combinations that the prior decides, for no row tells their parts apart: {told}.")
     if bodies:
         weak = ", ".join(f"{name} ({number} of 10)" for name, number in bodies.items())
         lines.append(f"Directions of single bodies that the prior decides: {weak}.")

@@ -28,8 +28,6 @@ from forcegp.robots.urdf_file import replace_inertial
 
 PARAMETERS = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 """Names of the standard parameters of one body; mx = m cx."""
-UNITS = ("kg", *("kg m",) * 3, *("kg m^2",) * 6)
-"""Their units."""
 
 
 def torque_regressor(
@@ -71,74 +69,36 @@ def parameter_names(robot: Robot) -> tuple[str, ...]:
 
 RANK_TOLERANCE = 1e-9
 """Diagonal entries of R below this fraction of the largest are zero, for columns of norm 1."""
-NAMED = 1e-6
-"""Coefficients below this fraction of the largest in a base parameter are rounding."""
 RANDOM_ROWS = 50
 """Random states per joint that stand for every motion."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class BaseParameters:
-    """What a regressor (rows, p) identifies of p parameters.
+    """What a regressor (rows, p) identifies: columns that are `independent`, and their `condition` at norm 1."""
 
-    `independent` are the columns of the base parameters, `dependent` those that are regrouped by `regrouping` (r, p -
-    r), `unseen` those that are zero; `condition` is that of the independent columns, each divided by its norm.
-    """
-
-    names: tuple[str, ...]
     independent: tuple[int, ...]
-    dependent: tuple[int, ...]
-    unseen: tuple[int, ...]
-    regrouping: Float[np.ndarray, "r dependent"]
     condition: float
 
     @classmethod
-    def of(cls, regressor: Float[np.ndarray, "rows p"], names: tuple[str, ...]) -> "BaseParameters":
+    def of(cls, regressor: Float[np.ndarray, "rows p"]) -> "BaseParameters":
         """From the stacked rows of a regressor. Raises InvalidInput where it is zero or not finite."""
         if not np.isfinite(regressor).all():
             raise InvalidInput("the regressor is not finite; check q, v and a for NaN and infinity.")
         norms = np.linalg.norm(regressor, axis=0)
-        seen = np.flatnonzero(norms > RANK_TOLERANCE * norms.max())
         if norms.max() == 0.0:
             raise InvalidInput("the regressor is zero: nothing moves and nothing weighs, so no parameter shows.")
+        seen = np.flatnonzero(norms > RANK_TOLERANCE * norms.max())
         triangular, order = scipy.linalg.qr(regressor[:, seen] / norms[seen], mode="r", pivoting=True)
         diagonal = np.abs(triangular.diagonal())
         rank = int((diagonal > RANK_TOLERANCE * diagonal[0]).sum())
-        first, rest = seen[order[:rank]], seen[order[rank:]]
-        scaled = scipy.linalg.solve_triangular(triangular[:rank, :rank], triangular[:rank, rank:])
-        regrouping = scaled * norms[rest] / norms[first][:, None]
         values = np.linalg.svd(triangular[:rank, :rank], compute_uv=False)
-        unseen = np.setdiff1d(np.arange(len(names)), seen)
-        return cls(
-            names,
-            *(tuple(int(k) for k in columns) for columns in (first, rest, unseen)),
-            regrouping=regrouping,
-            condition=float(values[0] / values[-1]),
-        )
+        return cls(tuple(seen[order[:rank]].tolist()), float(values[0] / values[-1]))
 
     @property
     def rank(self) -> int:
         """How many base parameters there are."""
         return len(self.independent)
-
-    @property
-    def expressions(self) -> tuple[str, ...]:
-        """Every base parameter as a sum, for instance "fore.mz + 0.25 hand.m"."""
-        return tuple(self._expression(row) for row in range(self.rank))
-
-    def values(self, parameters: Float[np.ndarray, " p"]) -> Float[np.ndarray, " r"]:
-        """Base parameters beta of these parameters."""
-        return parameters[list(self.independent)] + self.regrouping @ parameters[list(self.dependent)]
-
-    def _expression(self, row: int) -> str:
-        weights = self.regrouping[row]
-        terms = [self.names[self.independent[row]]]
-        scale = max(1.0, float(abs(weights).max(initial=0.0)))
-        for column, weight in zip(self.dependent, weights, strict=True):
-            if abs(weight) > NAMED * scale:
-                factor = "" if abs(abs(weight) - 1.0) < NAMED else f"{abs(weight):.3g} "
-                terms.append(f"{'+' if weight > 0 else '-'} {factor}{self.names[column]}")
-        return " ".join(terms)
 
 
 def base_parameters(robot: Robot) -> BaseParameters:
@@ -153,7 +113,7 @@ def excitation(
 ) -> BaseParameters:
     """What recorded states identify: `rank` below that of `base_parameters` means that something never showed."""
     states = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, a))
-    return BaseParameters.of(torque_regressor(robot, *states).flatten(0, 1).cpu().numpy(), parameter_names(robot))
+    return BaseParameters.of(torque_regressor(robot, *states).flatten(0, 1).cpu().numpy())
 
 
 # symmetric matrices Z = sum_k z_k E_k, orthonormal in the Frobenius norm

@@ -14,7 +14,7 @@ from forcegp.data.views import at_rest, postures
 from forcegp.doubts import Doubt, Doubts, look
 from forcegp.errors import DatasetError, InvalidInput, require_type
 from forcegp.evidence import Accelerations, Torques
-from forcegp.evidence.bodies import BaseParameters, parameter_names, thickened
+from forcegp.evidence.bodies import BaseParameters, thickened
 from forcegp.evidence.least_squares import (
     LEAST,
     ROUNDS,
@@ -294,7 +294,7 @@ def _estimates(
     everything = len(space.carried) == len(space.own) and all(each.payload is None for each in space.carried)
     if everything and space.carried:
         Y = equations.parts[0].without_contacts(equations.measured[0].regressor)
-        base = BaseParameters.of(Y.reshape(-1, Y.shape[-2] * 10), parameter_names(space.model.robot))
+        base = BaseParameters.of(Y.reshape(-1, Y.shape[-2] * 10))
         by_body = _weak_directions(space, fit.information, prior.T @ prior)
     return Estimates.of_search(
         space.parameters,

@@ -2,7 +2,7 @@ from .actuation import (
     Actuation as Actuation, LinkForce as LinkForce, ObservedWind as ObservedWind, ObservedWrench as ObservedWrench,
     Thrusters as Thrusters,
 )
-from .contact_friction import ContactFriction as ContactFriction, foot_friction as foot_friction
+from .contact_friction import ContactFriction as ContactFriction
 from .force import Force as Force, Law as Law
 from .joint_law import JointLaw as JointLaw
 from .joint_forces import (

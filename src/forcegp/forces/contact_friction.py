@@ -262,11 +262,3 @@ def refined_loads(forces: UnknownForces, robot: Robot, table: Table) -> UnknownF
 def _wants_load(term: Unknown) -> bool:
     """Whether its latent is a friction coefficient, and the load is still to be found."""
     return isinstance(term, ContactFriction) and term.load and term.expected is None
-
-
-def foot_friction(contacts: tuple[int, ...] = (0, 1, 2, 3)) -> tuple[ContactFriction, ...]:
-    """Friction under feet that slide, in proportion to the normal force at each of the contacts.
-
-    In rows whose switch is 0 there is none. Points that are held (`fixed_point`) do not slide.
-    """
-    return tuple(ContactFriction(contact=contact, load=True) for contact in contacts)

@@ -50,7 +50,6 @@ SHORT: dict[str, tuple[str, Mapping[str, Any]]] = {
     "tool-friction": ("tool-forces", {}),
     "tool-forces": ("tool-forces", {"inputs": ("velocity", "position"), "kernel": "squared-exponential"}),
     "load-friction": ("contact-friction", {"load": True}),
-    "foot-friction": ("contact_friction.foot_friction", {}),
 }
 """Names that `parse_forces` takes besides, with fields that differ from their defaults."""
 

@@ -87,12 +87,11 @@ class Estimate:
 class Estimates(Summary, Mapping[str, Estimate]):
     """The numbers that a fit estimated, by name: `estimates["payload.mass"].value`; `settled` if the search converged.
 
-    `covariance` (n, n) is that of all values, in SI units; `open_directions` are combinations that the prior decides.
+    `covariance` (n, n) is that of all values, in SI units.
     """
 
     entries: tuple[Estimate, ...] = ()
     covariance: Float[np.ndarray, "n n"] | None = None
-    open_directions: tuple[str, ...] = ()
     by_body: Mapping[str, int] | None = None
     """Of ten directions of each body, how many the prior decides, where it decides any."""
     base: BaseParameters | None = None
@@ -145,9 +144,8 @@ class Estimates(Summary, Mapping[str, Estimate]):
         return {
             "parameters": {each.name: each.to_dict() for each in self.entries},
             "covariance": None if self.covariance is None else self.covariance.tolist(),
-            "open_directions": list(self.open_directions),
             "by_body": None if self.by_body is None else dict(self.by_body),
-            "base_parameters": None if self.base is None else list(self.base.expressions),
+            "base_parameters": None if self.base is None else self.base.rank,
             "condition_number": None if self.base is None else self.base.condition,
             **{name: getattr(self, name) for name in ("evidence", "rows", "evaluations", "settled")},
             "thickened": list(self.thickened),
@@ -162,8 +160,7 @@ class Estimates(Summary, Mapping[str, Estimate]):
         kept: dict[str, Any] = {
             name: stored[name] for name in ("by_body", "evidence", "rows", "evaluations", "settled")
         }
-        kept |= {name: tuple(stored[name]) for name in ("open_directions", "thickened")}
-        return cls(entries, covariance, **kept)
+        return cls(entries, covariance, thickened=tuple(stored["thickened"]), **kept)
 
     @classmethod
     def of_search(
@@ -235,27 +232,7 @@ class Estimates(Summary, Mapping[str, Estimate]):
                 why = "rows show it only together with others"
             numbers = float(values[k]), float(std[k]), each.start, float(prior_std[k])
             entries.append(Estimate(each.name, each.unit, *numbers, "prior" if held else "log", why))
-        return cls(tuple(entries), spread, _open_directions(information, prior, slopes, names), **more)
-
-
-def _open_directions(
-    information: np.ndarray, prior: np.ndarray, slopes: np.ndarray, names: Sequence[str]
-) -> tuple[str, ...]:
-    """Combinations of numbers, in their prior deviations, of which the log holds less than the prior; worst first."""
-    root = np.linalg.inv(np.linalg.cholesky(prior.T @ prior)).T  # a body of which some parts are open has more rows
-    values, vectors = np.linalg.eigh(root.T @ information @ root)
-    out = []
-    for value, vector in zip(values, vectors.T, strict=True):
-        if value >= 1.0:
-            break
-        change = slopes @ (root @ vector)
-        scale = np.sqrt(np.maximum(((slopes @ root) ** 2).sum(1), 1e-300))
-        share = change / scale
-        main = [k for k in np.argsort(-abs(share)) if abs(share[k]) >= 0.5 * abs(share).max()][:3]
-        sign = 1.0 if share[main[0]] > 0 else -1.0
-        text = " ".join(f"{'-' if sign * change[k] < 0 else '+'} {abs(change[k]):.2g} {names[k]}" for k in main)
-        out.append(text.removeprefix("+ "))
-    return tuple(out)
+        return cls(tuple(entries), spread, **more)
 
 
 HORIZONS = (0.1, 0.25, 0.5, 1.0)  # s, by default
