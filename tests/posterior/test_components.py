@@ -115,13 +115,16 @@ def test_components_are_those_of_dense_conditioning(posterior, dense, states, co
     close(total.covariance, B @ covariance @ B.mT)
     alone = sum(part.joint_force.covariance for part in components.values())
     assert float((total.covariance - alone).abs().max()) > 1e-4  # the data tie the parts to each other
-    for gaussian, affine in (
-        (predicted.multiplier, dynamics.multiplier_map()),
-        (predicted.contact_force, dynamics.contact_force_map()),
-        (predicted.acceleration, dynamics.acceleration_map()),
+    learned = B @ covariance @ B.mT
+    noise = moved.unlearned(dynamics)
+    whole = learned if noise is None else learned + noise
+    for gaussian, affine, spread in (
+        (predicted.multiplier, dynamics.multiplier_map(), whole),
+        (predicted.contact_force, dynamics.contact_force_map(), whole),
+        (predicted.acceleration, dynamics.acceleration_map(), learned),
     ):
         close(gaussian.mean, affine(total.mean))
-        close(gaussian.covariance, affine.matrix @ B @ covariance @ B.mT @ affine.matrix.mT)
+        close(gaussian.covariance, affine.matrix @ spread @ affine.matrix.mT)
     if contacts == "none":
         assert float(components["contact-friction"].joint_force.mean.abs().max()) == 0.0
     bare = moved.components(*states, covariance=False)

@@ -141,28 +141,17 @@ class Graph:
         if len(operands) < 2:
             return None
         y = operands[1]
-        minus_x, minus_y = self._negated(x), self._negated(y)
         match operation:
             case "add" if ZERO in operands:
                 return y if x == ZERO else x
-            case "add" if minus_y is not None:
-                return self.apply("subtract", x, minus_y)
-            case "add" if minus_x is not None:
-                return self.apply("subtract", y, minus_x)
             case "subtract" if x == y:
                 return ZERO
             case "subtract" if ZERO in operands:
                 return x if y == ZERO else self.apply("negate", y)
-            case "subtract" if minus_y is not None:
-                return self.apply("add", x, minus_y)
             case "multiply" if ZERO in operands:
                 return ZERO
             case "multiply" if ONE in operands:
                 return y if x == ONE else x
-            case "multiply" | "divide" if minus_x is not None:
-                return self.apply("negate", self.apply(operation, minus_x, y))
-            case "multiply" | "divide" if minus_y is not None:
-                return self.apply("negate", self.apply(operation, x, minus_y))
             case "divide" if x == ZERO or y == ONE:
                 return x
             case "divide" if known[1]:

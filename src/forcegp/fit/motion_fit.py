@@ -133,7 +133,7 @@ class MotionFit:
         return self.stride * self.recorded.dt
 
     @cached_property
-    def q(self) -> Float[Tensor, "K rows nv"]:
+    def q(self) -> Float[Tensor, "K rows nq"]:
         """Recorded positions at the ends of the steps."""
         return torch.as_tensor(self.recorded.q[:, :: self.stride].copy())
 

@@ -43,9 +43,9 @@ class WindowMotions:
     `in_start` and `in_parameters` are derivatives of q in (q_0, v_0) and in p.
     """
 
-    q: Float[Tensor, "K rows nv"]
+    q: Float[Tensor, "K rows nq"]
     v: Float[Tensor, "K rows nv"]
-    middle_q: Float[Tensor, "K T nv"]
+    middle_q: Float[Tensor, "K T nq"]
     middle_v: Float[Tensor, "K T nv"]
     found: Bool[Tensor, " K"]
     in_start: Float[Tensor, "K rows nv 2*nv"] | None = None
@@ -54,11 +54,11 @@ class WindowMotions:
 
 def window_motions(
     accelerations: Accelerations,
-    q0: Float[Tensor, "K nv"],
+    q0: Float[Tensor, "K nq"],
     v0: Float[Tensor, "K nv"],
     u: Float[Tensor, "K T nu"],
     h: float,
-    guess: tuple[Float[Tensor, "K T nv"], Float[Tensor, "K T nv"]],
+    guess: tuple[Float[Tensor, "K T nq"], Float[Tensor, "K T nv"]],
     *,
     patient: bool = True,
 ) -> WindowMotions:
@@ -89,7 +89,7 @@ def window_motions(
 
 def _step_by_step(
     accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, h: float
-) -> tuple[Float[Tensor, "K T nv"], Float[Tensor, "K T nv"], Bool[Tensor, " K"]]:
+) -> tuple[Float[Tensor, "K T nq"], Float[Tensor, "K T nv"], Bool[Tensor, " K"]]:
     """The middles of motions, by Newton's method with shorter steps, and which of them have an end."""
     positions, velocities, ended = [], [], torch.ones(len(q), dtype=torch.bool, device=q.device)
     for force in u.unbind(1):
