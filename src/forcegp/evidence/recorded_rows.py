@@ -235,7 +235,8 @@ class RecordedRows:
         M = M + self.inertia + self.space.added_inertia(x)
         torque, _ = self._terms(x, np.zeros_like(self.v))
         parts = (M, self.held, self.right, np.zeros((*self.right.shape, 3)), self.force - bias - torque)
-        dynamics = ConstrainedDynamics(self.state, *(torch.as_tensor(part) for part in parts))
+        mass, A, b, normals, force = map(torch.as_tensor, parts)
+        dynamics = ConstrainedDynamics(self.state, mass, A, b, normals, force)
         return dynamics.acceleration_map().offset.numpy(), M, dynamics.H.numpy()
 
     def in_acceleration(self, x: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

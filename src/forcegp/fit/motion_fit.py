@@ -92,7 +92,7 @@ class Unknowns:
         carriers = [each.body for each in self.space.carried]
 
         def at(q: Tensor, v: Tensor, u: Tensor, parameters: bool) -> Linear:
-            a, slopes = rows_jacobian(lambda z: mean(*z.split(nv, dim=-1), u), torch.cat([q, v], dim=-1))
+            a, slopes = rows_jacobian(lambda z: mean(z[:, :nv], z[:, nv:], u), torch.cat([q, v], dim=-1))
             a_q, a_v = slopes.split(nv, dim=-1)
             if not parameters:
                 return Linear(a, a_q, a_v)

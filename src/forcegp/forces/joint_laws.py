@@ -298,7 +298,8 @@ def law_columns(laws: Iterable[Law], robot: Robot, q: np.ndarray, v: Values, u: 
 
     Laws without numbers count as 1: of a law that is linear in its first coefficient the column is the regressor.
     """
-    state = State(*(torch.tensor(np.array(x), device=robot.device) for x in (q, v, u)), robot)
+    at_q, at_v, at_u = (torch.tensor(np.array(x), device=robot.device) for x in (q, v, u))
+    state = State(at_q, at_v, at_u, robot)
     out = []
     for law in laws:
         if not isinstance(law, JointLaw):
