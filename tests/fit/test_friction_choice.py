@@ -9,7 +9,7 @@ import torch
 from tests.forces.test_presliding import JOINTS, log_of, lugre_log, motion  # noqa: F401  # a fixture
 from tests.posterior.arm import arm_model
 
-from forcegp import Torques, fit
+from forcegp import Torques, fit, score
 from forcegp.data import Dataset
 from forcegp.evidence import motion_residuals
 from forcegp.fit.friction_choice import (
@@ -95,6 +95,15 @@ def test_motors_that_turn_with_two_joints_are_found(T):
     words = friction_in_words(posterior.model, log, "Nm")
     assert ("the motor of bend turns with -1 lift +1 bend" in words) == (T is COUPLED)
     assert words.count("the motor of") == (T is COUPLED)
+
+
+def test_models_of_such_motors_are_scored_on_rows_that_are_held_out():
+    """Rows of a split, and points among them, know the strokes of motors that the fit has found."""
+    log = log_with(lambda v, rigid: (LEVEL * sign(v @ COUPLED.T) + 0.2 * (v @ COUPLED.T)) @ COUPLED, rows=1500)
+    how = {"split": "blocks:5:3", "identification": "viscous+gear+rotor@torques", "horizons": (), "points": 30}
+    found = score(["identified"], log, seeds=1, **how)
+    assert not found.failures
+    assert found.value("share", "torque", "identified") < 0.2
 
 
 def test_a_transmission_that_is_stated_or_that_of_the_actuators_is_taken():

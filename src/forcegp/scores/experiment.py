@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from forcegp.data import Dataset, contact_doubts, farthest_rows
+from forcegp.data import Dataset, contact_doubts, farthest_rows, with_strokes
 from forcegp.data.dataset import require_rows
 from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, require_type
 from forcegp.fit import fit
@@ -111,6 +111,10 @@ class Experiment:
     def motions(self, split: Split) -> HeldOutMotions:
         """The motions to predict in what this split holds out."""
         return held_out_motions(self.recording, split.test_rows(self.recording), self.horizons, self.starts)
+
+    def rows_for(self, identified: Model | str | None) -> Dataset:
+        """All rows, which know the strokes of the motors that an identified model has found, also those of a split."""
+        return with_strokes(self.rows, identified.memory.transmission) if isinstance(identified, Model) else self.rows
 
     def fitted(
         self, work: Candidate, rows: Dataset, recording: Dataset, identified: Model | str | None, seed: int = 0
@@ -221,8 +225,8 @@ def _identify(experiment: Experiment, train: Dataset, name: str) -> dict[str, An
 def _score(
     store: JobStore, experiment: Experiment, split: Split, spec: Mapping[str, Any], work: Candidate
 ) -> dict[str, Any]:
-    train, test = split.apply(experiment.rows)
     identified, before = identified_before(store, spec["identified"]) if "identified" in spec else (None, 0.0)
+    train, test = split.apply(experiment.rows_for(identified))
     start = time.process_time()
     posterior = experiment.fitted(work, train, split.apply(experiment.recording)[0], identified, spec["seed"])
     seconds = before + time.process_time() - start

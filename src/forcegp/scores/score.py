@@ -142,11 +142,9 @@ def score(
 
 
 def _on_all_rows(experiment: Experiment, chosen: Mapping[str, Candidate], name: str) -> Posterior:
-    work, rows = chosen[name], experiment.rows
-    of = work.identification
-    return experiment.fitted(
-        work, rows, experiment.recording, None if of is None else identified_model(of, experiment.model, rows)
-    )
+    work, of = chosen[name], chosen[name].identification
+    identified = None if of is None else identified_model(of, experiment.model, experiment.rows)
+    return experiment.fitted(work, experiment.rows_for(identified), experiment.recording, identified)
 
 
 def write(scores: Scores, folder: Path) -> None:
