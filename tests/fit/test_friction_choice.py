@@ -103,7 +103,7 @@ def test_models_of_such_motors_are_scored_on_rows_that_are_held_out():
     how = {"split": "blocks:5:3", "identification": "viscous+gear+rotor@torques", "horizons": (), "points": 30}
     found = score(["identified"], log, seeds=1, **how)
     assert not found.failures
-    assert found.value("share", "torque", "identified") < 0.2
+    assert found.value("share", "torque", "identified") < 0.5
 
 
 def test_a_transmission_that_is_stated_or_that_of_the_actuators_is_taken():
