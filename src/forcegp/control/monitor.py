@@ -67,9 +67,9 @@ class ContactMonitor:
     learned forces adds where `model`, `posterior.predictor()` or a `Model`, has one. D_s are errors of friction near
     rest, of the size s exp(-|v| / v_s), filtered as tau is: reversals show how large they are, and a joint that creeps
     has them for long. Where M a of a joint goes beyond what free motion has shown, its errors grow in proportion. An
-    alarm is raised where tau^T S^-1 tau
-    exceeds a threshold that free motion reaches as often as stated. Raises InvalidInput for arguments that do not fit
-    and a monitor that was not calibrated, DatasetError for free motion that is too short.
+    alarm is raised where tau^T S^-1 tau exceeds a threshold that free motion reaches as often as stated. Raises
+    InvalidInput for arguments that do not fit and a monitor that was not calibrated, DatasetError for free motion that
+    is too short.
     """
 
     def __init__(self, model: Moving, *, dt: float, bandwidth: float = 2.0) -> None:
@@ -121,7 +121,7 @@ class ContactMonitor:
             )
         tau, M = torch.cat([each[0] for each in found]), torch.cat([each[1] for each in found])
         v, inertial = torch.cat([each[3] for each in found]), torch.cat([each[4] for each in found])
-        self.largest = inertial.abs().amax(0)
+        self.largest = inertial.abs().amax(0).clamp_min(1e-9)  # of a joint that rested, any motion is beyond
         self.noise = NoiseLevels.of(torch.linalg.solve(M, tau[..., None])[..., 0].numpy(), M.numpy())
         speed = np.maximum(v.square().mean(0).sqrt().numpy(), 1e-12)
         slow = [np.concatenate([self._near_rest(each[3], share * speed)[settle:] for each in found]) for share in SLOW]
