@@ -360,6 +360,9 @@ class Payload(Command):
         baseline = None if self.baseline is None else self._rows(terminal, self.baseline, notes)[1]
         notes += forces_of(model)
         words = [word for word in self.forces if word != "none"]
+        if self.forces == LAWS and forcegp.data.views.at_rest(rows):
+            words = ["offset"]
+            notes.append("the log is of postures alone: no motion shows friction, of which each rest has its own share")
         model = forcegp.scores.named_model(model, words)
         with terminal.progress("identifying"):
             found = with_payload(model, rows, self.link, baseline)

@@ -129,6 +129,13 @@ class ParameterSpace:
         count = self.bodies.size
         return np.concatenate([self.bodies.moved(x[:count], step[:count]), x[count:] + step[count:]])
 
+    def change(self, x: Float[np.ndarray, " k"], other: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """The step from x to others, straight in parameters of bodies."""
+        count = self.bodies.size
+        moved = self.bodies.parameters(other[:count]) - self.bodies.parameters(x[:count])
+        of_bodies = np.linalg.solve(self.bodies.slopes(x[:count]), moved.ravel()) if count else x[:0]
+        return np.concatenate([of_bodies, other[count:] - x[count:]])
+
     # --- what the coordinates are
 
     @cached_property

@@ -174,17 +174,19 @@ class Estimates(Summary, Mapping[str, Estimate]):
         white: Float[np.ndarray, "N k+1"],
         stretches: Sequence[np.ndarray],
         prior: Float[np.ndarray, "entries k"],
+        changes: Float[np.ndarray, "stretches k"] | None = None,
         **more: Any,
     ) -> "Estimates":
         """From the Jacobian of whitened residuals, with them as last column, rows by stretches, and of the prior.
 
-        `slopes` are derivatives of the values in the coordinates. Without stretches the covariance is F^-1.
+        `slopes` are derivatives of the values in the coordinates, `changes` those of the coordinates without each
+        stretch, if not by one step. Without stretches the covariance is F^-1.
         """
         J, r, G = white[:, :-1], white[:, -1], prior.T @ prior
         information = J.T @ J
         whole, root = information + G, np.linalg.inv(np.linalg.cholesky(G)).T
-        moved = []
-        for at in stretches:
+        moved = [] if changes is None else list(changes)
+        for at in stretches if changes is None else ():
             own = J[at]
             # in coordinates in which the prior is the identity, what is left has eigenvalues of 1 at least
             sizes, vectors = np.linalg.eigh(root.T @ (whole - own.T @ own) @ root)
