@@ -301,6 +301,29 @@ class ParameterSpace:
             column += len(term.size)
         return known, -slopes * of_gain
 
+    @property
+    def has_gains(self) -> bool:
+        """Whether gains of the actuators are estimated."""
+        return any(isinstance(self.model.laws[term.law], Actuation) for term in self.terms)
+
+    def as_logged(
+        self, x: Float[np.ndarray, " k"], r: Float[np.ndarray, "rows nv"], jacobian: Float[np.ndarray, "rows nv k"]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Residual torques and their Jacobian over the gains: in units of the log, whose noise no gain changes.
+
+        As torques they vanish with the gains and all that is unknown, which no noise would speak against.
+        """
+        count, column = self.bodies.size, 0
+        for own, term in zip(self.split(x)[1], self.terms, strict=True):
+            if isinstance(self.model.laws[term.law], Actuation):
+                places, gains = list(term.joints or ()), np.ones(r.shape[1])
+                gains[places] = term.values(own)
+                r, jacobian = r / gains, jacobian / gains[:, None]
+                columns = range(count + column, count + column + len(places))
+                jacobian[:, places, columns] -= r[:, places] * (term.slopes(own) / gains[places])
+            column += len(term.size)
+        return r, jacobian
+
     @cached_property
     def _estimated(self) -> dict[int, Law]:
         return {index: self.model.laws[index] for index in dict.fromkeys(term.law for term in self.terms)}

@@ -60,6 +60,7 @@ class Equations:
         self.ends = np.cumsum([len(log) for log in logs])[:-1]
         self.measured = [part.moving(a) for part, a in zip(self.parts, self.each(self.a), strict=True)]
         self.held = _stacked([part.open if evidence.of_torque else part.held for part in self.parts])
+        self.in_units_of_log = space.has_gains and not self.held.shape[1]
         seconds = evidence.mean if isinstance(evidence, Torques) else None
         self.tell_bodies = seconds is not None and not all(map(at_rest, logs))  # any numbers explain a few postures
         self.windows = None if seconds is None else WindowMeans(logs, seconds)
@@ -84,13 +85,13 @@ class Equations:
         return np.concatenate(r), Chained(self._regressor, slopes, np.concatenate(in_terms))
 
     def in_torque(self, x: np.ndarray, motions: Sequence[Motion]) -> tuple[np.ndarray, Jacobian]:
-        """Torques needed less those measured."""
+        """Torques needed less those measured; where gains are estimated and contacts hide nothing, as they are logged."""
         found = [part.in_torque(x, motion)[:3] for part, motion in zip(self.parts, motions, strict=True)]
         r, jacobian = self.equations(x, found)
-        if self.windows is None:
-            return r, jacobian
-        free = partial(without, span=self.held.swapaxes(1, 2) if self.held.shape[1] else None)
-        return self.windows.mean(free(r)), self.windows.mean(free(np.asarray(jacobian)))
+        if self.windows is not None:
+            free = partial(without, span=self.held.swapaxes(1, 2) if self.held.shape[1] else None)
+            r, jacobian = self.windows.mean(free(r)), self.windows.mean(free(np.asarray(jacobian)))
+        return self.space.as_logged(x, r, np.asarray(jacobian)) if self.in_units_of_log else (r, jacobian)
 
     def in_acceleration(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Accelerations measured less those predicted."""
@@ -238,7 +239,7 @@ def fit_physical(
     elif evidence.of_torque:
         torque = partial(equations.in_torque, motions=equations.measured)
         fit = search(torque, start=x, held=held, progress=note)
-        if equations.rests and held is None and space.carried:
+        if options["sizes"] is not None and held is None:
             changes = changes_without_rests(search, torque, space, fit.x, equations.rests)
     else:
         fit = search(equations.in_acceleration, start=x, progress=note)
