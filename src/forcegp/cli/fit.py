@@ -424,4 +424,5 @@ def with_payload(
 def payload_dict(found: Any, baseline: bool) -> dict[str, Any]:
     """Payload and other numbers as plain JSON values, with the link that carries it."""
     [payload] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
-    return {"link": payload.link, "baseline": baseline, **found.estimates.to_dict()}
+    doubts = found.settings["doubts"]
+    return {"link": payload.link, "baseline": baseline, "doubts": doubts, **found.estimates.to_dict()}

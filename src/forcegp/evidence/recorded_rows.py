@@ -132,7 +132,7 @@ class RecordedRows:
     ) -> None:
         model, robot = space.model, space.model.loaded_robot
         at_q, at_v, at_u = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, u))
-        self.space, self.loaded, self.v = space, loaded, np.array(v)
+        self.space, self.loaded, self.q, self.v = space, loaded, np.array(q), np.array(v)
         past = None if strokes is None else torch.as_tensor(np.array(strokes), device=robot.device)
         self.state = replace(model.state(at_q, at_v, at_u), strokes=past)
         self.kinematics = self.state.kinematics

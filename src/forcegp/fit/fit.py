@@ -279,6 +279,7 @@ def _of_numbers(model: Model, logs: Sequence[Dataset], evidence: Any, rows: int 
         "evidence": str(evidence),
         "forces": [described_force(force) for force in model.forces],
         "noise": found.noise.to_dict(),
+        "doubts": list(found.doubts),
     }
     noise = found.noise.parameters(model.robot.nv, model.robot.device)
     return Posterior.conditioned(trained, training, noise, result, settings, estimates=found.estimates)

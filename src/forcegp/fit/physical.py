@@ -29,6 +29,7 @@ from forcegp.evidence.least_squares import (
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, RecordedRows, sensed_of
 from forcegp.fit.doubts import doubts_of_base
+from forcegp.fit.misfit import misfit
 from forcegp.fit.payloads import changes_without_rests, doubts_of_payloads, with_payloads_placed
 from forcegp.fit.unseen import Unseen
 from forcegp.forces import Payload
@@ -85,7 +86,7 @@ class Equations:
         return np.concatenate(r), Chained(self._regressor, slopes, np.concatenate(in_terms))
 
     def in_torque(self, x: np.ndarray, motions: Sequence[Motion]) -> tuple[np.ndarray, Jacobian]:
-        """Torques needed less those measured; where gains are estimated and contacts hide nothing, as they are logged."""
+        """Torques needed less those measured; beside gains, where contacts hide nothing, as they are logged."""
         found = [part.in_torque(x, motion)[:3] for part, motion in zip(self.parts, motions, strict=True)]
         r, jacobian = self.equations(x, found)
         if self.windows is not None:
@@ -202,6 +203,8 @@ class Solution:
     history: tuple[float, ...]
     x: Float[np.ndarray, " k"]
     """Its coordinates."""
+    doubts: tuple[dict[str, Any], ...] = ()
+    """What speaks against it, as JSON."""
 
 
 def fit_physical(
@@ -256,11 +259,17 @@ def fit_physical(
     found = space.model_at(fit.x)
     residual = equations.a - equations.accelerations(fit.x)[0]
     doubts = [*doubts_of_payloads(space, fit, equations.tell_bodies), *_doubts_of_memory(space, fit.x)]
-    estimates = _estimates(space, fit, equations, evidence, thick, changes)
+    cause = None
+    averaged = equations.windows is not None and equations.tell_bodies and not evidence.noisy_in_both
+    if averaged and not model.contacts and any(each.payload is not None for each in space.carried):
+        cause = misfit(found, equations.parts, equations.each(equations.a), equations.windows.mean, fit)
+    doubts += [] if cause is None else [cause[0]]
+    estimates = _estimates(space, fit, equations, evidence, thick, changes, None if cause is None else cause[1])
     if not robot.space.is_vector_space:
         doubts += doubts_of_base(model, found, equations.parts[0], residual[: len(logs[0])])
     doubts += unseen.doubts(model)
     Doubts(doubts).warn(stacklevel=4)
+    told = tuple(doubt.to_dict() for doubt in doubts)
     level = model.noise
     if evidence.of_torque and model.contacts and noise is None:
         noise = unseen.levels(equations.a, equations.accelerations(fit.x), equations.held, fit.noise)
@@ -268,7 +277,7 @@ def fit_physical(
         found_levels = Noise(tuple(np.sqrt((residual**2).mean(0)).clip(1e-12)))
         level = found_levels if noise is None else Noise(tuple(noise.acceleration), tuple(noise.force))
         level = unseen.with_pushes(level)
-    return Solution(found, estimates, level, with_memory(logs[0], found), tuple(history) or (0.0,), fit.x)
+    return Solution(found, estimates, level, with_memory(logs[0], found), tuple(history) or (0.0,), fit.x, told)
 
 
 def _with_noise_in_both(
@@ -303,6 +312,7 @@ def _estimates(
     evidence: Torques | Accelerations,
     thick: tuple[str, ...],
     changes: np.ndarray | None,
+    move: np.ndarray | None,
 ) -> Estimates:
     """The numbers at the end of the search."""
     white = np.concatenate([fit.white_jacobian, fit.white[..., None]], axis=-1)
@@ -321,6 +331,7 @@ def _estimates(
         equations.stretches(),
         prior,
         changes,
+        move,
         by_body=by_body,
         base=base,
         evidence=str(evidence),

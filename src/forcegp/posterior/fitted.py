@@ -175,12 +175,14 @@ class Estimates(Summary, Mapping[str, Estimate]):
         stretches: Sequence[np.ndarray],
         prior: Float[np.ndarray, "entries k"],
         changes: Float[np.ndarray, "stretches k"] | None = None,
+        move: Float[np.ndarray, " k"] | None = None,
         **more: Any,
     ) -> "Estimates":
         """From the Jacobian of whitened residuals, with them as last column, rows by stretches, and of the prior.
 
         `slopes` are derivatives of the values in the coordinates, `changes` those of the coordinates without each
-        stretch, if not by one step. Without stretches the covariance is F^-1.
+        stretch, if not by one step; `move` what another cause that explains more would change. Without stretches the
+        covariance is F^-1.
         """
         J, r, G = white[:, :-1], white[:, -1], prior.T @ prior
         information = J.T @ J
@@ -198,6 +200,7 @@ class Estimates(Summary, Mapping[str, Estimate]):
             unseen = np.linalg.solve(whole, np.linalg.solve(whole, G).T)
             reach = float(student.ppf(0.975, max(count - 1, 1))) / REACH  # of fewer stretches, such as postures
             covariance = reach**2 * (count - 1) / count * apart.T @ apart + unseen
+            covariance = covariance if move is None else covariance + np.outer(move, move)
         return cls.of_covariance(parameters, values, slopes, np.linalg.inv(whole), prior, covariance, **more)
 
     @classmethod
