@@ -107,7 +107,7 @@ def at_rest(dataset: Dataset) -> bool:
 
 
 def one_row_per_rest(dataset: Dataset) -> Dataset:
-    """A log of postures alone as its means, an episode each, without motion; other logs as they are.
+    """A log of postures alone as its medians, an episode each, without motion; other logs as they are.
 
     Stiction holds the same share of the load in all rows of a rest, so they are one observation of it.
     """
@@ -116,13 +116,13 @@ def one_row_per_rest(dataset: Dataset) -> Dataset:
         return dataset
     _, first, label = np.unique(number, return_index=True, return_inverse=True)
 
-    def mean(values: np.ndarray) -> np.ndarray:
-        return np.stack([values[label == each].mean(axis=0) for each in range(len(first))])
+    def median(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.median(values[label == each], axis=0) for each in range(len(first))])
 
     still = np.zeros((len(first), dataset.nv))
-    means = {"q": mean(dataset.q), "v": still, "a": still, "u": mean(dataset.u)}
-    measured = {name: mean(values) for name, values in dataset.measured.items()}
-    return replace(dataset.rows(first), **means, measured=measured, episode=label[first])
+    rows = {"q": median(dataset.q), "v": still, "a": still, "u": median(dataset.u)}
+    measured = {name: median(values) for name, values in dataset.measured.items()}
+    return replace(dataset.rows(first), **rows, measured=measured, episode=label[first])
 
 
 def _within(dataset: Dataset) -> Float[np.ndarray, " nq"]:

@@ -191,6 +191,11 @@ class RecordedRows:
         fixed = fixed - self.at_contacts if given else fixed
         return Motion(a, np.ascontiguousarray(Y[:, :, self._carriers] * self._there[:, None]), fixed)
 
+    def by_body(self, a: Rows) -> Float[np.ndarray, "rows nv bodies"]:
+        """What each body needs, without what is estimated of it."""
+        Y = self.kinematics.torque_regressor(torch.as_tensor(np.array(a), device=self.kinematics.robot.device))
+        return (Y.cpu().numpy() * self._stated).sum(-1)
+
     def without_contacts(self, values: Float[np.ndarray, "rows nv *k"]) -> Float[np.ndarray, "rows nv *k"]:
         """The part of joint forces (first axis after the rows) that no lambda can explain."""
         return without(values, self.open.swapaxes(1, 2))
