@@ -21,7 +21,7 @@ from forcegp.evidence.least_squares import Fit
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
 from forcegp.fit import fit
-from forcegp.fit.misfit import misfit
+from forcegp.fit.payloads import misfit
 from forcegp.fit.physical import typical_sizes
 from forcegp.forces import Actuation, Body, Offset, Payload, RigidBodies, Rotor, Stribeck, Viscous
 from forcegp.model import Model

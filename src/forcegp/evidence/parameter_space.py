@@ -124,9 +124,7 @@ class ParameterSpace:
         """Distance from the prior in its standard deviations, and its Jacobian."""
         of_bodies, of_terms = self.split(x)
         distance, jacobian = self.bodies.distance(of_bodies)
-        weighed = [
-            10 * k for k, each in enumerate(self.carried) if each.weighed
-        ]  # the logarithms of the root of masses
+        weighed = [10 * k for k, each in enumerate(self.carried) if each.weighed]  # log of the root of the mass
         distance = np.append(distance, of_bodies[weighed] / SCALES)
         jacobian = np.vstack([jacobian, np.eye(self.bodies.size)[weighed] / SCALES])
         values = [(own - term.center) / term.spread for own, term in zip(of_terms, self.terms, strict=True)]
@@ -137,13 +135,6 @@ class ParameterSpace:
         """x + step to first order, along which parameters of bodies are straight (`Bodies.moved`)."""
         count = self.bodies.size
         return np.concatenate([self.bodies.moved(x[:count], step[:count]), x[count:] + step[count:]])
-
-    def change(self, x: Float[np.ndarray, " k"], other: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-        """The step from x to others, straight in parameters of bodies."""
-        count = self.bodies.size
-        moved = self.bodies.parameters(other[:count]) - self.bodies.parameters(x[:count])
-        of_bodies = np.linalg.solve(self.bodies.slopes(x[:count]), moved.ravel()) if count else x[:0]
-        return np.concatenate([of_bodies, other[count:] - x[count:]])
 
     # --- what the coordinates are
 
@@ -309,29 +300,6 @@ class ParameterSpace:
                 of_gain[column : column + len(term.size)] = True
             column += len(term.size)
         return known, -slopes * of_gain
-
-    @property
-    def has_gains(self) -> bool:
-        """Whether gains of the actuators are estimated."""
-        return any(isinstance(self.model.laws[term.law], Actuation) for term in self.terms)
-
-    def as_logged(
-        self, x: Float[np.ndarray, " k"], r: Float[np.ndarray, "rows nv"], jacobian: Float[np.ndarray, "rows nv k"]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Residual torques and their Jacobian over the gains: in units of the log, whose noise no gain changes.
-
-        As torques they vanish with the gains and all that is unknown, which no noise would speak against.
-        """
-        count, column = self.bodies.size, 0
-        for own, term in zip(self.split(x)[1], self.terms, strict=True):
-            if isinstance(self.model.laws[term.law], Actuation):
-                places, gains = list(term.joints or ()), np.ones(r.shape[1])
-                gains[places] = term.values(own)
-                r, jacobian = r / gains, jacobian / gains[:, None]
-                columns = range(count + column, count + column + len(places))
-                jacobian[:, places, columns] -= r[:, places] * (term.slopes(own) / gains[places])
-            column += len(term.size)
-        return r, jacobian
 
     @cached_property
     def _estimated(self) -> dict[int, Law]:

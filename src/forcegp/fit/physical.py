@@ -29,10 +29,9 @@ from forcegp.evidence.least_squares import (
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, RecordedRows, sensed_of
 from forcegp.fit.doubts import doubts_of_base
-from forcegp.fit.misfit import misfit
-from forcegp.fit.payloads import changes_without_rests, doubts_of_payloads, with_payloads_placed
+from forcegp.fit.payloads import changes_without_rests, doubts_of_payloads, misfit, with_payloads_placed
 from forcegp.fit.unseen import Unseen
-from forcegp.forces import Payload
+from forcegp.forces import Actuation, Payload
 from forcegp.model import Model
 from forcegp.noise import Noise
 from forcegp.posterior.fitted import STRETCHES, Estimates
@@ -61,7 +60,8 @@ class Equations:
         self.ends = np.cumsum([len(log) for log in logs])[:-1]
         self.measured = [part.moving(a) for part, a in zip(self.parts, self.each(self.a), strict=True)]
         self.held = _stacked([part.open if evidence.of_torque else part.held for part in self.parts])
-        self.in_units_of_log = space.has_gains and not self.held.shape[1]
+        gains = any(isinstance(space.model.laws[term.law], Actuation) for term in space.terms)
+        self.in_units_of_log = gains and not self.held.shape[1]
         seconds = evidence.mean if isinstance(evidence, Torques) else None
         self.tell_bodies = seconds is not None and not all(map(at_rest, logs))  # any numbers explain a few postures
         self.windows = None if seconds is None else WindowMeans(logs, seconds)
@@ -92,7 +92,23 @@ class Equations:
         if self.windows is not None:
             free = partial(without, span=self.held.swapaxes(1, 2) if self.held.shape[1] else None)
             r, jacobian = self.windows.mean(free(r)), self.windows.mean(free(np.asarray(jacobian)))
-        return self.space.as_logged(x, r, np.asarray(jacobian)) if self.in_units_of_log else (r, jacobian)
+        return self._as_logged(x, r, np.asarray(jacobian)) if self.in_units_of_log else (r, jacobian)
+
+    def _as_logged(self, x: np.ndarray, r: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals and their Jacobian over the gains, in units of the log, whose noise no gain changes.
+
+        As torques they vanish with the gains and all that is unknown, which no noise would speak against.
+        """
+        column = self.space.bodies.size
+        for own, term in zip(self.space.split(x)[1], self.space.terms, strict=True):
+            if isinstance(self.space.model.laws[term.law], Actuation):
+                places, gains = list(term.joints or ()), np.ones(r.shape[1])
+                gains[places] = term.values(own)
+                r, jacobian = r / gains, jacobian / gains[:, None]
+                columns = range(column, column + len(places))
+                jacobian[:, places, columns] -= r[:, places] * (term.slopes(own) / gains[places])
+            column += len(term.size)
+        return r, jacobian
 
     def in_acceleration(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Accelerations measured less those predicted."""
@@ -260,9 +276,9 @@ def fit_physical(
     residual = equations.a - equations.accelerations(fit.x)[0]
     doubts = [*doubts_of_payloads(space, fit, equations.tell_bodies), *_doubts_of_memory(space, fit.x)]
     cause = None
-    averaged = equations.windows is not None and equations.tell_bodies and not evidence.noisy_in_both
-    if averaged and not model.contacts and any(each.payload is not None for each in space.carried):
-        cause = misfit(found, equations.parts, equations.each(equations.a), equations.windows.mean, fit)
+    means = equations.windows if equations.tell_bodies and not evidence.noisy_in_both else None
+    if means is not None and not model.contacts and any(each.payload is not None for each in space.carried):
+        cause = misfit(found, equations.parts, equations.each(equations.a), means.mean, fit)
     doubts += [] if cause is None else [cause[0]]
     estimates = _estimates(space, fit, equations, evidence, thick, changes, None if cause is None else cause[1])
     if not robot.space.is_vector_space:
