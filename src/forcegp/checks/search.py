@@ -12,7 +12,7 @@ from forcegp.checks.check_input import CheckInput
 from forcegp.checks.explanations import NUMBER, SIGN, Cause, candidates, changed
 from forcegp.checks.torques import Comparison, positive_fit, positive_solution, torque_noise
 from forcegp.data.views import white_noise
-from forcegp.doubts import Doubt, listed, look
+from forcegp.doubts import Doubt, listed, look, wrong
 
 UNKNOWN = "unknown cause"
 FEWEST_ROWS = 30
@@ -229,7 +229,7 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
     if sure:
         factor = np.where(np.isin(np.arange(len(root.floor)), sure), -1.0, 1.0)
         root = replace(root, log=root.log.after(changed("u", factor=factor)), turned=tuple(sure))
-    return root, [*_signs(root, inputs), *_unknown(root, inputs)]
+    return root, [*_signs(root, inputs), *_currents(root, inputs), *_unknown(root, inputs)]
 
 
 def _root(inputs: CheckInput) -> Explanation:
@@ -286,10 +286,26 @@ def _factors(best: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         about="torque constant" if len(off) == 1 else "torque unit",
         what=f"the measured torque is a multiple of what the motion needs: {each}.",
         do="Such factors point to torque before the gears (multiply by the gear ratio), motor current (multiply by the "
-        "torque constant), a rotor inertia that is missing, or wrong masses; compare with the data sheet.",
+        "torque constant), a rotor inertia that is missing, or wrong masses; compare with the data sheet, or let "
+        "forcegp payload --forces gain,viscous,gear,offset,rotor estimate the constants of all joints.",
         joints=joints,
         numbers={"factor": dict(zip(joints, factors.tolist(), strict=True))},
     )
+
+
+def _currents(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
+    """Torques that several joints show as multiples, though friction hides those of others: currents, perhaps."""
+    off = np.flatnonzero((root.chosen >= 2) & (root.exact <= EXPLAINED) & (root.shares > RESTS))
+    if len(off) > 1:
+        factors = dict(zip(inputs.named(off), root.factors[off].tolist(), strict=True))
+        each = ", ".join(f"{name} {value:.4g}" for name, value in factors.items())
+        yield wrong(
+            about="torque unit",
+            what=f"the measured torque is a multiple of what the motion needs: {each}; u may be in A, % or ticks.",
+            do="forcegp payload --forces gain,viscous,gear,offset,rotor estimates the constants of all joints.",
+            joints=inputs.named(off),
+            numbers={"factor": factors},
+        )
 
 
 def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
