@@ -56,6 +56,7 @@ def test_a_baseline_replaces_the_robot_file(folder, forcegp):
     require_mass(content)
 
 
+@pytest.mark.nightly
 def test_a_load_that_was_weighed_calibrates_the_drives(folder, forcegp):
     """Torques 12 % too large: another log's mass is right with the gains of the first, whose file is no robot's."""
     for name in ("loaded", "empty"):
