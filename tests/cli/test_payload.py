@@ -2,11 +2,12 @@
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
 from tests.fit.test_payload import CENTER, MASS, TEXT, loaded, log
 
-from forcegp import Robot
+from forcegp import Dataset, Robot
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +54,25 @@ def test_a_baseline_replaces_the_robot_file(folder, forcegp):
     content = json.loads(done.stdout)
     assert content["baseline"]
     require_mass(content)
+
+
+@pytest.mark.nightly
+def test_a_load_that_was_weighed_calibrates_the_drives(folder, forcegp):
+    """Torques 12 % too large: another log's mass is right with the gains of the first, whose file is no robot's."""
+    for name in ("loaded", "empty"):
+        data = Dataset.load(folder / f"{name}.h5")
+        replace(data, u=1.12 * data.u).save(folder / f"{name}_off.h5")
+    known = ("payload", "loaded_off.h5", "--cutoff", "none", "--delay", 0, "--mass", MASS, "--out", "calibrated")
+    done = forcegp(*known, folder=folder)
+    assert done.returncode == 0, done.stderr
+    other = ("payload", "loaded_off.h5", "--cutoff", "none", "--delay", 0, "--identified", "calibrated", "--json")
+    found = json.loads(forcegp(*other, folder=folder).stdout)
+    require_mass(found)
+    assert found["conditional_on"] == "masses of the URDF"
+    assert found["parameters"]["gain.elbow_joint"]["value"] == pytest.approx(1.0 / 1.12, rel=0.01)
+    both = forcegp(*WORDS, "--baseline", "empty.h5", "--forces", "gain,viscous,offset", folder=folder)
+    assert both.returncode == 2
+    assert "only their products are known" in both.stderr
 
 
 def test_people_see_mass_and_millimetres(folder, forcegp):

@@ -234,7 +234,7 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
     if sure:
         factor = np.where(np.isin(np.arange(len(root.floor)), sure), -1.0, 1.0)
         root = replace(root, log=root.log.after(changed("u", factor=factor)), turned=tuple(sure))
-    said = [*_signs(root, inputs), *_unknown(root, inputs)]
+    said = [*_signs(root, inputs), *_currents(root, inputs), *_unknown(root, inputs)]
     if said and not sure and (turned := _all_turned(root, inputs)):
         return turned
     return root, said
@@ -325,10 +325,26 @@ def _factors(best: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         about="torque constant" if len(off) == 1 else "torque unit",
         what=f"the measured torque is a multiple of what the motion needs: {each}.",
         do="Such factors point to torque before the gears (multiply by the gear ratio), motor current (multiply by the "
-        "torque constant), a rotor inertia that is missing, or wrong masses; compare with the data sheet.",
+        "torque constant), a rotor inertia that is missing, or wrong masses; compare with the data sheet, or let "
+        "forcegp payload --forces gain,viscous,gear,offset,rotor estimate the constants of all joints.",
         joints=joints,
         numbers={"factor": dict(zip(joints, factors.tolist(), strict=True))},
     )
+
+
+def _currents(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
+    """Torques that several joints show as multiples, though friction hides those of others: currents, perhaps."""
+    off = np.flatnonzero((root.chosen >= 2) & (root.exact <= EXPLAINED) & (root.shares > RESTS))
+    if len(off) > 1:
+        factors = dict(zip(inputs.named(off), root.factors[off].tolist(), strict=True))
+        each = ", ".join(f"{name} {value:.4g}" for name, value in factors.items())
+        yield wrong(
+            about="torque unit",
+            what=f"the measured torque is a multiple of what the motion needs: {each}; u may be in A, % or ticks.",
+            do="forcegp payload --forces gain,viscous,gear,offset,rotor estimates the constants of all joints.",
+            joints=inputs.named(off),
+            numbers={"factor": factors},
+        )
 
 
 def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:

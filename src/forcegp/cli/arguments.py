@@ -45,7 +45,6 @@ COMMANDS: Mapping[str, str] = {
 """A new command is an entry here, and a subclass of Command of that name."""
 MODULES = {
     "logs": ("import", "check"),
-    "fit": ("payload",),
     "shown": ("robot", "view"),
     "deploy": ("export", "monitor", "excite"),
     "simulated": ("simulate", "demo", "reproduce"),

@@ -22,8 +22,9 @@ import forcegp.report
 import forcegp.scores
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json
 from forcegp.cli.command import CONFIG, LOG, Command, options_of, unless_given
-from forcegp.cli.fit import LAWS, payload_dict, payload_text, with_payload, write_estimates
+from forcegp.cli.fit import write_estimates
 from forcegp.cli.logs import ColumnOptions, FilterOptions, prepared_rows, resolved, stance_text
+from forcegp.cli.payload import LAWS, payload_dict, payload_text, with_payload
 from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal, doubts_table, facts, shown
 from forcegp.doubts import Doubt, Doubts, wrong

@@ -35,7 +35,6 @@ from forcegp.cli.command import (
     unless_given,
     values_of,
 )
-from forcegp.cli.logs import FilterOptions
 from forcegp.cli.robot_options import (
     CONTACTS,
     SYSTEM_FILE,
@@ -204,6 +203,14 @@ class Fit(Command):
                 write_estimates(folder, posterior)
 
 
+def quick_doubts(log: Path, dataset: forcegp.Dataset, model: forcegp.Model) -> Doubts:
+    """What would spoil a fit. Raises DatasetError for a motion that needs torques, of which none was measured."""
+    used = forcegp.checks.quick_check(dataset, model)
+    for doubt in () if dataset.u.any() else used.of("constant channel").at("wrong"):
+        raise DatasetError(f"{log}: {doubt.what} Masses and friction do not show; give the columns of the torques.")
+    return used
+
+
 def write_estimates(folder: Path, posterior: Any, name: str = "identified") -> None:
     """The numbers that were found, and robot and known forces with them: for --identified, and as a URDF."""
     estimates, known = posterior.estimates, identified_system(posterior.model)
@@ -311,121 +318,3 @@ def what_is_open(estimates: forcegp.posterior.Estimates) -> list[str]:
     if estimates.thickened:
         lines.append(f"Links that were lines, plates or points got some thickness: {', '.join(estimates.thickened)}.")
     return lines
-
-
-WINDOW = 0.4
-"""Seconds that torques are averaged over: it takes noise of the acceleration, and leaves friction as sharp as it is."""
-LAWS = "viscous", "gear", "offset", "rotor"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Payload(Command):
-    """Estimate mass, centre of mass and inertia of a payload, together with friction and rotors.
-
-    It is `forcegp fit --forces payload:LINK,... --evidence torques:mean=.4` on a log that is filtered first: a motion
-    of 20 s or more that turns every joint in both directions, without contact but for feet that stand. Without
-    --baseline, errors of the URDF's links count as payload. With one, the links are estimated from both logs.
-
-    For example:
-      forcegp payload loaded.h5 --robot arm.urdf
-      forcegp payload loaded.h5 --baseline empty.h5 --link tool0 --out payload
-    """
-
-    log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
-    """The log with the payload (a dataset, raw or prepared)."""
-    baseline: Annotated[Path | None, DATASET, unless_given("LOG", "the URDF", Path)] = None
-    """A log of the same robot without the payload."""
-    link: Annotated[str | None, unless_given("LINK", "a base that moves, else the last link", str)] = None
-    """The link that carries the payload; results are in its frame."""
-    forces: Annotated[tuple[str, ...], listed(goes_on=FIELDS), arg(metavar="FORCE,...")] = LAWS
-    """What is estimated beside it, as for forcegp fit."""
-    out: Annotated[Path | None, unless_given("FOLDER", "nothing is written", Path)] = None
-    """Write payload.json, loaded.urdf (the robot with the payload) and system.json (for --identified) into it."""
-    robot: RobotOptions = RobotOptions()
-    filter: FilterOptions = FilterOptions(cutoff="auto", delay="auto")
-
-    def run(self, terminal: Terminal) -> Mapping[str, Any]:
-        """Prepare, estimate, write and show."""
-        self.require_free(self.out)
-        notes: list[str] = []
-        model, rows = self._rows(terminal, self.log, notes)
-        baseline = None if self.baseline is None else self._rows(terminal, self.baseline, notes)[1]
-        notes += forces_of(model)
-        words = [word for word in self.forces if word != "none"]
-        model = forcegp.scores.named_model(model, words)
-        with terminal.progress("identifying"):
-            found = with_payload(model, rows, self.link, baseline)
-        content = {"data": str(self.log), **payload_dict(found, baseline is not None)}
-        if self.out is not None:
-            given = {"command": self.words("baseline", "link", "forces", "cutoff", "delay")}
-            with self.folder(self.out, {"data": str(self.log), **given}) as folder:
-                write_json(folder / "payload.json", content)
-                write_estimates(folder, found, "loaded")
-        for note in notes:
-            terminal.note(note)
-        if not found.estimates.settled:
-            terminal.warn("the search did not converge: take the numbers with care, and record more or faster motion.")
-        if found.estimates["payload.mass"].interval[0] <= 0.0:
-            terminal.warn("the payload may weigh nothing by this log: centre of mass and inertia mean nothing then.")
-        beside = "the URDF" if baseline is None else "the baseline"
-        title = f"payload in the frame of {content['link']}, beside {beside}; {found.estimates.rows} rows"
-        own = {name: each for name, each in found.estimates.items() if name.startswith("payload.")}
-        others = {name: each for name, each in found.estimates.items() if name not in own and baseline is None}
-        tables = [estimates_table("joints", others)] if others else []
-        terminal.show(estimates_table(title, own), *tables)
-        return content
-
-    def _rows(self, terminal: Terminal, path: Path, notes: list[str]) -> tuple[forcegp.Model, forcegp.Dataset]:
-        """The robot, and rows behind the filter; those of a dataset that was prepared before are as they are."""
-        dataset = forcegp.Dataset.load(path)
-        model = self.robot.chosen_model(dataset, path)
-        if used := quick_doubts(path, dataset, model).at("wrong"):
-            terminal.warn(f"{path}: {used.in_one_line()}. See forcegp check.")
-        if forcegp.data.preparation_report(dataset.metadata):
-            return model, dataset
-        with terminal.progress(f"preparing {path}"):
-            raw = replace(dataset, model=model)
-            prepared = self.filter.preparation().apply(raw)
-        why = forcegp.data.preparation_report(prepared.metadata)["why"]
-        notes += [f"{path}: {name}: {why[name]}" for name in ("cutoff", "delay") if name in why]
-        return model, prepared
-
-
-def quick_doubts(log: Path, dataset: forcegp.Dataset, model: forcegp.Model) -> Doubts:
-    """What would spoil a fit. Raises DatasetError for a motion that needs torques, of which none was measured."""
-    used = forcegp.checks.quick_check(dataset, model)
-    for doubt in () if dataset.u.any() else used.of("constant channel").at("wrong"):
-        raise DatasetError(f"{log}: {doubt.what} Masses and friction do not show; give the columns of the torques.")
-    return used
-
-
-def with_payload(
-    model: forcegp.Model, rows: forcegp.Dataset, link: str | None, baseline: forcegp.Dataset | None = None
-) -> Any:
-    """The posterior of a model that carries something; with a baseline the links are estimated, too."""
-    bodies = () if baseline is None else (forcegp.RigidBodies("all"),)
-    noisy = "u" if model.robot.space.is_vector_space else "both"
-    evidence = (forcegp.Torques(noisy, mean=WINDOW),)
-    loaded = model.with_forces(*bodies, forcegp.Payload(link))
-    return forcegp.scores.learn(loaded, rows, evidence, baseline=baseline)[0]
-
-
-def payload_dict(found: Any, baseline: bool) -> dict[str, Any]:
-    """Payload and other numbers as plain JSON values, with the link that carries it."""
-    [payload] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
-    return {"link": payload.link, "baseline": baseline, **found.estimates.to_dict()}
-
-
-SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
-
-
-def payload_text(found: Any) -> str:
-    """Mass with its 95 % interval and place; or that there is none."""
-    parts = {name: found.estimates[f"payload.{name}"] for name in ("mass", *(f"center_of_mass.{x}" for x in "xyz"))}
-    mass, *center = parts.values()
-    error = 0.5 * (mass.interval[1] - mass.interval[0])
-    if mass.value < max(SURE * mass.std, LEAST_PAYLOAD):
-        return f"none ({mass.value:.2g} ± {error:.1g} kg)"
-    place = ", ".join(f"{1e3 * each.value:.0f}" for each in center)
-    [held] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
-    return f"{mass.value:.3g} ± {error:.1g} kg at ({place}) mm of {held.link}, if the URDF's links are right"

@@ -107,7 +107,9 @@ class Preparation:
                     )
                 except (DatasetError, InvalidInput) as error:
                     reasons["lag"] = f"rotors are taken to follow at once: {error}"
-        if self.delay == "auto":
+        if self.delay == "auto" and at_rest(dataset):
+            chosen, reasons["delay"] = replace(chosen, delay=0.0), "in a log of postures alone none shows"
+        elif self.delay == "auto":
             chosen = replace(chosen, delay=0.0)
             try:
                 found = estimate_delay(_filtered(chosen, dataset))

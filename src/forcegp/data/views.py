@@ -59,8 +59,9 @@ def move_on(dataset: Dataset) -> bool:
 
 RESTS, IDLE = 0.01, 0.1
 """Share of its whole range within which a joint rests; of the largest range, which counts for idle joints."""
-STILL, SHORTEST, OFTEN = 1e-3, 0.3, 0.25
-"""Share of its range within which a joint stays for the shortest rest [s]; share of rows at rest in such a log."""
+STILL, SHORTEST, OFTEN, ALONE = 1e-3, 0.3, 0.25, 0.95
+"""Share of its range within which a joint stays for the shortest rest [s]; shares of rows at rest in logs of postures,
+and of postures alone."""
 
 
 def postures(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
@@ -68,11 +69,15 @@ def postures(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
 
     A log of postures rests three times or more, in a quarter of its rows, with all joints at once.
     """
-    if not dataset.time_ordered:
-        return None
-    least = _within(dataset)
+    number, count, share = _rests(dataset)
+    return number if count > 2 and share >= OFTEN else None
+
+
+def _rests(dataset: Dataset) -> tuple[Int[np.ndarray, " rows"], int, float]:
+    """The rest that each row belongs to or comes after, how many there are, and the share of rows at rest."""
     number, resting, count = np.zeros(len(dataset), int), 0, 0
-    for episode in dataset.episodes:
+    least = _within(dataset)
+    for episode in dataset.episodes if dataset.time_ordered else ():
         rows = np.flatnonzero(dataset.episode == episode)
         q, time = dataset.q[rows], dataset.time[rows]
         ahead = np.minimum(np.searchsorted(time, time + SHORTEST), len(rows) - 1)
@@ -83,13 +88,41 @@ def postures(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
                 number[rows[last:end]], last = count, end
                 resting, count = resting + end - begin, count + 1
         number[rows[last:]] = max(count - 1, 0)
-    return number if count > 2 and resting >= OFTEN * len(dataset) else None
+    return number, count, resting / len(dataset)
+
+
+def rests_alone(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
+    """The rest of each row of a log of postures alone, three or more: an episode each, or one after the other."""
+    of_episode = np.unique(dataset.episode, return_inverse=True)[1]
+    within = [np.ptp(dataset.q[of_episode == each], axis=0) for each in range(of_episode.max() + 1)]
+    if len(within) > 2 and (np.max(within, axis=0) <= _within(dataset)).all():
+        return of_episode
+    number, count, share = _rests(dataset)
+    return number if count > 2 and share >= ALONE else None
 
 
 def at_rest(dataset: Dataset) -> bool:
-    """Whether the log is of postures alone, each an episode: three or more, in which every joint rests."""
-    within = [np.ptp(dataset.q[dataset.episode == each], axis=0) for each in dataset.episodes]
-    return len(within) > 2 and bool((np.max(within, axis=0) <= _within(dataset)).all())
+    """Whether the log is of postures alone, in which every joint rests."""
+    return rests_alone(dataset) is not None
+
+
+def one_row_per_rest(dataset: Dataset) -> Dataset:
+    """A log of postures alone as its medians, an episode each, without motion; other logs as they are.
+
+    Stiction holds the same share of the load in all rows of a rest, so they are one observation of it.
+    """
+    number = rests_alone(dataset)
+    if number is None:
+        return dataset
+    _, first, label = np.unique(number, return_index=True, return_inverse=True)
+
+    def median(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.median(values[label == each], axis=0) for each in range(len(first))])
+
+    still = np.zeros((len(first), dataset.nv))
+    rows = {"q": median(dataset.q), "v": still, "a": still, "u": median(dataset.u)}
+    measured = {name: median(values) for name, values in dataset.measured.items()}
+    return replace(dataset.rows(first), **rows, measured=measured, episode=label[first])
 
 
 def _within(dataset: Dataset) -> Float[np.ndarray, " nq"]:

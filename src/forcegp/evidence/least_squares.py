@@ -105,6 +105,8 @@ PASSES = 20
 """Over the noise of residuals, in each round, where unknown forces are left out."""
 LEAST_NOISE = 1e-6
 """Noise that is this fraction of the residual at the start counts as none: the data are exact."""
+SHARED = 2.0
+"""Rows that the level of noise that all joints share, relative to their sizes, counts as where rows are few."""
 SETTLED = 1e-3
 """Relative change of the noise level that ends them."""
 
@@ -206,12 +208,14 @@ def weighted_least_squares(
     known: Float[np.ndarray, " nv"] | None = None,
     evaluations: int = MOST_EVALUATIONS,
     moved: Moved = np.add,
+    sizes: Float[np.ndarray, " nv"] | None = None,
 ) -> Fit:
     """Minimise sum_nj (r_nj / sigma_j)^2 + |prior|^2 over x and sigma; `progress(round, rms)` after each round.
 
     `longest` is the most that a coordinate may change in one step. `held` are directions of r that unknown forces have,
     which do not count. `known` is sigma where it is not to be found. A round takes so many `evaluations` at most. Steps
-    follow `moved`: residuals that are as good as linear along it have no curved valleys.
+    follow `moved`: residuals that are as good as linear along it have no curved valleys. With `sizes` of r, sigma is
+    drawn towards one share of these, as if by `SHARED` rows more: of a few rows a joint may be fitted exactly.
     """
     last: list[tuple[np.ndarray, tuple[np.ndarray, Any]]] = []
 
@@ -239,6 +243,9 @@ def weighted_least_squares(
         # forces of contacts hide most of it at first
         for _ in range(0 if known is not None else 1 if held is None else PASSES):
             noise = np.maximum(noise * _noise(r[some] / noise, _span(seen, noise)), floor)
+        if sizes is not None:
+            common = ((noise / sizes) ** 2).mean() * sizes**2
+            noise = np.sqrt((len(r) * noise**2 + SHARED * common) / (len(r) + SHARED))
         if progress is not None:
             progress(round_number, float(np.sqrt((without(r, _span(held, np.ones_like(noise))) ** 2).mean())))
         settled = bool((abs(noise - before) <= SETTLED * before).all())

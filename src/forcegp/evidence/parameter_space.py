@@ -26,6 +26,8 @@ from forcegp.robots.inertia import physical_of_pseudo_inertia
 
 LINEAR_SPREAD = 10.0
 """Standard deviation of the weak prior on numbers that are not logarithms, in their sizes: as large as the torques."""
+SCALES = 1e-4
+"""Half the relative error of a mass that was weighed: of scales, far below that of any log."""
 FARTHEST = 25.0
 """Largest coordinate of a number that is estimated on a log scale about a median: a factor of 7e10."""
 
@@ -70,6 +72,8 @@ class Carried:
     """The number of the force, for a payload."""
     offset: Float[np.ndarray, "4 4"] | None = None
     """The pose of its link in the frame of the body."""
+    weighed: bool = False
+    """Whether its mass is known."""
 
 
 class ParameterSpace:
@@ -120,6 +124,9 @@ class ParameterSpace:
         """Distance from the prior in its standard deviations, and its Jacobian."""
         of_bodies, of_terms = self.split(x)
         distance, jacobian = self.bodies.distance(of_bodies)
+        weighed = [10 * k for k, each in enumerate(self.carried) if each.weighed]  # log of the root of the mass
+        distance = np.append(distance, of_bodies[weighed] / SCALES)
+        jacobian = np.vstack([jacobian, np.eye(self.bodies.size)[weighed] / SCALES])
         values = [(own - term.center) / term.spread for own, term in zip(of_terms, self.terms, strict=True)]
         slopes = [1.0 / term.spread for term in self.terms]
         return self._joined(distance, values), block_diag(jacobian, np.diag(np.concatenate([[], *slopes])))
@@ -436,5 +443,5 @@ def _carried(model: Model) -> list[Carried]:
             offset = np.linalg.inv(layout.child_frames[body]) @ layout.links[law.link].offset
             titles = [isinstance(x, Payload) and not x.known for x in model.laws]
             name = "payload" if sum(titles) == 1 else f"payload.{law.link}"
-            out.append(Carried(name, body, law.usual(offset), law.prior, index, offset))
+            out.append(Carried(name, body, law.usual(offset), law.prior, index, offset, law.mass is not None))
     return out

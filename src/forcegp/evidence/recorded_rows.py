@@ -132,7 +132,7 @@ class RecordedRows:
     ) -> None:
         model, robot = space.model, space.model.loaded_robot
         at_q, at_v, at_u = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, u))
-        self.space, self.loaded, self.v = space, loaded, np.array(v)
+        self.space, self.loaded, self.q, self.v = space, loaded, np.array(q), np.array(v)
         past = None if strokes is None else torch.as_tensor(np.array(strokes), device=robot.device)
         self.state = replace(model.state(at_q, at_v, at_u), strokes=past)
         self.kinematics = self.state.kinematics
@@ -190,6 +190,11 @@ class RecordedRows:
         fixed = Y.reshape(*a.shape, -1) @ self._stated.ravel() + a @ (self.inertia + self._armature) - self.force
         fixed = fixed - self.at_contacts if given else fixed
         return Motion(a, np.ascontiguousarray(Y[:, :, self._carriers] * self._there[:, None]), fixed)
+
+    def by_body(self, a: Rows) -> Float[np.ndarray, "rows nv bodies"]:
+        """What each body needs, without what is estimated of it."""
+        Y = self.kinematics.torque_regressor(torch.as_tensor(np.array(a), device=self.kinematics.robot.device))
+        return (Y.cpu().numpy() * self._stated).sum(-1)
 
     def without_contacts(self, values: Float[np.ndarray, "rows nv *k"]) -> Float[np.ndarray, "rows nv *k"]:
         """The part of joint forces (first axis after the rows) that no lambda can explain."""

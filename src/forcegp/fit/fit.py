@@ -29,7 +29,8 @@ from forcegp.fit.doubts import (
 from forcegp.fit.friction_choice import with_friction_chosen
 from forcegp.fit.joint import CHANGE, MOST_ROUNDS, FreeNumbers, estimates_beside, numbers_beside, with_free_numbers
 from forcegp.fit.motion_fit import refine_on_motions
-from forcegp.fit.physical import fit_physical, typical_sizes, with_payloads_placed
+from forcegp.fit.payloads import with_payloads_placed
+from forcegp.fit.physical import fit_physical, typical_sizes
 from forcegp.fit.refinement import (
     fit_with_refined_loads,
     independent_rows,
@@ -278,6 +279,7 @@ def _of_numbers(model: Model, logs: Sequence[Dataset], evidence: Any, rows: int 
         "evidence": str(evidence),
         "forces": [described_force(force) for force in model.forces],
         "noise": found.noise.to_dict(),
+        "doubts": list(found.doubts),
     }
     noise = found.noise.parameters(model.robot.nv, model.robot.device)
     return Posterior.conditioned(trained, training, noise, result, settings, estimates=found.estimates)

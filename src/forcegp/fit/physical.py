@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 
 from forcegp.data import Dataset, evenly, with_memory
-from forcegp.data.views import at_rest, postures
+from forcegp.data.views import at_rest, one_row_per_rest, postures, rests_alone
 from forcegp.doubts import Doubt, Doubts, look
-from forcegp.errors import DatasetError, InvalidInput, require_type
+from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence import Accelerations, Torques
 from forcegp.evidence.bodies import BaseParameters, thickened
 from forcegp.evidence.least_squares import (
@@ -28,14 +28,14 @@ from forcegp.evidence.least_squares import (
 )
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, RecordedRows, sensed_of
-from forcegp.fit.doubts import doubts_of_base, doubts_of_no_body, doubts_of_offsets
+from forcegp.fit.doubts import doubts_of_base
+from forcegp.fit.payloads import changes_without_rests, doubts_of_payloads, misfit, with_payloads_placed
 from forcegp.fit.unseen import Unseen
-from forcegp.forces import Payload
+from forcegp.forces import Actuation, Payload
 from forcegp.model import Model
 from forcegp.noise import Noise
 from forcegp.posterior.fitted import STRETCHES, Estimates
 from forcegp.progress import tell
-from forcegp.robots import Robot
 from forcegp.summary import listed
 
 
@@ -60,6 +60,8 @@ class Equations:
         self.ends = np.cumsum([len(log) for log in logs])[:-1]
         self.measured = [part.moving(a) for part, a in zip(self.parts, self.each(self.a), strict=True)]
         self.held = _stacked([part.open if evidence.of_torque else part.held for part in self.parts])
+        gains = any(isinstance(space.model.laws[term.law], Actuation) for term in space.terms)
+        self.in_units_of_log = gains and not self.held.shape[1]
         seconds = evidence.mean if isinstance(evidence, Torques) else None
         self.tell_bodies = seconds is not None and not all(map(at_rest, logs))  # any numbers explain a few postures
         self.windows = None if seconds is None else WindowMeans(logs, seconds)
@@ -84,13 +86,29 @@ class Equations:
         return np.concatenate(r), Chained(self._regressor, slopes, np.concatenate(in_terms))
 
     def in_torque(self, x: np.ndarray, motions: Sequence[Motion]) -> tuple[np.ndarray, Jacobian]:
-        """Torques needed less those measured."""
+        """Torques needed less those measured; beside gains, where contacts hide nothing, as they are logged."""
         found = [part.in_torque(x, motion)[:3] for part, motion in zip(self.parts, motions, strict=True)]
         r, jacobian = self.equations(x, found)
-        if self.windows is None:
-            return r, jacobian
-        free = partial(without, span=self.held.swapaxes(1, 2) if self.held.shape[1] else None)
-        return self.windows.mean(free(r)), self.windows.mean(free(np.asarray(jacobian)))
+        if self.windows is not None:
+            free = partial(without, span=self.held.swapaxes(1, 2) if self.held.shape[1] else None)
+            r, jacobian = self.windows.mean(free(r)), self.windows.mean(free(np.asarray(jacobian)))
+        return self._as_logged(x, r, np.asarray(jacobian)) if self.in_units_of_log else (r, jacobian)
+
+    def _as_logged(self, x: np.ndarray, r: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals and their Jacobian over the gains, in units of the log, whose noise no gain changes.
+
+        As torques they vanish with the gains and all that is unknown, which no noise would speak against.
+        """
+        column = self.space.bodies.size
+        for own, term in zip(self.space.split(x)[1], self.space.terms, strict=True):
+            if isinstance(self.space.model.laws[term.law], Actuation):
+                places, gains = list(term.joints or ()), np.ones(r.shape[1])
+                gains[places] = term.values(own)
+                r, jacobian = r / gains, jacobian / gains[:, None]
+                columns = range(column, column + len(places))
+                jacobian[:, places, columns] -= r[:, places] * (term.slopes(own) / gains[places])
+            column += len(term.size)
+        return r, jacobian
 
     def in_acceleration(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Accelerations measured less those predicted."""
@@ -125,15 +143,23 @@ class Equations:
             return noise
         return NoiseLevels(np.fmax(noise.acceleration, least.acceleration), np.fmax(noise.force, least.force))
 
+    @cached_property
+    def rests(self) -> list[np.ndarray]:
+        """Numbers of equations by rest of logs of postures: friction holds the same share as long as a joint stands."""
+        nv, found = self.a.shape[1], [rests_alone(log) for log in self.logs]
+        found = [postures(log) if each is None else each for each, log in zip(found, self.logs, strict=True)]
+        if any(each is None or each.max() >= STRETCHES for each in found):
+            return []
+        label = np.concatenate([each + STRETCHES * k for k, each in enumerate(found) if each is not None])
+        label = label if self.windows is None else label[self.windows.starts]
+        return [(nv * np.flatnonzero(label == each)[:, None] + np.arange(nv)).ravel() for each in np.unique(label)]
+
     def stretches(self) -> list[np.ndarray]:
         """Numbers of equations by stretch of time, some of each log in every one; of postures each is one."""
+        if self.rests:
+            return self.rests
         lengths = [len(log) for log in self.logs] if self.windows is None else self.windows.lengths
         nv, starts = self.a.shape[1], np.concatenate([[0], np.cumsum(lengths)])
-        found = [each for log in self.logs if (each := postures(log)) is not None and each.max() < STRETCHES]
-        if len(found) == len(self.logs):  # friction holds the same share of the load as long as a joint stands
-            label = np.concatenate([each + STRETCHES * k for k, each in enumerate(found)])
-            label = label if self.windows is None else label[self.windows.starts]
-            return [(nv * np.flatnonzero(label == each)[:, None] + np.arange(nv)).ravel() for each in np.unique(label)]
         numbers = []
         for log, start, length in zip(self.logs, starts, lengths, strict=False):
             order = np.arange(length)
@@ -180,8 +206,6 @@ STEPS = 6
 """Evaluations in each, since the next one begins with other accelerations; twice as many after a search in vain."""
 REACHED = 0.02
 """They end where a step is to lower the cost by fewer nats per coordinate: each is within a fifth of its error."""
-FEWEST = 10 * STRETCHES
-"""Rows that a payload needs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,6 +219,8 @@ class Solution:
     history: tuple[float, ...]
     x: Float[np.ndarray, " k"]
     """Its coordinates."""
+    doubts: tuple[dict[str, Any], ...] = ()
+    """What speaks against it, as JSON."""
 
 
 def fit_physical(
@@ -206,9 +232,11 @@ def fit_physical(
     model = replace(model, robot=robot)
     most = min(ROWS, EQUATIONS // robot.nv) if rows is None else rows
     logs = [with_memory(log, model) for log in logs]
+    model = with_payloads_placed(model, logs)
+    if robot.space.is_vector_space and evidence.of_torque and not evidence.noisy_in_both:
+        logs = [one_row_per_rest(log) for log in logs]
     logs = [log.rows(evenly(log, most)) for log in logs]
     typical = typical_sizes(model, logs)
-    model = with_payloads_placed(model, logs)
     space = ParameterSpace(model, typical)
     unseen = Unseen.of(model, logs[0], typical["force"])
     equations = Equations(space, logs, evidence, unseen.pushed)
@@ -222,13 +250,16 @@ def fit_physical(
         tell(min(done, ROUNDS), ROUNDS, f"all rows, step {done}: {rms:.3g}")
 
     options: dict[str, Any] = {"longest": space.longest_steps, "moved": space.moved}
+    options["sizes"] = typical["force"] if all(len(log) == len(log.episodes) > 2 for log in logs) else None
     search = partial(weighted_least_squares, prior=space.prior, bounds=space.bounds, **options)
-    noise, x = None, space.start
+    noise, x, changes = None, space.start, None
     if evidence.noisy_in_both:
         fit, noise = _with_noise_in_both(equations, search, x, note)
     elif evidence.of_torque:
         torque = partial(equations.in_torque, motions=equations.measured)
         fit = search(torque, start=x, held=held, progress=note)
+        if options["sizes"] is not None and held is None:
+            changes = changes_without_rests(search, torque, space, fit.x, equations.rests)
     else:
         fit = search(equations.in_acceleration, start=x, progress=note)
         for _ in range(REWEIGHTINGS):
@@ -243,12 +274,18 @@ def fit_physical(
             fit = search(white, start=fit.x, progress=note)
     found = space.model_at(fit.x)
     residual = equations.a - equations.accelerations(fit.x)[0]
-    doubts = [*_doubts_of_payloads(space, fit, equations.tell_bodies), *_doubts_of_memory(space, fit.x)]
-    estimates = _estimates(space, fit, equations, evidence, thick)
+    doubts = [*doubts_of_payloads(space, fit, equations.tell_bodies), *_doubts_of_memory(space, fit.x)]
+    cause = None
+    means = equations.windows if equations.tell_bodies and not evidence.noisy_in_both else None
+    if means is not None and not model.contacts and any(each.payload is not None for each in space.carried):
+        cause = misfit(found, equations.parts, equations.each(equations.a), means.mean, fit)
+    doubts += [] if cause is None else [cause[0]]
+    estimates = _estimates(space, fit, equations, evidence, thick, changes, None if cause is None else cause[1])
     if not robot.space.is_vector_space:
         doubts += doubts_of_base(model, found, equations.parts[0], residual[: len(logs[0])])
     doubts += unseen.doubts(model)
     Doubts(doubts).warn(stacklevel=4)
+    told = tuple(doubt.to_dict() for doubt in doubts)
     level = model.noise
     if evidence.of_torque and model.contacts and noise is None:
         noise = unseen.levels(equations.a, equations.accelerations(fit.x), equations.held, fit.noise)
@@ -256,7 +293,7 @@ def fit_physical(
         found_levels = Noise(tuple(np.sqrt((residual**2).mean(0)).clip(1e-12)))
         level = found_levels if noise is None else Noise(tuple(noise.acceleration), tuple(noise.force))
         level = unseen.with_pushes(level)
-    return Solution(found, estimates, level, with_memory(logs[0], found), tuple(history) or (0.0,), fit.x)
+    return Solution(found, estimates, level, with_memory(logs[0], found), tuple(history) or (0.0,), fit.x, told)
 
 
 def _with_noise_in_both(
@@ -285,7 +322,13 @@ def _with_noise_in_both(
 
 
 def _estimates(
-    space: ParameterSpace, fit: Fit, equations: Equations, evidence: Torques | Accelerations, thick: tuple[str, ...]
+    space: ParameterSpace,
+    fit: Fit,
+    equations: Equations,
+    evidence: Torques | Accelerations,
+    thick: tuple[str, ...],
+    changes: np.ndarray | None,
+    move: np.ndarray | None,
 ) -> Estimates:
     """The numbers at the end of the search."""
     white = np.concatenate([fit.white_jacobian, fit.white[..., None]], axis=-1)
@@ -303,6 +346,8 @@ def _estimates(
         white.reshape(-1, white.shape[-1]),
         equations.stretches(),
         prior,
+        changes,
+        move,
         by_body=by_body,
         base=base,
         evidence=str(evidence),
@@ -340,62 +385,6 @@ def typical_sizes(model: Model, logs: Sequence[Dataset]) -> dict[str, Float[np.n
     position = state.positions.cpu().numpy()
     position = np.maximum(np.sqrt((position**2).mean(0)), 1e-3)
     return {"force": torque, "velocity": velocity, "inertia": mass, "position": position}
-
-
-def _usual_link(robot: Robot) -> str:
-    """A base that moves, else of the last joint the last link of the file.
-
-    Joints that move several bodies, as those of fingers, count as none, if there are others: what fingers hold moves
-    with the hand.
-    """
-    if robot.base != "fixed":
-        return robot.layout.moving[0]
-    drives = [drive.joint for drive in robot.layout.drives]
-    solid = {place.body for place in robot.layout.links.values()}
-    alone = [body for body, joint in enumerate(drives) if drives.count(joint) == 1 and body in solid]
-    last = max(alone, default=len(robot.layout.bodies) - 1)
-    return [name for name, place in robot.layout.links.items() if place.body == last][-1]
-
-
-def with_payloads_placed(model: Model, logs: Sequence[Dataset]) -> Model:
-    """The model whose payload without a link is on the usual one.
-
-    Raises DatasetError for logs too short for a payload.
-    """
-    unknown = [law for law in model.laws if isinstance(law, Payload) and not law.known]
-    for name, log in zip(("the log", "the baseline"), logs, strict=False):
-        if unknown and len(log) < FEWEST:
-            raise DatasetError(f"{name} has {len(log)} rows; a payload needs {FEWEST} or more.")
-    open_ones = [law for law in unknown if law.link is None]
-    if len(open_ones) > 1:
-        raise InvalidInput("forces list two payloads without a link, which no log tells apart; name their links.")
-    named = [law.link for law in unknown if law.link is not None]
-    bodies = [model.robot.layout.links[model.robot.link(link).name].body for link in named]
-    if len(set(bodies)) < len(bodies):
-        raise InvalidInput(
-            f"forces list two payloads on one body ({', '.join(named)}), which no log tells apart; leave one out."
-        )
-    if not open_ones:
-        return model
-    placed = replace(open_ones[0], link=_usual_link(model.robot))
-    return replace(model, forces=tuple(placed if force is open_ones[0] else force for force in model.forces))
-
-
-def _doubts_of_payloads(space: ParameterSpace, fit: Fit, averaged: bool) -> Iterator[Doubt]:
-    for body, each in enumerate(space.carried):
-        if each.payload is None:
-            continue
-        own, column = space.bodies.slices[body], space.names.index(f"{each.name}.mass")
-        slope = space.number_slopes(fit.x)[column, own]
-        laws = [type(space.model.laws[term.law]).__name__ for term in space.terms for _ in term.size]
-        offsets = np.array([law == "Offset" for law in laws], dtype=bool)
-        yield from doubts_of_offsets(fit, offsets, slope, own)
-        if averaged:  # noise of single rows hides what is left
-            number = len(space.carried)
-            one = np.eye(10 * number)[10 * body : 10 * body + 10].reshape(10, 1, number, 10)
-            slopes = space.bodies.chained(fit.x[: space.bodies.size], one)[:, 0, own]
-            link = getattr(space.model.laws[each.payload], "link", "")
-            yield from doubts_of_no_body(fit, space.standard_parameters(fit.x)[body], slopes, own, link)
 
 
 def _doubts_of_memory(space: ParameterSpace, x: np.ndarray) -> Iterator[Doubt]:

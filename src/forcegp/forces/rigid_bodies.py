@@ -75,22 +75,25 @@ class Payload(Law):
 
     link: None stands for the base that moves, else for the last link of the last joint.
     mass [kg], center_of_mass [m] in the axes of the link, and inertia [kg m^2] (3, 3) about the centre of mass and
-        along these axes; without a mass, `forcegp.fit` estimates all ten numbers. Other sizes are 0 by default.
+        along these axes; without a mass, `forcegp.fit` estimates all ten numbers, with center_of_mass None all but the
+        mass. Other sizes are 0 by default.
     """
 
     link: str | None = None
     mass: float | None = None
-    center_of_mass: Sequence[float] = (0.0, 0.0, 0.0)
+    center_of_mass: Sequence[float] | None = (0.0, 0.0, 0.0)
     inertia: Sequence[Sequence[float]] | None = None
 
     @usable_arguments("Payload")
     def __post_init__(self) -> None:
-        if self.link is None and self.mass is not None:
+        if self.link is None and self.known:
             raise InvalidInput(f"Payload has a mass of {self.mass} kg and no link; name the link that carries it.")
         if self.mass is not None and not 0.0 < self.mass < np.inf:
             raise InvalidInput(
                 f"Payload mass is {self.mass!r}; give a positive number in kg, or None to have it found."
             )
+        if self.center_of_mass is None:
+            return
         center = np.array(self.center_of_mass, dtype=np.float64)
         inertia = None if self.inertia is None else np.array(self.inertia, dtype=np.float64)
         if center.shape != (3,) or (inertia is not None and inertia.shape != (3, 3)):
@@ -103,12 +106,12 @@ class Payload(Law):
     @property
     def known(self) -> bool:
         """Whether its numbers are given."""
-        return self.mass is not None
+        return self.mass is not None and self.center_of_mass is not None
 
     @property
     def pseudo_inertia(self) -> Float[np.ndarray, "4 4"]:
         """In the axes of the link, of a payload that is known."""
-        assert self.mass is not None, "it is known"
+        assert self.mass is not None and self.center_of_mass is not None, "it is known"  # noqa: PT018
         inertia = np.zeros((3, 3)) if self.inertia is None else np.array(self.inertia)
         return pseudo_inertia(self.mass, np.array(self.center_of_mass), inertia)
 
@@ -135,10 +138,10 @@ class Payload(Law):
         """Of a payload that is to be estimated: hardly any."""
         return Body(WEAK)
 
-    @staticmethod
-    def usual(offset: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        """Pseudo-inertia of a usual payload on a link with this pose in the frame of its body."""
+    def usual(self, offset: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+        """Pseudo-inertia of a usual payload, of its mass if that is given, on a link with this pose in its body."""
         mass, size = USUAL
+        mass = self.mass or mass
         return offset @ pseudo_inertia(mass, np.zeros(3), 0.4 * mass * size**2 * np.eye(3)) @ offset.T
 
 

@@ -171,17 +171,21 @@ class Estimates(Summary, Mapping[str, Estimate]):
         white: Float[np.ndarray, "N k+1"],
         stretches: Sequence[np.ndarray],
         prior: Float[np.ndarray, "entries k"],
+        changes: Float[np.ndarray, "stretches k"] | None = None,
+        move: Float[np.ndarray, " k"] | None = None,
         **more: Any,
     ) -> "Estimates":
         """From the Jacobian of whitened residuals, with them as last column, rows by stretches, and of the prior.
 
-        `slopes` are derivatives of the values in the coordinates. Without stretches the covariance is F^-1.
+        `slopes` are derivatives of the values in the coordinates, `changes` those of the coordinates without each
+        stretch, if not by one step; `move` what another cause that explains more would change. Without stretches the
+        covariance is F^-1.
         """
         J, r, G = white[:, :-1], white[:, -1], prior.T @ prior
         information = J.T @ J
         whole, root = information + G, np.linalg.inv(np.linalg.cholesky(G)).T
-        moved = []
-        for at in stretches:
+        moved = [] if changes is None else list(changes)
+        for at in stretches if changes is None else ():
             own = J[at]
             # in coordinates in which the prior is the identity, what is left has eigenvalues of 1 at least
             sizes, vectors = np.linalg.eigh(root.T @ (whole - own.T @ own) @ root)
@@ -193,6 +197,7 @@ class Estimates(Summary, Mapping[str, Estimate]):
             unseen = np.linalg.solve(whole, np.linalg.solve(whole, G).T)
             reach = float(student.ppf(0.975, max(count - 1, 1))) / REACH  # of fewer stretches, such as postures
             covariance = reach**2 * (count - 1) / count * apart.T @ apart + unseen
+            covariance = covariance if move is None else covariance + np.outer(move, move)
         return cls.of_covariance(parameters, values, slopes, np.linalg.inv(whole), prior, covariance, **more)
 
     @classmethod

@@ -1,0 +1,169 @@
+"""`forcegp payload`: what the robot carries, and the gains of its drives from a load that was weighed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import Positional, arg
+
+import forcegp
+import forcegp.data
+import forcegp.forces
+import forcegp.posterior
+import forcegp.scores
+from forcegp.atomic_files import write_json, write_text
+from forcegp.cli.command import DATASET, FIELDS, Command, listed, unless_given
+from forcegp.cli.fit import estimates_table, quick_doubts, write_estimates
+from forcegp.cli.logs import FilterOptions
+from forcegp.cli.robot_options import SYSTEM_FILE, RobotOptions, forces_of
+from forcegp.cli.terminal import Terminal
+from forcegp.errors import InvalidInput
+
+WINDOW = 0.4
+"""Seconds that torques are averaged over: it takes noise of the acceleration, and leaves friction as sharp as it is."""
+LAWS = "viscous", "gear", "offset", "rotor"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Payload(Command):
+    """Estimate mass, centre of mass and inertia of a payload, together with friction and rotors.
+
+    It is `forcegp fit --forces payload:LINK,... --evidence torques:mean=.4` on a log that is filtered first: a motion
+    of 20 s or more that turns every joint in both directions, without contact but for feet that stand. Without
+    --baseline, errors of the URDF's links count as payload. With one, the links are estimated from both logs. With
+    --mass, a known load calibrates the gains of the drives, which --identified then knows of other loads.
+
+    For example:
+      forcegp payload loaded.h5 --robot arm.urdf
+      forcegp payload loaded.h5 --baseline empty.h5 --link tool0 --out payload
+      forcegp payload known.h5 --robot arm.urdf --mass 2.8 --out calibrated
+      forcegp payload other.h5 --identified calibrated
+    """
+
+    log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
+    """The log with the payload (a dataset, raw or prepared)."""
+    baseline: Annotated[Path | None, DATASET, unless_given("LOG", "the URDF", Path)] = None
+    """A log of the same robot without the payload."""
+    link: Annotated[str | None, unless_given("LINK", "a base that moves, else the last link", str)] = None
+    """The link that carries the payload; results are in its frame."""
+    mass: Annotated[float | None, unless_given("KG", "estimated", float)] = None
+    """The mass of the payload, if it was weighed: gains of the drives (`gain`) are estimated from it."""
+    forces: Annotated[tuple[str, ...], listed(goes_on=FIELDS), arg(metavar="FORCE,...")] = LAWS
+    """What is estimated beside it, as for forcegp fit; gain for factors of u, which is then in any unit."""
+    out: Annotated[Path | None, unless_given("FOLDER", "nothing is written", Path)] = None
+    """Write payload.json, loaded.urdf (the robot with the payload) and system.json (for --identified) into it."""
+    robot: RobotOptions = RobotOptions()
+    filter: FilterOptions = FilterOptions(cutoff="auto", delay="auto")
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Prepare, estimate, write and show."""
+        self.require_free(self.out)
+        notes: list[str] = []
+        model, rows = self._rows(terminal, self.log, notes)
+        baseline = None if self.baseline is None else self._rows(terminal, self.baseline, notes)[1]
+        notes += forces_of(model)
+        words = [word for word in self.forces if word != "none"]
+        if self.forces == LAWS and forcegp.data.views.at_rest(rows):
+            words = ["offset"]
+            notes.append("the log is of postures alone: no motion shows friction, of which each rest has its own share")
+        words = ["gain", *words] if self.mass is not None and "gain" not in words else words
+        model = forcegp.scores.named_model(model, words)
+        if model.actuation.learned and baseline is not None and self.mass is None:
+            raise InvalidInput(
+                "gains and all masses are unknown, so only their products are known; give --mass of the payload, or "
+                "leave the baseline or the gains out."
+            )
+        with terminal.progress("identifying"):
+            found = with_payload(model, rows, self.link, baseline, self.mass)
+        content = {"data": str(self.log), **payload_dict(found, baseline is not None)}
+        if self.out is not None:
+            given = {"command": self.words("baseline", "link", "forces", "cutoff", "delay")}
+            with self.folder(self.out, {"data": str(self.log), **given}) as folder:
+                write_json(folder / "payload.json", content)
+                write_estimates(folder, found, "loaded")
+                if self.mass is not None:
+                    write_text(folder / SYSTEM_FILE, calibrated(found).to_json() + "\n")
+        known = "torques of the log" if not model.actuation.learned else "masses of the URDF"
+        known = (
+            known if self.mass is None else f"{known} and the payload's mass" if baseline is None else "payload's mass"
+        )
+        notes.append(f"numbers are as right as the {known}: a factor of these is one of all masses")
+        content["conditional_on"] = known
+        for note in notes:
+            terminal.note(note)
+        if not found.estimates.settled:
+            terminal.warn("the search did not converge: take the numbers with care, and record more or faster motion.")
+        if found.estimates["payload.mass"].interval[0] <= 0.0:
+            terminal.warn("the payload may weigh nothing by this log: centre of mass and inertia mean nothing then.")
+        beside = "the URDF" if baseline is None else "the baseline"
+        title = f"payload in the frame of {content['link']}, beside {beside}; {found.estimates.rows} rows"
+        own = {name: each for name, each in found.estimates.items() if name.startswith("payload.")}
+        others = {name: each for name, each in found.estimates.items() if name not in own and baseline is None}
+        tables = [estimates_table("joints", others)] if others else []
+        terminal.show(estimates_table(title, own), *tables)
+        return content
+
+    def _rows(self, terminal: Terminal, path: Path, notes: list[str]) -> tuple[forcegp.Model, forcegp.Dataset]:
+        """The robot, and rows behind the filter; those of a dataset that was prepared before are as they are."""
+        dataset = forcegp.Dataset.load(path)
+        model = self.robot.chosen_model(dataset, path)
+        if used := quick_doubts(path, dataset, model).at("wrong"):
+            terminal.warn(f"{path}: {used.in_one_line()}. See forcegp check.")
+        if forcegp.data.preparation_report(dataset.metadata):
+            return model, dataset
+        with terminal.progress(f"preparing {path}"):
+            raw = replace(dataset, model=model)
+            prepared = self.filter.preparation().apply(raw)
+        why = forcegp.data.preparation_report(prepared.metadata)["why"]
+        notes += [f"{path}: {name}: {why[name]}" for name in ("cutoff", "delay") if name in why]
+        return model, prepared
+
+
+def with_payload(
+    model: forcegp.Model,
+    rows: forcegp.Dataset,
+    link: str | None,
+    baseline: forcegp.Dataset | None = None,
+    mass: float | None = None,
+) -> Any:
+    """The posterior of a model that carries something, of this `mass`; with a baseline links are estimated, too."""
+    bodies = () if baseline is None else (forcegp.RigidBodies("all"),)
+    noisy = "u" if model.robot.space.is_vector_space else "both"
+    evidence = (forcegp.Torques(noisy, mean=WINDOW),)
+    loaded = model.with_forces(*bodies, forcegp.Payload(link, mass, None))
+    return forcegp.scores.learn(loaded, rows, evidence, baseline=baseline)[0]
+
+
+def calibrated(found: Any) -> forcegp.Model:
+    """The robot without payload, with gains as they were found: priors of the fits to come."""
+    estimates, robot = found.estimates, found.model.robot
+    gains = [estimates.get(f"gain.{joint}") for joint in robot.joint_names]
+    median = [1.0 if each is None else each.value for each in gains]
+    spread = [0.0 if each is None else each.std / each.value for each in gains]
+    actuation = replace(found.model.actuation, gain=forcegp.LogNormal(median, spread))
+    return replace(found.model.known, forces=(actuation, forcegp.RigidBodies()))
+
+
+def payload_dict(found: Any, baseline: bool) -> dict[str, Any]:
+    """Payload and other numbers as plain JSON values, with the link that carries it."""
+    [payload] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
+    doubts = found.settings["doubts"]
+    return {"link": payload.link, "baseline": baseline, "doubts": doubts, **found.estimates.to_dict()}
+
+
+SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
+
+
+def payload_text(found: Any) -> str:
+    """Mass with its 95 % interval and place; or that there is none."""
+    parts = {name: found.estimates[f"payload.{name}"] for name in ("mass", *(f"center_of_mass.{x}" for x in "xyz"))}
+    mass, *center = parts.values()
+    error = 0.5 * (mass.interval[1] - mass.interval[0])
+    if mass.value < max(SURE * mass.std, LEAST_PAYLOAD):
+        return f"none ({mass.value:.2g} ± {error:.1g} kg)"
+    place = ", ".join(f"{1e3 * each.value:.0f}" for each in center)
+    [held] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
+    return f"{mass.value:.3g} ± {error:.1g} kg at ({place}) mm of {held.link}, if the URDF's links are right"

@@ -1,0 +1,196 @@
+"""Payloads that are to be found: where they are, what speaks against them, and what rests and misfits leave open."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from forcegp.data import Dataset
+from forcegp.data.views import at_rest
+from forcegp.doubts import Doubt, look
+from forcegp.errors import DatasetError, InvalidInput
+from forcegp.evidence.least_squares import Fit, Residual
+from forcegp.evidence.parameter_space import ParameterSpace
+from forcegp.evidence.recorded_rows import RecordedRows
+from forcegp.fit.doubts import CLEARLY_MORE, LEAST, RIGHT, doubts_of_no_body, doubts_of_offsets
+from forcegp.forces import Actuation, Payload
+from forcegp.model import Model
+from forcegp.posterior.fitted import STRETCHES
+from forcegp.robots import Robot
+
+FEWEST = 10 * STRETCHES
+"""Rows that a payload needs, but in a log of postures alone."""
+
+
+def _usual_link(robot: Robot) -> str:
+    """A base that moves, else of the last joint the last link of the file.
+
+    Joints that move several bodies, as those of fingers, count as none, if there are others: what fingers hold moves
+    with the hand.
+    """
+    if robot.base != "fixed":
+        return robot.layout.moving[0]
+    drives = [drive.joint for drive in robot.layout.drives]
+    solid = {place.body for place in robot.layout.links.values()}
+    alone = [body for body, joint in enumerate(drives) if drives.count(joint) == 1 and body in solid]
+    last = max(alone, default=len(robot.layout.bodies) - 1)
+    return [name for name, place in robot.layout.links.items() if place.body == last][-1]
+
+
+def with_payloads_placed(model: Model, logs: Sequence[Dataset]) -> Model:
+    """The model whose payload without a link is on the usual one.
+
+    Raises DatasetError for logs too short for a payload.
+    """
+    unknown = [law for law in model.laws if isinstance(law, Payload) and not law.known]
+    for name, log in zip(("the log", "the baseline"), logs, strict=False):
+        if unknown and len(log) < FEWEST and not at_rest(log):
+            raise DatasetError(f"{name} has {len(log)} rows; a payload needs {FEWEST} or more.")
+    open_ones = [law for law in unknown if law.link is None]
+    if len(open_ones) > 1:
+        raise InvalidInput("forces list two payloads without a link, which no log tells apart; name their links.")
+    named = [law.link for law in unknown if law.link is not None]
+    bodies = [model.robot.layout.links[model.robot.link(link).name].body for link in named]
+    if len(set(bodies)) < len(bodies):
+        raise InvalidInput(
+            f"forces list two payloads on one body ({', '.join(named)}), which no log tells apart; leave one out."
+        )
+    if not open_ones:
+        return model
+    placed = replace(open_ones[0], link=_usual_link(model.robot))
+    return replace(model, forces=tuple(placed if force is open_ones[0] else force for force in model.forces))
+
+
+def doubts_of_payloads(space: ParameterSpace, fit: Fit, averaged: bool) -> Iterator[Doubt]:
+    """Offsets that look like its weight, and a link on which no body explains the log, where that is `averaged`."""
+    for body, each in enumerate(space.carried):
+        if each.payload is None:
+            continue
+        own, column = space.bodies.slices[body], space.names.index(f"{each.name}.mass")
+        slope = space.number_slopes(fit.x)[column, own]
+        laws = [type(space.model.laws[term.law]).__name__ for term in space.terms for _ in term.size]
+        offsets = np.array([law == "Offset" for law in laws], dtype=bool)
+        yield from doubts_of_offsets(fit, offsets, slope, own)
+        if averaged:  # noise of single rows hides what is left
+            number = len(space.carried)
+            one = np.eye(10 * number)[10 * body : 10 * body + 10].reshape(10, 1, number, 10)
+            slopes = space.bodies.chained(fit.x[: space.bodies.size], one)[:, 0, own]
+            link = getattr(space.model.laws[each.payload], "link", "")
+            yield from doubts_of_no_body(fit, space.standard_parameters(fit.x)[body], slopes, own, link)
+
+
+def changes_without_rests(
+    search: Callable[..., Fit],
+    residual: Residual,
+    space: ParameterSpace,
+    x: Float[np.ndarray, " k"],
+    rests: Sequence[np.ndarray],
+) -> Float[np.ndarray, "rests k"]:
+    """What leads from x to the end of a search without each of the rests, whose numbers of equations are given.
+
+    Levels of noise are found anew in each, since those of few rests are as unsure as the numbers: with the levels of
+    all rests, intervals of four postures held half of the loads.
+    """
+    changes = []
+    for at in rests:
+
+        def others(x: np.ndarray, at: np.ndarray = at) -> tuple[np.ndarray, np.ndarray]:
+            r, jacobian = residual(x)
+            kept = np.ones(len(r), dtype=bool)
+            kept[at // r.shape[1]] = False
+            return r[kept], np.asarray(jacobian)[kept]
+
+        other, size = search(others, start=x).x, space.bodies.size
+        step = space.standard_parameters(other) - space.standard_parameters(x)  # straight in parameters of bodies
+        of_bodies = np.linalg.solve(space.bodies.slopes(x[:size]), step.ravel()) if size else x[:0]
+        changes.append(np.append(of_bodies, (other - x)[size:]))
+    return np.stack(changes)
+
+
+CAUSES = {
+    "gains": (
+        0.2,
+        "torques of the log times",
+        "Estimate gains (--forces gain,...), or calibrate them (--mass).",
+    ),
+    "lengths": (0.1, "lengths before the joints times", "Correct the URDF's lengths."),
+    "masses": (0.2, "masses of the links times", "Give a baseline (a log without the payload), or identify all links."),
+}
+"""Usual deviations of the logarithms of factors, what they are of, and what to do. Of two causes the first is named,
+unless the other explains a tenth more."""
+STEP = 1e-4
+"""Of a length, for its derivative."""
+WRONG = 0.03
+"""Logarithm of the largest factor below which a cause is not worth a word."""
+
+
+def misfit(
+    model: Model,
+    rows: Sequence[RecordedRows],
+    a: Sequence[Float[np.ndarray, "rows nv"]],
+    mean: Callable[[np.ndarray], np.ndarray],
+    fit: Fit,
+) -> tuple[Doubt, Float[np.ndarray, " k"]] | None:
+    """The cause that explains most, if far more than `model`, and how far the coordinates move with it.
+
+    `model` has the numbers of the fit, `a` are accelerations of the rows, `mean` makes equations of what rows have. At
+    the best x, causes c with columns C lower the whitened residual r (Frisch & Waugh 1933): c = -(C' C - C' J F^-1 J' C
+    + S^-2)^-1 C' r with F = J' J + prior, and x moves by -F^-1 J' C c.
+    """
+    [actuation] = [law for law in model.laws if isinstance(law, Actuation)]
+    gains = 1.0 if actuation.is_exact else actuation.values["gain"].cpu().numpy()[:, None]
+    white, J = fit.white.ravel(), fit.white_jacobian.reshape(fit.white.size, -1)
+    inverse, cost = np.linalg.inv(fit.information + fit.prior_information), 0.5 * float((fit.white**2).sum())
+    best, found = max(CLEARLY_MORE, LEAST * cost), None
+    scales = [10 * k for k, each in enumerate(rows[0].space.carried) if each.payload is not None]
+    if np.linalg.norm(fit.residual) <= RIGHT * np.linalg.norm(0.5 * fit.jacobian[..., scales]):
+        return None  # of the torques of payloads, next to nothing is left
+    for cause, (usual, said, do) in CAUSES.items():
+        if cause != "lengths" and not actuation.is_exact:
+            continue  # a factor of all masses is one of the gains that are estimated
+        parts = [_columns(cause, model, part, each) for part, each in zip(rows, a, strict=True)]
+        names, C = parts[0][0], np.concatenate([each for _, each in parts])
+        C = mean(C) / gains
+        if cause == "gains":  # as the log has them: with the torques, what is needed would vanish, too
+            C = C - fit.residual[:, :, None] * np.eye(C.shape[1])
+        C = (C / fit.noise[:, None]).reshape(white.size, -1)
+        across = J.T @ C
+        own = C.T @ C - across.T @ inverse @ across
+        change = -np.linalg.solve(own + np.eye(C.shape[1]) / usual**2, C.T @ white)
+        more, off, factors = -0.5 * float(white @ C @ change), abs(change) > WRONG, np.exp(change)
+        if more > best and off.any():
+            told = ", ".join(f"{names[k]} {factors[k]:.3g}" for k in np.flatnonzero(off))
+            doubt = look(
+                about="payload",
+                what=f"{said} these factors would leave {more / cost:.0%} less of the log: {told}. "
+                "The intervals hold what that would change.",
+                do=do,
+                joints=tuple(np.array(names)[off].tolist()),
+                numbers={cause: dict(zip(names, factors.tolist(), strict=True))},
+            )
+            best, found = 1.1 * more, (doubt, -inverse @ (across @ change))
+    return found
+
+
+def _columns(
+    cause: str, model: Model, rows: RecordedRows, a: Float[np.ndarray, "rows nv"]
+) -> tuple[list[str], Float[np.ndarray, "rows nv causes"]]:
+    """Names of joints or links, and derivatives of torques needed less those measured in logarithms of factors."""
+    robot = model.loaded_robot if rows.loaded else model.robot
+    if cause == "gains":
+        return list(robot.joint_names), -rows.delivered[:, :, None] * np.eye(robot.nv)
+    if cause == "masses":
+        return [body.child for body in robot.layout.bodies], rows.by_body(a)
+    q, v, at = (torch.as_tensor(np.array(x), device=robot.device) for x in (rows.q, rows.v, a))
+    names, columns = [], []
+    for body, drive in enumerate(robot.layout.drives):
+        if robot.layout.parents[body] >= 0 and bool(robot.tree.rest[body, :3, 3].any()):
+            rest = robot.tree.rest.clone()
+            rest[body, :3, 3] *= 1.0 + STEP
+            longer = replace(robot, tree=replace(robot.tree, rest=rest))
+            change = longer.inverse_dynamics(q, v, at) - robot.inverse_dynamics(q, v, at)
+            names.append(robot.joint_names[drive.joint])
+            columns.append(change.cpu().numpy() / STEP)
+    return names, np.stack(columns, axis=-1) if columns else np.zeros((*a.shape, 0))
