@@ -29,7 +29,7 @@ def test_a_page_needs_no_network_is_small_and_shows_everything(page, tmp_path):
     assert not re.findall(r'<(?:script|link|img)[^>]*(?:src|href)="https?:', player)
     assert page.best in text
     pictures = re.findall(r'<img src="data:image/png;base64,([^"]+)"', text)
-    assert len(pictures) == len(page.pictures) == 2  # friction curves, accelerations
+    assert len(pictures) == len(page.pictures) == 1  # friction curves
     for picture in pictures:
         assert Image.open(io.BytesIO(base64.b64decode(picture))).width > 500
     (table,) = page.tables

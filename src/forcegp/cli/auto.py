@@ -283,7 +283,8 @@ def identification(model: forcegp.Model) -> str:
 def default_models(model: forcegp.Model, identified: forcegp.Posterior, rows: forcegp.Dataset) -> tuple[str, ...]:
     """What is compared: what thrusters fly through shows in no regression, so it is learned on the robot as given.
 
-    Accelerations are learned from as well where torques have made them predictable, unlike those of light wrists.
+    Accelerations are learned from as well where torques have made them predictable, unlike those of light wrists: by
+    half in most joints.
     """
     friction = bool(model.robot.single_joint_names)
     if forcegp.data.thruster_columns(model):
@@ -291,7 +292,7 @@ def default_models(model: forcegp.Model, identified: forcegp.Posterior, rows: fo
     models = ["given", "identified", *(["identified+gp:joint-friction"] if friction else [])]
     if model.robot.space.is_vector_space and not model.contacts:
         missed = forcegp.evidence.motion_residuals(rows, identified.model)[1].std(axis=0)
-        if (missed < rows.a.std(axis=0)).mean() > 0.5:
+        if (missed < USABLE * rows.a.std(axis=0)).mean() > 0.5:
             models.append("identified@accelerations")
     return tuple(models)
 

@@ -113,7 +113,7 @@ CAUSES = {
     "gains": (
         0.2,
         "torques of the log times",
-        "Estimate gains (--forces gain,...), or calibrate them (--mass).",
+        "Estimate gains (`gain` among the forces), or calibrate them by a load of known mass.",
     ),
     "lengths": (0.1, "lengths before the joints times", "Correct the URDF's lengths."),
     "masses": (0.2, "masses of the links times", "Give a baseline (a log without the payload), or identify all links."),
