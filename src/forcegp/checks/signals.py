@@ -317,6 +317,7 @@ FACTORS: dict[float, tuple[str, str | None]] = {
 CLOSE = 0.05  # deviation from one of them, or from 1, that noise and filters explain
 UNEXPLAINED = 0.3  # share of the power of v that dq/dt may leave unexplained, at the best factor and shift
 FEW = 0.05  # share below which a factor is meant seriously
+IDLE = 0.01  # of the largest of all joints, up to which what moves a joint may be noise
 TINY_SPEED = 1e-20  # of the mean square velocity of all joints
 SHIFTS = np.linspace(-0.05, 0.05, 101)  # s
 LEAST_SHIFT = 1.2  # time steps by which v must be late or early to be reported
@@ -335,7 +336,11 @@ def motion_doubts(inputs: CheckInput, joints: Sequence[int] | None = None) -> li
     for name, source in (("v", "q"), ("a", "v")):
         if name == "a" and any(doubt.level != "ok" for doubt in found):
             break  # of wrong velocities nothing better can come
-        compared = ((joint, _compared(pieces, name, source, joint)) for joint in joints)
+        slopes = np.concatenate([differentiate(getattr(rows, source), rows.time) for rows in pieces])
+        size = np.sqrt([np.square(x).mean(axis=0) for x in (getattr(even, name), slopes)]).max(axis=0)
+        kinds = (max(size[k] for k in joints if inputs.rotates[k] == inputs.rotates[joint]) for joint in joints)
+        moved = [joint for joint, most in zip(joints, kinds, strict=True) if size[joint] > IDLE * most]
+        compared = ((joint, _compared(pieces, name, source, joint)) for joint in moved)
         fits = {joint: fit for joint, fit in compared if fit is not None}
         found += _differences(inputs, name, source, fits, len(joints))
         if not found and fits and name == "v":

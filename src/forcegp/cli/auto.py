@@ -87,8 +87,8 @@ class Auto(Command):
         model, mapping = self.columns.model(self.robot), self.columns.mapped(self.logs, terminal)
         for note in forces_of(model):
             terminal.note(note)
-        dataset, done, mapping, mistakes = self._imported(terminal, model, mapping)
-        corrected = self._command(mapping)
+        dataset, done, mapping, mistakes, robot = self._imported(terminal, model, mapping)
+        model, corrected = self.columns.model(robot), self._command(mapping, robot)
         if mistakes and not self.correct:
             terminal.show(doubts_table(Doubts(mistakes), terminal.worded), "Run:")
             terminal.command(corrected)
@@ -126,7 +126,8 @@ class Auto(Command):
         scores, posterior = self._scored(terminal, rows, recording, model, identified)
         content: dict[str, Any] = {
             "out": str(self.out),
-            "seconds": sum(each["seconds"] for each in done["recordings"]),
+            "seconds": sum(each["seconds"] for each in done["recordings"])
+            - sum(end - begin for each in done["stops"] for begin, end in each["numbers"]["seconds"]),
             "import": done,
             "mistakes": [doubt.to_dict() for doubt in mistakes],
             "check": report.to_dict(),
@@ -149,9 +150,9 @@ class Auto(Command):
 
     def _imported(
         self, terminal: Terminal, model: forcegp.Model, mapping: forcegp.recordings.ColumnMapping
-    ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.recordings.ColumnMapping, list[Doubt]]:
+    ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.recordings.ColumnMapping, list[Doubt], RobotOptions]:
         """The dataset behind all corrections that its own evidence asks for, and the mistakes that these correct."""
-        mistakes: list[Doubt] = []
+        mistakes, robot = list[Doubt](), self.robot
         for _ in range(MOST_CORRECTIONS):
             try:
                 with terminal.progress("importing") as progress:
@@ -173,16 +174,20 @@ class Auto(Command):
             if not found and undecided is not None:
                 raise undecided
             if not found:
-                return dataset, done, mapping, mistakes
+                dataset, stops = forcegp.checks.without_stops(dataset)
+                return dataset, {**done, "stops": [each.to_dict() for each in stops]}, mapping, mistakes, robot
             mistakes.append(found[0])
+            for gravity in found[0].correction.get("gravity", {}).values():
+                robot = replace(robot, gravity=gravity)
+                model = self.columns.model(robot)
             mapping = mapping.corrected_by(found[0].correction, dataset.joint_names, done["columns"])
         raise DatasetError("the log is not right after eight corrections; look at it with forcegp check.")
 
-    def _command(self, mapping: forcegp.recordings.ColumnMapping) -> str:
-        """The same command with the columns, units and signs of the mapping."""
+    def _command(self, mapping: forcegp.recordings.ColumnMapping, robot: RobotOptions) -> str:
+        """The same command with the columns, units and signs of the mapping, and this robot."""
         stated = {item.name for item in fields(mapping)} | {"mapping", "logs", "out"}
         others = [name for name in options_of(Auto) if name not in stated]
-        words = ["forcegp", "auto", *map(str, self.logs), *mapping.flags(), *self.words(*others)]
+        words = ["forcegp", "auto", *map(str, self.logs), *mapping.flags(), *replace(self, robot=robot).words(*others)]
         return shlex.join([*words, "--out", str(self.out)])
 
     def _prepared_rows(
@@ -353,6 +358,7 @@ def answer_lines(
     return [
         ("log", f"{len(dataset)} rows, {seconds:.3g} s at {rate:.4g} Hz, {freedoms}{jitter}"),
         ("corrected", mistakes),
+        *(("left out", each["what"]) for each in done["stops"]),
         ("timing", f"{shifted}; {filtered}"),
         *([("stance", stance_text(prepared))] if "stance" in prepared else []),
         *of_joints,

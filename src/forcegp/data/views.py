@@ -70,20 +70,27 @@ def postures(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
     """
     if not dataset.time_ordered:
         return None
-    least = _within(dataset)
-    number, resting, count = np.zeros(len(dataset), int), 0, 0
+    found = rests(dataset)
+    ends = np.array([rows[-1] for rows in found], int)
+    number = np.searchsorted(ends, np.arange(len(dataset)))
+    elsewhere = np.append(dataset.episode[ends], dataset.episode.max() + 1)[number] != dataset.episode
+    resting = sum(map(len, found))
+    return np.maximum(number - elsewhere, 0) if len(found) > 2 and resting >= OFTEN * len(dataset) else None
+
+
+def rests(dataset: Dataset) -> list[Int[np.ndarray, " _"]]:
+    """Rows of each rest: all joints stand still at once."""
+    least, found = _within(dataset), list[np.ndarray]()
     for episode in dataset.episodes:
         rows = np.flatnonzero(dataset.episode == episode)
         q, time = dataset.q[rows], dataset.time[rows]
         ahead = np.minimum(np.searchsorted(time, time + SHORTEST), len(rows) - 1)
-        still, last = (np.abs(q[ahead] - q) <= STILL / RESTS * least).all(1), 0
+        still = (np.abs(q[ahead] - q) <= STILL / RESTS * least).all(1)
         for begin, end in runs(np.asarray(still)):
             end = int(ahead[end - 1]) + 1
             if time[end - 1] - time[begin] >= 0.99 * SHORTEST and (np.ptp(q[begin:end], axis=0) <= least).all():
-                number[rows[last:end]], last = count, end
-                resting, count = resting + end - begin, count + 1
-        number[rows[last:]] = max(count - 1, 0)
-    return number if count > 2 and resting >= OFTEN * len(dataset) else None
+                found.append(rows[begin:end])
+    return found
 
 
 def at_rest(dataset: Dataset) -> bool:
