@@ -23,8 +23,7 @@ from forcegp.checks.signals import (
     target_doubts,
     without_registers,
 )
-from forcegp.checks.stops import without_stops
-from forcegp.checks.torque_doubts import TOUCHES, held_points, torque_doubts
+from forcegp.checks.torque_doubts import TOUCHES, held_points, torque_doubts, without_stops
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
@@ -269,7 +268,7 @@ def excitation_doubts(inputs: CheckInput) -> Iterator[Doubt]:
         (one_way, turned, "Record motion to and fro."),
     ):
         if joints:
-            numbers = {"joints": motions}
+            numbers = {"joints": motions, "still": still}
             said = f"{listed(joints)} {what}"
             yield look(about="excitation", what=said, do=remedy, joints=tuple(joints), numbers=numbers)
     yield from _held(inputs, still)

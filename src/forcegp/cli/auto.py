@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -98,7 +98,7 @@ class Auto(Command):
         terminal.names_stages = True  # of minutes, most of which have nothing to count
         with terminal.progress("checking"):
             report = forcegp.check(dataset)
-        bad = report.doubts.at("wrong")
+        bad, still = report.doubts.at("wrong"), [x for doubt in report.doubts for x in doubt.numbers.get("still", ())]
         if bad and not self.accept:
             terminal.show(doubts_table(bad, terminal.worded))
             raise DatasetError(
@@ -123,11 +123,11 @@ class Auto(Command):
                 payload, held = payload_dict(found, False), payload_text(found)
             except DatasetError as error:
                 held = f"not estimated: {error}"
-        scores, posterior = self._scored(terminal, rows, recording, model, identified)
+        scores, posterior = self._scored(terminal, rows, recording, model, identified, still)
         content: dict[str, Any] = {
             "out": str(self.out),
-            "seconds": sum(each["seconds"] for each in done["recordings"])
-            - sum(end - begin for each in done["stops"] for begin, end in each["numbers"]["seconds"]),
+            "seconds": (len(dataset) - len(dataset.episodes))
+            * (done["resampled_to_step"] or done["recordings"][0]["median_step"]),
             "import": done,
             "mistakes": [doubt.to_dict() for doubt in mistakes],
             "check": report.to_dict(),
@@ -137,7 +137,7 @@ class Auto(Command):
             **{name: value for name, value in scores.to_dict().items() if name in SCORES},
             "code": self._code(terminal, posterior),
         }
-        answer = answer_lines(content, dataset, recording, identified, held, scores)
+        answer = answer_lines(content, dataset, recording, identified, held, scores, still)
         best = verdict(scores, dataset)
         content |= {"answer": [": ".join(line) for line in answer], "best": best}
         self._write_report(terminal, posterior, recording, content, answer, scores)
@@ -177,9 +177,8 @@ class Auto(Command):
                 dataset, stops = forcegp.checks.without_stops(dataset)
                 return dataset, {**done, "stops": [each.to_dict() for each in stops]}, mapping, mistakes, robot
             mistakes.append(found[0])
-            for gravity in found[0].correction.get("gravity", {}).values():
-                robot = replace(robot, gravity=gravity)
-                model = self.columns.model(robot)
+            robot = replace(robot, gravity=found[0].correction.get("gravity", {}).get("base", robot.gravity))
+            model = self.columns.model(robot)
             mapping = mapping.corrected_by(found[0].correction, dataset.joint_names, done["columns"])
         raise DatasetError("the log is not right after eight corrections; look at it with forcegp check.")
 
@@ -211,11 +210,12 @@ class Auto(Command):
         recording: forcegp.Dataset,
         model: forcegp.Model,
         identified: forcegp.Posterior,
+        still: Sequence[str],
     ) -> tuple[forcegp.scores.Scores, forcegp.posterior.Posterior]:
         """The scores of the models, and the recommended one, learned from all rows and stored."""
         how: dict[str, Any] = {"model": model, "recording": recording, "identification": identification(model)}
         how |= {"points": min(100, len(rows) // 4), "restarts": 1}
-        models = self.models.names() or default_models(model, identified, rows)
+        models = self.models.names() or default_models(model, identified, rows, still)
         with terminal.progress("scoring"):
             folder = self.out / "validation"
             scores = forcegp.score(models, rows, split="folds", seeds=1, folder=folder, overwrite=self.overwrite, **how)
@@ -284,16 +284,18 @@ def identification(model: forcegp.Model) -> str:
     return f"bodies{laws}@{'torques' if model.robot.space.is_vector_space else 'torques:both'}"
 
 
-def default_models(model: forcegp.Model, identified: forcegp.Posterior, rows: forcegp.Dataset) -> tuple[str, ...]:
+def default_models(
+    model: forcegp.Model, identified: forcegp.Posterior, rows: forcegp.Dataset, still: Sequence[str] = ()
+) -> tuple[str, ...]:
     """What is compared: what thrusters fly through shows in no regression, so it is learned on the robot as given.
 
-    Accelerations are learned from as well where torques have made them predictable, unlike those of light wrists.
+    Accelerations are learned from as well where torques have made them predictable, unlike of light or still joints.
     """
     friction = bool(model.robot.single_joint_names)
     if forcegp.data.thruster_columns(model):
         return "given", "identified", "gp:joint-friction+gp:aerodynamic" if friction else "gp:aerodynamic"
     models = ["given", "identified", *(["identified+gp:joint-friction"] if friction else [])]
-    if model.robot.space.is_vector_space and not model.contacts:
+    if model.robot.space.is_vector_space and not model.contacts and not still:
         missed = forcegp.evidence.motion_residuals(rows, identified.model)[1].std(axis=0)
         if (missed < rows.a.std(axis=0)).mean() > 0.5:
             models.append("identified@accelerations")
@@ -307,6 +309,7 @@ def answer_lines(
     identified: Any,
     held: str,
     scores: forcegp.scores.Scores,
+    still: Sequence[str],
 ) -> list[tuple[str, str]]:
     """What was found, in ten lines."""
     from forcegp.fit.friction_choice import friction_in_words  # PyTorch is not needed for a page of help
@@ -316,11 +319,10 @@ def answer_lines(
     done, prepared, seconds, out = content["import"], content["preparation"], content["seconds"], content["out"]
     deviation = max(each["largest_deviation_of_a_step"] for each in done["recordings"])
     jitter = f", steps up to {deviation:.0%} off (evened out)" if done["resampled_to_step"] is not None else ""
-    rate = (len(dataset) - len(dataset.episodes)) / seconds
     # `q=deg`, `sign u=1,-1`, or what was wrong where an order was corrected
     flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
     mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
-    late, lag = prepared["delay"], prepared["lag"]
+    late, lag, rate = prepared["delay"], prepared["lag"], (len(dataset) - len(dataset.episodes)) / seconds
     when = "late" if late > 0.0 else "early: a controller that holds u is half a time step"
     on_time = "u shows no delay" if "delay" in prepared["why"] else "u is taken to be on time"
     shifted = f"u was logged {1e3 * abs(late):.1f} ms {when} (shifted)" if late else on_time
@@ -334,13 +336,15 @@ def answer_lines(
         for two in (("rad", "m"), ("Nm", "N"), ("kg m²", "kg"))
     )
 
+    open_ones = f"; of {', '.join(still)} not known from this log" if still else ""
+
     def each(field: str) -> str:
-        return ", ".join(f"{values[f'{field}.{name}'].value:.3g}" for name in joints)
+        return ", ".join("–" if name in still else f"{values[f'{field}.{name}'].value:.3g}" for name in joints)
 
     of_joints = [
-        ("dry friction", friction_in_words(identified.model, recording, force)),
-        ("viscous", f"{each('viscous')} {force} per {q}/s"),
-        ("rotors", f"{each('rotor')} {inertia}"),
+        ("dry friction", friction_in_words(identified.model, recording, force, still) + open_ones),
+        ("viscous", f"{each('viscous')} {force} per {q}/s{open_ones}"),
+        ("rotors", f"{each('rotor')} {inertia}{open_ones}"),
     ] if joints else []  # fmt: skip
     by = ", if thrust coefficients are right" if forcegp.data.thruster_columns(identified.model) else ""
     mass, error = values.total_mass
