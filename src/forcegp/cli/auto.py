@@ -319,7 +319,8 @@ def answer_lines(
     done, prepared, seconds, out = content["import"], content["preparation"], content["seconds"], content["out"]
     deviation = max(each["largest_deviation_of_a_step"] for each in done["recordings"])
     jitter = f", steps up to {deviation:.0%} off (evened out)" if done["resampled_to_step"] is not None else ""
-    # `q=deg`, `sign u=1,-1`, or what was wrong where an order was corrected
+    told = {"stop", "spring", "drift", "unknown cause"}
+    seen = [(x["about"], x["what"]) for x in (*done["stops"], *content["check"]["doubts"]) if x["about"] in told]
     flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
     mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
     late, lag, rate = prepared["delay"], prepared["lag"], (len(dataset) - len(dataset.episodes)) / seconds
@@ -352,8 +353,7 @@ def answer_lines(
         f"{short_name(name)} {number(_motion(scores, name))} / {number(_acceleration(scores, name))}"
         for name in scores.models
     )
-    unit = "rad or m" if moving else q
-    ahead = f" after {scores.horizons[-1]:g} s" if scores.horizons else ""
+    ahead = (f" after {scores.horizons[-1]:g} s" if scores.horizons else "") + f" [{'rad or m' if moving else q}]"
     covered = scores.value("coverage_95", model=best)
     intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered:.0f} % of unseen rows"
     weak = ", ".join(list(values.by_body or {})[:3])
@@ -362,13 +362,13 @@ def answer_lines(
     return [
         ("log", f"{len(dataset)} rows, {seconds:.3g} s at {rate:.4g} Hz, {freedoms}{jitter}"),
         ("corrected", mistakes),
-        *(("left out", each["what"]) for each in done["stops"]),
+        *seen,
         ("timing", f"{shifted}; {filtered}"),
         *([("stance", stance_text(prepared))] if "stance" in prepared else []),
         *of_joints,
         *([("whole mass", f"{mass:.4g} ± {1.96 * error:.1g} kg{by}")] if moving else []),
         ("payload", held + by),
-        ("models", f"error of q{ahead} [{unit}] / nRMSE of the acceleration, on unseen time: {errors}"),
+        ("models", f"error of q{ahead} / nRMSE of the acceleration, on unseen time: {errors}"),
         *left_of_torques(scores, best),
         ("best", f"{short_name(best)}{intervals}"),
         ("record next", command + (f" (least is known of {weak})" if weak else "")),

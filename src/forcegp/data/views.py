@@ -74,8 +74,8 @@ def postures(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
     ends = np.array([rows[-1] for rows in found], int)
     number = np.searchsorted(ends, np.arange(len(dataset)))
     elsewhere = np.append(dataset.episode[ends], dataset.episode.max() + 1)[number] != dataset.episode
-    resting = sum(map(len, found))
-    return np.maximum(number - elsewhere, 0) if len(found) > 2 and resting >= OFTEN * len(dataset) else None
+    often = len(found) > 2 and sum(map(len, found)) >= OFTEN * len(dataset)
+    return np.maximum(number - elsewhere, 0) if often else None
 
 
 def rests(dataset: Dataset) -> list[Int[np.ndarray, " _"]]:

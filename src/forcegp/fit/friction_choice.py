@@ -393,10 +393,7 @@ def _with_transmission(model: Model, transmission: Any) -> Model:
 
 
 def friction_in_words(model: Model, log: Dataset, unit: str, still: Container[str] = ()) -> str:
-    """Dry friction of the joints at the speed and load of the log (root mean squares), near rest, and its memory.
-
-    Joints that stand `still` get a dash in the place of a number.
-    """
+    """Dry friction at the speed and load of the log (root mean squares), near rest, and its memory; not of `still`."""
     [law] = [law for law in model.laws if isinstance(law, DryFriction)]
     state = law.seen(model.state(*tensors(with_memory(log, model), model.robot.device)[:3]))
     v, load = (x.square().mean(0).sqrt() for x in (state.v, state.delivered))
