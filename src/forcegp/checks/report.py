@@ -137,6 +137,7 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
     doubts = [*registers, *signal_doubts(inputs)]
     if inputs.log.time_ordered:
         doubts = [*sampling_doubts(inputs), *doubts, *motion_doubts(inputs)]
+    moved = Doubts(doubts).of("velocity").level != "wrong"
     contacts = contact_doubts(inputs.mended, model)
     doubts += [*contacts, *stance_doubts(inputs.log, model)]
     comparison = None
@@ -148,7 +149,7 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
         return [*doubts, *targets], None
     if inputs.log.u.any() and not contacts:
         found, said = search(inputs)
-        if said and (held := held_points(inputs)):
+        if said and moved and (held := held_points(inputs)):
             return [*doubts, *held], None
         if said and said[-1].about == UNKNOWN and inputs.sharper is not None:
             sharp, heard = search(replace(inputs, compared=inputs.sharper))
