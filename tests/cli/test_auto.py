@@ -184,7 +184,7 @@ def _stopped(*_):
 def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
     dataset = SimpleNamespace(units={"q": "rad"})
 
-    def told(errors, moved=0.01, shares=None, covered=0.94):
+    def told(errors, moved=0.01, shares=None, covered=0.94, still=()):
         table = {"acceleration": {"nrmse": errors, "coverage_95": [covered] * 3}}
         table |= {"position after 1 s": {"rmse": [moved] * 3}}
         table |= {"torque": {"share": shares}} if shares else {}
@@ -192,7 +192,7 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
         run = {"split": "s", "seed": 0, "error": None, "table": table, "motions": motions, "stretches": {}}
         names = ("hip", "knee", "wrist")
         about = {"given": {"kind": "given", "summary": ""}}
-        return verdict(Scores(models=about, runs={"given": [run]}, joint_names=names, units={}), dataset)
+        return verdict(Scores(models=about, runs={"given": [run]}, joint_names=names, units={}), dataset, still)
 
     lost = told([328.2, 0.9, None], None)
     assert lost.startswith("Do not use any of these models: on unseen time the best one, “the URDF”, leaves of the acc")
@@ -206,6 +206,7 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
         "Use “the URDF”: on unseen time it leaves 2 to 5 % of each torque, "
         "but it is for torques: do not predict motions, positions 1 s ahead are wrong by 0.01 rad."
     )
+    assert "do not predict" not in told([0.1, 0.16, 2.8], shares=[0.02, 0.03, 0.05], still=["wrist"])
     whole = told([0.1, 0.16, 2.6], shares=[0.02, 0.03, 0.05])
     assert whole.endswith("of each torque, and positions 1 s ahead are wrong by 0.01 rad.")
     assert "wrist 51 %" in told([0.1] * 3, shares=[0.02, 0.03, 0.51])

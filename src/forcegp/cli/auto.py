@@ -138,7 +138,7 @@ class Auto(Command):
             "code": self._code(terminal, posterior),
         }
         answer = answer_lines(content, dataset, recording, identified, held, scores, still)
-        best = verdict(scores, dataset)
+        best = verdict(scores, dataset, still)
         content |= {"answer": [": ".join(line) for line in answer], "best": best}
         self._write_report(terminal, posterior, recording, content, answer, scores)
         content |= {"cpu_seconds": time.process_time() - begin}
@@ -394,14 +394,13 @@ USABLE, LEAST_COVERAGE = 0.5, 0.8
 coverage of 95 % intervals that is no reason to doubt them."""
 
 
-def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> str:
+def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset, still: Sequence[str] = ()) -> str:
     """Use it, use it for these joints, or do not use it; what it was measured by, and against the URDF alone."""
     best = scores.recommended
     assert best is not None, "a model was scored"
     quantity, score = (
         (TORQUE, "share") if "share" in scores.quantities(best).get(TORQUE, ()) else (ACCELERATION, "nrmse")
     )
-    what = "torque" if quantity == TORQUE else "acceleration"
     left = [math.inf if x is None else x for x in scores.columns(score, quantity, best)]
     good = [name for name, x in zip(scores.joint_names, left, strict=True) if x <= USABLE]
     lost = [f"{name} {100.0 * x:.0f} %" if math.isfinite(x) else f"{name} not known from this log"
@@ -409,19 +408,20 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> str:
     use = f"“{short_name(best)}”"
     if not good:
         return (
-            f"Do not use any of these models: on unseen time the best one, {use}, leaves of the {what} of "
+            f"Do not use any of these models: on unseen time the best one, {use}, leaves of the {quantity} of "
             f"{', '.join(lost)}. Forces, flags of stance, units or the robot's file are wrong, or it hardly moves."
         )
-    finite = [x for x in left if x <= USABLE]
-    ends = dict.fromkeys(f"{100.0 * x:.2g}" for x in (min(finite), max(finite)))
-    told = f"on unseen time it leaves {' to '.join(ends)} % of each {what}"
+    ends = dict.fromkeys(f"{100.0 * x:.2g}" for x in (min(left), max(x for x in left if x <= USABLE)))
+    told = f"on unseen time it leaves {' to '.join(ends)} % of each {quantity}"
     motion, urdf = _motion(scores, best), _motion(scores, "given")
     if motion is not None:
         unit = dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m"
         against = "they diverge" if urdf is None else f"by {urdf:.2g}"
         against = f"; with the URDF alone {against}" if "given" in scores.models and best != "given" else ""
         ahead = f"positions {scores.horizons[-1]:g} s ahead are wrong by {motion:.2g} {unit}{against}"
-        lost_there = (_acceleration(scores, best) or 0.0) >= 1.0  # no better than a = 0, as of light wrists
+        errors = zip(scores.joint_names, scores.columns("nrmse", ACCELERATION, best), strict=True)
+        there = [x or 0.0 for name, x in errors if name not in still]
+        lost_there = sum(there) >= max(len(there), 1)  # no better than a = 0, as of light wrists
         told += f", but it is for torques: do not predict motions, {ahead}" if lost_there else f", and {ahead}"
     elif scores.horizons:
         told += ", but its motions diverge: do not simulate with it"
@@ -431,7 +431,7 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> str:
     )  # fmt: skip
     if not lost:
         return f"Use {use}: {told}.{doubt}"
-    others = f"Not for the others, of whose {what} is left: {', '.join(lost)}."
+    others = f"Not for the others, of whose {quantity} is left: {', '.join(lost)}."
     return f"Use {use} for {', '.join(good)}: {told}. {others}{doubt}"
 
 
