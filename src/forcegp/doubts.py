@@ -25,7 +25,7 @@ class Doubt:
     what: what was seen, with joint, row, time and numbers. do: what to do about it, beside the `command`.
     joints: names of the joints concerned; numbers: the numbers of `what`, for programs.
     correction: what an import has to state, for `ColumnMapping.corrected_by`: unit, sign and order by signal,
-    orientation of q and axes of v and a.
+    orientation of q and axes of v and a; and of the robot gravity in the axes of its base.
     """
 
     level: Level
@@ -42,6 +42,7 @@ class Doubt:
         each = [("orientation", own[0]) for own in self.correction.get("orientation", {}).values()]
         stated = ((name, self.correction.get(name)) for name in ("axes", "unit", "sign"))
         flags = [f"--{name} {text}" for name, text in (*each, *((n, stated_as(x)) for n, x in stated if x))]
+        flags += [f"--gravity={','.join(f'{x:g}' for x in own)}" for own in self.correction.get("gravity", {}).values()]
         return " ".join(["forcegp import", *flags]) if flags else ""
 
     @property

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.checks.logs import arm, clean, column, pendulum
+import torch
+from tests.checks.logs import RATE, arm, clean, column, pendulum
 
-from forcegp.checks import CheckReport, check
-from forcegp.data import Preparation
+from forcegp.checks import CheckReport, check, without_stops
+from forcegp.data import Dataset, Preparation
 from forcegp.errors import InvalidInput
 from forcegp.mechanics import fixed_point
 
@@ -33,6 +34,41 @@ def test_a_joint_that_stays_does_not_show_its_friction():
     small = {name: getattr(data, name) * np.array([1e-3, 1, 1]) for name in "qva"}
     (found,) = [each for each in check(replace(data, **small)).doubts.of("excitation") if each.joints]
     assert (found.level, found.joints) == ("look", ("pan",))
+
+
+@pytest.mark.parametrize(("share", "level"), [(0.005, "ok"), (0.012, "wrong")])
+def test_velocities_are_compared_of_joints_that_move(share, level):
+    data = clean(4, noise=0.0)
+    pace = data.v[:, 0] * share * np.std(data.v, axis=0).max() / np.std(data.v[:, 0])
+    data = column(data, "v", 0, lambda _: 1.5 * pace)
+    data = column(data, "q", 0, lambda q: q.mean() + np.cumsum(pace) / RATE)
+    assert check(data).doubts.of("velocity").level == level
+
+
+def stopped(torque):
+    """A motion that rests in the middle, on torques that lack so much [Nm] of what the posture needs."""
+    data = clean(4, arm())
+    rows = np.r_[:700, np.repeat(700, 200), 700:1400]
+    still, time = slice(700, 900), np.arange(len(rows)) / RATE
+    moved = {name: getattr(data, name)[rows] for name in "qvua"}
+    moved["v"][still], moved["a"][still] = 0.0, 0.0
+    hold = data.model.robot.gravity_forces(torch.tensor(data.q[700])).numpy()
+    moved["u"][still] = hold - torque + 0.03 * np.random.default_rng(0).normal(size=(200, 3))
+    return Dataset(**moved, time=time, model=data.model)
+
+
+@pytest.mark.parametrize("lacking", [0.4, 1.1])
+def test_a_rest_on_brakes_is_left_out(lacking):
+    data = stopped(np.array([0.0, lacking, 0.0]))
+    found = check(data).doubts.of("stop")
+    assert len(found) == (lacking > 1.0)
+    if found:
+        [[begin, end]] = found[0].numbers["seconds"]
+        assert (begin, end) == pytest.approx((3.5, 4.495), abs=0.03)
+        assert "3.5 to" in found[0].what
+        kept, _ = without_stops(data)
+        assert len(kept.episodes) == 2
+        assert np.abs(kept.v).max(axis=1).min() > 0.0
 
 
 def test_a_gap_is_not_differentiated_across():

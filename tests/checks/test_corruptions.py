@@ -10,6 +10,7 @@ from tests.checks.corruptions import (
     CORRUPTIONS,
     ROBOTS,
     UNSEEN,
+    at,
     cases,
     clean,
     invented,
@@ -74,6 +75,18 @@ def test_a_unit_of_all_joints_is_stated_once():
     data = clean(two_links(), 0)
     (found,) = check(replace(data, v=np.rad2deg(data.v))).doubts.of("velocity")
     assert found.command == "forcegp import --unit v=deg/s"
+    (found,) = check(replace(data, q=np.rad2deg(data.q))).doubts.of("velocity")
+    assert found.command == "forcegp import --unit q=deg"
+
+
+def test_a_contact_is_not_sought_where_velocities_are_wrong(monkeypatch):
+    asked = []
+    monkeypatch.setattr("forcegp.checks.report.held_points", lambda inputs: asked.append(inputs) or [])
+    data = at(clean(two_links(), 0), "u", [1, -1])
+    check(replace(data, v=np.rad2deg(data.v)))
+    assert not asked
+    check(data)
+    assert asked
 
 
 def test_noise_of_the_acceleration_is_no_cause():

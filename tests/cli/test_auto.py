@@ -8,6 +8,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.checks import corruptions
+from tests.checks.corruptions import recorded_under
 from tests.checks.logs import clean, pendulum
 from tests.simulation.pendulum import double_pendulum
 
@@ -116,6 +118,22 @@ def test_correct_does_it_at_once(folder, forcegp, monkeypatch):
     assert rows.time[-1] == pytest.approx(8.0, abs=0.01)
 
 
+def test_a_base_on_a_wall_is_corrected(tmp_path, forcegp, monkeypatch):
+    monkeypatch.setattr("forcegp.cli.auto.Auto._prepared_rows", _stopped)
+    data = recorded_under(corruptions.clean(corruptions.two_links(), 0, noise="qvu"), (0.0, -9.81, 0.0))
+    (tmp_path / "arm.urdf").write_text(data.model.robot.urdf_text)
+    names = ("t", *(f"{what}{k}" for what in "qvu" for k in range(2)))
+    table = np.c_[data.time, data.q, data.v, data.u]
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header=",".join(names), comments="")
+    columns = [word for what in "qvu" for word in (f"--{what}", what + "{0..1}")]
+    words = ("auto", "log.csv", *columns, "--robot", "arm.urdf", "--out", "answer")
+    told = forcegp(*words, folder=tmp_path).stdout
+    assert "--gravity=0,9.81,0" in told[told.index("Run:") :]
+    assert "reached" in forcegp(*words, "--correct", folder=tmp_path).stderr
+    kept = Dataset.load(tmp_path / "answer" / "log.h5").model.robot.gravity
+    assert kept.tolist() == [0.0, 9.81, 0.0]
+
+
 def test_the_printed_command_keeps_every_option():
     columns = "--headerless 1,2 --side-by-side --time a:c1 --q b --u 0 --sign u=1,-1 --robot arm.urdf"
     others = "--accept --overwrite --cutoff 9 --every 3 --lock finger=0.1 --gravity=-9.81,0,0 --link tool"
@@ -123,7 +141,7 @@ def test_the_printed_command_keeps_every_option():
     words = ["auto", "a.txt", "b.txt", *columns.split(), *others.split()]
     command = parse_arguments(words)
     mapping = command.columns.mapped([], Terminal(json=False))
-    again = parse_arguments(shlex.split(command._command(mapping))[1:])
+    again = parse_arguments(shlex.split(command._command(mapping, command.robot))[1:])
     assert again == command
 
 
@@ -166,7 +184,7 @@ def _stopped(*_):
 def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
     dataset = SimpleNamespace(units={"q": "rad"})
 
-    def told(errors, moved=0.01, shares=None, covered=0.94):
+    def told(errors, moved=0.01, shares=None, covered=0.94, still=()):
         table = {"acceleration": {"nrmse": errors, "coverage_95": [covered] * 3}}
         table |= {"position after 1 s": {"rmse": [moved] * 3}}
         table |= {"torque": {"share": shares}} if shares else {}
@@ -174,7 +192,7 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
         run = {"split": "s", "seed": 0, "error": None, "table": table, "motions": motions, "stretches": {}}
         names = ("hip", "knee", "wrist")
         about = {"given": {"kind": "given", "summary": ""}}
-        return verdict(Scores(models=about, runs={"given": [run]}, joint_names=names, units={}), dataset)
+        return verdict(Scores(models=about, runs={"given": [run]}, joint_names=names, units={}), dataset, still)
 
     lost = told([328.2, 0.9, None], None)
     assert lost.startswith("Do not use any of these models: on unseen time the best one, “the URDF”, leaves of the acc")
@@ -188,6 +206,7 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
         "Use “the URDF”: on unseen time it leaves 2 to 5 % of each torque, "
         "but it is for torques: do not predict motions, positions 1 s ahead are wrong by 0.01 rad."
     )
+    assert "do not predict" not in told([0.1, 0.16, 2.8], shares=[0.02, 0.03, 0.05], still=["wrist"])
     whole = told([0.1, 0.16, 2.6], shares=[0.02, 0.03, 0.05])
     assert whole.endswith("of each torque, and positions 1 s ahead are wrong by 0.01 rad.")
     assert "wrist 51 %" in told([0.1] * 3, shares=[0.02, 0.03, 0.51])
@@ -200,5 +219,6 @@ def test_accelerations_are_learned_from_where_torques_make_them_predictable():
     data = clean(0, pendulum(), noise=0.0)
     known = fit(data.model.with_forces(Viscous(0.1), Coulomb(0.2), noise=Noise(1.0)), data)
     assert default_models(data.model, known, data)[-1] == "identified@accelerations"
+    assert default_models(data.model, known, data, ["elbow"])[-1] == "identified+gp:joint-friction"
     loud = replace(data, u=data.u + 3.0 * np.random.default_rng(0).normal(size=data.u.shape))
     assert default_models(data.model, known, loud)[-1] == "identified+gp:joint-friction"

@@ -95,6 +95,8 @@ def test_motors_that_turn_with_two_joints_are_found(T):
     words = friction_in_words(posterior.model, log, "Nm")
     assert ("the motor of bend turns with -1 lift +1 bend" in words) == (T is COUPLED)
     assert words.count("the motor of") == (T is COUPLED)
+    [first, *_] = friction_in_words(posterior.model, log, "Nm", {log.joint_names[1]}).split(" Nm")
+    assert first.split(", ")[1] == "–" != first.split(", ")[0]
 
 
 def test_models_of_such_motors_are_scored_on_rows_that_are_held_out():

@@ -1,3 +1,4 @@
 from .report import (
     CheckReport as CheckReport, check as check, quick_check as quick_check,
 )
+from .torque_doubts import without_stops as without_stops

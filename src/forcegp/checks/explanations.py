@@ -403,8 +403,9 @@ def _gravities(now: Comparison, pulls: Float[np.ndarray, "rows nv 3"]) -> Iterat
         cause = Cause(
             about="gravity",
             what=f"the torques fit gravity along ({text}) m/s² of the base far better{away}",
-            do=f"Give `gravity`={text.replace(' ', '')}.",
+            do="Give it to `Robot.from_file`.",
             numbers={"gravity": gravity.tolist(), "degrees": float(np.rad2deg(angle))},
+            correction={"gravity": {"base": tuple(round(float(x), 3) + 0.0 for x in gravity)}},
             cost=cost,
             number=True,
         )

@@ -23,7 +23,7 @@ from forcegp.checks.signals import (
     target_doubts,
     without_registers,
 )
-from forcegp.checks.torque_doubts import TOUCHES, held_points, torque_doubts
+from forcegp.checks.torque_doubts import TOUCHES, held_points, torque_doubts, without_stops
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
@@ -36,7 +36,7 @@ from forcegp.summary import Summary, plain
 
 BEFORE_A_FIT = frozenset(
     ("contact", "velocity", "acceleration", "delay", "torque unit", "torque constant", "masses", "lengths",
-     "joint zero", "gravity", "dead torque")
+     "joint zero", "gravity", "dead torque", "stop")
 )  # fmt: skip
 """Subjects that a fit reports also where a person should judge."""
 
@@ -104,9 +104,10 @@ def check(dataset: Dataset, model: Model | None = None, *, preparation: Preparat
     if robot.layout.groups:  # torques and filters are not looked at
         inputs = CheckInput.as_recorded(dataset, model)
         return CheckReport(doubts=_of_base(dataset, model, preparation), inputs=inputs, comparison=None)
+    dataset, stops = without_stops(dataset, model)
     dataset, registers = without_registers(dataset)
     inputs = CheckInput.of(dataset, model, preparation)
-    doubts, comparison = _doubts(inputs, model, registers)
+    doubts, comparison = _doubts(inputs, model, [*stops, *registers])
     if inputs.prepared is not None:
         doubts += [*excitation_doubts(inputs), *noise_doubts(inputs)]
     return CheckReport(doubts=Doubts(doubts), inputs=inputs, comparison=comparison)
@@ -122,8 +123,9 @@ def quick_check(dataset: Dataset, model: Model | None = None) -> Doubts:
     require_rows("dataset", dataset, model.robot.joint_names, model.robot.name)
     if model.robot.layout.groups:
         return Doubts(each for each in _of_base(dataset, model) if each.level != "ok")
+    dataset, stops = without_stops(dataset, model)
     dataset, registers = without_registers(dataset)
-    doubts, _ = _doubts(CheckInput.quick(dataset, model), model, registers)
+    doubts, _ = _doubts(CheckInput.quick(dataset, model), model, [*stops, *registers])
     said = [each for each in doubts if each.level == "look" and each.about in BEFORE_A_FIT]
     if dataset.nv == 1:  # friction of one joint can look like a delay
         said = [each for each in said if each.about != "delay"]
@@ -135,10 +137,11 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
     doubts = [*registers, *signal_doubts(inputs)]
     if inputs.log.time_ordered:
         doubts = [*sampling_doubts(inputs), *doubts, *motion_doubts(inputs)]
+    moved = Doubts(doubts).of("velocity").level != "wrong"
     contacts = contact_doubts(inputs.mended, model)
     doubts += [*contacts, *stance_doubts(inputs.log, model)]
     comparison = None
-    if inputs.compared is None or any(each.numbers["quantity"] == "q" for each in registers):
+    if inputs.compared is None or any(each.numbers.get("quantity") == "q" for each in registers):
         return doubts, None
     if inputs.contacts:
         return [*doubts, TOUCHES], None
@@ -146,7 +149,7 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
         return [*doubts, *targets], None
     if inputs.log.u.any() and not contacts:
         found, said = search(inputs)
-        if said and (held := held_points(inputs)):
+        if said and moved and (held := held_points(inputs)):
             return [*doubts, *held], None
         if said and said[-1].about == UNKNOWN and inputs.sharper is not None:
             sharp, heard = search(replace(inputs, compared=inputs.sharper))
@@ -266,7 +269,7 @@ def excitation_doubts(inputs: CheckInput) -> Iterator[Doubt]:
         (one_way, turned, "Record motion to and fro."),
     ):
         if joints:
-            numbers = {"joints": motions}
+            numbers = {"joints": motions, "still": still}
             said = f"{listed(joints)} {what}"
             yield look(about="excitation", what=said, do=remedy, joints=tuple(joints), numbers=numbers)
     yield from _held(inputs, still)

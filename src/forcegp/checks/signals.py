@@ -306,17 +306,18 @@ def _repeated(log: Dataset, follows: np.ndarray) -> Iterator[Doubt]:
 RPM = np.pi / 30.0
 FACTORS: dict[float, tuple[str, str | None]] = {
     1.0 / DEGREE: ("deg/s where q is in rad, or q in rad where v is in deg/s", "deg/s"),
-    DEGREE: ("rad/s where q is in degrees", None),
+    DEGREE: ("rad/s where q is in degrees", "rad/s"),
     1.0 / RPM: ("rpm where q is in rad", "rpm"),
     1000.0: ("mrad/s", "mrad/s"),
     0.001: ("per millisecond", None),
     0.5 / np.pi: ("turns per second where q is in rad", "rev/s"),
 }
-"""Ratios of v to dq/dt, what explains each, and the unit that `forcegp import --unit v=` takes where q is in rad."""
+"""Ratios of v to dq/dt, what explains each, and the unit of v, where q is in rad but for that of degrees."""
 
 CLOSE = 0.05  # deviation from one of them, or from 1, that noise and filters explain
 UNEXPLAINED = 0.3  # share of the power of v that dq/dt may leave unexplained, at the best factor and shift
 FEW = 0.05  # share below which a factor is meant seriously
+IDLE = 0.01  # of the largest of all joints, up to which what moves a joint may be noise
 TINY_SPEED = 1e-20  # of the mean square velocity of all joints
 SHIFTS = np.linspace(-0.05, 0.05, 101)  # s
 LEAST_SHIFT = 1.2  # time steps by which v must be late or early to be reported
@@ -335,9 +336,13 @@ def motion_doubts(inputs: CheckInput, joints: Sequence[int] | None = None) -> li
     for name, source in (("v", "q"), ("a", "v")):
         if name == "a" and any(doubt.level != "ok" for doubt in found):
             break  # of wrong velocities nothing better can come
-        compared = ((joint, _compared(pieces, name, source, joint)) for joint in joints)
+        slopes = np.concatenate([differentiate(getattr(rows, source), rows.time) for rows in pieces])
+        size = np.sqrt([np.square(x).mean(axis=0) for x in (getattr(even, name), slopes)]).max(axis=0)
+        kinds = (max(size[k] for k in joints if inputs.rotates[k] == inputs.rotates[joint]) for joint in joints)
+        moved = [joint for joint, most in zip(joints, kinds, strict=True) if size[joint] > IDLE * most]
+        compared = ((joint, _compared(pieces, name, source, joint)) for joint in moved)
         fits = {joint: fit for joint, fit in compared if fit is not None}
-        found += _differences(inputs, name, source, fits, len(joints))
+        found += _differences(inputs, name, source, fits, joints)
         if not found and fits and name == "v":
             error = max(unexplained for _, _, unexplained in fits.values())
             seen = f"v is dq/dt in every joint (at most {100.0 * error:.2g} % of its power is not)."
@@ -367,7 +372,7 @@ def _compared(pieces: list[Dataset], name: str, source: str, joint: int) -> tupl
 
 
 def _differences(
-    inputs: CheckInput, name: str, source: str, fits: Mapping[int, tuple[float, float, float]], count: int
+    inputs: CheckInput, name: str, source: str, fits: Mapping[int, tuple[float, float, float]], of: Sequence[int]
 ) -> Iterator[Doubt]:
     """One doubt for all joints in which v or a differs from the derivative in the same way."""
     step = float(np.median(np.diff(inputs.even.time)))
@@ -382,7 +387,7 @@ def _differences(
     what = EVERY_QUANTITY[name]
     for (kind, known), joints in groups.items():
         factor, shift, unexplained = fits[joints[0]]
-        named, every = inputs.named(joints), len(joints) == count > 2
+        named, every = inputs.named(joints), len(joints) == len(of) > 2
         one = f"the {what} of {'all joints' if every else listed(named)} is"
         guess, unit = FACTORS.get(known, ("", None)) if name == "v" else ("", None)
         level: Level = "wrong"
@@ -407,9 +412,11 @@ def _differences(
         correction: dict[str, Any] = {}
         if name == "v" and kind == "sign" and abs(factor + 1.0) < CLOSE:
             correction = {"sign": {"v": tuple(-1.0 if each in named else 1.0 for each in inputs.names)}}
-        elif level == "wrong" and unit is not None and len(joints) == count:
-            units = [unit if joint in fits else own for joint, own in enumerate(inputs.unit_of_each("v"))]
-            correction = {"unit": {"v": tuple(units)}}
+        elif level == "wrong" and unit is not None and len(joints) == len(fits):
+            signal, word = ("q", "deg") if known == DEGREE else ("v", unit)
+            alike = {k for k in of if inputs.rotates[k] == inputs.rotates[joints[0]]}  # also those that stand still
+            units = [word if k in alike else own for k, own in enumerate(inputs.unit_of_each(signal))]
+            correction = {"unit": {signal: tuple(units)}}
         each = [
             {"quantity": name, "factor": f, "delay": s if np.isfinite(s) else None, "unexplained": left}
             for f, s, left in (fits[joint] for joint in joints)

@@ -1,4 +1,4 @@
-"""Doubts of torques beside those of the search: dead channels, what is left, delay."""
+"""Doubts of torques beside those of the search: dead channels, what is left, delay, stops."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -8,16 +8,20 @@ import torch
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
 from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, Explanation
-from forcegp.checks.torques import Comparison
-from forcegp.data import estimate_delay
+from forcegp.checks.torques import WIDTHS, Comparison, with_gravity
+from forcegp.data import Dataset, estimate_delay
+from forcegp.data.views import consecutive, rests
 from forcegp.doubts import Doubt, listed, look, ok, wrong
 from forcegp.errors import DatasetError
 from forcegp.model import Model
+from forcegp.robots import Robot
 from forcegp.summary import plain
 
 UNEXPLAINED = 0.5
 LEAST_DELAY = 0.75  # time steps below which a delay is not reported
 MUCH = 0.5  # a delay that leaves less of what was unexplained is wrong to leave in
+HELD = 3.0  # of the dry friction and of what remains in motion, from which on no gear holds the joint
+HELD_ROWS = 1000
 RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
 
 
@@ -131,3 +135,57 @@ TOUCHES = ok(
     what="not compared with inverse dynamics: the robot touches something, and the forces of contacts are not known. "
     "Check free motion, too.",
 )
+
+
+def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, list[Doubt]]:
+    """The log without rests whose torques are not those of this posture, and what is said of them.
+
+    Torques in motion say what a posture needs, under any gravity and with any masses.
+    """
+    model = log.model if model is None else model
+    plain = log.time_ordered and not model.robot.layout.groups and not model.contacts and log.u.shape == log.v.shape
+    found = rests(log) if plain else []
+    if not found or sum(map(len, found)) > len(log) // 2:
+        return log, []
+    still = np.unique(np.concatenate(found))
+    inputs, at, held = CheckInput.quick(_cut(log, still), model), log.rows(still), np.zeros(len(still), bool)
+    rows = replace(
+        inputs, compared=inputs.mended if inputs.compared is None else inputs.compared, most_rows=1000
+    ).rows()
+    columns, standing = _needs(inputs.robot, rows), _needs(inputs.robot, at)
+    for k, (u, v, a) in enumerate(zip(rows.u.T, rows.v.T, rows.a.T, strict=True)):
+        slow = np.sqrt(np.square(v).mean()) + 1e-300
+        dry = np.stack([np.tanh(v / (width * slow)) for width in WIDTHS], axis=1)
+        both = np.c_[columns[:, k], a, v, dry]
+        size = np.linalg.norm(both, axis=0) + 1e-300
+        number = np.linalg.lstsq(both / size, u, rcond=1e-6)[0] / size
+        most = np.abs(dry @ number[-len(WIDTHS) :]).max() + np.std(u - both @ number)
+        held |= np.abs(at.u[:, k] - standing[:, k] @ number[: columns.shape[-1]]) > HELD * most
+    stops = [each for each in found if held[np.isin(still, each)].mean() > 0.5]
+    if not stops:
+        return log, []
+    out = np.unique(np.concatenate(stops))
+    spans = [log.time[each[[0, -1]]].tolist() for each in np.split(out, np.flatnonzero(np.diff(out) > 1) + 1)]
+    doubt = look(
+        about="stop",
+        what=f"all joints stand still from {', '.join(f'{x:.4g} to {y:.4g}' for x, y in spans)} s, and their torques "
+        "are not those that this posture needs: brakes hold the robot, or its drives are off.",
+        do="These rows are left out of all checks, and of forcegp auto; of other fits leave them out yourself.",
+        numbers={"seconds": spans},
+    )
+    return _cut(log, out), [doubt]
+
+
+def _cut(log: Dataset, rows: np.ndarray) -> Dataset:
+    """Without these rows; what was before and behind them are episodes."""
+    kept = ~np.isin(np.arange(len(log)), rows)
+    begins = np.diff(kept, prepend=True) | ~np.insert(consecutive(log)[:-1], 0, True)
+    return replace(log.rows(kept), episode=np.cumsum(begins)[kept])
+
+
+def _needs(robot: Robot, rows: Dataset) -> np.ndarray:
+    """What bodies of any mass need under any gravity, and an offset (rows, nv, k)."""
+    q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
+    bases = [with_gravity(robot, each).kinematics(q, v) for each in (np.zeros(3), *np.eye(3))]
+    parts = [each.torque_regressor(a).flatten(-2).detach().cpu().numpy() for each in bases]
+    return np.concatenate([*parts, np.ones((*rows.v.shape, 1))], axis=-1)

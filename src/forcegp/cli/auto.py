@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -88,8 +88,8 @@ class Auto(Command):
         model, mapping = self.columns.model(self.robot), self.columns.mapped(self.logs, terminal)
         for note in forces_of(model):
             terminal.note(note)
-        dataset, done, mapping, mistakes = self._imported(terminal, model, mapping)
-        corrected = self._command(mapping)
+        dataset, done, mapping, mistakes, robot = self._imported(terminal, model, mapping)
+        model, corrected = self.columns.model(robot), self._command(mapping, robot)
         if mistakes and not self.correct:
             terminal.show(doubts_table(Doubts(mistakes), terminal.worded), "Run:")
             terminal.command(corrected)
@@ -99,7 +99,7 @@ class Auto(Command):
         terminal.names_stages = True  # of minutes, most of which have nothing to count
         with terminal.progress("checking"):
             report = forcegp.check(dataset)
-        bad = report.doubts.at("wrong")
+        bad, still = report.doubts.at("wrong"), [x for doubt in report.doubts for x in doubt.numbers.get("still", ())]
         if bad and not self.accept:
             terminal.show(doubts_table(bad, terminal.worded))
             raise DatasetError(
@@ -124,10 +124,11 @@ class Auto(Command):
                 payload, held = payload_dict(found, False), payload_text(found)
             except DatasetError as error:
                 held = f"not estimated: {error}"
-        scores, posterior = self._scored(terminal, rows, recording, model, identified)
+        scores, posterior = self._scored(terminal, rows, recording, model, identified, still)
         content: dict[str, Any] = {
             "out": str(self.out),
-            "seconds": sum(each["seconds"] for each in done["recordings"]),
+            "seconds": (len(dataset) - len(dataset.episodes))
+            * (done["resampled_to_step"] or done["recordings"][0]["median_step"]),
             "import": done,
             "mistakes": [doubt.to_dict() for doubt in mistakes],
             "check": report.to_dict(),
@@ -137,8 +138,8 @@ class Auto(Command):
             **{name: value for name, value in scores.to_dict().items() if name in SCORES},
             "code": self._code(terminal, posterior),
         }
-        answer = answer_lines(content, dataset, recording, identified, held, scores)
-        best = verdict(scores, dataset)
+        answer = answer_lines(content, dataset, recording, identified, held, scores, still)
+        best = verdict(scores, dataset, still)
         content |= {"answer": [": ".join(line) for line in answer], "best": best}
         self._write_report(terminal, posterior, recording, content, answer, scores)
         content |= {"cpu_seconds": time.process_time() - begin}
@@ -150,9 +151,9 @@ class Auto(Command):
 
     def _imported(
         self, terminal: Terminal, model: forcegp.Model, mapping: forcegp.recordings.ColumnMapping
-    ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.recordings.ColumnMapping, list[Doubt]]:
+    ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.recordings.ColumnMapping, list[Doubt], RobotOptions]:
         """The dataset behind all corrections that its own evidence asks for, and the mistakes that these correct."""
-        mistakes: list[Doubt] = []
+        mistakes, robot = list[Doubt](), self.robot
         for _ in range(MOST_CORRECTIONS):
             try:
                 with terminal.progress("importing") as progress:
@@ -174,16 +175,19 @@ class Auto(Command):
             if not found and undecided is not None:
                 raise undecided
             if not found:
-                return dataset, done, mapping, mistakes
+                dataset, stops = forcegp.checks.without_stops(dataset)
+                return dataset, {**done, "stops": [each.to_dict() for each in stops]}, mapping, mistakes, robot
             mistakes.append(found[0])
+            robot = replace(robot, gravity=found[0].correction.get("gravity", {}).get("base", robot.gravity))
+            model = self.columns.model(robot)
             mapping = mapping.corrected_by(found[0].correction, dataset.joint_names, done["columns"])
         raise DatasetError("the log is not right after eight corrections; look at it with forcegp check.")
 
-    def _command(self, mapping: forcegp.recordings.ColumnMapping) -> str:
-        """The same command with the columns, units and signs of the mapping."""
+    def _command(self, mapping: forcegp.recordings.ColumnMapping, robot: RobotOptions) -> str:
+        """The same command with the columns, units and signs of the mapping, and this robot."""
         stated = {item.name for item in fields(mapping)} | {"mapping", "logs", "out"}
         others = [name for name in options_of(Auto) if name not in stated]
-        words = ["forcegp", "auto", *map(str, self.logs), *mapping.flags(), *self.words(*others)]
+        words = ["forcegp", "auto", *map(str, self.logs), *mapping.flags(), *replace(self, robot=robot).words(*others)]
         return shlex.join([*words, "--out", str(self.out)])
 
     def _prepared_rows(
@@ -207,11 +211,12 @@ class Auto(Command):
         recording: forcegp.Dataset,
         model: forcegp.Model,
         identified: forcegp.Posterior,
+        still: Sequence[str],
     ) -> tuple[forcegp.scores.Scores, forcegp.posterior.Posterior]:
         """The scores of the models, and the recommended one, learned from all rows and stored."""
         how: dict[str, Any] = {"model": model, "recording": recording, "identification": identification(model)}
         how |= {"points": min(100, len(rows) // 4), "restarts": 1}
-        models = self.models.names() or default_models(model, identified, rows)
+        models = self.models.names() or default_models(model, identified, rows, still)
         with terminal.progress("scoring"):
             folder = self.out / "validation"
             scores = forcegp.score(models, rows, split="folds", seeds=1, folder=folder, overwrite=self.overwrite, **how)
@@ -280,20 +285,20 @@ def identification(model: forcegp.Model) -> str:
     return f"bodies{laws}@{'torques' if model.robot.space.is_vector_space else 'torques:both'}"
 
 
-def default_models(model: forcegp.Model, identified: forcegp.Posterior, rows: forcegp.Dataset) -> tuple[str, ...]:
+def default_models(
+    model: forcegp.Model, identified: forcegp.Posterior, rows: forcegp.Dataset, still: Sequence[str] = ()
+) -> tuple[str, ...]:
     """What is compared: what thrusters fly through shows in no regression, so it is learned on the robot as given.
 
-    Accelerations are learned from as well where torques have made them predictable, unlike those of light wrists: by
-    half in most joints.
+    Accelerations are learned from as well where torques predict them by half, unlike of light or still joints.
     """
     friction = bool(model.robot.single_joint_names)
     if forcegp.data.thruster_columns(model):
         return "given", "identified", "gp:joint-friction+gp:aerodynamic" if friction else "gp:aerodynamic"
     models = ["given", "identified", *(["identified+gp:joint-friction"] if friction else [])]
-    if model.robot.space.is_vector_space and not model.contacts:
+    if model.robot.space.is_vector_space and not model.contacts and not still:
         missed = forcegp.evidence.motion_residuals(rows, identified.model)[1].std(axis=0)
-        if (missed < USABLE * rows.a.std(axis=0)).mean() > 0.5:
-            models.append("identified@accelerations")
+        models += ["identified@accelerations"] if (missed < USABLE * rows.a.std(axis=0)).mean() > 0.5 else []
     return tuple(models)
 
 
@@ -304,6 +309,7 @@ def answer_lines(
     identified: Any,
     held: str,
     scores: forcegp.scores.Scores,
+    still: Sequence[str],
 ) -> list[tuple[str, str]]:
     """What was found, in ten lines."""
     from forcegp.fit.friction_choice import friction_in_words  # PyTorch is not needed for a page of help
@@ -313,11 +319,11 @@ def answer_lines(
     done, prepared, seconds, out = content["import"], content["preparation"], content["seconds"], content["out"]
     deviation = max(each["largest_deviation_of_a_step"] for each in done["recordings"])
     jitter = f", steps up to {deviation:.0%} off (evened out)" if done["resampled_to_step"] is not None else ""
-    rate = (len(dataset) - len(dataset.episodes)) / seconds
-    # `q=deg`, `sign u=1,-1`, or what was wrong where an order was corrected
+    told = {"stop", "spring", "drift", "unknown cause"}
+    seen = [(x["about"], x["what"]) for x in (*done["stops"], *content["check"]["doubts"]) if x["about"] in told]
     flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
     mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
-    late, lag = prepared["delay"], prepared["lag"]
+    late, lag, rate = prepared["delay"], prepared["lag"], (len(dataset) - len(dataset.episodes)) / seconds
     when = "late" if late > 0.0 else "early: a controller that holds u is half a time step"
     on_time = "u shows no delay" if "delay" in prepared["why"] else "u is taken to be on time"
     shifted = f"u was logged {1e3 * abs(late):.1f} ms {when} (shifted)" if late else on_time
@@ -331,13 +337,15 @@ def answer_lines(
         for two in (("rad", "m"), ("Nm", "N"), ("kg m²", "kg"))
     )
 
+    open_ones = f"; of {', '.join(still)} not known from this log" if still else ""
+
     def each(field: str) -> str:
-        return ", ".join(f"{values[f'{field}.{name}'].value:.3g}" for name in joints)
+        return ", ".join("–" if name in still else f"{values[f'{field}.{name}'].value:.3g}" for name in joints)
 
     of_joints = [
-        ("dry friction", friction_in_words(identified.model, recording, force)),
-        ("viscous", f"{each('viscous')} {force} per {q}/s"),
-        ("rotors", f"{each('rotor')} {inertia}"),
+        ("dry friction", friction_in_words(identified.model, recording, force, still) + open_ones),
+        ("viscous", f"{each('viscous')} {force} per {q}/s{open_ones}"),
+        ("rotors", f"{each('rotor')} {inertia}{open_ones}"),
     ] if joints else []  # fmt: skip
     by = ", if thrust coefficients are right" if forcegp.data.thruster_columns(identified.model) else ""
     mass, error = values.total_mass
@@ -345,8 +353,7 @@ def answer_lines(
         f"{short_name(name)} {number(_motion(scores, name))} / {number(_acceleration(scores, name))}"
         for name in scores.models
     )
-    unit = "rad or m" if moving else q
-    ahead = f" after {scores.horizons[-1]:g} s" if scores.horizons else ""
+    ahead = (f" after {scores.horizons[-1]:g} s" if scores.horizons else "") + f" [{'rad or m' if moving else q}]"
     covered = scores.value("coverage_95", model=best)
     intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered:.0f} % of unseen rows"
     weak = ", ".join(list(values.by_body or {})[:3])
@@ -355,12 +362,13 @@ def answer_lines(
     return [
         ("log", f"{len(dataset)} rows, {seconds:.3g} s at {rate:.4g} Hz, {freedoms}{jitter}"),
         ("corrected", mistakes),
+        *seen,
         ("timing", f"{shifted}; {filtered}"),
         *([("stance", stance_text(prepared))] if "stance" in prepared else []),
         *of_joints,
         *([("whole mass", f"{mass:.4g} ± {1.96 * error:.1g} kg{by}")] if moving else []),
         ("payload", held + by),
-        ("models", f"error of q{ahead} [{unit}] / nRMSE of the acceleration, on unseen time: {errors}"),
+        ("models", f"error of q{ahead} / nRMSE of the acceleration, on unseen time: {errors}"),
         *left_of_torques(scores, best),
         ("best", f"{short_name(best)}{intervals}"),
         ("record next", command + (f" (least is known of {weak})" if weak else "")),
@@ -386,14 +394,13 @@ USABLE, LEAST_COVERAGE = 0.5, 0.8
 coverage of 95 % intervals that is no reason to doubt them."""
 
 
-def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> str:
+def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset, still: Sequence[str] = ()) -> str:
     """Use it, use it for these joints, or do not use it; what it was measured by, and against the URDF alone."""
     best = scores.recommended
     assert best is not None, "a model was scored"
     quantity, score = (
         (TORQUE, "share") if "share" in scores.quantities(best).get(TORQUE, ()) else (ACCELERATION, "nrmse")
     )
-    what = "torque" if quantity == TORQUE else "acceleration"
     left = [math.inf if x is None else x for x in scores.columns(score, quantity, best)]
     good = [name for name, x in zip(scores.joint_names, left, strict=True) if x <= USABLE]
     lost = [f"{name} {100.0 * x:.0f} %" if math.isfinite(x) else f"{name} not known from this log"
@@ -401,19 +408,20 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> str:
     use = f"“{short_name(best)}”"
     if not good:
         return (
-            f"Do not use any of these models: on unseen time the best one, {use}, leaves of the {what} of "
+            f"Do not use any of these models: on unseen time the best one, {use}, leaves of the {quantity} of "
             f"{', '.join(lost)}. Forces, flags of stance, units or the robot's file are wrong, or it hardly moves."
         )
-    finite = [x for x in left if x <= USABLE]
-    ends = dict.fromkeys(f"{100.0 * x:.2g}" for x in (min(finite), max(finite)))
-    told = f"on unseen time it leaves {' to '.join(ends)} % of each {what}"
+    ends = dict.fromkeys(f"{100.0 * x:.2g}" for x in (min(left), max(x for x in left if x <= USABLE)))
+    told = f"on unseen time it leaves {' to '.join(ends)} % of each {quantity}"
     motion, urdf = _motion(scores, best), _motion(scores, "given")
     if motion is not None:
         unit = dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m"
         against = "they diverge" if urdf is None else f"by {urdf:.2g}"
         against = f"; with the URDF alone {against}" if "given" in scores.models and best != "given" else ""
         ahead = f"positions {scores.horizons[-1]:g} s ahead are wrong by {motion:.2g} {unit}{against}"
-        lost_there = (_acceleration(scores, best) or 0.0) >= 1.0  # no better than a = 0, as of light wrists
+        errors = zip(scores.joint_names, scores.columns("nrmse", ACCELERATION, best), strict=True)
+        there = [x or 0.0 for name, x in errors if name not in still]
+        lost_there = sum(there) >= max(len(there), 1)  # no better than a = 0, as of light wrists
         told += f", but it is for torques: do not predict motions, {ahead}" if lost_there else f", and {ahead}"
     elif scores.horizons:
         told += ", but its motions diverge: do not simulate with it"
@@ -423,7 +431,7 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset) -> str:
     )  # fmt: skip
     if not lost:
         return f"Use {use}: {told}.{doubt}"
-    others = f"Not for the others, of whose {what} is left: {', '.join(lost)}."
+    others = f"Not for the others, of whose {quantity} is left: {', '.join(lost)}."
     return f"Use {use} for {', '.join(good)}: {told}. {others}{doubt}"
 
 

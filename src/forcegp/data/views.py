@@ -69,26 +69,7 @@ def postures(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
 
     A log of postures rests three times or more, in a quarter of its rows, with all joints at once.
     """
-    number, count, share = _rests(dataset)
-    return number if count > 2 and share >= OFTEN else None
-
-
-def _rests(dataset: Dataset) -> tuple[Int[np.ndarray, " rows"], int, float]:
-    """The rest that each row belongs to or comes after, how many there are, and the share of rows at rest."""
-    number, resting, count = np.zeros(len(dataset), int), 0, 0
-    least = _within(dataset)
-    for episode in dataset.episodes if dataset.time_ordered else ():
-        rows = np.flatnonzero(dataset.episode == episode)
-        q, time = dataset.q[rows], dataset.time[rows]
-        ahead = np.minimum(np.searchsorted(time, time + SHORTEST), len(rows) - 1)
-        still, last = (np.abs(q[ahead] - q) <= STILL / RESTS * least).all(1), 0
-        for begin, end in runs(np.asarray(still)):
-            end = int(ahead[end - 1]) + 1
-            if time[end - 1] - time[begin] >= 0.99 * SHORTEST and (np.ptp(q[begin:end], axis=0) <= least).all():
-                number[rows[last:end]], last = count, end
-                resting, count = resting + end - begin, count + 1
-        number[rows[last:]] = max(count - 1, 0)
-    return number, count, resting / len(dataset)
+    return _numbered(dataset, OFTEN)
 
 
 def rests_alone(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
@@ -97,8 +78,34 @@ def rests_alone(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
     within = [np.ptp(dataset.q[of_episode == each], axis=0) for each in range(of_episode.max() + 1)]
     if len(within) > 2 and (np.max(within, axis=0) <= _within(dataset)).all():
         return of_episode
-    number, count, share = _rests(dataset)
-    return number if count > 2 and share >= ALONE else None
+    return _numbered(dataset, ALONE)
+
+
+def _numbered(dataset: Dataset, share: float) -> Int[np.ndarray, " rows"] | None:
+    """The rest that each row belongs to or comes after; None for fewer than three, or less than a share of the rows."""
+    if not dataset.time_ordered:
+        return None
+    found = rests(dataset)
+    ends = np.array([rows[-1] for rows in found], int)
+    number = np.searchsorted(ends, np.arange(len(dataset)))
+    elsewhere = np.append(dataset.episode[ends], dataset.episode.max() + 1)[number] != dataset.episode
+    often = len(found) > 2 and sum(map(len, found)) >= share * len(dataset)
+    return np.maximum(number - elsewhere, 0) if often else None
+
+
+def rests(dataset: Dataset) -> list[Int[np.ndarray, " _"]]:
+    """Rows of each rest: all joints stand still at once."""
+    least, found = _within(dataset), list[np.ndarray]()
+    for episode in dataset.episodes:
+        rows = np.flatnonzero(dataset.episode == episode)
+        q, time = dataset.q[rows], dataset.time[rows]
+        ahead = np.minimum(np.searchsorted(time, time + SHORTEST), len(rows) - 1)
+        still = (np.abs(q[ahead] - q) <= STILL / RESTS * least).all(1)
+        for begin, end in runs(np.asarray(still)):
+            end = int(ahead[end - 1]) + 1
+            if time[end - 1] - time[begin] >= 0.99 * SHORTEST and (np.ptp(q[begin:end], axis=0) <= least).all():
+                found.append(rows[begin:end])
+    return found
 
 
 def at_rest(dataset: Dataset) -> bool:

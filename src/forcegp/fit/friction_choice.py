@@ -1,6 +1,6 @@
 """Which parts of gear friction a log shows, joint by joint, by stretches held out: memory, load, speed, breakaway."""
 
-from collections.abc import Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -392,24 +392,26 @@ def _with_transmission(model: Model, transmission: Any) -> Model:
     return model if transmission is None else replace(model, forces=tuple(forces))
 
 
-def friction_in_words(model: Model, log: Dataset, unit: str) -> str:
-    """Dry friction of the joints at the speed and load of the log (root mean squares), near rest, and its memory."""
+def friction_in_words(model: Model, log: Dataset, unit: str, still: Container[str] = ()) -> str:
+    """Dry friction at the speed and load of the log (root mean squares), near rest, and its memory; not of `still`."""
     [law] = [law for law in model.laws if isinstance(law, DryFriction)]
     state = law.seen(model.state(*tensors(with_memory(log, model), model.robot.device)[:3]))
     v, load = (x.square().mean(0).sqrt() for x in (state.v, state.delivered))
     numbers = (law.level_at((speed, load), law.values).expand(v.shape) for speed in (v, 0.0 * v))
     joints = [log.joint_names.index(name) for name in model.robot.single_joint_names]
     moving, rest = (each[joints] for each in numbers)
-    text = f"{_listed(moving)} {unit}, near rest {_listed(rest - moving)} more"
+
+    def listed(numbers: Tensor, names: Iterable[str] = model.robot.single_joint_names) -> str:
+        each = zip(names, numbers.tolist(), strict=True)
+        return ", ".join("–" if name in still else f"{number:.3g}" for name, number in each)
+
+    text = f"{listed(moving)} {unit}, near rest {listed(rest - moving)} more"
     for name, row in zip(log.joint_names, law.turning(torch.eye(log.nv).to(v)).mT.tolist(), strict=True):
         terms = [f"{x:+.3g} {other}" for other, x in zip(log.joint_names, row, strict=True) if x]
         text += f"; the motor of {name} turns with {' '.join(terms)}" if len(terms) > 1 else ""
     if not (remember := law.memory_joints(model.robot)):
         return text
     ways = 1e3 / law.values["sigma"].expand(v.shape)[remember]
-    who = "all joints" if len(remember) == len(joints) else ", ".join(log.joint_names[j] for j in remember)
-    return f"{text}; {who} remember reversals, over {_listed(ways)} mrad or mm"
-
-
-def _listed(numbers: Tensor) -> str:
-    return ", ".join(f"{each:.3g}" for each in numbers.tolist())
+    names = [log.joint_names[j] for j in remember]
+    who = "all joints" if len(remember) == len(joints) else ", ".join(names)
+    return f"{text}; {who} remember reversals, over {listed(ways, names)} mrad or mm"
