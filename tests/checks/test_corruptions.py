@@ -125,7 +125,11 @@ def test_the_gravity_of_a_tilted_base_is_right(degrees):
     angle = np.deg2rad(degrees)
     true = 9.81 * np.array([np.sin(angle) * 0.6, np.sin(angle) * 0.8, -np.cos(angle)])
     data = recorded_under(clean(ROBOTS["spatial"](), 3, noise="qvu"), tuple(true))
-    gravity = np.array(said(data)[0].numbers["gravity"])
+    found = said(data)[0]
+    gravity = np.array(found.numbers["gravity"])
+    np.testing.assert_allclose(
+        [float(x) for x in found.command.removeprefix("forcegp import --gravity=").split(",")], gravity, atol=1e-3
+    )
     assert np.rad2deg(np.arccos(gravity @ true / np.linalg.norm(gravity) / 9.81)) < 2.0
 
 

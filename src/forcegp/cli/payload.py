@@ -34,7 +34,7 @@ class Payload(Command):
     It is `forcegp fit --forces payload:LINK,... --evidence torques:mean=.4` on a log that is filtered first: a motion
     of 20 s or more that turns every joint in both directions, without contact but for feet that stand. Without
     --baseline, errors of the URDF's links count as payload. With one, the links are estimated from both logs. With
-    --mass, a known load calibrates the gains of the drives, which --identified then knows of other loads.
+    --mass, a known load calibrates the gains of the drives, which --identified then takes for other loads.
 
     For example:
       forcegp payload loaded.h5 --robot arm.urdf
