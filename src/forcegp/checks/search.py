@@ -247,6 +247,8 @@ def _all_turned(root: Explanation, inputs: CheckInput) -> tuple[Explanation, lis
     """
     log, left = root.log, list[np.ndarray]()
     moving = np.ptp(log.rows.u, axis=0) > 0.0
+    if root.free[moving].mean() > RESTS:
+        return None  # no masses explain them under any sign
     laws = Actuation(), RigidBodies("all"), *(Law() for Law in (Viscous, Coulomb, Offset, Rotor))
     for sign in (1.0, -1.0):
         rows = replace(log.rows, u=sign * log.rows.u, model=Model(log.robot, (), laws))
