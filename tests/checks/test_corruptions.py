@@ -26,7 +26,9 @@ from tests.posterior.arm import arm_model
 
 from forcegp.checks import check, quick_check
 from forcegp.checks.check_input import CheckInput
+from forcegp.checks.explanations import _units
 from forcegp.checks.search import search
+from forcegp.checks.torque_doubts import held_points
 from forcegp.data import Dataset
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -196,14 +198,17 @@ def test_clean_logs_raise_no_alarm(seed):
         assert quick_check(data) == (), name
 
 
-LEG = """<robot name="leg"><link name="rail"/>
+ROUND = '<inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+LEG = f"""<robot name="leg"><link name="rail"/>
 <joint name="z" type="prismatic"><parent link="rail"/><child link="body"/><axis xyz="0 0 1"/></joint>
-<link name="body"><inertial><mass value="2"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="body"><inertial><mass value="2"/>{ROUND}
 <joint name="hip" type="continuous"><parent link="body"/><child link="thigh"/><axis xyz="0 1 0"/></joint>
-<link name="thigh"><inertial><origin xyz="0 0 -0.1"/><mass value="0.3"/><inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<joint name="knee" type="continuous"><parent link="thigh"/><child link="shank"/><axis xyz="0 1 0"/><origin xyz="0 0 -0.2"/></joint>
-<link name="shank"><inertial><origin xyz="0 0 -0.1"/><mass value="0.2"/><inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<joint name="ankle" type="fixed"><parent link="shank"/><child link="foot"/><origin xyz="0 0 -0.2"/></joint><link name="foot"/></robot>"""  # noqa: E501
+<link name="thigh"><inertial><origin xyz="0 0 -0.1"/><mass value="0.3"/>{ROUND}
+<joint name="knee" type="continuous"><parent link="thigh"/><child link="shank"/><axis xyz="0 1 0"/>
+<origin xyz="0 0 -0.2"/></joint>
+<link name="shank"><inertial><origin xyz="0 0 -0.1"/><mass value="0.2"/>{ROUND}
+<joint name="ankle" type="fixed"><parent link="shank"/><child link="foot"/><origin xyz="0 0 -0.2"/></joint>
+<link name="foot"/></robot>"""
 
 
 @pytest.mark.parametrize("held", [True, False])
@@ -223,6 +228,26 @@ def test_a_foot_that_stays_is_no_wrong_sign_or_unit(held):
     if held:
         assert "--contact foot:held" in found[0].do
         assert found[0].joints == ("z", "hip", "knee")
+
+
+@pytest.mark.parametrize(("slips", "held"), [(0.0, True), (0.02, True), (0.04, False)])
+def test_a_foot_that_slips_by_more_than_a_twentieth_is_free(slips, held):
+    robot, time = Robot.from_urdf_text(LEG), np.arange(0.0, 8.0, 0.005)
+    hip = 0.6 + 0.2 * np.sin(2.0 * time)
+    q = np.stack([0.4 * np.cos(hip), hip, -2.0 * hip + slips * np.sin(1.1 * time)], axis=1)
+    v = np.gradient(q, time, axis=0)
+    log = Dataset(q=q, v=v, u=0.0 * q + 1.0, a=np.gradient(v, time, axis=0), time=time, model=Model(robot))
+    assert bool(held_points(CheckInput.quick(log, log.model))) == held
+
+
+@pytest.mark.parametrize(("rate", "unit"), [(0.1, "ms"), (1.5, ""), (200.0, ""), (5000.0, ""), (8000.0, "min")])
+def test_another_unit_of_time_is_asked_for_only_at_rates_that_no_log_has(rate, unit):
+    data = clean(two_links(), 0)
+    inputs = CheckInput.quick(replace(data, time=np.arange(len(data)) / rate), data.model)
+    root = search(inputs)[0]
+    found = [each.correction["unit"]["time"][0] for each, _ in _units(root.log, inputs, root.factors)
+             if each.about == "time unit"]  # fmt: skip
+    assert (unit in found) if unit else not found
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -98,7 +98,10 @@ def test_correlation_time_of_an_autoregressive_process():
 def test_levels_of_few_rows_are_drawn_towards_the_one_that_joints_share():
     """Two rows' worth of a common share of the sizes: of a joint that is fitted exactly, too."""
     r, sizes = np.array([[3.0, 0.0], [-3.0, 0.0], [3.0, 0.0]]), np.array([10.0, 1.0])
-    prior = lambda x: (x, np.eye(1))  # noqa: E731
+
+    def prior(x):
+        return x, np.eye(1)
+
     bounds = np.full(1, -1.0), np.ones(1)
     fit = weighted_least_squares(lambda x: (r, np.zeros((3, 2, 1))), prior, np.zeros(1), bounds, sizes=sizes)
     share = 0.5 * 0.3**2

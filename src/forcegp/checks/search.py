@@ -234,7 +234,7 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
     if sure:
         factor = np.where(np.isin(np.arange(len(root.floor)), sure), -1.0, 1.0)
         root = replace(root, log=root.log.after(changed("u", factor=factor)), turned=tuple(sure))
-    said = [*_signs(root, inputs), *_currents(root, inputs), *_unknown(root, inputs)]
+    said = [*_signs(root, inputs), *_factors(root, inputs, explained=False), *_unknown(root, inputs)]
     if said and not sure and (turned := _all_turned(root, inputs)):
         return turned
     return root, said
@@ -315,15 +315,20 @@ FAR, MUCH_MORE = 3.0, 30.0
 """Factors that wrong masses do not explain: less torque than bodies need cannot be; more may be a rotor's inertia."""
 
 
-def _factors(best: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
-    """Torques that are a multiple of what the motion needs."""
+def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -> Iterator[Doubt]:
+    """Torques that are a multiple of what the motion needs; of a log that is not `explained` those of several joints.
+
+    Friction may hide those of the others, as where u is a current.
+    """
     off = np.flatnonzero(best.chosen >= 2)
-    if not len(off):
+    if not explained:
+        off = off[(best.exact[off] <= EXPLAINED) & (best.shares[off] > RESTS)]
+    if len(off) < (1 if explained else 2):
         return
     joints, factors = inputs.named(off), best.factors[off]
     each = ", ".join(f"{name} {value:.4g}" for name, value in zip(joints, factors, strict=True))
     yield Doubt(
-        level="wrong" if factors.min() < 1.0 / FAR or factors.max() > MUCH_MORE else "look",
+        level="wrong" if not explained or factors.min() < 1.0 / FAR or factors.max() > MUCH_MORE else "look",
         about="torque constant" if len(off) == 1 else "torque unit",
         what=f"the measured torque is a multiple of what the motion needs: {each}.",
         do="Such factors point to torque before the gears (multiply by the gear ratio), motor current (multiply by the "
@@ -332,21 +337,6 @@ def _factors(best: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         joints=joints,
         numbers={"factor": dict(zip(joints, factors.tolist(), strict=True))},
     )
-
-
-def _currents(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
-    """Torques that several joints show as multiples, though friction hides those of others: currents, perhaps."""
-    off = np.flatnonzero((root.chosen >= 2) & (root.exact <= EXPLAINED) & (root.shares > RESTS))
-    if len(off) > 1:
-        factors = dict(zip(inputs.named(off), root.factors[off].tolist(), strict=True))
-        each = ", ".join(f"{name} {value:.4g}" for name, value in factors.items())
-        yield wrong(
-            about="torque unit",
-            what=f"the measured torque is a multiple of what the motion needs: {each}; u may be in A, % or ticks.",
-            do="forcegp payload --forces gain,viscous,gear,offset,rotor estimates the constants of all joints.",
-            joints=inputs.named(off),
-            numbers={"factor": factors},
-        )
 
 
 def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:

@@ -111,7 +111,8 @@ class Payload(Law):
     @property
     def pseudo_inertia(self) -> Float[np.ndarray, "4 4"]:
         """In the axes of the link, of a payload that is known."""
-        assert self.mass is not None and self.center_of_mass is not None, "it is known"  # noqa: PT018
+        assert self.mass is not None, "it is known"
+        assert self.center_of_mass is not None, "it is known"
         inertia = np.zeros((3, 3)) if self.inertia is None else np.array(self.inertia)
         return pseudo_inertia(self.mass, np.array(self.center_of_mass), inertia)
 
