@@ -1,7 +1,5 @@
-"""Lags, stances and masses that are found of robots whose base moves, in simulation; for docs/how-to/moving-bases.md.
+"""Stances and masses that are found of robots whose base moves, in simulation; for docs/how-to/moving-bases.md.
 
-rotor-lag: `estimate_thruster_lag` on 26 flights of `simulate quadrotor` of 20 to 60 s, in wind of 0 to 12 m/s, with
-    lags of 40 to 100 ms, all drawn: errors in ms, and in deviations.
 stance: flags of `estimate_stance` on the quadruped against the true ones, with white noise of v, and with white noise
     of q behind a filter: the share that is right, and rows that are left open, least and largest over seeds.
 masses: of the quadruped by regression, where its poses have 1 mm and 1 mrad of white noise and joints a fifth of it:
@@ -11,7 +9,7 @@ load: of the quadruped, with friction in its joints; 200 rows of 30 s for each s
     learns mass and centre of the trunk with viscous and Coulomb friction by maximum likelihood, `force prior` friction
     as functions. Errors of accelerations are parts of those of the URDF.
 
-    python -m benchmarks.moving_bases {rotor-lag,stance,masses,load} [--runs N]
+    python -m benchmarks.moving_bases {stance,masses,load} [--runs N]
 """
 
 import argparse
@@ -23,12 +21,12 @@ import numpy as np
 import torch
 
 from forcegp import Coulomb, Dataset, JointFriction, Viscous
-from forcegp.data import Preparation, estimate_stance, estimate_thruster_lag
+from forcegp.data import Preparation, estimate_stance
 from forcegp.evidence import Torques
 from forcegp.fit import fit
 from forcegp.forces import Body, RigidBodies
 from forcegp.posterior import Posterior
-from forcegp.simulation import QuadrotorConfig, QuadrupedConfig, simulate_quadrotor, simulate_quadruped
+from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 
 def with_noise_of_poses(log: Dataset, noise: float, seed: int) -> Dataset:
@@ -38,20 +36,6 @@ def with_noise_of_poses(log: Dataset, noise: float, seed: int) -> Dataset:
     steps[:, 6:] *= 0.2
     q = log.model.robot.integrate(torch.tensor(log.q), torch.tensor(steps)).numpy()
     return replace(log, q=q, truth={}, noise_std=None)
-
-
-def rotor_lag(flights: int = 26) -> None:
-    rng, errors = np.random.default_rng(5), []
-    for seed in range(flights):
-        lag, seconds, wind = rng.uniform(0.04, 0.1), rng.choice([20.0, 40.0, 60.0]), rng.choice([0.0, 4.0, 8.0, 12.0])
-        config = QuadrotorConfig(seconds=float(seconds), seed=seed, lag=float(lag), wind=float(wind))
-        found, std = estimate_thruster_lag(simulate_quadrotor(config))
-        errors.append((1e3 * (found - lag), (found - lag) / std))
-        off = f"off by {errors[-1][0]:5.1f} ms, {errors[-1][1]:4.1f} deviations"
-        print(f"{seconds:.0f} s, {wind:2.0f} m/s: {1e3 * lag:5.1f} ms, {off}", flush=True)
-    size, share = np.abs(errors).T
-    print(f"median of errors {np.median(size):.1f} ms, root mean square {np.sqrt(np.square(size).mean()):.1f} ms")
-    print(f"within two deviations: {(share < 2.0).sum()} of {len(share)}")
 
 
 def stance(seeds: int = 10) -> None:
@@ -127,7 +111,7 @@ def load(seeds: int = 5) -> None:
             print(f"{seed:>4} {name:12} {parts[0]:7.4f} {parts[1]:7.4f} {load:10.4f} {feet:12.4f}", flush=True)
 
 
-QUESTIONS = {"rotor-lag": rotor_lag, "stance": stance, "masses": masses, "load": load}
+QUESTIONS = {"stance": stance, "masses": masses, "load": load}
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -52,7 +52,7 @@ MOVING = {
     "robot ": "robot arm.urdf --base floating",
     "check": "check moving.h5",
     "import": "import moving.h5 --cutoff 20 --out out.h5",
-    "import ": "import moving.h5 --cutoff 20 --lag auto --out out.h5",
+    "import ": "import moving.h5 --cutoff 20 --lag 0.05 --out out.h5",
     "fit": f"fit moving.h5 --forces gp:aerodynamic:frame=body {SMALL} --no-checks --out out",
     "fit ": f"fit moving.h5 --forces gp:base-wrench {SMALL} --no-checks --out out",
     "fit  ": "fit test.h5 --forces viscous --rows 50 --no-checks --out out",

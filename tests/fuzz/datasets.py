@@ -168,7 +168,7 @@ def check_commands(case: DataFile, folder: Path) -> None:
     number = sum(map(ord, repr(case)))
     lines = (
         "check data.h5",
-        "import data.h5 --cutoff 20 --lag auto --out o.h5",
+        "import data.h5 --cutoff 20 --lag 0.05 --out o.h5",
         "import data.h5 --cutoff 20 --out o.h5",
         f"score {INPUTS.folder / 'carried'} data.h5",
     )

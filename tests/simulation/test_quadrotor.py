@@ -1,4 +1,4 @@
-"""`quadrotor`: rows obey Newton and Euler, its lag is found, and its air forces are learned in wind that is new."""
+"""`quadrotor`: rows obey Newton and Euler, and its air forces are learned in wind that is new."""
 
 import warnings
 from dataclasses import replace
@@ -8,10 +8,9 @@ import pytest
 import torch
 
 from forcegp import AerodynamicForce, fit
-from forcegp.data import estimate_thruster_lag, lagged, recorded_motions
+from forcegp.data import lagged, recorded_motions
 from forcegp.errors import InvalidInput
 from forcegp.fit import calibrated
-from forcegp.forces import Actuation, RigidBodies
 from forcegp.posterior import export_c, load_posterior, observing, save_posterior
 from forcegp.posterior.observed_wrench import _lasting
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
@@ -56,24 +55,6 @@ def test_without_wind_at_rest_only_thrust_and_lag_are_unknown():
     known = calm.model.dynamics(*(torch.tensor(x) for x in (calm.q, calm.v, calm.u)))
     a = known.acceleration(torch.tensor(calm.truth["Q_U"]))
     np.testing.assert_allclose(a, calm.truth["a"], atol=1e-9)
-
-
-def test_the_lag_of_the_rotors_is_found(train):
-    found, std = estimate_thruster_lag(train)
-    assert found == pytest.approx(0.06, rel=0.2)
-    assert 0.0 < std < 0.02
-
-
-def test_the_lag_of_actuators_that_push_a_base_is_found(train):
-    """As MJCF has rotors: u are thrusts, and the columns of a matrix the wrenches of the base."""
-    rotors = train.model.forces[1]
-    q, v = (torch.zeros(4, size, dtype=torch.float64) for size in (7, 6))
-    q[:, 6] = 1.0
-    wrenches = rotors.force(train.model.state(q, v, torch.eye(4, dtype=torch.float64))) / rotors.thrust[0]
-    model = replace(train.model, forces=(Actuation(wrenches.mT, rotors.names), RigidBodies()))
-    thrusts = train.u**2 * float(rotors.thrust[0])
-    found, _ = estimate_thruster_lag(replace(train, model=model, u=thrusts, truth={}))
-    assert found == pytest.approx(0.06, rel=0.25)
 
 
 def test_new_wind_is_observed_from_the_past(posterior, test):

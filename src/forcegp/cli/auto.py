@@ -71,7 +71,7 @@ class Auto(Command):
     --out gets a folder for each and fleet.csv; --jobs logs are at work at once. What is finished is kept."""
     robot: RobotOptions = RobotOptions()
     columns: ColumnOptions = ColumnOptions()
-    filter: FilterOptions = FilterOptions(cutoff="auto", delay="auto", lag="auto")
+    filter: FilterOptions = FilterOptions(cutoff="auto", delay="auto")
     models: CandidateOptions = CandidateOptions()
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:

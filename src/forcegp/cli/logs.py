@@ -51,9 +51,8 @@ class FilterOptions(CutoffOptions):
     delay: Annotated[str, arg(metavar="S|auto")] = "0"
     """Delay of u in the log, in s. auto: estimated for all joints together where u are the torques of all joints and
     nothing is touched, else 0."""
-    lag: Annotated[str, arg(metavar="S|auto")] = "0"
-    """Time constant in s with which actuators of first order follow u, thrusters where a base has them. auto: estimated
-    for thrusters."""
+    lag: Annotated[float, arg(metavar="S")] = 0.0
+    """Time constant in s with which actuators of first order follow u, thrusters where a base has them."""
     every: Annotated[int | None, unless_given("N", "1, or what the filter leaves", int)] = None
     """Keep every N-th row, after the filter."""
     trim: Annotated[float, arg(metavar="S")] = 0.0
@@ -61,10 +60,11 @@ class FilterOptions(CutoffOptions):
 
     def preparation(self) -> forcegp.data.Preparation:
         """As above."""
-        late: dict[str, Any] = {"delay": self.delay, "lag": self.lag}
-        for name in [name for name, given in late.items() if given != "auto"]:
-            [late[name]] = numbers_of(late[name], f"--{name} is {late[name]!r}; give seconds, or auto.", one=True)
-        return replace(super().preparation(), every=1 if self.every is None else self.every, trim=self.trim, **late)
+        delay: float | Literal["auto"] = "auto"
+        if self.delay != "auto":
+            [delay] = numbers_of(self.delay, f"--delay is {self.delay!r}; give seconds, or auto.", one=True)
+        every = 1 if self.every is None else self.every
+        return replace(super().preparation(), delay=delay, lag=self.lag, every=every, trim=self.trim)
 
 
 def prepared_rows(

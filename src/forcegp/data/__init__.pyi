@@ -20,6 +20,6 @@ from .views import (
     time_blocks as time_blocks, with_memory as with_memory,
 )
 from .wind import (
-    AirLaw as AirLaw, estimate_thruster_lag as estimate_thruster_lag, find_wind as find_wind,
+    AirLaw as AirLaw, find_wind as find_wind,
     thruster_columns as thruster_columns, with_wind as with_wind,
 )

@@ -24,12 +24,11 @@ from forcegp.data.spectrum import FEWEST_ROWS, held_out_cutoff, motion_spectrum
 from forcegp.data.stance import estimate_stance
 from forcegp.data.strokes import with_strokes
 from forcegp.data.views import at_rest, postures
-from forcegp.data.wind import estimate_thruster_lag, thruster_columns
+from forcegp.data.wind import thruster_columns
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.robots.arguments import whole_number
 from forcegp.summary import plain
 
-LATE: tuple[Literal["delay"], Literal["lag"]] = "delay", "lag"
 FEW = 2_000  # rows of a whole log
 FAR_ABOVE = 100.0  # a cut-off: where the memory of a filter does not depend on the rate
 SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
@@ -43,8 +42,7 @@ class Preparation:
         which v and a are computed anew; "auto" as `motion_spectrum` and `held_out_cutoff` find it, None for none.
     delay: how much later than it acts u was logged [s]: `u(t) := u_logged(t + delay)`; "auto": `estimate_delay`, 0
         where u does not hold the torques of all joints, or something is touched.
-    lag: time constant of the actuators [s], of thrusters where a base has them: T u_a' + u_a = u; "auto":
-        `estimate_thruster_lag`, 0 where that finds none.
+    lag: time constant of the actuators [s], of thrusters where a base has them: T u_a' + u_a = u.
     every: keep every so many rows.
     trim: seconds to drop at both ends of each episode, where a filter has samples of one side only.
     differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities.
@@ -57,7 +55,7 @@ class Preparation:
 
     cutoff: float | Literal["auto"] | None = None
     delay: float | Literal["auto"] = 0.0
-    lag: float | Literal["auto"] = 0.0
+    lag: float = 0.0
     every: int = 1
     trim: float = 0.0
     differentiate: Literal["q", "v"] = "q"
@@ -70,9 +68,9 @@ class Preparation:
             raise InvalidInput(f"cutoff is {self.cutoff!r}; give a frequency > 0 in Hz, 'auto', or None for no filter.")
         for name, least in (("delay", -np.inf), ("lag", 0.0), ("trim", 0.0)):
             given = getattr(self, name)
-            if not (_finite(given) and given >= least) and not (name in LATE and given == "auto"):
-                limit = "" if name == "delay" else ", at least 0"
-                raise InvalidInput(f"{name} is {given!r}; give seconds{limit}{', or auto' if name in LATE else ''}.")
+            if not (_finite(given) and given >= least) and not (name == "delay" and given == "auto"):
+                limit = "or auto" if name == "delay" else "at least 0"
+                raise InvalidInput(f"{name} is {given!r}; give seconds, {limit}.")
         whole_number("every", self.every, 1)
         for name, allowed in (("differentiate", ("q", "v")), ("stance", ("log", "auto"))):
             if getattr(self, name) not in allowed:
@@ -96,17 +94,6 @@ class Preparation:
         if self.cutoff == "auto":
             cutoff, reasons["cutoff"] = _cutoff(dataset, self.differentiate)
             chosen = replace(chosen, cutoff=cutoff)
-        if self.lag == "auto":
-            chosen, reasons["lag"] = replace(chosen, lag=0.0), "u drives no thrusters"
-            if thruster_columns(dataset.model):
-                try:
-                    seconds, std = estimate_thruster_lag(_filtered(replace(chosen, delay=0.0), dataset))
-                    chosen, reasons["lag"] = (
-                        replace(chosen, lag=seconds),
-                        f"{1e3 * seconds:.1f} ms ± {1e3 * std:.1f} ms",
-                    )
-                except (DatasetError, InvalidInput) as error:
-                    reasons["lag"] = f"rotors are taken to follow at once: {error}"
         if self.delay == "auto" and at_rest(dataset):
             chosen, reasons["delay"] = replace(chosen, delay=0.0), "in a log of postures alone none shows"
         elif self.delay == "auto":

@@ -1,4 +1,4 @@
-"""A body that flies: the wind of a recording, which nobody measured, and the lag of thrusters, from forces on it."""
+"""A body that flies: the wind of a recording, which nobody measured, from forces on it."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from torch import Tensor
 import forcegp.forces
 import forcegp.mechanics
 from forcegp.data.dataset import Dataset
-from forcegp.data.delay import jackknife, least_squares, lowest
-from forcegp.data.filters import episodes_in_order, lagged, sums_before
+from forcegp.data.filters import episodes_in_order, sums_before
 from forcegp.data.views import in_blocks
-from forcegp.errors import DatasetError, InvalidInput
 from forcegp.robots.manifold import TURN
 
 SECONDS = 0.3  # s: rows that lie this far apart count 1/e for each other's wind
@@ -157,15 +155,6 @@ class _Forces:
         other = [self.delivered[:, 2:], self.height, np.ones_like(push), np.square(air[:, :2])]
         return np.concatenate(moving + other, axis=1), np.array([MOVING] * 2 + [20] * 4)
 
-    def beside_wind(self, thrust: np.ndarray) -> np.ndarray:
-        """What `thrust` of rotors, air and a wrong mass depend on, without wind (rows, causes)."""
-        v, w = self.velocity[:, :3], self.velocity[:, 3:]
-        push, speed = thrust.sum(axis=1, keepdims=True), np.linalg.norm(v, axis=1, keepdims=True)
-        spinning = (np.sqrt(np.abs(thrust))[..., None] * v[:, None]).reshape(len(v), -1)
-        parts = [thrust, push * v, v, speed * v, spinning, w, np.cross(w, v)]
-        parts += [w[:, [1, 2, 0]] * w[:, [2, 0, 1]], self.rotation.reshape(-1, 9)]
-        return np.concatenate(parts, axis=1)
-
     def solved(self, wind: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
         """Coefficients (6, causes) by least squares, what they leave (rows, 6), and an orthonormal basis of each."""
         X, counts = self.causes(wind)
@@ -244,55 +233,6 @@ def _first_winds(forces: _Forces, own: np.ndarray, count: int) -> np.ndarray:
     wind = np.zeros((count, 3))
     wind[:, :2] = found[2:].reshape(count, 2) / drag
     return np.clip(wind, -0.5 * STRONGEST, 0.5 * STRONGEST)
-
-
-FAST = 0.1  # s: slower changes, of wind and of what controllers answer to it, do not count
-TRIED = np.linspace(0.0, 0.3, 31)  # s
-SETTLED = 0.5  # s, of an episode, after which nothing depends on how it began
-
-
-def estimate_thruster_lag(dataset: Dataset) -> tuple[float, float]:
-    """Time constant [s] of thrusters that follow u by first order, T s' + s = u, and its standard deviation.
-
-    For every T, the force that accelerates the base is fitted by least squares to thrust (Mahony et al. 2012), air and
-    attitude, all without their slow part. The least sum of log residuals wins; its deviation is a block jackknife, and
-    half a step of time. Raises InvalidInput but for one body that flies with thrusters, and DatasetError where the
-    recording is too short, or shows no lag below .3 s.
-    """
-    columns = thruster_columns(dataset.model)
-    if not columns or dataset.nv > 6:
-        raise InvalidInput("this lag is that of thrusters on one body; give base='floating' and Thrusters, or S in s.")
-    episodes = [part for _, part, _ in episodes_in_order(dataset) if np.ptp(part.time) > 2.0 * SETTLED]
-    if sum(map(len, episodes)) < 1000:
-        raise DatasetError(
-            "the recording is too short for the lag of thrusters; record 1,000 rows or more, or give the lag in s."
-        )
-
-    known = [_Forces.of(part) for part in episodes]
-    needed = [_fast(each.wrench + each.delivered, part.time) for each, part in zip(known, episodes, strict=True)]
-
-    def misfits(seconds: float) -> Float[np.ndarray, " parts"]:
-        """Sums of log residuals of all rows, and without each block."""
-        causes = []
-        for each, part in zip(known, episodes, strict=True):
-            late = lagged(part.u[:, [*columns]], part.time, seconds)
-            thrust = np.where(np.array([*columns.values()]) == 2, late * np.abs(late), late)
-            causes.append(_fast(each.beside_wind(thrust), part.time))
-        X = np.concatenate(causes)
-        left = least_squares(X / (np.linalg.norm(X, axis=0) + 1e-300), np.concatenate(needed))
-        return np.log(np.maximum(left, 1e-300)).sum(axis=1)
-
-    profiles = np.array([misfits(float(seconds)) for seconds in TRIED]).T
-    lags = np.array([lowest(profile, TRIED) if np.argmin(profile) else 0.0 for profile in profiles])
-    if not np.isfinite(lags).all():
-        raise DatasetError("the recording shows no lag of the thrusters below .3 s; give the lag in s, or 0.")
-    half = 0.5 * float(np.median(np.diff(episodes[0].time)))
-    return float(lags[0]), float(np.hypot(jackknife(lags[None, 1:])[0], half))
-
-
-def _fast(values: Float[np.ndarray, "rows k"], time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, "kept k"]:
-    """Without what a low pass of first order leaves, where that has settled."""
-    return (values - lagged(values, time, FAST))[time - time[0] > SETTLED]
 
 
 def thruster_columns(model: forcegp.Model) -> dict[int, int]:
