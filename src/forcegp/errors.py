@@ -113,7 +113,7 @@ class RobotFileWarning(DataWarning):
 
 
 class ContactWarning(DataWarning):
-    """The rows contradict the contacts that are stated: no motion along the surface, or no force."""
+    """The rows contradict the contacts that are stated: no motion along the surface."""
 
 
 LARGEST = 1e9

@@ -1,5 +1,5 @@
 from .contacts import (
-    contact_doubts as contact_doubts, contact_rows as contact_rows, rows_in_contact as rows_in_contact,
+    contact_doubts as contact_doubts, rows_in_contact as rows_in_contact,
 )
 from .dataset import Dataset as Dataset, units_for as units_for
 from .delay import Delay as Delay, estimate_delay as estimate_delay
