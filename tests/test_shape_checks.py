@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 from tests.posterior.arm import arm_data
 from tests.posterior.test_predictor_of_moving_bases import hopper
+from tests.robots.random_positions import random_positions
 from tests.shapes import MisfitError, checked, unchecked
 from torch import Tensor
 
@@ -44,7 +45,7 @@ QUICK = OptimizerOptions(iterations=2)
 def hopper_data(rows: int) -> Dataset:
     """Of a floating base with two propellers and a foot that is held in every second row: each size is another."""
     model, generator = hopper("floating"), torch.Generator().manual_seed(0)
-    q = model.robot.random(generator, rows)
+    q = random_positions(model.robot, generator, rows)
     v, u = (torch.randn(rows, size, generator=generator).double() for size in model.sizes[1:])
     u[:, -1] = torch.arange(rows) % 2
     a = model.dynamics(q, v, u).acceleration(-0.3 * v)

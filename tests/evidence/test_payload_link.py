@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from tests.robots.random_positions import random_positions
 
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning
@@ -54,7 +55,10 @@ def rows(base: str, loaded: str, noise: float) -> Dataset:
     known = (Actuation(), *([ROTORS] if base == "floating" else []), RigidBodies())
     given, heavier = (Model(Robot.from_urdf_text(text, base=base), (), known) for text in (TWO_ARMS, loaded))
     draw = torch.Generator().manual_seed(0)
-    q, v = given.robot.random(draw, 400), torch.randn(400, given.robot.nv, generator=draw, dtype=torch.float64)
+    q, v = (
+        random_positions(given.robot, draw, 400),
+        torch.randn(400, given.robot.nv, generator=draw, dtype=torch.float64),
+    )
     u = 8.0 * torch.randn(400, len(given.inputs), generator=draw, dtype=torch.float64)
     friction = torch.zeros_like(v)
     friction[:, -4:] = -0.2 * v[:, -4:]

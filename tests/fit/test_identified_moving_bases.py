@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy.linalg import eigh, null_space
 from tests.mechanics.test_thrusters import DRONE
+from tests.robots.random_positions import random_positions
 from tests.robots.test_moving_bases import LIMBS, ROOTS, Pair
 
 from forcegp.data import Dataset
@@ -63,7 +64,7 @@ def rows_of(model, count, seed=0, switches=2):
     robot = model.robot
     v, u = (torch.randn(count, n, dtype=torch.float64, generator=generator) for n in model.sizes[1:])
     u[:, u.shape[1] - switches :] = torch.randint(0, 2, (count, switches), generator=generator).double()
-    return robot.random(generator, count), v, u
+    return random_positions(robot, generator, count), v, u
 
 
 def scaled(robot, factors):

@@ -1,6 +1,7 @@
 """Friction under several feet that slide on the ground, each in rows in which it stands."""
 
 import torch
+from tests.robots.random_positions import random_positions
 
 from forcegp import Contact, Model, Plane, Robot
 from forcegp.forces import ContactFriction
@@ -16,7 +17,7 @@ def test_feet_that_stand_resist_their_own_sliding_and_no_other():
     )
     model = Model(robot, contacts, held.forces)
     generator = torch.Generator().manual_seed(0)
-    q = robot.random(generator, 3)
+    q = random_positions(robot, generator, 3)
     v = torch.randn(3, robot.nv, generator=generator, dtype=torch.float64)
     u = torch.zeros(3, 14, dtype=torch.float64)
     u[:, 12:] = torch.tensor([[1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])

@@ -15,6 +15,7 @@ from safetensors.torch import load_file, save_file
 from tests.fuzz.made import INPUTS, MODELS
 from tests.fuzz.oracle import DefectError, Target, allowed, require_ended_well, require_no_code
 from tests.fuzz.values import DAMAGE, JSON, JSON_EDITS, XML_EDITS, Damage, damaged, edited_json, edited_xml
+from tests.robots.random_positions import random_positions
 
 from forcegp import Model, load_posterior
 from forcegp.atomic_files import write_digests
@@ -172,7 +173,7 @@ def check_system(case: StoredSystem, folder: Path) -> None:
         model = Model.from_json(text)
         repr(model)
         robot = model.robot
-        q = robot.random(torch.Generator().manual_seed(0))
+        q = random_positions(robot, torch.Generator().manual_seed(0))
         dynamics = model.dynamics(q, 0.0 * q[:, : robot.nv], torch.ones(1, len(model.inputs)).double())
         if not bool(torch.isfinite(dynamics.M).all()):
             raise DefectError("a mass matrix that is not finite")

@@ -6,6 +6,7 @@ from functools import partial
 import pytest
 import torch
 from tests.posterior.arm import arm_model
+from tests.robots.random_positions import random_positions
 from tests.robots.test_moving_bases import LIMBS
 
 from forcegp.errors import InvalidInput, NumericalError, NumericalWarning
@@ -198,7 +199,7 @@ def test_a_start_in_other_units_is_refused():
 
 def moved(robot, name, dt, seconds, speed=1.0):
     generator = torch.Generator().manual_seed(1)
-    q = robot.random(generator)
+    q = random_positions(robot, generator)
     v = speed * torch.randn(1, robot.nv, dtype=torch.float64, generator=generator)
     steps = torch.zeros(round(seconds / dt), 1, robot.nv, dtype=torch.float64)
     method = integrator_named(name, Model(robot))

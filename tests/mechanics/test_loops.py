@@ -9,6 +9,7 @@ import pytest
 import torch
 from tests.robots.mjcf_models import BAR, FOUR_BAR
 from tests.robots.mujoco_oracle import MujocoOracle
+from tests.robots.random_positions import random_positions
 
 from forcegp.errors import ContactError, InvalidInput
 from forcegp.integration import onto_contacts, violation
@@ -138,7 +139,7 @@ def test_rotors_on_links_that_move_are_inputs(tmp_path, base, gear):
     names = ("turn", *(("right",) if base else ()), "left")
     assert model.inputs == names
     oracle, generator = MujocoOracle(plain), torch.Generator().manual_seed(0)
-    q = model.robot.random(generator, 3)
+    q = random_positions(model.robot, generator, 3)
     v, u = (torch.randn(3, n, dtype=torch.float64, generator=generator) for n in (model.robot.nv, len(names)))
     delivered = model.state(q, v, u).delivered
     for k in range(3):

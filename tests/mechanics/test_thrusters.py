@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
+from tests.robots.random_positions import random_positions
 
 from forcegp import Model, Robot
 from forcegp.errors import InvalidInput
@@ -27,7 +28,7 @@ def robot():
 
 def states(robot, rows=5):
     generator = torch.Generator().manual_seed(3)
-    q = robot.random(generator, rows)
+    q = random_positions(robot, generator, rows)
     return q, *(torch.randn(rows, size, generator=generator, dtype=torch.float64) for size in (robot.nv, 3))
 
 

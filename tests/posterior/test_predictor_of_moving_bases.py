@@ -6,6 +6,7 @@ import subprocess
 import numpy as np
 import pytest
 import torch
+from tests.robots.random_positions import random_positions
 
 from forcegp import Contact, Dataset, JointFriction, Model, Noise, Plane, Robot, export_c, fit
 from forcegp.errors import InvalidInput
@@ -46,7 +47,7 @@ def fitted(model, prior, seed=0):
     """A posterior of random states, and others near by; every second row has its foot on the ground."""
     generator, robot = torch.Generator().manual_seed(seed), model.robot
     v, u = (torch.randn(ROWS, size, generator=generator, dtype=torch.float64) for size in model.sizes[1:])
-    q = robot.random(generator, ROWS)
+    q = random_positions(robot, generator, ROWS)
     if "stance" in model.inputs:
         u[:, -1] = torch.arange(ROWS) % 2
     friction = torch.zeros_like(v)

@@ -66,7 +66,7 @@ def test_frame_at_a_point(case, point):
     offset = torch.zeros(3).double() if point is None else torch.as_tensor(point, dtype=torch.float64)
     assert relative_error(ours[:, :3, :3] @ offset + ours[:, :3, 3], pose[:, :3, 3]) < 1e-12
     assert relative_error(robot.frame_jacobian(q, frame, point), jacobian) < 1e-12
-    assert relative_error(robot.frame_bias_acceleration(q, v, frame, point), acceleration) < 1e-11
+    assert relative_error(robot.kinematics(q, v).frame_bias_acceleration(frame, point), acceleration) < 1e-11
 
 
 @pytest.mark.parametrize("text", [TREE, CHAIN], ids=["tree", "chain"])
@@ -79,7 +79,7 @@ def test_every_frame(text):
         args = torch.tensor(q), torch.tensor(v)
         np.testing.assert_allclose(robot.frame_pose(args[0], frame), pose, atol=1e-13)
         np.testing.assert_allclose(robot.frame_jacobian(args[0], frame), jacobian, atol=1e-13)
-        np.testing.assert_allclose(robot.frame_bias_acceleration(*args, frame), acceleration, atol=1e-12)
+        np.testing.assert_allclose(robot.kinematics(*args).frame_bias_acceleration(frame), acceleration, atol=1e-12)
 
 
 def largest_error(ours: torch.Tensor, theirs: np.ndarray) -> float:
@@ -123,4 +123,4 @@ def test_frame_functions_are_differentiable(chain):
     q, v = q.clone().requires_grad_(), v.clone().requires_grad_()
     assert gradcheck(lambda q: robot.frame_pose(q, "tool"), [q])
     assert gradcheck(lambda q, p: robot.frame_jacobian(q, "tool", p), [q, point])
-    assert gradcheck(lambda q, v, p: robot.frame_bias_acceleration(q, v, "tool", p), [q, v, point])
+    assert gradcheck(lambda q, v, p: robot.kinematics(q, v).frame_bias_acceleration("tool", p), [q, v, point])

@@ -260,8 +260,8 @@ class Import(Command):
         else:
             mapping = self.columns.mapped(self.logs, terminal)
             given = {"model": self.columns.model(self.robot), "options": self.columns.options()}
-            with terminal.progress("importing") as report:
-                raw = forcegp.import_recordings(self.logs, mapping, **given, report=report)
+            with terminal.progress("importing"):
+                raw = forcegp.import_recordings(self.logs, mapping, **given)
             done = dict(raw.metadata["import"])
             if done["open_switches"]:
                 preparation = replace(preparation, stance="auto")

@@ -18,6 +18,7 @@ from forcegp.data import Dataset, is_dataset
 from forcegp.data.dataset import FORCE
 from forcegp.data.filters import JITTER
 from forcegp.errors import DatasetError, DataWarning, FileFormatError, InvalidInput, usable_arguments
+from forcegp.progress import tell
 from forcegp.recordings.arrays import ARRAYS, ArrayFile
 from forcegp.recordings.mapping import SIGNALS, ColumnMapping
 from forcegp.recordings.recording import Recording, read_recording
@@ -27,8 +28,6 @@ from forcegp.recordings.source import Columns, Source
 from forcegp.recordings.tables import DelimitedText
 
 ROUND_RATE = 1e-3  # a median rate within 0.1 % of one with three digits is taken for it: 499.93 Hz is a log at 500 Hz
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +79,6 @@ def import_recordings(
     *,
     model: forcegp.Model,
     options: ImportOptions | None = None,
-    report: Progress = lambda done, total, note: None,
 ) -> Dataset:
     """The dataset of this robot that these logs hold; `metadata["import"]` is what was done.
 
@@ -104,7 +102,7 @@ def import_recordings(
             )
     recordings = []
     for index, ((label, source), own) in enumerate(zip(sources, plans, strict=True)):
-        report(index, len(sources), f"reading {label}")
+        tell(index, len(sources), f"reading {label}")
         believed = own.joints if "q" in mapping.unit else ()
         recordings.append(read_recording(source, own, label, options, model.robot, believed))
     step = _even_step(recordings, options)

@@ -1,6 +1,5 @@
 """`Robot`: a URDF as an immutable value with batched, differentiable rigid-body functions."""
 
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,7 +27,6 @@ from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import SINGULAR
 from forcegp.robots.kinematics import Kinematics
 from forcegp.robots.layout import BaseChoice, check_base, check_choice, lay_out
-from forcegp.robots.manifold import TURN
 from forcegp.robots.mjcf import MjcfWriter, is_mjcf, translate
 from forcegp.robots.mjcf_model import LoopDescription, Translation
 from forcegp.robots.structure import RigidBodyDynamics, RobotStructure, bodies_without_inertia, compile_tree
@@ -311,20 +309,6 @@ class Robot(RobotStructure, RigidBodyDynamics):
         self.space.check(unit)
         return unit
 
-    def random(self, generator: torch.Generator, rows: int = 1) -> Float[Tensor, "rows nq"]:
-        """Positions drawn within the limits of the joints, else within half a turn or 1 m; turns of any direction."""
-        spread = torch.tensor([math.pi if joint.type != "prismatic" else 1.0 for joint in self.layout.joints])
-        lower, upper = (
-            torch.tensor([getattr(joint, side) for joint in self.layout.joints], dtype=torch.float64)
-            for side in ("lower", "upper")
-        )
-        lower, upper = torch.maximum(lower, -spread), torch.minimum(upper, spread)
-        share = torch.rand(rows, self.nv, dtype=torch.float64, generator=generator)
-        q = self.space.integrate(self.space.neutral(), lower + share * (upper - lower))
-        for group in self.layout.groups:  # directions of Gaussian vectors are uniform
-            q[:, group.places][:, TURN] = torch.randn(rows, 4, dtype=torch.float64, generator=generator)
-        return self.space.normalized(q).to(self.device)
-
     @override
     def _dynamics(self, function: str, *arguments: Any) -> Any:
         q, *others = arguments
@@ -342,9 +326,3 @@ class Robot(RobotStructure, RigidBodyDynamics):
     def frame_jacobian(self, q: Positions, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6 nv"]:
         """Jacobian (..., 6, nv) of a ``point`` (3,) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
         return self.kinematics(q).frame_jacobian(frame, point)
-
-    def frame_bias_acceleration(
-        self, q: Positions, v: JointValues, frame: str, point: Vector | None = None
-    ) -> Float[Tensor, "... 6"]:
-        """Jdot v (..., 6) of a ``point`` fixed in ``frame``: [linear; angular], world axes, without gravity."""
-        return self.kinematics(q, v).frame_bias_acceleration(frame, point)
