@@ -52,7 +52,6 @@ LAG = 0.02
     ("smooth", "gain", "accuracy"),
     [
         (LowPass(20.0), lambda f: LowPass(20.0).gain(np.array([f]), RATE)[0], 2e-6),
-        (LowPass(20.0, order=1), lambda f: LowPass(20.0, order=1).gain(np.array([f]), RATE)[0], 2e-6),
         (lambda values, time: lagged(values, time, LAG), lambda f: 1.0 / (1.0 + 2j * np.pi * f * LAG), 2e-3),
     ],
 )

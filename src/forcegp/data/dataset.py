@@ -197,15 +197,10 @@ class Dataset(Summary):
     @usable_arguments("Dataset.load")
     def load(path: str | Path) -> Dataset:
         """Read a file written by `save`. Raises FileFormatError saying what is wrong with the file."""
-        given, units = read_fields(Path(path))
         try:
-            found = Dataset(**given)
+            return Dataset(**read_fields(Path(path)))
         except DatasetError as error:
             raise FileFormatError(f"{path} holds data that are not valid: {error}") from error
-        for name, unit in found.units.items():
-            if units[name] not in ((unit,), unit, (unit,) * found.nv):
-                raise FileFormatError(f"{path}: {name!r} has the units {', '.join(units[name])}; convert it to {unit}.")
-        return found
 
     def _fields(self) -> dict[str, Any]:
         return {item.name: getattr(self, item.name) for item in fields(self)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from scipy.interpolate import CubicSpline
 from forcegp.data.configurations import actuators, continuous, rates, space_of, through
 from forcegp.data.dataset import Dataset
 from forcegp.errors import DatasetError, InvalidInput
-from forcegp.robots.arguments import whole_number
 from forcegp.robots.manifold import ConfigurationSpace
 
 Signal = Literal["q", "v", "u", "a"]
@@ -35,7 +34,7 @@ class LowPass:
     """
 
     cutoff: float
-    order: int = 4
+    order: ClassVar[int] = 4
 
     def __call__(self, values: Values, time: Float[np.ndarray, " rows"]) -> Values:
         """Filtered, for rows at even times. Raises as `uniform_step`."""
@@ -44,7 +43,6 @@ class LowPass:
             raise InvalidInput(
                 f"cutoff is {self.cutoff} Hz; it must be > 0 and below {rate / 2:.6g} Hz, half the sample rate."
             )
-        whole_number("order", self.order, 1, 12)
         from scipy.signal import butter, sosfiltfilt  # half a second, which only filtering should cost
 
         sections = butter(self.order, self.cutoff, fs=rate, output="sos")

@@ -71,14 +71,13 @@ def new_file(path: Path) -> Iterator[h5py.File]:
     path.write_bytes(image)
 
 
-def read_fields(path: Path) -> tuple[dict[str, Any], dict[str, tuple[str, ...]]]:
-    """The fields of the Dataset in a file, and the units of its columns. Raises FileFormatError."""
+def read_fields(path: Path) -> dict[str, Any]:
+    """The fields of the Dataset in a file. Raises FileFormatError."""
     if not path.is_file():
         raise FileFormatError(f"{path} is not a file; give the path of a dataset written by forcegp (.h5).")
     try:
         with h5py.File(path, "r") as file:
-            reader = _Reader(path, file)
-            return reader.fields(), {name: reader.units(name) for name in COLUMNS if name != "episode"}
+            return _Reader(path, file).fields()
     except FileFormatError:
         raise
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # whatever h5py meets in a damaged file
@@ -96,7 +95,7 @@ class _Reader:
             raise FileFormatError(f"{self.path}{problem}")
 
     def fields(self) -> dict[str, Any]:
-        file, required = self.file, (*COLUMNS, "joint_names", "metadata", "model")
+        file, required = self.file, (*COLUMNS, "metadata", "model")
         kind, version = file.attrs.get("format"), file.attrs.get("format_version")
         ours = f"is an HDF5 file, but not a forcegp dataset (its 'format' is {kind!r}, not {FORMAT!r})."
         self.require(isinstance(kind, str) and kind == FORMAT, f" {ours}")
@@ -125,8 +124,6 @@ class _Reader:
             values["model"] = forcegp.Model.from_json(self.text("model"))
         except ForceGPError as error:
             raise FileFormatError(f"{self.path}: its robot or contacts cannot be used: {error}") from error
-        names, own = self.texts("joint_names"), list(values["model"].robot.joint_names)
-        self.require(names == own, f": its columns are those of {names}, but its robot has {own}.")
         return values
 
     def stored(self, name: str) -> h5py.Dataset:
@@ -155,8 +152,3 @@ class _Reader:
         texts = self.texts(name)
         self.require(len(texts) == 1, f": {name!r} must hold one text; it holds {len(texts)}.")
         return texts[0]
-
-    def units(self, name: str) -> tuple[str, ...]:
-        units: Any = self.file[name].attrs.get("units")
-        self.require(units is not None, f": {name!r} has no attribute 'units'.")
-        return tuple(map(str, np.atleast_1d(units)))
