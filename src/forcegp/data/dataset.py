@@ -33,8 +33,8 @@ def units_for(robot: forcegp.robots.Robot) -> dict[str, Any]:
     return {name: texts[0] if len(set(texts)) == 1 else texts for name, texts in each.items()} | {"time": "s"}
 
 
-ORDER = "a", "lambda", "Q_U", "in_contact"
-TRUTH = re.compile(r"a|lambda|Q_U|in_contact|(Q_U|force)\.[a-zA-Z0-9-]*[a-zA-Z0-9][a-zA-Z0-9-]*")
+ORDER = "a", "lambda", "Q_U"
+TRUTH = re.compile(r"a|lambda|Q_U|(Q_U|force)\.[a-zA-Z0-9-]*[a-zA-Z0-9][a-zA-Z0-9-]*")
 """Names of what is true; parts of Q_U and forces on points of the robot have names of their own."""
 
 
@@ -57,8 +57,8 @@ class Dataset(Summary):
     measured: what other sensors say by name: "force.FRAME" (rows, 3) is the force on the robot at that frame [N, world
         axes], of a force sensor; where a contact is there, at its point.
     truth: what a simulation provides: noise-free "a" (rows, nv), constraint multipliers "lambda" (rows, m) [N],
-        the unknown joint forces "Q_U" (rows, nv), their parts "Q_U.<name>" (rows, nv), forces on the robot
-        "force.<name>" (rows, 3) [N, world axes], and "in_contact" (rows, m), 1 where a contact acts and 0 elsewhere.
+        the unknown joint forces "Q_U" (rows, nv), their parts "Q_U.<name>" (rows, nv), and forces on the robot
+        "force.<name>" (rows, 3) [N, world axes].
     metadata: a copy of anything that JSON can hold.
     strokes: what rows know of the motion before them (`forcegp.data.strokes`), (rows, nv, k), for friction that
         remembers. Of a log of postures they are those before its filter. Those of motors are not stored.
@@ -236,14 +236,12 @@ def _truth(
 ) -> dict[str, np.ndarray]:
     unknown = sorted(name for name in given if not TRUTH.fullmatch(name))
     if unknown:
-        raise DatasetError(f"truth has no {unknown}; allowed: a, lambda, Q_U, in_contact, Q_U.<name>, force.<name>.")
+        raise DatasetError(f"truth has no {unknown}; allowed: a, lambda, Q_U, Q_U.<name>, force.<name>.")
     checked = {}
     for name in sorted(given, key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER)):
-        of_contacts, columns = name in ("lambda", "in_contact"), joint_names
-        if not name.startswith(("a", "Q_U")):
-            columns = () if of_contacts else ("x", "y", "z")
+        columns = () if name == "lambda" else joint_names if name.startswith(("a", "Q_U")) else ("x", "y", "z")
         checked[name] = values = finite_columns(f"truth[{name!r}]", given[name], columns, rows)
-        if of_contacts and values.shape[1] != len(model.contacts):
+        if name == "lambda" and values.shape[1] != len(model.contacts):
             raise DatasetError(
                 f"truth[{name!r}] has {values.shape[1]} columns; the model has {len(model.contacts)} contacts."
             )

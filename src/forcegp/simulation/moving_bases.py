@@ -49,13 +49,12 @@ def simulate_quadruped(config: QuadrupedConfig) -> Dataset:
         parts.append(_episode(loaded, model, config, episode, steps))
         tell(episode + 1, config.episodes)
     q, v, u, a, Q_U, forces = (torch.cat(part).numpy() for part in zip(*parts, strict=True))
-    stands = np.repeat(u[:, -len(LEGS) :], 3, axis=1)
     return recorded(
         "quadruped",
         config,
         model,
         {"q": q, "v": v, "u": u, "a": a},
-        {"lambda": forces, "in_contact": stands, "Q_U": Q_U, "Q_U.joint-friction": Q_U},
+        {"lambda": forces, "Q_U": Q_U, "Q_U.joint-friction": Q_U},
         {"payload": {"frame": "trunk", "mass": config.payload, "center": list(PLACE)}},
     )
 
