@@ -94,15 +94,15 @@ def test_limits_names_and_losses():
 HINGE = '<mujoco><worldbody><body name="a"><joint name="j" {0}/>{1}</body></worldbody>{2}</mujoco>'
 BALL = '<geom size=".1"/>'
 LOSSES = {
-    "springs (Model.from_mjcf has them) (j)": ('stiffness="2"', BALL, ""),
-    "tendons (t)": ("", BALL, '<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>'),
-    "laws of actuators (u holds joint forces) (servo)": (
+    "springs (Model.from_mjcf has them) (1)": ('stiffness="2"', BALL, ""),
+    "tendons (1)": ("", BALL, '<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>'),
+    "laws of actuators (u holds joint forces) (1)": (
         "",
         BALL,
         '<actuator><position name="servo" joint="j" kp="3"/></actuator>',
     ),
-    "forces of a medium": ("", BALL, '<option viscosity="1"/>'),
-    "compensation of gravity (b)": ("", BALL + '<body name="b" gravcomp="1"><geom size=".1"/></body>', ""),
+    "forces of a medium (1)": ("", BALL, '<option viscosity="1"/>'),
+    "compensation of gravity (1)": ("", BALL + '<body name="b" gravcomp="1"><geom size=".1"/></body>', ""),
     "couplings of joints that are not linear (equality 0)": (
         "",
         BALL + '<body name="b"><joint name="k"/><geom size=".1"/></body>',

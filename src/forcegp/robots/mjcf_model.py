@@ -1,6 +1,6 @@
 """A model that MuJoCo compiled, as URDF elements, rotor inertias and closed loops (:mod:`forcegp.robots.mjcf`)."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -317,44 +317,34 @@ class CompiledModel:
         self.problems.note(f"left out: {what}", where)
 
     def _note_losses(self, motors: bool) -> None:
-        """Note what acts on the joints in MuJoCo and not here."""
-        model, site = self.model, self.mujoco.mjtTrn.mjTRN_SITE
-
-        def names(of: str, places: Iterable[Any]) -> None:
-            for what, place in places:
-                self._lose(what, getattr(model, of)(place).name or f"{of} {place}")
-
-        for joint in range(model.njnt):
-            dof = model.jnt_dofadr[joint]
-            where = self.joints[joint]
-            if self._is_sprung(joint):
-                if not self.for_system:
-                    self._lose("springs (Model.from_mjcf has them)", where)
-            elif model.jnt_stiffness[joint] or _any(model, "jnt_stiffnesspoly", joint):
-                self._lose("springs", where)
-            if _any(model, "dof_dampingpoly", dof):
-                self._lose("damping that is not linear", where)
-        names("body", (("compensation of gravity", k) for k in np.flatnonzero(model.body_gravcomp)))
-        names("body", (("motions from outside (mocap)", k) for k in np.flatnonzero(model.body_mocapid >= 0)))
-        names("tendon", (("tendons", k) for k in range(model.ntendon)))
-        for k in range(model.nu):
-            if not self._is_motor(k):
-                self._lose("laws of actuators (u holds joint forces)", model.actuator(k).name or f"actuator {k}")
-            elif not (motors and model.actuator_trntype[k] == site) and not any(
-                k in self._actuators_of(joint) and model.jnt_type[joint] >= 2 for joint in range(model.njnt)
-            ):
-                self._lose("actuators that drive no single joint", model.actuator(k).name or f"actuator {k}")
-        if model.nflex:
-            self._lose("forces of deformable bodies", f"{model.nflex} <flex>")
-        if model.nplugin:
-            self._lose("forces of plugins", f"{model.nplugin} <plugin>")
-        if model.opt.density or model.opt.viscosity:
-            self._lose("forces of a medium", "<option density, viscosity>")
-        kinds = self.mujoco.mjtEq
+        """Note what acts on the joints in MuJoCo and not here, and how often."""
+        model, joints, kinds = self.model, range(self.model.njnt), self.mujoco.mjtEq
         known = [int(kind) for kind in (kinds.mjEQ_JOINT, kinds.mjEQ_CONNECT, kinds.mjEQ_WELD)]
-        for k in range(model.neq):
-            if model.eq_active0[k] and model.eq_type[k] not in known:
-                self._lose("constraints of other kinds than joint, connect and weld", self._equality(k))
+        driving = {k for joint in joints if model.jnt_type[joint] >= 2 for k in self._actuators_of(joint)}
+        if motors:
+            driving |= {k for k in range(model.nu) if model.actuator_trntype[k] == self.mujoco.mjtTrn.mjTRN_SITE}
+        sprung = [k for k in joints if model.jnt_stiffness[k] or _any(model, "jnt_stiffnesspoly", k)]
+        linear = [k for k in sprung if self._is_sprung(k)]
+        servos = [k for k in range(model.nu) if not self._is_motor(k)]
+        lost = {
+            "springs (Model.from_mjcf has them)": 0 if self.for_system else len(linear),
+            "springs": len(sprung) - len(linear),
+            "damping that is not linear": sum(_any(model, "dof_dampingpoly", model.jnt_dofadr[k]) for k in joints),
+            "compensation of gravity": np.count_nonzero(model.body_gravcomp),
+            "motions from outside (mocap)": np.count_nonzero(model.body_mocapid >= 0),
+            "tendons": model.ntendon,
+            "laws of actuators (u holds joint forces)": len(servos),
+            "actuators that drive no single joint": len({*range(model.nu)} - driving - {*servos}),
+            "forces of deformable bodies": model.nflex,
+            "forces of plugins": model.nplugin,
+            "forces of a medium": int(bool(model.opt.density or model.opt.viscosity)),
+            "constraints of other kinds than joint, connect and weld": np.count_nonzero(
+                np.array(model.eq_active0, bool) & ~np.isin(model.eq_type, known)
+            ),
+        }
+        for what, count in lost.items():
+            if count:
+                self._lose(what, str(count))
 
 
 def _any(model: Any, name: str, row: int | np.integer) -> bool:
