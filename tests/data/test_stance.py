@@ -128,7 +128,6 @@ def test_prepared_rows_carry_the_flags_and_leave_open_ones_out():
     report = prepared.metadata["preparation"]["stance"]
     assert report["open_rows"] == -(-len(log) // 2) - len(kept)
     assert report["standing"]["front_left_stands"] == pytest.approx(flags[:, 0].mean(), abs=0.03)
-    assert Preparation(stance="auto", every=2).rows(log).u.shape == prepared.u.shape
 
 
 def test_open_rows_are_filled_by_the_nearest_decided_one():

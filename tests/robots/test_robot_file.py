@@ -10,7 +10,6 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.optimize import minimize
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import CHAIN, MODELS, loaded
 from tests.robots.test_mimic import CHAIN_MIMICS, with_mimics
@@ -134,26 +133,12 @@ def test_the_nearest_is_possible_and_no_possible_one_is_nearer(seed):
     inertia = symmetric(seed) + np.eye(3)
     nearest = nearest_inertia(inertia)
     assert physical_objection(1.0, np.zeros(3), nearest) is None
-    # independent: constrained minimisation over the principal moments in the same axes
-    moments = np.linalg.eigvalsh(inertia)
-    second = 0.5 * moments.sum() - moments
-    least = MARGIN * np.maximum(second, 0.0).sum()
-    start = np.full(3, 1.0 + abs(moments).max())
-    found = minimize(
-        lambda m: ((m - moments) ** 2).sum(),
-        start,
-        jac=lambda m: 2.0 * (m - moments),
-        constraints={"type": "ineq", "fun": lambda m: 0.5 * m.sum() - m - least, "jac": lambda m: 0.5 - np.eye(3)},
-        method="SLSQP",
-        options={"ftol": 1e-14, "maxiter": 300},
-    )
-    ours = np.linalg.norm(nearest - inertia) ** 2
-    assert ours == pytest.approx(found.fun, rel=1e-5, abs=1e-9)
     # the optimality condition of a projection onto a convex set, whatever the axes of the other point
     root = np.random.default_rng(seed + 1).normal(size=(3, 3))
-    other_second = root @ root.T + least * np.eye(3)
-    other = np.trace(other_second) * np.eye(3) - other_second
-    assert np.sum((inertia - nearest) * (other - nearest)) < 1e-8
+    before, after = (0.5 * np.trace(x) * np.eye(3) - x for x in (inertia, nearest))
+    least = MARGIN * np.maximum(np.linalg.eigvalsh(before), 0.0).sum()
+    assert np.linalg.eigvalsh(after)[0] > (1.0 - 1e-9) * least
+    assert np.sum((before - after) * (root @ root.T + least * np.eye(3) - after)) < 1e-8
 
 
 def test_the_repaired_robot_says_so_and_can_be_stored():

@@ -105,10 +105,6 @@ class Preparation:
                 reasons["delay"] = f"u is taken to be on time: {error}"
         return replace(chosen, why=reasons)
 
-    def rows(self, dataset: Dataset) -> Dataset:
-        """The prepared rows without their price, as `apply` gives them but with the metadata of `dataset`."""
-        return _prepared(self.resolved(dataset), dataset)[0]
-
     def apply(self, dataset: Dataset) -> Dataset:
         """The prepared Dataset, with its price under "preparation" in the metadata.
 

@@ -46,11 +46,6 @@ class MotionSpectrum:
     cutoff: Float[np.ndarray, " nv"]
 
     @property
-    def acceleration_density(self) -> Float[np.ndarray, "frequencies nv"]:
-        """Power density of the acceleration by exact derivatives [unit^2/s^4/Hz]."""
-        return self.density * (2.0 * np.pi * self.frequency[:, None]) ** (2 * _derivatives(self.source))
-
-    @property
     def noise_density(self) -> Float[np.ndarray, "frequencies nv"]:
         """Power density of the noise of `source`: the floor below the knee, what was seen above it; NaN if unknown."""
         below = self.frequency[:, None] < self.knee
@@ -80,7 +75,8 @@ def motion_spectrum(dataset: Dataset, source: Literal["q", "v"] = "q") -> Motion
     spectrum = MotionSpectrum(
         source=source, step=step, frequency=frequency, density=density, knee=knee, floor=floor, cutoff=cutoff
     )
-    motion = np.sqrt((spectrum.acceleration_density * (frequency[:, None] <= knee)).sum(axis=0) * frequency[0])
+    acceleration = density * (2.0 * np.pi * frequency[:, None]) ** (2 * _derivatives(source))
+    motion = np.sqrt((acceleration * (frequency[:, None] <= knee)).sum(axis=0) * frequency[0])
     with np.errstate(invalid="ignore"):
         quiet = spectrum.acceleration_noise() < LEAST_NOISE * motion
     spectrum.cutoff[quiet] = np.nan  # the floor is that of the rounding of numbers

@@ -14,7 +14,7 @@ from forcegp.model import Model
 from forcegp.robots.arguments import whole_number
 
 Select = Callable[[Dataset, int], Int[np.ndarray, " chosen"]]
-"""Which rows: numbers of at most so many of a log, such as `evenly` and `farthest` give."""
+"""Which rows: numbers of at most so many of a log, such as `evenly` gives."""
 
 BLOCK = 4096  # rows
 EVEN_STEPS = 1e-3  # time steps of a recording count as equal within this fraction
@@ -322,13 +322,8 @@ def time_blocks(
     """Row numbers in blocks: rows of one episode in one stretch of `seconds` form a block, in order of time.
 
     `time` [s] and `episode` may come in any order. Stretches are counted from the first of these rows in every episode;
-    every row is in exactly one. Raises InvalidInput for a length that is not positive and finite, and columns that
-    differ.
+    every row is in exactly one.
     """
-    if not 0.0 < seconds < float("inf"):
-        raise InvalidInput(f"seconds is {seconds}; it must be positive and finite.")
-    if time.shape != episode.shape:
-        raise InvalidInput(f"time has {len(time)} rows and episode {len(episode)}; give both for the same rows.")
     blocks: dict[tuple[int, int], list[int]] = {}
     first = {int(number): float(time[episode == number].min()) for number in np.unique(episode)}
     for row in np.lexsort((time, episode)):
@@ -375,17 +370,12 @@ def farthest_point_sampling(
     """Numbers of `count` rows of which each is the farthest from all rows chosen before it, from `start` on.
 
     Greedy k-centre (Gonzalez 1985), Euclidean on columns standardised to mean 0 and deviation 1; deterministic and
-    nested; repeated rows come last. Time O(rows * count * features). Raises InvalidInput if `points` is not a finite
-    table, or for a `count` or `start` outside the rows.
+    nested; repeated rows come last. Time O(rows * count * features). Raises InvalidInput for
+    a `count` or `start` outside the rows.
     """
-    table = np.asarray(points)
-    if table.ndim != 2 or table.dtype.kind not in "fiu" or table.shape[0] == 0 or not np.isfinite(table).all():
-        raise InvalidInput(
-            f"points must be a (rows, features) table of finite numbers; given: {table.dtype} {table.shape}."
-        )
-    rows = table.shape[0]
+    rows = len(points)
     count = whole_number("count", count, 1, rows, "the number of rows")
-    columns = _standardized_columns(table)
+    columns = _standardized_columns(points)
     distance = np.full(rows, np.inf)
     chosen = np.empty(count, dtype=np.int64)
     chosen[0] = whole_number("start", start, 0, rows - 1, "the last row")
@@ -403,14 +393,10 @@ def farthest_point_sampling(
     return chosen
 
 
-def farthest(dataset: Dataset, count: int, *, start: int = 0) -> Int[np.ndarray, " count"]:
-    """The rows of a Dataset that cover its inputs `(q, v, u)` best, in the order of `farthest_point_sampling`."""
-    return farthest_point_sampling(np.hstack([dataset.q, dataset.v, dataset.u]), count, start=start)
-
-
 def farthest_rows(dataset: Dataset, count: int, *, start: int = 0) -> Dataset:
-    """A Dataset of the rows that are `farthest`: one of fewer points takes the first, `farthest_rows(...)[:100]`."""
-    return dataset.rows(farthest(dataset, count, start=start))
+    """The rows that cover the inputs (q, v, u) best, in order: for fewer points, take the first of them."""
+    inputs = np.hstack([dataset.q, dataset.v, dataset.u])
+    return dataset.rows(farthest_point_sampling(inputs, count, start=start))
 
 
 def _standardized_columns(table: np.ndarray) -> np.ndarray:

@@ -114,10 +114,7 @@ def with_wind(dataset: Dataset, wind: Float[np.ndarray, "rows 3"]) -> Dataset:
 
 
 def _flies(dataset: Dataset) -> bool:
-    if dataset.model.contacts:
-        return False
-    groups = dataset.model.robot.layout.groups
-    return bool(groups) and groups[0].kind == "floating"
+    return bool(dataset.model.robot.layout.groups) and not dataset.model.contacts
 
 
 @dataclass(frozen=True)
@@ -238,7 +235,7 @@ def _first_winds(forces: _Forces, own: np.ndarray, count: int) -> np.ndarray:
 def thruster_columns(model: forcegp.Model) -> dict[int, int]:
     """Columns of u that push a base that floats, and the powers in which they act: `Thrusters`, and such actuators."""
     groups = model.robot.layout.groups
-    if not groups or groups[0].kind != "floating":
+    if not groups:
         return {}
     matrix, kind = model.actuation.matrix, forcegp.forces.Thrusters
     pushes = [] if matrix is None else np.flatnonzero(torch.as_tensor(matrix)[groups[0].rows].cpu().numpy().any(0))

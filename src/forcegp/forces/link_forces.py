@@ -371,7 +371,7 @@ def _base_rows(robot: Robot) -> slice:
 def _root_of_thrust(state: State) -> Float[Tensor, "*batch 1"]:
     """Of the force along z of a base that flies; of all that actuators deliver where there is none."""
     groups, push = state.robot.layout.groups, state.delivered[..., _base_rows(state.robot)]
-    push = push[..., 2:3] if groups and groups[0].kind == "floating" else push
+    push = push[..., 2:3] if groups else push
     return (push.square().sum(-1, keepdim=True) + 1e-4).sqrt().sqrt()  # smooth where rotors stand
 
 

@@ -7,7 +7,6 @@ velocity in its own axes, as in Pinocchio (Sola, Deray & Atchuthan 2018; Hairer,
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -34,8 +33,6 @@ class Group:
     row: int
     place: int
     body: int
-    kind: ClassVar[str] = "floating"
-    extra: ClassVar[int] = 1  # entries of q more than of v
 
     @property
     def rows(self) -> slice:

@@ -75,7 +75,7 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
     for group in layout.groups:
         own[group.bodies, group.bodies] = 1.0
         positions[group.rows] = group.place
-        positions[group.rows.stop :] += group.extra
+        positions[group.rows.stop :] += 1  # quaternions have an entry more
     moves = own.copy()  # [i, j] = 1 where body j is moved by joint i
     for i, (parent, origin) in enumerate(zip(layout.parents, layout.origins, strict=True)):
         x, y, z, translation = origin.T

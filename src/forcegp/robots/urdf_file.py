@@ -180,22 +180,10 @@ MARGIN = 1e-3
 
 
 def nearest_inertia(inertia: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
-    """The nearest inertia I (kg m^2), in |I' - I|_F, of a body whose second moments are at least `MARGIN` of their sum.
-
-    A projection in three variables: |dI|_F^2 = |s|^2 + (s_1 + s_2 + s_3)^2 for changes s of the second moments.
-    """
+    """The inertia (kg m^2) of the body whose second moments are nearest, and at least `MARGIN` of their sum."""
     moments, axes = np.linalg.eigh(inertia)
     second = 0.5 * moments.sum() - moments
-    least = MARGIN * np.maximum(second, 0.0).sum()
-    held = second < least  # the others share what is left: all change alike, or are held as well
-    while True:
-        change = np.where(held, least - second, 0.0)
-        change[~held] = -change.sum() / (1.0 + (~held).sum())
-        below = (second + change < least) & ~held
-        if not below.any():
-            break
-        held |= below
-    second = second + change
+    second = np.maximum(second, MARGIN * np.maximum(second, 0.0).sum())
     return (axes * (second.sum() - second)) @ axes.T
 
 

@@ -19,25 +19,6 @@ Numbers = Mapping[str, Any]
 """Coefficients by name, one number or one per joint; "velocity" stands for velocities that have no number here."""
 
 
-def joint_laws(expression: str, robot: Robot, numbers: Numbers) -> tuple[Law, ...]:
-    """The laws of this expression (`parse_forces`), with viscous friction, bound to the robot.
-
-    Coefficients that it does not give have these numbers, or their defaults.
-    """
-    forces = parse_forces(expression)
-    laws = forces if any(isinstance(force, Viscous) for force in forces) else (Viscous(), *forces)
-    out = []
-    for law in laws:
-        assert isinstance(law, JointLaw), "`require_joint_friction` sees to it"
-        found = {}
-        for name, coefficient in law.coefficients.items():
-            given = getattr(law, name)
-            number = numbers.get(name, numbers["velocity"] if coefficient.unit == "velocity" else coefficient.default)
-            found[name] = number if given is None else given
-        out.append(law.with_values(found).bound_to(robot))
-    return tuple(out)
-
-
 @dataclass(frozen=True, eq=False)
 class LawsOfJoints:
     """What laws make of velocities, step by step."""
@@ -47,8 +28,22 @@ class LawsOfJoints:
 
     @classmethod
     def named(cls, expression: str, robot: Robot, numbers: Numbers) -> "LawsOfJoints":
-        """`joint_laws`; none for "none"."""
-        return cls(robot, () if expression == "none" else joint_laws(expression, robot, numbers))
+        """The laws of this expression (`parse_forces`) with viscous friction; none for "none".
+
+        Coefficients that it does not give have these numbers, or their defaults.
+        """
+        forces = () if expression == "none" else parse_forces(expression)
+        laws = forces if not forces or any(isinstance(force, Viscous) for force in forces) else (Viscous(), *forces)
+        out = []
+        for law in laws:
+            assert isinstance(law, JointLaw), "`require_joint_friction` sees to it"
+            found = {}
+            for name, coefficient in law.coefficients.items():
+                given = getattr(law, name)
+                usual = numbers["velocity"] if coefficient.unit == "velocity" else coefficient.default
+                found[name] = numbers.get(name, usual) if given is None else given
+            out.append(law.with_values(found).bound_to(robot))
+        return cls(robot, tuple(out))
 
     def __call__(
         self, v: Float[np.ndarray, "*batch nv"], u: np.ndarray | None = None
