@@ -147,10 +147,8 @@ def test_units(quantity, name, given, si):
             "--headerless seven",
         ),
         *(
-            "--headerless 0",
             "--step -1",
             "--time t --step 1",
-            "--joints a,a",
             "--unit q=",
             "--unit q=deg,q=rad",
             "--q a,,b",

@@ -85,7 +85,7 @@ def test_a_law_of_ones_own_acts_in_plants(monkeypatch):
     np.testing.assert_allclose(joint_law("quadratic")(v), -0.3 * np.abs(v) * v - D * v)
     twice = joint_law("quadratic:drag=0.6,viscous:0")
     np.testing.assert_allclose(twice(v), -0.6 * np.abs(v) * v, atol=1e-14)
-    with pytest.raises(InvalidInput, match="joint_friction is 'payload:l7'; give one of none"):
+    with pytest.raises(InvalidInput, match="joint_friction is 'payload:l7'; give laws of joints"):
         joint_law("payload:l7")
 
 

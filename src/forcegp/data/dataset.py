@@ -165,9 +165,9 @@ class Dataset(Summary):
     def rows(self, index: slice | Sequence[int] | np.ndarray) -> Dataset:
         """The rows of a slice, boolean mask (rows,) or list of row numbers, in the order given.
 
-        Raises InvalidInput for row numbers that do not exist or repeat, and for an empty selection.
+        Raises InvalidInput for row numbers that do not exist, DatasetError where one repeats and for none at all.
         """
-        chosen = _row_numbers(index, len(self))
+        chosen = np.arange(len(self))[index]
         truth, measured = ({name: values[chosen] for name, values in of.items()} for of in (self.truth, self.measured))
         names = ("q", "v", "u", "a", "time", "episode", "strokes")
         arrays = {name: values[chosen] for name in names if (values := getattr(self, name)) is not None}
@@ -302,27 +302,6 @@ def _check_time(time: np.ndarray, episode: np.ndarray, ordered: bool) -> None:
         f"time does not increase at row {row} (episode {number}, time {at} s). "
         "Sort the rows, drop repeated time stamps, or number a new recording as a new episode."
     )
-
-
-def _row_numbers(index: slice | Sequence[int] | np.ndarray, rows: int) -> np.ndarray:
-    given = np.arange(rows)[index] if isinstance(index, slice) else np.asarray(index)
-    if given.dtype == bool and given.shape == (rows,):
-        given = np.flatnonzero(given)
-    if given.ndim != 1 or (given.size and given.dtype.kind not in "iu"):
-        raise InvalidInput(
-            f"rows are chosen by a slice, {rows} booleans or a list of integers; "
-            f"given: {given.dtype} of shape {given.shape}."
-        )
-    if given.size == 0:
-        raise InvalidInput("no rows selected; a Dataset has at least one row.")
-    wrong = given[(given < -rows) | (given >= rows)]
-    if wrong.size:
-        raise InvalidInput(f"row {wrong[0]} does not exist; this Dataset has {rows} rows, 0 to {rows - 1}.")
-    chosen = given.astype(np.intp) % rows
-    values, counts = np.unique(chosen, return_counts=True)
-    if counts.max() > 1:
-        raise InvalidInput(f"row {values[counts > 1][0]} is selected more than once; select each row once.")
-    return chosen
 
 
 def require_rows(name: str, rows: object, joint_names: Sequence[str], whose: str, example: str = "") -> None:

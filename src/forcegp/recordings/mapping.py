@@ -127,8 +127,6 @@ class ColumnMapping:
             raise InvalidInput("give a column for the time or the step between rows, not both.")
         if self.step is not None and not (isinstance(self.step, Real) and 0.0 < self.step < float("inf")):
             raise InvalidInput(f"step is {self.step} s; it must be positive and finite.")
-        if len(set(self.joints)) < len(self.joints) or not all(self.joints):
-            raise InvalidInput(f"joints are {', '.join(self.joints)}; every joint needs a name of its own.")
         if self.orientation not in (None, *ORIENTATIONS):
             raise InvalidInput(f"orientation is {self.orientation!r}; give {', '.join(ORIENTATIONS)}.")
         for signal, names in self.axes.items():
@@ -148,8 +146,6 @@ class ColumnMapping:
                 raise InvalidInput(f"sign names {signal!r}; it has {', '.join(SIGNALS)}.")
             if not set(numbers) <= {1.0, -1.0}:
                 raise InvalidInput(f"sign of {signal} is {', '.join(map(str, numbers))}; give 1 or -1.")
-        if any(columns < 1 for columns in self.headerless):
-            raise InvalidInput(f"headerless is {self.headerless}; a row has at least one number.")
 
     def corrected_by(
         self,
