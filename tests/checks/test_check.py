@@ -26,7 +26,7 @@ def told(report: CheckReport) -> str:
 def test_a_clean_log_raises_no_alarm(model, seed, noise):
     report = check(clean(seed, SYSTEMS[model](), noise=noise))
     assert report.doubts.level == "ok", told(report)
-    assert {item.about for item in report.doubts} >= {"sampling", "velocity", "torque", "excitation", "noise"}
+    assert {item.about for item in report.doubts} >= {"sampling", "velocity", "torque", "noise"}
 
 
 def test_a_joint_that_stays_does_not_show_its_friction():

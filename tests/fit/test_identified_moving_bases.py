@@ -99,7 +99,7 @@ def test_columns_and_their_rank_are_those_of_pinocchio(base):
         for limits in [(-np.ones(pair.model.nq), np.ones(pair.model.nq))]
         for v, a in rng.normal(size=(60, 2, robot.nv))
     ]
-    assert base_parameters(robot).rank == np.linalg.matrix_rank(np.concatenate(stacked), tol=1e-8)
+    assert len(base_parameters(robot)) == np.linalg.matrix_rank(np.concatenate(stacked), tol=1e-8)
 
 
 @pytest.mark.parametrize("likelihood", ["torque", "acceleration"])
@@ -173,8 +173,6 @@ def test_a_walker_is_found_again(walker, likelihood):
     found = identified(recorded(truth, 300, noise=1e-3), walker, OPEN, EVIDENCE[likelihood], strength=1e-3)
     mass, error = found.parameters.total_mass
     assert abs(mass - heavier[:, 3, 3].sum()) < 5 * error + 1e-2
-    base = found.parameters.base
-    assert base.rank == base_parameters(walker.robot).rank
     for name, value in {"viscous": 0.3, "coulomb.level": 0.5}.items():
         for joint in walker.robot.single_joint_names:
             assert abs(found.parameters[f"{name}.{joint}"].value - value) < 0.03

@@ -196,10 +196,6 @@ class RecordedRows:
         Y = self.kinematics.torque_regressor(torch.as_tensor(np.array(a), device=self.kinematics.robot.device))
         return (Y.cpu().numpy() * self._stated).sum(-1)
 
-    def without_contacts(self, values: Float[np.ndarray, "rows nv *k"]) -> Float[np.ndarray, "rows nv *k"]:
-        """The part of joint forces (first axis after the rows) that no lambda can explain."""
-        return without(values, self.open.swapaxes(1, 2))
-
     def _terms(self, x: np.ndarray, a: Rows, load: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Torque of the laws that are estimated and its derivatives, under the measured load or one of all motors."""
         state = self.state

@@ -14,7 +14,7 @@ from forcegp.data.views import at_rest, one_row_per_rest, postures, rests_alone
 from forcegp.doubts import Doubt, Doubts, look
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence import Accelerations, Torques
-from forcegp.evidence.bodies import BaseParameters, thickened
+from forcegp.evidence.bodies import thickened
 from forcegp.evidence.least_squares import (
     LEAST,
     ROUNDS,
@@ -333,11 +333,9 @@ def _estimates(
     """The numbers at the end of the search."""
     white = np.concatenate([fit.white_jacobian, fit.white[..., None]], axis=-1)
     prior = space.prior(fit.x)[1]
-    base, by_body = None, None
+    by_body = None
     everything = len(space.carried) == len(space.own) and all(each.payload is None for each in space.carried)
     if everything and space.carried:
-        Y = equations.parts[0].without_contacts(equations.measured[0].regressor)
-        base = BaseParameters.of(Y.reshape(-1, Y.shape[-2] * 10))
         by_body = _weak_directions(space, fit.information, prior.T @ prior)
     return Estimates.of_search(
         space.parameters,
@@ -349,7 +347,6 @@ def _estimates(
         changes,
         move,
         by_body=by_body,
-        base=base,
         evidence=str(evidence),
         rows=len(equations.a),
         evaluations=fit.evaluations,
