@@ -9,16 +9,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from forcegp.data import Dataset, contact_doubts, thruster_columns
+from forcegp.data import Dataset, contact_doubts
 from forcegp.data.strokes import motor_positions
 from forcegp.doubts import Doubt, Doubts, look
 from forcegp.errors import ContactWarning, InvalidInput
-from forcegp.evidence.bodies import carrying
 from forcegp.evidence.least_squares import Fit
 from forcegp.evidence.likelihood import CONSTANT, FAR_FROM_SURFACE, MarginalLikelihood, checked_values
 from forcegp.evidence.parameter_space import force_title
-from forcegp.evidence.recorded_rows import RecordedRows
-from forcegp.forces import Force, Normal, Offset, RigidBodies
+from forcegp.forces import Force, Normal, Offset
 from forcegp.model import Model
 from forcegp.summary import listed
 
@@ -146,44 +144,6 @@ def without_idle_offsets(model: Model, dataset: Dataset) -> Model:
     return model if bool(idle.all()) else replace(model, forces=tuple(map(kept, model.forces)))
 
 
-BRAKED = 0.4
-"""Correlation of missing accelerations of a base with its velocity: below .2 in logs of feet, wheels and rotors without
-drag, .45 to .83 with drag or ground friction."""
-OTHER_ROBOT = 2.0  # factor between the masses of log and file, or of what holds the robot up, from which one is wrong
-
-
-def doubts_of_base(
-    given: Model, found: Model, rows: RecordedRows, residual: Float[np.ndarray, "rows nv"]
-) -> Iterator[Doubt]:
-    """Log and file have different masses, the base lacks a force of the size of gravity, or something brakes it."""
-    robot, missing = given.robot, 0.0
-    own = carrying(robot)
-    if not any(isinstance(law, RigidBodies) and len(law.bodies(own, robot)) == len(own) for law in given.laws):
-        return
-    masses = [sum(each.robot.tree.inertias[carrying(each.robot), 3, 3, 0].tolist()) for each in (given, found)]
-    if robot.base == "floating":
-        rotation = rows.kinematics.frame_pose(robot.layout.moving[0])[:, :3, :3].cpu().numpy()
-        missing = float(np.linalg.norm((rotation @ residual[:, :3, None]).mean(0)))
-    wrong = ""
-    if not masses[0] / OTHER_ROBOT <= masses[1] <= masses[0] * OTHER_ROBOT:
-        wrong = f"by this log the robot weighs {masses[1]:.3g} kg, by its file {masses[0]:.3g} kg"
-    elif missing * OTHER_ROBOT > np.linalg.norm(robot.gravity.cpu().numpy()) > 0.0:
-        wrong = f"accelerations of the base are wrong by {missing:.3g} m/s^2 on average"
-    linear = {"floating": 3, "planar": 2}.get(robot.base, 0)
-    missed, v = residual[:, :linear], rows.v[:, :linear]
-    braked = -float((missed * v).sum()) / max(float(np.linalg.norm(missed) * np.linalg.norm(v)), 1e-300)
-    if wrong:
-        what, remedy = f"{wrong}: what holds it up is not what the log states.", "flags of stance, thrust coefficients"
-        yield look(about="base", what=what, do=f"Check {remedy} and the unit of u.")
-    elif braked > BRAKED:
-        remedy = "Weigh it, since thrust and mass look alike, and let forcegp fit learn the forces."
-        if not thruster_columns(given):
-            remedy = "forcegp fit --forces rigid-bodies:LINK,gp:joint,gp:joint-friction learns both."
-        what = f"what the model lacks brakes the base (correlation {braked:.2g} with its velocity): ground friction or "
-        yield look(about="base", what=f"{what}drag, which this regression takes for mass.", do=remedy)
-
-
-ALIKE = 5.0  # times the error of a mass without offsets
 RIGHT = 0.01  # residuals over a payload's torques below which it is right as it is
 LEAST = 0.05  # share of the squares that a payload leaves, which only numbers of no body explain
 
@@ -213,28 +173,6 @@ def doubts_of_reversals(model: Model, log: Dataset) -> Iterator[Doubt]:
                     f"{', '.join(names)}.",
                     do="Do not rely on sigma there, or record finer positions.",
                 )
-
-
-def doubts_of_offsets(
-    fit: Fit, offsets: Bool[np.ndarray, " terms"], slope: Float[np.ndarray, " 10"], own: slice
-) -> Iterator[Doubt]:
-    """Constant torques of joints look like the weight, since postures differ little; `slope` is that of the mass.
-
-    `own` are the coordinates of the payload, and the last ones those of `offsets`.
-    """
-    whole, seen = fit.information + fit.prior_information, np.zeros(len(fit.x))
-    seen[own] = slope
-    held = np.append(np.ones(len(seen) - len(offsets), dtype=bool), ~offsets)
-    known = whole[np.ix_(held, held)]
-    with_offsets, without = seen @ np.linalg.solve(whole, seen), seen[held] @ np.linalg.solve(known, seen[held])
-    if with_offsets > ALIKE**2 * without:
-        yield look(
-            about="payload",
-            what="constant torques of the joints ('offset') look like the payload's weight in these postures: with "
-            f"them its mass is {(with_offsets / without) ** 0.5:.0f} times as unsure, and small errors of the model "
-            "change it.",
-            do="Leave 'offset' out, or give a baseline, or a log of more postures.",
-        )
 
 
 def doubts_of_no_body(

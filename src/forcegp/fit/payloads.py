@@ -14,7 +14,7 @@ from forcegp.errors import DatasetError, InvalidInput
 from forcegp.evidence.least_squares import Fit, Residual
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
-from forcegp.fit.doubts import CLEARLY_MORE, LEAST, RIGHT, doubts_of_no_body, doubts_of_offsets
+from forcegp.fit.doubts import CLEARLY_MORE, LEAST, RIGHT, doubts_of_no_body
 from forcegp.forces import Actuation, Payload
 from forcegp.model import Model
 from forcegp.posterior.fitted import STRETCHES
@@ -63,18 +63,11 @@ def with_payloads_placed(model: Model, logs: Sequence[Dataset]) -> Model:
     return replace(model, forces=tuple(placed if force is open_ones[0] else force for force in model.forces))
 
 
-def doubts_of_payloads(space: ParameterSpace, fit: Fit, averaged: bool) -> Iterator[Doubt]:
-    """Offsets that look like its weight, and a link on which no body explains the log, where that is `averaged`."""
+def doubts_of_payloads(space: ParameterSpace, fit: Fit) -> Iterator[Doubt]:
+    """Of a link on which no body explains the log."""
     for body, each in enumerate(space.carried):
-        if each.payload is None:
-            continue
-        own, column = space.bodies.slices[body], space.names.index(f"{each.name}.mass")
-        slope = space.number_slopes(fit.x)[column, own]
-        laws = [type(space.model.laws[term.law]).__name__ for term in space.terms for _ in term.size]
-        offsets = np.array([law == "Offset" for law in laws], dtype=bool)
-        yield from doubts_of_offsets(fit, offsets, slope, own)
-        if averaged:  # noise of single rows hides what is left
-            number = len(space.carried)
+        if each.payload is not None:
+            own, number = space.bodies.slices[body], len(space.carried)
             one = np.eye(10 * number)[10 * body : 10 * body + 10].reshape(10, 1, number, 10)
             slopes = space.bodies.chained(fit.x[: space.bodies.size], one)[:, 0, own]
             link = getattr(space.model.laws[each.payload], "link", "")
