@@ -11,7 +11,6 @@ from forcegp.forces import (
     FORCES,
     Actuation,
     AerodynamicForce,
-    BaseWrench,
     ContactFriction,
     Coulomb,
     DirectionalFriction,
@@ -63,7 +62,6 @@ NAMES = {
     "gp:independent": IndependentAccelerations(),
     "gp:joint-friction": JointFriction(),
     "gp:contact-friction": ContactFriction(),
-    "gp:base-wrench:hand": BaseWrench("hand"),
     "gp:aerodynamic:frame=hand:observe=0.2": AerodynamicForce("hand", observe=0.2),
 }
 EXPRESSIONS = {

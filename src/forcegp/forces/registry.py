@@ -36,7 +36,6 @@ FORCES: dict[str, str | type[Force]] = {
     "joint-position": "joint_forces.JointPositionForces",
     "tool-forces": "link_forces.ToolForces",
     "contact-friction": "contact_friction.ContactFriction",
-    "base-wrench": "link_forces.BaseWrench",
     "aerodynamic": "link_forces.AerodynamicForce",
 }
 """Name -> class, or where in this package it is, so that only what is used is imported. Add yours."""
