@@ -26,7 +26,7 @@ def told(report: CheckReport) -> str:
 def test_a_clean_log_raises_no_alarm(model, seed, noise):
     report = check(clean(seed, SYSTEMS[model](), noise=noise))
     assert report.doubts.level == "ok", told(report)
-    assert {item.about for item in report.doubts} >= {"sampling", "velocity", "torque", "noise"}
+    assert {item.about for item in report.doubts} >= {"sampling", "velocity"}
 
 
 def test_a_joint_that_stays_does_not_show_its_friction():
@@ -77,7 +77,6 @@ def test_a_gap_is_not_differentiated_across():
     assert lost.numbers["gaps"] == 1
     assert len(report.inputs.even.episodes) == 2
     assert not report.doubts.of("torque sign")
-    assert report.doubts.of("torque")[0].level == "ok"
 
 
 def test_a_prepared_log_is_told_with_the_price_that_was_paid():
@@ -91,7 +90,6 @@ def test_a_prepared_log_is_told_with_the_price_that_was_paid():
     assert report.to_dict()["cutoff"] == 8.0
     paid = prepared.metadata["preparation"]["acceleration_noise"]["after"]
     assert [each["noise_after"] for each in report.per_joint()] == pytest.approx(paid)
-    assert "when this dataset was prepared" in report.doubts.of("noise")[0].what
 
 
 def test_switches_of_a_foot_that_lifts_are_no_lost_rows():

@@ -27,7 +27,7 @@ from forcegp.checks.torque_doubts import TOUCHES, held_points, torque_doubts, wi
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
-from forcegp.doubts import LEVELS, Doubt, Doubts, listed, look, ok
+from forcegp.doubts import LEVELS, Doubt, Doubts, listed, look
 from forcegp.errors import InvalidInput, require_type
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -197,25 +197,14 @@ MUCH = 0.2  # noise relative to the spread of the signal from which a filter is 
 
 
 def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
-    """Noise of the acceleration before and after the filter, in rad/s^2 or m/s^2."""
+    """Accelerations that are not filtered, and those that are noisy although they are."""
     if inputs.prepared is None:
         return
     cutoff, measured = inputs.price.get("cutoff"), inputs.price.get("acceleration_noise", {})
     if cutoff is None or any(len(measured.get(when, ())) != len(inputs.names) for when in ("before", "after")):
-        yield ok(about="noise", what="the positions show no noise worth a filter.")
-        return
+        return  # the positions show no noise worth a filter
     before, after = (np.array(measured[when], float) for when in ("before", "after"))
     spread = np.std(inputs.prepared.a, axis=0)
-    if np.isfinite(after).any():
-        when = " when this dataset was prepared" if inputs.cutoff is None else ""
-        worst = int(np.nanargmax(after / np.maximum(spread, 1e-300)))
-        unit, levels = "rad/s²" if inputs.rotates[worst] else "m/s²", f"{before[worst]:.3g} to {after[worst]:.2g}"
-        what = f"a filter at {cutoff:.3g} Hz{when} takes the noise of a of {inputs.names[worst]}, the worst"
-        yield ok(
-            about="noise",
-            what=f"{what}, from {levels} {unit}.",
-            numbers={"cutoff": cutoff, "before": plain(before), "after": plain(after)},
-        )
     with np.errstate(invalid="ignore"):
         loud, left = np.flatnonzero(before > MUCH * spread), np.flatnonzero(after > MUCH * spread)
     # a log may hold better accelerations than differences
