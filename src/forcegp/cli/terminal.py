@@ -27,9 +27,6 @@ _ARGUMENT = re.compile(r"`([a-z_.]+)(?:=([^`]*))?`")
 OTHERWISE = {"contacts": "contact", "folder": "out", "locked": "lock", "model": "robot"}
 """Options whose argument has another name in Python."""
 
-ELSEWHERE = {"`posterior.with_model(dataset.model)`": "--system data"}
-"""Calls of Python that an option stands for."""
-
 
 def with_option_names(message: str, options: Collection[str]) -> str:
     """The message with --points 5 for `points=5`, where the command has such an option; those of others stay."""
@@ -42,8 +39,6 @@ def with_option_names(message: str, options: Collection[str]) -> str:
         flag = f"--{name.replace('_', '-')}"
         return flag if value in ("", "True") else f"{flag}{'=' if value.startswith('-') else ' '}{value}"
 
-    for call, words in ELSEWHERE.items():
-        message = message.replace(call, words)
     return _ARGUMENT.sub(option, message)
 
 

@@ -27,57 +27,40 @@ ROUNDING = 1e-12  # |M^-1 B_c| relative to the largest of them below which a lat
 
 
 def check_forces(likelihood: MarginalLikelihood) -> None:
-    """Refuse what cannot be learned at all, and warn of what cannot be learned in part.
+    """Refuse what cannot be learned at all, and warn (DataWarning) of latents that the contacts hide.
 
-    Raises InvalidInput for wrong shapes, forces that change no acceleration, and constant features. Warns
-    (DataWarning) of single features that are constant, and of latents that the contacts hide.
+    Raises InvalidInput for wrong shapes, forces that change no acceleration, and constant features.
     """
     dynamics, robot, unknown = likelihood.dynamics, likelihood.model.robot, likelihood.model.unknown
     B, features = checked_values(unknown, dynamics)
     names = unknown.latent_names(robot)
     if not names:
         return
-    doubts = [*_of_features(likelihood, names, features)]
+    _refuse_constant_features(likelihood, names, features)
     effect = likelihood.observed.matrix @ B
     terms = [number for number, which in enumerate(unknown.slices(robot)) for _ in range(which.stop - which.start)]
-    doubts += _of_effects(names, terms, dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B), effect)
-    Doubts(doubts).warn(stacklevel=5)
+    free = dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B)
+    Doubts(_hidden(names, terms, free, effect)).warn(stacklevel=5)
 
 
-def _of_features(likelihood: MarginalLikelihood, names: Sequence[str], features: Sequence[Tensor]) -> Iterator[Doubt]:
-    robot, unknown = likelihood.model.robot, likelihood.model.unknown
-    labels, scalings = unknown.feature_names(robot), unknown.scalings(robot)
-    idle: dict[tuple[str, ...], list[str]] = {}
+def _refuse_constant_features(likelihood: MarginalLikelihood, names: Sequence[str], features: Sequence[Tensor]) -> None:
+    labels = likelihood.model.unknown.feature_names(likelihood.model.robot)
     for index, (name, z) in enumerate(zip(names, features, strict=True)):
-        if not z.shape[-1]:
-            continue
         spread = z.var(0, correction=0).sqrt()
-        constant = spread <= CONSTANT * (1.0 + z.mean(0).abs())
-        known = tuple(f"feature {k}" for k in range(z.shape[-1])) if labels is None else labels[index]
-        which = tuple(label for label, flat in zip(known, constant.tolist(), strict=True) if flat)
-        if bool(constant.all()):
+        if z.shape[-1] and bool((spread <= CONSTANT * (1.0 + z.mean(0).abs())).all()):
+            which = [f"feature {k}" for k in range(z.shape[-1])] if labels is None else labels[index]
             values = ", ".join(f"{value:.4g}" for value in z[0].tolist()[:4])
             raise InvalidInput(
                 f"latent {name!r} depends on {', '.join(which)}, which is the same in all {len(z)} training rows "
                 f"({values}), so its function cannot be learned; give data in which it changes, or leave this "
                 "prior (or this joint) out"
             )
-        ways = scalings[index]
-        if which and any(way != "none" for way in ((ways,) if isinstance(ways, str) else ways)):
-            idle.setdefault(which, []).append(name)
-    for which, latents in idle.items():
-        yield look(
-            about="features",
-            what=f"{listed(which)} never changes in the training rows, so nothing is learned of how {_few(latents)} "
-            "depends on it;",
-            do="leave that input out (inputs=...), or give data in which it changes",
-        )
 
 
-def _of_effects(names: Sequence[str], terms: Sequence[int], free: Tensor, effect: Tensor) -> list[Doubt]:
+def _hidden(names: Sequence[str], terms: Sequence[int], free: Tensor, effect: Tensor) -> Iterator[Doubt]:
     """`free` is what each latent would do without the contacts, `effect` what it does."""
     size, shown = (part.square().sum(-2).mean(0).sqrt() for part in (free, effect))
-    absent, doubts = (size <= ROUNDING * size.max()).tolist(), list[Doubt]()
+    absent = (size <= ROUNDING * size.max()).tolist()
     for term in set(terms):
         own = [index for index, number in enumerate(terms) if number == term]
         if all(absent[index] for index in own):
@@ -85,11 +68,6 @@ def _of_effects(names: Sequence[str], terms: Sequence[int], free: Tensor, effect
                 f"{_few([names[index] for index in own])} exerts no force at any training row; check frame, point and "
                 "contact of the prior, or leave it out"
             )
-    if any(absent):
-        idle = _few([name for name, nothing in zip(names, absent, strict=True) if nothing])
-        what = f"{idle} moves no joint at any training row, so its posterior is its prior;"
-        remedy = "give data in other postures, or leave it out if the prior can do without"
-        doubts.append(look(about="effects", what=what, do=remedy))
     hidden = [not nothing and flat for nothing, flat in zip(absent, (shown <= INVISIBLE * size).tolist(), strict=True)]
     blind = [name for name, flat in zip(names, hidden, strict=True) if flat]
     remedy = "use axes='surface', which leaves out the normal direction, or leave that prior out"
@@ -101,8 +79,7 @@ def _of_effects(names: Sequence[str], terms: Sequence[int], free: Tensor, effect
     if blind:
         what = f"no data can identify {_few(blind)}: the contacts take that force, the acceleration shows none of it, "
         what += "and its posterior and that of the normal force are the prior;"
-        doubts.append(look(about="effects", what=what, do=remedy))
-    return doubts
+        yield look(about="effects", what=what, do=remedy)
 
 
 def _few(names: Sequence[str]) -> str:
