@@ -87,7 +87,9 @@ class Score(Command):
         start, raw = time.monotonic(), forcegp.Dataset.load(data)
         models: dict[str, Any] = {}
         for path in runs:
-            models[path.name if path.name not in models else str(path)] = _loaded(path, raw, data)
+            posterior = forcegp.load_posterior(path)
+            require_same_joints(posterior, raw, data)
+            models[path.name if path.name not in models else str(path)] = posterior
         if self.observe:
             seen = raw.time < raw.time[0] + self.observe
             if fits or len(raw.episodes) > 1 or not 0 < seen.sum() < len(raw):
@@ -184,13 +186,6 @@ class Score(Command):
                 picture.save(self.out)
         header, each = forcegp.scores.model_table(scores)
         terminal.show(columns(f"{title}; accelerations in {forcegp.scores.unit_of(scores, 'a')}", header, each))
-
-
-def _loaded(path: Path, log: forcegp.Dataset, data: Path) -> forcegp.posterior.Posterior:
-    """A fitted model of the joints of the log. Raises InvalidInput for others."""
-    posterior = forcegp.load_posterior(path)
-    require_same_joints(posterior, log, data)
-    return posterior
 
 
 def comparison(scores: forcegp.scores.Scores, title: str) -> list[Any]:

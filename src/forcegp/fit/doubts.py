@@ -6,21 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from forcegp.data import Dataset, contact_doubts
 from forcegp.data.strokes import motor_positions
 from forcegp.doubts import Doubt, Doubts, look
 from forcegp.errors import ContactWarning, InvalidInput
-from forcegp.evidence.least_squares import Fit
 from forcegp.evidence.likelihood import CONSTANT, FAR_FROM_SURFACE, MarginalLikelihood, checked_values
 from forcegp.evidence.parameter_space import force_title
 from forcegp.forces import Force, Normal, Offset
 from forcegp.model import Model
 from forcegp.summary import listed
 
-CLEARLY_MORE = 10.0  # nats
 MISLEADING = 0.1  # share of the rows in which the past of friction is not known
 INVISIBLE = 1e-9  # |H B_c| over |M^-1 B_c| below which accelerations show nothing of a latent: rounding, measured 1e-15
 ROUNDING = 1e-12  # |M^-1 B_c| relative to the largest of them below which a latent moves nothing
@@ -121,10 +119,6 @@ def without_idle_offsets(model: Model, dataset: Dataset) -> Model:
     return model if bool(idle.all()) else replace(model, forces=tuple(map(kept, model.forces)))
 
 
-RIGHT = 0.01  # residuals over a payload's torques below which it is right as it is
-LEAST = 0.05  # share of the squares that a payload leaves, which only numbers of no body explain
-
-
 def doubts_of_past(model: Model, log: Dataset, known: Bool[np.ndarray, " rows"]) -> Iterator[Doubt]:
     """That many rows do not know the past of friction that is estimated."""
     share, estimated = 1.0 - known.mean(), any(law.learned and law.memory_names(model.robot) for law in model.laws)
@@ -150,28 +144,3 @@ def doubts_of_reversals(model: Model, log: Dataset) -> Iterator[Doubt]:
                     f"{', '.join(names)}.",
                     do="Do not rely on sigma there, or record finer positions.",
                 )
-
-
-def doubts_of_no_body(
-    fit: Fit, parameters: Float[np.ndarray, "10"], slopes: Float[np.ndarray, "10 10"], own: slice, link: str
-) -> Iterator[Doubt]:
-    """Ten free numbers in place of the payload's `parameters` explain much more: no body there does.
-
-    `own` are the coordinates of the payload, `slopes` derivatives of its parameters in them.
-    """
-    payload = fit.jacobian[..., own] @ np.linalg.inv(slopes)
-    white, others = fit.residual / fit.noise, np.delete(fit.jacobian, np.r_[own], axis=-1)
-    free = (np.concatenate([payload, others], axis=-1) / fit.noise[:, None]).reshape(white.size, -1)
-    free = free / np.linalg.norm(free, axis=0).clip(1e-300)
-    left = white.ravel() - free @ np.linalg.lstsq(free, white.ravel(), rcond=1e-10)[0]
-    cost = 0.5 * float((white**2).sum())
-    more = cost - 0.5 * float((left**2).sum())
-    rough = np.linalg.norm(fit.residual) > RIGHT * np.linalg.norm(payload @ parameters)
-    if rough and more > max(CLEARLY_MORE, LEAST * cost):
-        yield look(
-            about="payload",
-            what=f"no body on {link} explains the log: free numbers in place of its mass, centre and inertia leave "
-            f"{more / cost:.0%} less. The payload is on another link, or links weigh less or otherwise than the URDF "
-            "states.",
-            do="Give link, or a baseline (a log without the payload), or identify all links.",
-        )
