@@ -335,7 +335,8 @@ def kept_laws(space: ParameterSpace, any_contact: bool = False, sensed: Iterable
     if model.carries_known_forces:
         raise InvalidInput("the forces lack RigidBodies(); list it, since without gravity no number can be estimated.")
     skipped: Sequence[type[Law]] = (RigidBodies, *OBSERVED)
-    return tuple(law for law in model.laws if type(law) not in skipped and not space.is_estimated(law))
+    estimated = {term.law for term in space.terms}
+    return tuple(law for k, law in enumerate(model.laws) if type(law) not in skipped and k not in estimated)
 
 
 def slides(contact: Contact) -> bool:

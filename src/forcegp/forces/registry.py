@@ -87,14 +87,6 @@ def force_to_dict(force: Force) -> dict[str, Any]:
     return {"type": force_name(force), **force.to_dict()}
 
 
-def described_force(force: Force) -> dict[str, Any]:
-    """`force_to_dict`, or the class alone of a force that is not in `FORCES`: only storing a model needs more."""
-    try:
-        return force_to_dict(force)
-    except InvalidInput:
-        return {"type": type(force).__name__}
-
-
 def force_from_dict(stored: object) -> Force:
     """The force that `force_to_dict` stored. Raises FileFormatError for an unknown type or wrong fields."""
     if not isinstance(stored, Mapping):
