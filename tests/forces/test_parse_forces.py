@@ -33,7 +33,7 @@ from forcegp.forces import (
     force_from_dict,
     parse_forces,
 )
-from forcegp.forces.registry import SHORT, is_unknown
+from forcegp.forces.registry import SHORT, force_to_dict, is_unknown
 
 BUILT_IN = tuple(name for name, where in FORCES.items() if isinstance(where, str))
 SURFACE_FORCES = ToolForces(inputs=("velocity", "position"), kernel="squared-exponential")
