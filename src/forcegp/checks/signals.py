@@ -28,11 +28,11 @@ CLIPPED_ROWS = 10
 
 
 def signal_doubts(inputs: CheckInput) -> list[Doubt]:
-    """Constant, frozen and clipped channels, angles that wrap or jump."""
+    """Constant, frozen and clipped channels, angles that jump."""
     joints = range(inputs.log.nv)
     frozen = chain.from_iterable(_frozen(inputs, name, joint) for name in QUANTITY for joint in joints)
     clipped = chain.from_iterable(_clipped(inputs, joint) for joint in joints)
-    return [*_leaps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *clipped]
+    return [*_jumps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *clipped]
 
 
 FEWEST_VALUES, GAPS = 20, 8  # on either side of a gap, and how many gaps are looked at
@@ -103,24 +103,18 @@ def target_doubts(inputs: CheckInput) -> list[Doubt]:
     return []
 
 
-def _leaps(inputs: CheckInput) -> Iterator[Doubt]:
-    turn = "by a turn: the angle wraps", "Unwrap it (forcegp import --unwrap, or np.unwrap(q, axis=0))."
-    far = (
-        "by more than pi",
-        "Look at the raw log there; nothing could be differentiated, so motion and torque were not checked. Are the "
-        "units right (degrees for radians)?",
-    )
-    for places, (how, remedy) in ((inputs.wraps, turn), (inputs.jumps, far)):
-        if places.any():
-            row, joint = (int(index) for index in np.argwhere(places)[0])
-            yield wrong(
-                about="jumps",
-                what=f"the position of {inputs.names[joint]} jumps {how} after row {row} at {inputs.log.time[row]:.3f} "
-                f"s ({int(places.sum())} times in all).",
-                do=remedy,
-                joints=inputs.named(np.flatnonzero(places.any(axis=0))),
-                numbers={"row": row, "count": int(places.sum())},
-            )
+def _jumps(inputs: CheckInput) -> Iterator[Doubt]:
+    if inputs.jumps.any():
+        row, joint = (int(index) for index in np.argwhere(inputs.jumps)[0])
+        yield wrong(
+            about="jumps",
+            what=f"the position of {inputs.names[joint]} jumps by more than pi after row {row} at "
+            f"{inputs.log.time[row]:.3f} s ({int(inputs.jumps.sum())} times in all), so that motion and torques were "
+            "not checked.",
+            do="Unwrap angles (forcegp import --unwrap, or np.unwrap(q, axis=0)), or convert degrees to radians.",
+            joints=inputs.named(np.flatnonzero(inputs.jumps.any(axis=0))),
+            numbers={"row": row, "count": int(inputs.jumps.sum())},
+        )
 
 
 def _dropped(inputs: CheckInput) -> Iterator[Doubt]:
