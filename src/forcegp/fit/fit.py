@@ -39,7 +39,6 @@ from forcegp.fit.refinement import (
     require_memory_to_learn,
 )
 from forcegp.fit.search import (
-    LOG_VARIANCE_SPREAD,
     MOST_POINTS_FOR_RESTARTS,
     FitObjective,
     Search,
@@ -51,6 +50,7 @@ from forcegp.fit.search import (
 )
 from forcegp.fit.unseen import Unseen
 from forcegp.forces import UnknownForces
+from forcegp.forces.kernels import LOG_VARIANCE_SPREAD
 from forcegp.inference import Engine, OptimizationResult, OptimizerOptions, engine_of
 from forcegp.model import Model
 from forcegp.noise import Noise
