@@ -150,24 +150,16 @@ class Model(Summary):
 
     @classmethod
     @usable_arguments("Model.from_mjcf")
-    def from_mjcf(
-        cls,
-        path: str | Path,
-        forces: tuple[Force, ...] | None = None,
-        baumgarte: Baumgarte | None = None,
-        **options: Any,
-    ) -> "Model":
+    def from_mjcf(cls, path: str | Path, **options: Any) -> "Model":
         """The robot of an MJCF file with its equalities of type connect and weld as closed loops, which are exact here.
 
         `options` are those of `Robot.from_mjcf`, which this raises the errors of. Damping, dry friction and springs of
-        the file are forces of the model. By default u are joint forces; where motors act at sites of bodies,
+        the file are forces of the model. u are joint forces; where motors act at sites of bodies,
         such as rotors, u are the inputs of all motors, those of bodies that are not free last.
         """
         robot, found = Robot.read_mjcf(read_text(path), str(path), Path(path), for_system=True, **options)
-        contacts = [contact for loop in found.loops for contact in closing(loop)]
-        if forces is None:
-            forces = forces_of_mjcf(robot, found)
-        return cls(robot, tuple(contacts), forces, baumgarte=baumgarte)
+        contacts = tuple(contact for loop in found.loops for contact in closing(loop))
+        return cls(robot, contacts, forces_of_mjcf(robot, found))
 
     def to_mjcf(self, path: str | Path | None = None) -> str:
         """`Robot.to_mjcf` with its closed loops as equalities, which MuJoCo holds softly; contacts are left out."""
