@@ -11,6 +11,7 @@ from tests.checks.logs import RATE, arm, clean, column, pendulum
 from forcegp.checks import CheckReport, check, without_stops
 from forcegp.data import Dataset, Preparation
 from forcegp.errors import InvalidInput
+from forcegp.forces import Coulomb
 from forcegp.mechanics import fixed_point
 
 SYSTEMS = {"arm": arm, "pendulum": pendulum}
@@ -163,3 +164,11 @@ def test_a_joint_that_is_held_in_one_episode_is_named():
     (found,) = check(replace(both, u=both.u * 0 + np.sin(both.time[:, None]))).doubts.of("held joint")
     assert found.joints == ("lift",)
     assert found.numbers["stretches"] == [1]
+
+
+def test_a_model_whose_friction_remembers_is_compared_as_if_its_joints_had_slid_on():
+    log = clean(4)
+    steady, remembering = (Coulomb(0.4, 0.05, sigma=1e3, memory=memory) for memory in (False, True))
+    forces = log.model.forces
+    reports = [check(log, log.model.with_forces(*forces, law)) for law in (steady, remembering)]
+    assert reports[0].to_dict() == reports[1].to_dict()

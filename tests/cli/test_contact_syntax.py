@@ -42,10 +42,25 @@ def test_feet_read_as_written():
     left, right = fixed_point("FL", switch="FL_stands"), fixed_point("a@b", (0.0, 0.1, -0.02), "a@b_stands")
     assert parse_feet(("FL", "a@b@0,.1,-2e-2")) == (*left, *right)
     assert parse_feet(("l_sole:flat",)) == fixed_frame("l_sole", "l_sole_stands")
+    assert parse_feet(("FL:ball=.02",)) == fixed_point("FL", switch="FL_stands", radius=0.02)
     assert parse_feet(()) == ()
 
 
-@pytest.mark.parametrize("text", ["", "@0,0,0", "FL@1,2", "FL@a,b,c", "FL@0,0,nan", ":flat", "FL@0,0,0:flat"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "@0,0,0",
+        "FL@1,2",
+        "FL@a,b,c",
+        "FL@0,0,nan",
+        ":flat",
+        "FL@0,0,0:flat",
+        "FL:ball=",
+        "FL:ball=-1",
+        "FL:ball=.1:flat",
+    ],
+)
 def test_other_feet_are_refused(text):
     with pytest.raises(InvalidInput):
         parse_feet((text,))

@@ -9,6 +9,7 @@ from tests.robots.test_moving_bases import LIMBS
 from forcegp.errors import ContactError, InvalidInput
 from forcegp.forces import Actuation
 from forcegp.mechanics import Contact, Plane, Sphere, fixed_frame, fixed_point
+from forcegp.mechanics.constraints import contact_from_dict, contact_to_dict
 from forcegp.model import Model
 from forcegp.robots import Robot
 
@@ -72,6 +73,32 @@ def test_a_frame_that_is_held_neither_moves_nor_turns(robot):
     a = model.dynamics(q, v, u).acceleration(torch.zeros_like(v))
     moved = (robot.frame_jacobian(q, "a_foot") @ a[..., None])[..., 0]
     assert moved.abs().max() < 1e-9 * a.abs().max()
+
+
+def test_the_point_of_a_ball_that_touches_level_ground_rests(robot):
+    """Its velocity is that of the material point below the centre; the drift is the change of A v, by differences."""
+    radius, ball = 0.03, fixed_point("a_foot", POINT, radius=0.03)
+    q, v, _ = states(robot, 3, rows=5)
+
+    def rates(at):
+        return torch.stack([each.row(robot.kinematics(at, v), v).A for each in ball], -2) @ v[..., None]
+
+    touching = rates(q)[..., 0]
+    kinematics = robot.kinematics(q, v)
+    below = (
+        -radius * kinematics.frame_pose("a_foot")[..., 2, :3]
+    ).tolist()  # of the world's z, in the axes of the foot
+    for k, offset in enumerate(below):
+        point = tuple(np.add(POINT, offset))
+        velocity = robot.frame_jacobian(q[k], "a_foot", point)[:3] @ v[k]
+        torch.testing.assert_close(touching[k], velocity, rtol=1e-12, atol=1e-12)
+    step = 1e-6
+    change = (rates(robot.integrate(q, step * v)) - rates(robot.integrate(q, -step * v)))[..., 0] / (2.0 * step)
+    drift = torch.stack([each.row(kinematics, v).drift for each in ball], -1)
+    torch.testing.assert_close(drift, change, rtol=1e-6, atol=1e-6)
+    with pytest.raises(InvalidInput, match="must be a Held"):
+        Contact("a_foot", POINT, Plane((0.0, 0.0, 1.0), 0.0), radius=radius)
+    assert Contact.__eq__(ball[0], contact_from_dict(contact_to_dict(ball[0])))
 
 
 def test_matrices_that_do_not_fit_are_refused(robot):

@@ -97,7 +97,7 @@ class ColumnOptions:
     feet: Annotated[tuple[str, ...], listed(goes_on=NUMBERS), unless_given(FEET, "none")] = ()
     """Frames, or points of them, that stand on the ground at times: 1 or 0 in columns of u after those of the
     actuators, in this order. Without these columns motion and forces decide; rows that leave it open are dropped.
-    FRAME:flat is a foot that does not turn while it stands."""
+    FRAME:flat is a foot that does not turn while it stands, FRAME:ball=RADIUS (m) a ball that rolls on level ground."""
     mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "log.yaml or forcegp.yaml beside it", Path)] = (
         None
     )

@@ -206,7 +206,7 @@ SYNTAX = {"plane": "nx,ny,nz,offset", "sphere": "cx,cy,cz,radius"}
 """Numbers of each surface in m: plane n . p = offset."""
 CONTACTS = "FRAME@x,y,z:SURFACE,..."
 EXAMPLE = "lbr_iiwa_link_7@0,0,0.1:plane:0,0,1,0.055"
-FEET, FLAT = "FRAME@x,y,z,...", ":flat"  # FLAT stands behind the frame of a foot that does not turn while it stands
+FEET, FLAT, BALL = "FRAME@x,y,z,...", ":flat", ":ball="  # behind the frame: does not turn; rolls, with its radius in m
 HELD = ":held"  # behind a point that is bolted down
 STANDS = "{}_stands"  # the input that switches the contact of a foot
 
@@ -240,13 +240,17 @@ def parse_contact(text: str) -> tuple[forcegp.Contact, ...]:
 
 
 def parse_feet(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
-    """Points `FRAME@x,y,z` or flat feet `FRAME:flat`, each with a switch. Raises InvalidInput."""
+    """Points `FRAME@x,y,z`, balls `FRAME:ball=RADIUS` and flat feet `FRAME:flat`, with switches. Or InvalidInput."""
     feet: dict[str, tuple[forcegp.Contact, ...]] = {}
     for text in texts:
-        complaint = f"--feet {text!r} is not FRAME, FRAME@x,y,z (m) or FRAME{FLAT}; for example FL_foot@0,0,-0.02"
-        flat, named = text.endswith(FLAT), text.removesuffix(FLAT)
+        complaint = (
+            f"--feet {text!r} is not FRAME, FRAME@x,y,z (m), FRAME{BALL}RADIUS (m) or FRAME{FLAT}; for example "
+            "FL_foot@0,0,-0.02"
+        )
+        flat, (named, ball, size) = text.endswith(FLAT), text.removesuffix(FLAT).partition(BALL)
         frame, point = _frame_and_point(named, complaint)
-        if not frame or (flat and "@" in named):
+        radius = numbers_of(size, complaint) if ball else [0.0]
+        if not frame or (flat and (ball or "@" in named)) or len(radius) != 1:
             raise InvalidInput(complaint)
         if frame in feet:
             raise InvalidInput(f"--feet names {frame} twice; a frame has one foot.")
@@ -254,7 +258,7 @@ def parse_feet(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
         feet[frame] = (
             forcegp.mechanics.fixed_frame(frame, switch)
             if flat
-            else forcegp.mechanics.fixed_point(frame, point, switch)
+            else forcegp.mechanics.fixed_point(frame, point, switch, radius[0])
         )
     return tuple(contact for points in feet.values() for contact in points)
 

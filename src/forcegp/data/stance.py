@@ -17,15 +17,18 @@ from forcegp.data.dataset import Dataset
 from forcegp.data.views import in_blocks
 from forcegp.errors import ContactError, DatasetError, DataWarning
 
-WINDOW, OPEN, EDGE = 0.04, 0.1, 0.03
+WINDOW, OPEN, EDGE = 0.04, 0.1, 0.015
 """s: of the averages; of open rows that follow those around them; on either side of what is not sure."""
-SLOW, DEVIATIONS, CLEARLY = 0.01, 2.3, 2.0
-"""m/s that is rest, or root-mean-square noises (99.9 % of three normal numbers) if more; times that which moves."""
+SLOW, DEVIATIONS, CLEARLY, LOUD = 0.01, 2.3, 2.0, 0.3
+"""m/s that is rest, or root-mean-square noises (99.9 % of three normal numbers) if more; times that which moves; m/s
+of noise beyond which slow and fast cannot be told apart."""
 QUARTER = 0.3186
 """Of |x| of a normal number, in standard deviations: a quarter of the rows is quiet also where a foot moves much."""
 FREE, LEAST, BEARS = 0.95, 0.02, 0.4
 """Quantile of the forces on feet that clearly move; shares of the force above and below which feet at rest carry half
-of all that they carry: nothing, and surely bearing."""
+of all that they carry: nothing, surely bearing."""
+CERTAIN, APART = 20.0, 1.5
+"""How much likelier one class of forces is than the other; distance of their means over the sum of their widths."""
 FALLS, SURE = 0.2, 0.1
 """Of the weight: nothing bears this share while a robot falls, and something where it stands; noise of its average up
 to which its absence decides."""
@@ -122,11 +125,11 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
         speed[:, k] = np.linalg.norm(smooth, axis=1)
         noise[k] = max(_noise(smooth, episodes, [times * width for width in widths]) for times in (1, 2))
     slow = np.maximum(SLOW, DEVIATIONS * noise)
-    rests, moves = speed <= slow, speed >= CLEARLY * slow
-    bearing = _bearing(force, rests, moves)
+    rests, moves = (speed <= slow) & (slow <= LOUD), speed >= CLEARLY * slow
+    bearing = _bearing(force, moves)
     bears, unloaded = (force >= bearing[1], force <= bearing[0]) if np.isfinite(bearing).all() else (rests, moves)
     flags = np.full(force.shape, np.nan)
-    flags[rests & bears], flags[(rests | moves) & unloaded] = 1.0, 0.0
+    flags[~moves & bears], flags[unloaded] = 1.0, 0.0
     for rows in episodes:
         flags[rows] = _between(flags[rows], dataset.time[rows])
     flags[moves & bears] = np.nan
@@ -181,16 +184,37 @@ def _noise(values: Float[np.ndarray, "rows m"], episodes: list[np.ndarray], stri
     return float(np.linalg.norm(each))
 
 
-def _bearing(force: np.ndarray, rests: np.ndarray, moves: np.ndarray) -> Float[np.ndarray, " 2"]:
-    """Forces up to which nothing bears, and from which a foot stands [N]; NaN where they do not differ."""
-    carried = np.sort(force[rests])  # by what they carry: of a foot that swings most of the time, rest is rare
+def _bearing(force: np.ndarray, moves: np.ndarray) -> Float[np.ndarray, " 2"]:
+    """Forces up to which nothing bears, and from which a foot stands [N]; NaN where they do not differ.
+
+    Logarithms of forces in two normal classes, split with the least error (Kittler & Illingworth 1986); in between
+    neither class is `CERTAIN` times as likely. Where hardly a foot moves, shares of what feet at rest carry.
+    """
+    carried = np.sort(force[~moves])  # by what they carry: of a foot that swings most of the time, rest is rare
     half = np.searchsorted(carried.cumsum(), 0.5 * carried.sum())
     standing = float(carried[half]) if len(carried) else 0.0
-    free, bears = LEAST * standing, BEARS * standing
-    if moves.sum() >= FEW:
-        free = max(free, float(np.quantile(force[moves], FREE)))
-        bears = 2.0 * free
-    return np.array([free, bears]) if 0.0 < free <= BEARS * standing else np.full(2, np.nan)
+    if moves.sum() < FEW:
+        return np.array([LEAST, BEARS]) * standing if standing > 0.0 else np.full(2, np.nan)
+    logs = np.sort(np.log(np.maximum(force.ravel(), 1e-3 * standing + 1e-12)))
+    best, limits = np.inf, np.full(2, np.nan)
+    for count in np.unique(np.linspace(0.02 * len(logs), 0.98 * len(logs), 99).astype(int)):
+        if min(count, len(logs) - count) < FEW:
+            continue
+        parts = logs[:count], logs[count:]
+        shares = np.array([count, len(logs) - count]) / len(logs)
+        means, widths = (np.array([of(part) for part in parts]) for of in (np.mean, lambda part: np.std(part) + 1e-3))
+        cost = 2.0 * (shares * np.log(widths / shares)).sum()
+        apart = means[1] - means[0] > APART * widths.sum()
+        if cost < best and apart:
+            between = np.linspace(*means, 200)
+            density = np.log(shares / widths) - 0.5 * np.square((between[:, None] - means) / widths)
+            likelier = density[:, 1] - density[:, 0]
+            sure = np.log(CERTAIN)
+            if (likelier < -sure).any() and (likelier > sure).any():
+                best, limits = cost, np.exp([between[likelier < -sure][-1], between[likelier > sure][0]])
+    if not (limits[0] <= BEARS * standing and np.median(force[moves]) < limits[1]):
+        return np.full(2, np.nan)
+    return np.array([min(limits[0], np.quantile(force[moves], FREE)), limits[1]])
 
 
 def _between(flags: np.ndarray, time: Float[np.ndarray, " rows"]) -> np.ndarray:

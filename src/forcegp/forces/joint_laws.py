@@ -296,7 +296,8 @@ Inputs = Float[np.ndarray, "rows nu"]
 def law_columns(laws: Iterable[Law], robot: Robot, q: np.ndarray, v: Values, u: Inputs, a: Values) -> list[Values]:
     """The torque [Nm or N] that each law of joints needs at these states, of numbers that it is given.
 
-    Laws without numbers count as 1: of a law that is linear in its first coefficient the column is the regressor.
+    Laws without numbers count as 1: of a law that is linear in its first coefficient the column is the regressor. Dry
+    friction counts as where a joint has slid on for long: these states have no past.
     """
     at_q, at_v, at_u = (torch.tensor(np.array(x), device=robot.device) for x in (q, v, u))
     state = State(at_q, at_v, at_u, robot)
@@ -305,7 +306,8 @@ def law_columns(laws: Iterable[Law], robot: Robot, q: np.ndarray, v: Values, u: 
         if not isinstance(law, JointLaw):
             continue
         first = next(iter(law.coefficients))
-        own = (law.with_values({first: 1.0}) if first in law.learned else law).bound_to(robot)  # type: ignore[dict-item]  # a number is one of what coefficients take
+        known = law.with_values({first: 1.0}) if first in law.learned else law  # type: ignore[dict-item]  # a number is one of what coefficients take
+        own = (replace(known, memory=False) if isinstance(known, DryFriction) else known).bound_to(robot)
         with torch.no_grad():
             needed = -own.force(state).cpu().numpy()
             inertia = own.added_inertia(robot)

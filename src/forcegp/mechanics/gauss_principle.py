@@ -58,12 +58,15 @@ class Contact:
     """A point of the robot stays on a surface: one bilateral constraint s(p(q)) = 0.
 
     `point` is in m in the link frame `frame`. With a `switch` it acts in rows whose input of that name is 1, not 0.
+    With a `radius` [m] the point is the centre of a ball that rolls on level ground, and what a `Held` surface holds is
+    the point of the ball that touches it.
     """
 
     frame: str
     point: tuple[float, float, float]
     surface: Surface
     switch: str | None = None
+    radius: float = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
         if not isinstance(self.frame, str):
@@ -76,6 +79,9 @@ class Contact:
             raise InvalidInput(f"Contact switch is {self.switch!r}; give the name of an input, or None.")
         point = finite_vector("Contact point", self.point, 3, f" x, y, z in m, in frame {self.frame!r}")
         object.__setattr__(self, "point", tuple(point.tolist()))
+        require_number("Contact radius", self.radius, "give that of a ball in m, 0 for a point", 0.0, 1e3)
+        if self.radius and not isinstance(self.surface, Held):
+            raise InvalidInput("Contact radius is of a ball that rolls on level ground; its surface must be a Held.")
 
     def check(self, robot: Robot) -> None:
         """Raise UnknownName for a frame that is not there, ContactError where the contact constrains nothing."""
@@ -96,16 +102,25 @@ class Contact:
     def row(self, kinematics: Kinematics, v: Float[Tensor, "*batch nv"] | None = None) -> "Row":
         """c(q), A = s_p J_p and s_p; with velocities also A' v = s_p Jdot_p v + (J_p v)^T s_pp (J_p v)."""
         p = self.position(kinematics)
-        J = kinematics.frame_jacobian(self.frame, self.point)[..., :3, :]
+        J = self._touching(kinematics.frame_jacobian(self.frame, self.point))
         gradient = self.surface.gradient(p)
         A = (gradient[..., None, :] @ J)[..., 0, :]
         drift = None
         if v is not None:
-            bias_acceleration = kinematics.frame_bias_acceleration(self.frame, self.point)[..., :3]
+            bias = kinematics.frame_bias_acceleration(self.frame, self.point)
+            bias_acceleration = self._touching(bias[..., None])[..., 0]
             velocity = (J @ v[..., None])[..., 0]
             curvature = (velocity[..., None, :] @ self.surface.hessian(p) @ velocity[..., None])[..., 0, 0]
             drift = (gradient * bias_acceleration).sum(-1) + curvature
         return Row(self.surface.value(p), A, gradient, drift)
+
+    def _touching(self, twist: Float[Tensor, "*batch 6 k"]) -> Float[Tensor, "*batch 3 k"]:
+        """v + w x r of what touches the ground, r = -`radius` z (Featherstone 2008, section 3.5)."""
+        linear, angular = twist[..., :3, :], twist[..., 3:, :]
+        if not self.radius:
+            return linear
+        x, y, z = angular.unbind(-2)
+        return linear + self.radius * torch.stack([-y, x, torch.zeros_like(z)], dim=-2)
 
     def constraint(
         self, state: "State", baumgarte: Baumgarte | None
@@ -129,10 +144,13 @@ AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def fixed_point(
-    frame: str, point: tuple[float, float, float] = (0.0, 0.0, 0.0), switch: str | None = None
+    frame: str, point: tuple[float, float, float] = (0.0, 0.0, 0.0), switch: str | None = None, radius: float = 0.0
 ) -> tuple[Contact, Contact, Contact]:
-    """A point of the robot that does not move, such as a foot: its multipliers are the force on it in N, world axes."""
-    return tuple(Contact(frame, point, Held(axis), switch) for axis in AXES)  # type: ignore[return-value]  # three
+    """A point of the robot that does not move, such as a foot: its multipliers are the force on it in N, world axes.
+
+    With a `radius` [m] it is the centre of a ball that rolls on level ground without slipping.
+    """
+    return tuple(Contact(frame, point, Held(axis), switch, radius=radius) for axis in AXES)  # type: ignore[return-value]  # three
 
 
 def fixed_frame(frame: str, switch: str | None = None, size: float = 0.1) -> tuple[Contact, ...]:
