@@ -14,7 +14,7 @@ from typing_extensions import override
 
 from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput, require_type, usable_arguments
 from forcegp.forces import Actuation, Force, Law, Payload, RigidBodies, Rotor, Thrusters, Viscous
-from forcegp.forces.actuation import FADES, OBSERVED, ObservedWrench, forces_of_file, forces_of_mjcf
+from forcegp.forces.actuation import OBSERVED, forces_of_file, forces_of_mjcf
 from forcegp.forces.force import Memory
 from forcegp.forces.registry import force_from_dict, force_to_dict
 from forcegp.forces.rigid_bodies import carrying
@@ -237,18 +237,11 @@ class Model(Summary):
         held = {name for force in self.forces if isinstance(force, OBSERVED) for name in force.names}
         return tuple(index for index, name in enumerate(self.inputs) if name in held)
 
-    def foreseen(self, u: Float[Tensor, "*batch rows nu"], dt: float) -> Float[Tensor, "*batch rows nu"]:
-        """u of a motion: what observers report stays as in its first row, or fades to what lasts (`ObservedWrench`)."""
-        if not (held := list(self.held_inputs)):
-            return u
-        u = u.clone()
-        u[..., held] = u[..., :1, held]
-        fade = torch.exp(-dt / FADES * torch.arange(u.shape[-2], dtype=u.dtype, device=u.device))[:, None]
-        for force in self.forces:
-            if isinstance(force, ObservedWrench) and len(force.names) == 12:
-                first = self.inputs.index(force.names[0])
-                now, lasting = u[..., first : first + 6], u[..., first + 6 : first + 12]
-                u[..., first : first + 6] = lasting + fade * (now - lasting)
+    def foreseen(self, u: Float[Tensor, "*batch rows nu"]) -> Float[Tensor, "*batch rows nu"]:
+        """u of a motion: what observers report stays as in its first row."""
+        if held := list(self.held_inputs):
+            u = u.clone()
+            u[..., held] = u[..., :1, held]
         return u
 
     @property
