@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from PIL import Image
 
-from benchmarks.contact_monitor import EVERY, LASTING, monitors, qvu, recordings
 from benchmarks.tracking import (
     CONFIG,
     GAINS,
@@ -32,7 +30,6 @@ from benchmarks.tracking import (
 from forcegp import Model, Robot
 from forcegp.control import PDGravity
 from forcegp.posterior import Posterior
-from forcegp.scores import contacts_figure
 from forcegp.scores.figures.style import (
     IDENTIFIED,
     KNOWN_PHYSICS,
@@ -45,7 +42,6 @@ from forcegp.scores.figures.style import (
     legend_below,
     new_figure,
     quiet,
-    save_figure,
 )
 from forcegp.simulation.kuka_surface import joint_friction_of
 
@@ -173,21 +169,9 @@ def draw_friction(
     return lambda frame: dot.set_data(velocity[frame : frame + 1], now[frame : frame + 1])
 
 
-def contacts() -> Figure:
-    """Pushes of 5 N over 8 s."""
-    found = recordings(SEED)
-    monitor = monitors(SEED, found["calibration"])["learned"]
-    some = {name: x[: round(8.0 * RATE)] for name, x in found["5 N"].items()}
-    state, time = monitor.run(*qvu(some)), np.arange(len(some["q"])) / RATE
-    pushes = [(start, start + LASTING) for start in np.arange(0.0, 8.0, EVERY)]
-    arrays = time, state.distance.numpy(), monitor.threshold, state.torque.numpy()
-    return contacts_figure(*arrays, pushes, monitor.robot.joint_names, "KUKA iiwa, pushed with 5 N at the elbow")
-
-
 if __name__ == "__main__":
     FOLDER.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
-    save_figure(contacts(), FOLDER / "monitor.png")
     arm, model, found = motions()
     first, *others = film(arm, model, found)
     more = {"duration": 1000 // FRAMES_PER_SECOND, "loop": 0, "optimize": True}

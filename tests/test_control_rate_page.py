@@ -3,9 +3,11 @@
 import re
 from pathlib import Path
 
+import pytest
 from tests.examples import run_example
 
 
+@pytest.mark.nightly  # tests of predictors ask each function
 def test_the_page_on_control_rates_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "control-rate.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

@@ -125,7 +125,7 @@ def test_the_commands_and_forces_of_the_page_on_forces_exist(repository: Path):
     rows = page.partition("## Which force?")[2].partition("\n## ")[0]
     told = {name.partition(":")[0] for name in re.findall(r"^\| `([^`]+)` \|", rows, re.MULTILINE)}
     assert all(is_unknown(name) for name in told)
-    assert len(told) == 11
+    assert len(told) == 10
     rows = page.partition("## Kernels")[2].partition("\n## ")[0]
     told = {
         name for cell in re.findall(r"^\| (`[^|]+) \|", rows, re.MULTILINE) for name in re.findall(r"`(.+?)`", cell)

@@ -14,7 +14,7 @@ from typing_extensions import override
 
 from forcegp.errors import ContactError, FileFormatError, ForceGPError, InvalidInput, require_type, usable_arguments
 from forcegp.forces import Actuation, Force, Law, Payload, RigidBodies, Rotor, Thrusters, Viscous
-from forcegp.forces.actuation import FADES, OBSERVED, ObservedWrench, forces_of_file, forces_of_mjcf
+from forcegp.forces.actuation import OBSERVED, forces_of_file, forces_of_mjcf
 from forcegp.forces.force import Memory
 from forcegp.forces.registry import force_from_dict, force_to_dict
 from forcegp.forces.rigid_bodies import carrying
@@ -150,24 +150,16 @@ class Model(Summary):
 
     @classmethod
     @usable_arguments("Model.from_mjcf")
-    def from_mjcf(
-        cls,
-        path: str | Path,
-        forces: tuple[Force, ...] | None = None,
-        baumgarte: Baumgarte | None = None,
-        **options: Any,
-    ) -> "Model":
+    def from_mjcf(cls, path: str | Path, **options: Any) -> "Model":
         """The robot of an MJCF file with its equalities of type connect and weld as closed loops, which are exact here.
 
         `options` are those of `Robot.from_mjcf`, which this raises the errors of. Damping, dry friction and springs of
-        the file are forces of the model. By default u are joint forces; where motors act at sites of bodies,
+        the file are forces of the model. u are joint forces; where motors act at sites of bodies,
         such as rotors, u are the inputs of all motors, those of bodies that are not free last.
         """
         robot, found = Robot.read_mjcf(read_text(path), str(path), Path(path), for_system=True, **options)
-        contacts = [contact for loop in found.loops for contact in closing(loop)]
-        if forces is None:
-            forces = forces_of_mjcf(robot, found)
-        return cls(robot, tuple(contacts), forces, baumgarte=baumgarte)
+        contacts = tuple(contact for loop in found.loops for contact in closing(loop))
+        return cls(robot, contacts, forces_of_mjcf(robot, found))
 
     def to_mjcf(self, path: str | Path | None = None) -> str:
         """`Robot.to_mjcf` with its closed loops as equalities, which MuJoCo holds softly; contacts are left out."""
@@ -245,18 +237,11 @@ class Model(Summary):
         held = {name for force in self.forces if isinstance(force, OBSERVED) for name in force.names}
         return tuple(index for index, name in enumerate(self.inputs) if name in held)
 
-    def foreseen(self, u: Float[Tensor, "*batch rows nu"], dt: float) -> Float[Tensor, "*batch rows nu"]:
-        """u of a motion: what observers report stays as in its first row, or fades to what lasts (`ObservedWrench`)."""
-        if not (held := list(self.held_inputs)):
-            return u
-        u = u.clone()
-        u[..., held] = u[..., :1, held]
-        fade = torch.exp(-dt / FADES * torch.arange(u.shape[-2], dtype=u.dtype, device=u.device))[:, None]
-        for force in self.forces:
-            if isinstance(force, ObservedWrench) and len(force.names) == 12:
-                first = self.inputs.index(force.names[0])
-                now, lasting = u[..., first : first + 6], u[..., first + 6 : first + 12]
-                u[..., first : first + 6] = lasting + fade * (now - lasting)
+    def foreseen(self, u: Float[Tensor, "*batch rows nu"]) -> Float[Tensor, "*batch rows nu"]:
+        """u of a motion: what observers report stays as in its first row."""
+        if held := list(self.held_inputs):
+            u = u.clone()
+            u[..., held] = u[..., :1, held]
         return u
 
     @property

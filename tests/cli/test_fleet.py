@@ -114,6 +114,7 @@ def test_processes_are_those_of_the_words_unless_others_are_given(listed, monkey
     assert [*fleet(asked), *fleet([*asked, "--jobs", "3"]), *fleet([*asked, "--jobs", "3"], 2)] == [1, 3, 2]
 
 
+@pytest.mark.nightly  # tests/parallel has executors, and a process that is killed
 def test_a_cluster_whose_worker_is_killed_gives_the_same_rows(listed):
     distributed = pytest.importorskip("distributed")
     alone = fleet(words("alone"))

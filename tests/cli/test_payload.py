@@ -48,12 +48,19 @@ def test_the_payload_is_printed_and_written(folder, forcegp, held):
     assert "payload" not in {each["about"] for each in json.loads(checked.stdout)["doubts"]}
 
 
-def test_a_baseline_replaces_the_robot_file(folder, forcegp):
-    done = forcegp(*WORDS, "--baseline", "empty.h5", "--json", folder=folder)
-    assert done.returncode == 0, done.stderr
-    content = json.loads(done.stdout)
+LIGHT = ("--forces", "viscous,coulomb,offset,rotor")  # laws that are found sooner
+
+
+def test_a_baseline_replaces_the_robot_file_and_people_see_millimetres(folder, forcegp):
+    shown = forcegp(*WORDS, *LIGHT, "--baseline", "empty.h5", "--out", "both", folder=folder)
+    assert shown.returncode == 0, shown.stderr
+    content = json.loads((folder / "both" / "payload.json").read_text())
     assert content["baseline"]
     require_mass(content)
+    mass = re.search(r"mass\s+\S+\s+(\S+)\s+\S+ … \S+\s+kg", shown.stdout)
+    place = re.search(r"center_of_mass.z\s+\S+\s+(\S+)\s+\S+ … \S+\s+mm", shown.stdout)
+    assert float(mass[1]) == pytest.approx(MASS, rel=0.01)
+    assert float(place[1]) == pytest.approx(1e3 * CENTER[2], abs=2.0)
 
 
 @pytest.mark.nightly
@@ -75,18 +82,9 @@ def test_a_load_that_was_weighed_calibrates_the_drives(folder, forcegp):
     assert "only their products are known" in both.stderr
 
 
-def test_people_see_mass_and_millimetres(folder, forcegp):
-    shown = forcegp(*WORDS, folder=folder)
-    assert shown.returncode == 0, shown.stderr
-    mass = re.search(r"mass\s+\S+\s+(\S+)\s+\S+ … \S+\s+kg", shown.stdout)
-    place = re.search(r"center_of_mass.z\s+\S+\s+(\S+)\s+\S+ … \S+\s+mm", shown.stdout)
-    assert float(mass[1]) == pytest.approx(MASS, rel=0.01)
-    assert float(place[1]) == pytest.approx(1e3 * CENTER[2], abs=2.0)
-
-
 def test_a_payload_that_may_be_none_has_no_place(folder, forcegp):
     """Its mass is a positive number with an interval around 0; the warning stands with that alone."""
-    nothing = forcegp("payload", "empty.h5", "--cutoff", "none", "--delay", 0, "--json", folder=folder)
+    nothing = forcegp("payload", "empty.h5", *WORDS[2:], *LIGHT, "--json", folder=folder)
     low, high = json.loads(nothing.stdout)["parameters"]["payload.mass"]["interval_95"]
     assert low <= 0.0 < high
     assert "centre of mass and inertia mean nothing" in " ".join(nothing.stderr.split())

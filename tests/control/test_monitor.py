@@ -236,9 +236,7 @@ def test_a_log_becomes_a_table_of_contacts(workshop, monkeypatch, tmp_path, caps
     assert len(rows) == len(found["contacts"]) == 2
     assert [float(row["start"]) for row in rows] == pytest.approx([3.0, 6.0], abs=0.1)
     assert [float(row["end"]) for row in rows] == pytest.approx([4.0, 7.0], abs=0.3)  # it fades
-    assert {"contacts.csv", "contacts.json", "contacts.png", "config.json", "SHA256SUMS"} == {
-        f.name for f in out.iterdir()
-    }
+    assert {"contacts.csv", "contacts.json", "config.json", "SHA256SUMS"} == {f.name for f in out.iterdir()}
     assert json.loads((out / "config.json").read_text())["bandwidth"] == 2.0
 
 

@@ -8,7 +8,7 @@ from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import CHAIN, TREE
 
 from forcegp.errors import InvalidInput
-from forcegp.evidence import parameter_names, standard_parameters, torque_regressor
+from forcegp.evidence import standard_parameters, torque_regressor
 from forcegp.robots import Robot
 
 ROBOTS = {"arm": (URDF, {}), "tree": (TREE, {}), "chain": (CHAIN, {}), "locked": (TREE, {"right_shoulder": 0.4})}
@@ -67,14 +67,6 @@ def test_derivative_in_the_acceleration_is_the_mass_matrix():
         lambda given: torque_regressor(robot, q, v, given) @ standard_parameters(robot), a
     )
     torch.testing.assert_close(jacobian, robot.mass_matrix(q))
-
-
-def test_names_belong_to_columns():
-    robot = Robot.from_urdf_text(URDF)
-    one = torque_regressor(robot, *states(robot, 4, 6))
-    names = parameter_names(robot)
-    assert one.shape[-1] == len(names) == len(set(names)) == 30
-    assert names[12] == "fore.my"
 
 
 def test_wrong_shapes_are_named():

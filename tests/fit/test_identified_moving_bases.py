@@ -12,7 +12,7 @@ from tests.robots.random_positions import random_positions
 from tests.robots.test_moving_bases import LIMBS, ROOTS, Pair
 
 from forcegp.data import Dataset
-from forcegp.errors import DataWarning, InvalidInput
+from forcegp.errors import InvalidInput
 from forcegp.evidence import (
     Accelerations,
     NoiseLevels,
@@ -23,7 +23,7 @@ from forcegp.evidence import (
     torque_regressor,
 )
 from forcegp.evidence.bodies import body_pseudo_inertias, carrying, with_bodies
-from forcegp.evidence.least_squares import weighted_least_squares
+from forcegp.evidence.least_squares import weighted_least_squares, without
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
 from forcegp.fit import fit
@@ -100,7 +100,7 @@ def test_columns_and_their_rank_are_those_of_pinocchio(base):
         for limits in [(-np.ones(pair.model.nq), np.ones(pair.model.nq))]
         for v, a in rng.normal(size=(60, 2, robot.nv))
     ]
-    assert base_parameters(robot).rank == np.linalg.matrix_rank(np.concatenate(stacked), tol=1e-8)
+    assert len(base_parameters(robot)) == np.linalg.matrix_rank(np.concatenate(stacked), tol=1e-8)
 
 
 @pytest.mark.parametrize("likelihood", ["torque", "acceleration"])
@@ -119,7 +119,8 @@ def test_residuals_and_their_jacobians(walker, likelihood):
         else:
             r, in_parameters, in_laws = rows.in_acceleration(x, a)
         jacobian = np.concatenate([space.bodies.chained(x[: space.bodies.size], in_parameters), in_laws], -1)
-        return (rows.without_contacts(r), rows.without_contacts(jacobian)) if likelihood == "torque" else (r, jacobian)
+        free = rows.open.swapaxes(1, 2) if likelihood == "torque" else None
+        return without(r, free), without(jacobian, free)
 
     start = space.start
     dynamics = model.dynamics(*(torch.tensor(s) for s in (q, v, u)))
@@ -174,8 +175,6 @@ def test_a_walker_is_found_again(walker, likelihood):
     found = identified(recorded(truth, 300, noise=1e-3), walker, OPEN, EVIDENCE[likelihood], strength=1e-3)
     mass, error = found.parameters.total_mass
     assert abs(mass - heavier[:, 3, 3].sum()) < 5 * error + 1e-2
-    base = found.parameters.base
-    assert base.rank == base_parameters(walker.robot).rank
     for name, value in {"viscous": 0.3, "coulomb.level": 0.5}.items():
         for joint in walker.robot.single_joint_names:
             assert abs(found.parameters[f"{name}.{joint}"].value - value) < 0.03
@@ -241,8 +240,7 @@ def test_noise_of_accelerations_takes_no_mass_away(walker):
     log = recorded(walker, 250)
     noisy = replace(log, a=log.a + 3.0 * np.random.default_rng(0).normal(size=log.a.shape))
     mass = standard_parameters(walker.robot)[::10].sum().item()
-    with pytest.warns(DataWarning, match="by this log the robot weighs"):
-        assert identified(noisy, evidence=Torques()).parameters.total_mass[0] < 0.5 * mass
+    assert identified(noisy, evidence=Torques()).parameters.total_mass[0] < 0.5 * mass
     found = identified(noisy)
     assert found.parameters.evidence == str(Torques("both"))
     assert found.parameters.total_mass[0] == pytest.approx(mass, rel=0.02)
@@ -313,26 +311,6 @@ def test_a_robot_that_cannot_move_teaches_nothing(walker):
     rows = Dataset(q=q.numpy(), v=still, u=u[:, :3].numpy(), a=still, time=np.arange(20.0), model=model)
     with pytest.raises(InvalidInput, match="no equation is left"):
         identified(rows, evidence=Torques())
-
-
-def standing(model, count, seed=0):
-    """Rows in which both feet stand and nothing accelerates much."""
-    log = recorded(model, count, seed=seed)
-    u = log.u.copy()
-    u[:, -2:] = 1.0
-    q, v = torch.tensor(log.q), torch.tensor(0.05 * log.v)
-    a = model.dynamics(q, v, torch.tensor(u)).acceleration_map().offset
-    return replace(log, v=v.numpy(), u=u, a=a.numpy())
-
-
-def test_feet_that_carry_and_are_flagged_as_swinging_are_named(walker):
-    log = standing(walker, 200)
-    laws = (*OPEN, Rotor())
-    identified(log, laws=laws)  # without a warning
-    lifted = log.u.copy()
-    lifted[:, -2:] = 0.0
-    with pytest.warns(DataWarning, match="9.* m/s.2 on average: what holds it up .* Check flags of stance"):
-        identified(replace(log, u=lifted, a=0.0 * log.a), laws=laws)
 
 
 LINK = """<link name="{}"><inertial><origin xyz="0 0 {}"/><mass value="{}"/>

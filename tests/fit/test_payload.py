@@ -1,7 +1,6 @@
 """A `Payload` that is estimated, against payloads that Pinocchio's inverse dynamics carries."""
 
 import re
-from contextlib import nullcontext
 from dataclasses import replace
 from importlib.resources import files
 from types import SimpleNamespace
@@ -265,22 +264,6 @@ def test_the_hand_carries_the_payload_of_fingers_that_follow_each_other():
     assert estimate.link == "tool0"
     assert estimate.mass == pytest.approx(MASS, rel=0.01)
     assert estimate.estimates["rotor.left"].value == pytest.approx(0.0055, rel=0.05)
-
-
-@pytest.mark.parametrize(("pace", "friction", "warned"), [(0.5, (Viscous(), Offset()), True),
-                         (0.5, (Viscous(),), False), (10.0, (Viscous(), Offset()), False)], ids=str)  # fmt: skip
-def test_offsets_that_look_like_weight_are_warned_of(pace, friction, warned):
-    """A lift, whose weight is as constant as an offset: the mass is that which its accelerations show."""
-    lift = FINGER.format("lift", "").replace("tool0", "pole").replace("revolute", "prismatic")
-    arm = f'<robot name="lift"><link name="pole"/>{lift}</robot>'
-    robot = Robot.from_urdf_text(arm)
-    holding = robot.with_text(replace_inertial(arm, "lift_link", 1.0, np.array([0.2, 0, 0]), INERTIA, source="a test"))
-    draw = np.random.default_rng(0)
-    q, v, a = pace * draw.normal(size=(3, 400, 1))
-    u = holding.inverse_dynamics(*map(torch.tensor, (q, v, a))).numpy() + 0.01 * draw.normal(size=(400, 1))
-    rows = Dataset(q=q, v=v, u=u, a=a, time=0.5 * np.arange(400), model=Model(robot))
-    with pytest.warns(DataWarning, match="'offset'.* times as unsure") if warned else nullcontext():
-        Found(rows, laws=friction)
 
 
 def test_the_payload_is_found_with_friction_and_rotors(found):

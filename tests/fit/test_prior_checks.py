@@ -83,20 +83,6 @@ def test_all_hidden_is_refused(data):
         fit(rows, JointFriction())
 
 
-class Sideways(JointFriction):
-    """Of the first joint a force that is always zero; with no joint beside it, of nothing."""
-
-    def direction(self, dynamics):
-        return super().direction(dynamics) * (torch.arange(3) > 0)
-
-
-def test_a_force_that_moves_no_joint_is_pointed_out(data):
-    with pytest.warns(DataWarning, match=r"'pan' moves no joint.* postures"):
-        posterior = fit(data, Sideways())
-    latents = posterior.components(data.q, data.v, data.u)["sideways"].latents
-    assert float(latents.mean[:, 0].abs().max()) < 1e-6
-
-
 def test_a_term_that_moves_no_joint_is_refused(data):
     class Idle(JointFriction):
         def direction(self, dynamics):
@@ -104,17 +90,6 @@ def test_a_term_that_moves_no_joint_is_refused(data):
 
     with pytest.raises(InvalidInput, match=r"'idle pan', 'idle lift', .*no force.*frame, point and contact"):
         fit(data, JointFriction(), Idle())
-
-
-def test_an_input_that_never_changes_is_pointed_out(data):
-    still = with_columns(data, u=np.full((12, 3), 2.0) + data.u * [1.0, 0.0, 1.0])
-    with pytest.warns(DataWarning) as caught:
-        fit(still, JointForces())
-    (message,) = [str(warning.message) for warning in caught]
-    assert message.startswith("u of lift [Nm] never changes in the training rows")
-    assert "how 'pan', 'lift', 'bend' depends on it; leave that input out (inputs=...)" in message
-    with pytest.warns(DataWarning, match=r"u of pan \[Nm\], u of lift \[Nm\], u of bend \[Nm\]"):
-        fit(with_columns(data, u=np.ones((12, 3))), JointForces(("v", "u")))
 
 
 @pytest.mark.parametrize(

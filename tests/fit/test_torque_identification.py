@@ -133,7 +133,6 @@ def test_what_the_log_does_not_show_is_said():
     assert told["parameters"]["hand.mass"]["unit"] == "kg"
     assert told["parameters"]["viscous.pan"]["unit"] == "Nm s/rad"
     assert found.parameters.by_body["upper"] == 10
-    assert found.parameters.base.rank < 15
 
 
 def test_progress_and_a_limit_on_rows():

@@ -8,7 +8,6 @@ from tests.forces.third_party_unknown import AirDrag
 
 from forcegp.forces import (
     AerodynamicForce,
-    BaseWrench,
     ContactFriction,
     JointAccelerations,
     JointForces,
@@ -43,11 +42,6 @@ class TestJointFriction(UnknownConformance):
 
 class TestJointFrictionOfTwoJoints(UnknownConformance):
     prior = JointFriction(("bend", "pan"), kernel="linear + squared-exponential")
-
-
-class TestBaseWrench(UnknownConformance):
-    prior = BaseWrench("hand", ("velocity", "angular-velocity", "height", "attitude"))
-    acts_at = ("hand", (0.0, 0.0, 0.0))
 
 
 class TestAerodynamicForce(UnknownConformance):

@@ -11,7 +11,6 @@ from forcegp.forces import (
     FORCES,
     Actuation,
     AerodynamicForce,
-    BaseWrench,
     ContactFriction,
     Coulomb,
     DirectionalFriction,
@@ -34,7 +33,7 @@ from forcegp.forces import (
     force_from_dict,
     parse_forces,
 )
-from forcegp.forces.registry import SHORT, described_force, is_unknown
+from forcegp.forces.registry import SHORT, force_to_dict, is_unknown
 
 BUILT_IN = tuple(name for name, where in FORCES.items() if isinstance(where, str))
 SURFACE_FORCES = ToolForces(inputs=("velocity", "position"), kernel="squared-exponential")
@@ -63,7 +62,6 @@ NAMES = {
     "gp:independent": IndependentAccelerations(),
     "gp:joint-friction": JointFriction(),
     "gp:contact-friction": ContactFriction(),
-    "gp:base-wrench:hand": BaseWrench("hand"),
     "gp:aerodynamic:frame=hand:observe=0.2": AerodynamicForce("hand", observe=0.2),
 }
 EXPRESSIONS = {
@@ -122,13 +120,13 @@ def test_every_name_that_needs_no_columns_of_u_is_here():
 @pytest.mark.parametrize("expression", [*NAMES, *EXPRESSIONS])
 def test_expressions(expression):
     (found,) = parse_forces(expression)
-    assert described_force(found) == described_force({**NAMES, **EXPRESSIONS}[expression])
+    assert force_to_dict(found) == force_to_dict({**NAMES, **EXPRESSIONS}[expression])
 
 
 def test_several_are_written_with_commas():
     several = parse_forces("viscous, coulomb:0.1,gp:tool-friction:kernel=(linear + matern-3/2),axes=tool, payload:hand")
     wanted = (Viscous(), Coulomb(0.1), ToolForces(axes="tool", kernel="linear + matern-3/2"), Payload("hand"))
-    assert list(map(described_force, several)) == list(map(described_force, wanted))
+    assert list(map(force_to_dict, several)) == list(map(force_to_dict, wanted))
     assert [force.title for force in parse_forces(["viscous", "gp:joint-friction"])] == ["viscous", "joint-friction"]
 
 

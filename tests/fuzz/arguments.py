@@ -244,7 +244,6 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         _of_posterior("update", lambda made: made.predict(*STATE)),
         given=lambda: {"rows": INPUTS.data.rows([9])},
     ),
-    "predictor().refreshed": (lambda **k: INPUTS.predictor.refreshed(**k), lambda: {"posterior": INPUTS.posterior}),
     "curve": _call(Posterior.curve, _of_posterior("curve"), "features", lambda: {"latent": "pan", "points": 5}),
     "with_model": _call(Posterior.with_model, _of_posterior("with_model"), given=lambda: {"model": INPUTS.data.model}),
     "predictor": _call(

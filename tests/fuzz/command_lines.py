@@ -22,7 +22,7 @@ NAMES = words("carried independent nowhere train.h5/x . .. hostile.pkl loop out.
 AIR = words(
     "gp:aerodynamic gp:aerodynamic:frame=body gp:aerodynamic:observe=0 gp:aerodynamic:observe=-1 gp: "
     "gp:aerodynamic:observe=nan gp:aerodynamic:frame=x gp:aerodynamic:observe gp:joint,gp:joint viscous "
-    "gp:aerodynamic:height=1 gp:aerodynamic:inputs=x aerodynamic,gp:base-wrench floating planar spherical "
+    "gp:aerodynamic:height=1 gp:aerodynamic:inputs=x aerodynamic,gp:base floating planar spherical "
     "viscous:damping=x coulomb:,rotor payload:nowhere payload:hand:mass=-1 bodies:hand torques:mean=x"
 )
 ODD = ("", "a" * 300, "nowhere/x.h5", "\udcff.h5", "x\udcff", "x\x00y", "\u202ex")
@@ -54,7 +54,7 @@ MOVING = {
     "import": "import moving.h5 --cutoff 20 --out out.h5",
     "import ": "import moving.h5 --cutoff 20 --lag 0.05 --out out.h5",
     "fit": f"fit moving.h5 --forces gp:aerodynamic:frame=body {SMALL} --no-checks --out out",
-    "fit ": f"fit moving.h5 --forces gp:base-wrench {SMALL} --no-checks --out out",
+    "fit ": f"fit moving.h5 --forces gp:aerodynamic {SMALL} --no-checks --out out",
     "fit  ": "fit test.h5 --forces viscous --rows 50 --no-checks --out out",
     "simulate": "simulate quadrotor --seconds 0.1 --wind 3 --out out.h5",
 }

@@ -65,7 +65,6 @@ def test_every_kind_of_model_is_a_row_and_identified_is_always_among_them(found)
     kinds = {name: each["kind"] for name, each in scores.models.items()}
     assert kinds == {"identified": "identified", "given": "given", "friction": "force prior",
                      "broken": "force prior", "before": "given"}  # fmt: skip
-    assert scores.rival == "identified"
     assert scores.value("nrmse", model="identified") < 0.5 * scores.value("nrmse", model="given")
     for name, model in scores.models.items():
         assert {run["seed"] for run in scores.runs[name]} == {0, 1}, model
@@ -94,9 +93,7 @@ def test_what_was_fitted_before_is_scored_as_it_is(found, data):
     assert alone.columns("mae", model="before") == scores.columns("mae", model="before")
     after = "position after 0.1 s"
     assert alone.columns("rmse", after, "before") == scores.columns("rmse", after, "before")
-    assert all(
-        each.value == pytest.approx(1.0) for name, each in alone.differences["other"].items() if name != "density"
-    )
+    assert alone.difference("force", "other", "before").value == pytest.approx(1.0)
 
 
 def test_a_run_resumes_and_grows(data, tmp_path):
@@ -150,7 +147,7 @@ def test_an_identification_that_fails_leaves_the_mass_matrix_as_given(data, tmp_
     assert scores.about["mass_matrix"] == ["the model as given, because its identification failed (too still)"]
     assert len(scores.failures) == 2
     assert all(each.endswith("the identification that it rests on failed: too still") for each in scores.failures)
-    assert (scores.rival, scores.recommended) == ("given", "given")
+    assert scores.recommended == "given"
 
 
 def test_folders_of_others_are_not_touched(data, tmp_path):

@@ -7,7 +7,7 @@ from scipy.stats import ttest_rel
 
 from forcegp.errors import FitError, InvalidInput
 from forcegp.scores import Scores
-from forcegp.scores.scores import paired_difference
+from forcegp.scores.scores import CRITERIA, paired_difference
 
 
 @pytest.mark.parametrize("axis", [0, 2], ids=["seeds", "stretches"])
@@ -91,7 +91,7 @@ def scores(runs: dict[str, list[dict]], kinds: dict[str, str] = KINDS) -> Scores
     return Scores(models=models, runs=runs, joint_names=("j",), units={})
 
 
-def test_every_model_stands_against_the_best_identified_one():
+def test_models_are_compared_over_the_runs_that_both_finished():
     found = scores(
         {
             "urdf": [cell(k, 4.0 + 0.1 * k) for k in range(3)],
@@ -103,13 +103,12 @@ def test_every_model_stands_against_the_best_identified_one():
     )
     assert found.best_of(("identified",), "force") == "ls"
     assert found.best_of(("black box",), "force") is None
-    assert found.rival == "ls"
-    assert set(found.differences) == {"urdf", "ls2", "gp"}
-    assert {name: each.outcome for name, each in found.differences["gp"].items()} == {
+    against = {name: found.difference(name, "gp", "ls") for name in CRITERIA}
+    assert {name: each.outcome for name, each in against.items()} == {
         "acceleration": "better", "force": "better", "density": "better", "motion": "no difference"
     }  # fmt: skip
-    assert found.differences["ls2"]["force"].runs == 2
-    gp, urdf = (found.differences[name]["force"] for name in ("gp", "urdf"))
+    gp, urdf, seldom = (found.difference("force", name, "ls") for name in ("gp", "urdf", "ls2"))
+    assert seldom.runs == 2
     assert (urdf.outcome, gp.wins, gp.ahead, urdf.ahead, gp.stretches) == ("worse", 3, 2, 0, 2)
     assert [line.split(" (")[0] for line in found.failures] == [
         "ls2 failed in 1 of 3 runs",
@@ -134,7 +133,7 @@ def test_the_model_to_take_is_parametric_unless_another_is_shown_to_be_better():
     alone = scores({"net": cells["net"]})
     assert {each.model for each in alone.winners.values()} == {alone.recommended} == {"net"}
     nothing = scores({"net": [cell(0, None)]})
-    assert (nothing.winners, nothing.recommended, nothing.rival) == ({}, None, None)
+    assert (nothing.winners, nothing.recommended) == ({}, None)
     with pytest.raises(FitError, match="no model was fitted: net failed in 1 of 1 runs"):
         nothing.fitted_on_all_rows()
 

@@ -10,7 +10,8 @@ from tests.mechanics.test_thrusters import DRONE
 from tests.posterior.arm import arm_data, arm_model
 from tests.robots.test_moving_bases import LIMBS
 
-from forcegp import JointFriction, Model, Noise, fit
+from forcegp import Coulomb, JointFriction, Model, Noise, fit
+from forcegp.data import with_memory
 from forcegp.errors import InvalidInput
 from forcegp.evidence import Motions, Torques
 from forcegp.forces import Actuation, RigidBodies, Thrusters
@@ -82,6 +83,16 @@ def test_rows_that_resemble_each_other_are_worth_less(bare, tmp_path):
     save_posterior(wide, tmp_path / "run")
     again = load_posterior(tmp_path / "run")
     np.testing.assert_array_equal(again.predict(*state).covariance, wide.predict(*state).covariance)
+
+
+def test_the_past_of_friction_need_not_be_in_u():
+    """A plain log and one with columns of what friction remembers give the same noise of forces."""
+    model = arm_model(contacts=0, baumgarte=None).with_forces(JointFriction())
+    remembers = Coulomb(2.0, 0.05, sigma=50.0, memory=True)
+    model = replace(model, forces=(*model.forces, remembers), noise=Noise(0.1, learn=True))
+    log = replace(arm_data(60, 0, arm_model(contacts=0, baumgarte=None)), time=0.01 * np.arange(60))
+    plain, complete = (with_force_noise(model, rows).noise.force for rows in (log, with_memory(log, model)))
+    assert plain == complete
 
 
 def test_noise_of_forces_is_learned_where_rows_show_it():

@@ -12,7 +12,6 @@ from forcegp.data import lagged, recorded_motions
 from forcegp.errors import InvalidInput
 from forcegp.fit import calibrated
 from forcegp.posterior import export_c, load_posterior, observing, save_posterior
-from forcegp.posterior.observed_wrench import _lasting
 from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
 
@@ -91,24 +90,6 @@ def test_predicted_motions_keep_the_wind_of_their_start(posterior, test):
     after = np.linalg.norm(first.q[-1, :3].numpy() - seen.q[300 + len(first.q) - 1, :3])
     blind = posterior.rollout(seen.q[300], seen.v[300], u[:, :4], 1 / 240)
     assert after < 0.3 * np.linalg.norm(blind.q[-1, :3].numpy() - seen.q[300 + len(first.q) - 1, :3])
-
-
-def test_what_lasts_is_foreseen_from_the_past():
-    """Of a wrench that comes back to its mean within .1 s that mean; of one that wanders all of it."""
-    rng, time = np.random.default_rng(0), np.arange(3000) / 100
-    back, wanders = np.zeros((2, 3000, 6))
-    for k in range(1, 3000):
-        noise = rng.standard_normal((2, 6))
-        back[k] = 5.0 + np.exp(-0.1) * (back[k - 1] - 5.0) + noise[0]
-        wanders[k] = wanders[k - 1] + noise[1]
-    late = np.arange(1500, 2950)
-    for wrench, share in ((back, 0.0), (wanders, 1.0)):
-        now = np.vstack([np.zeros(6), wrench[:-1]])
-        lasting = _lasting(wrench, now, time)
-        slow = np.array([np.average(wrench[:k], axis=0, weights=np.exp((np.arange(k) - k) / 400)) for k in late])
-        found = ((lasting[late] - slow) * (now[late] - slow)).sum() / np.square(now[late] - slow).sum()
-        assert found == pytest.approx(share, abs=0.2)
-    assert np.all(_lasting(back[:1], np.zeros((1, 6)), time[:1]) == 0.0)
 
 
 def test_what_cannot_be_observed_is_refused(posterior, test):

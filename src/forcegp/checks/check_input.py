@@ -40,7 +40,7 @@ class CheckInput:
     `log` is the Dataset as given; `even` its stretches without gaps at even times; `prepared` these after the filter;
     `compared` the same after a filter at half the cut-off: what torques are compared on, so that the noise of the
     acceleration is not taken for a wrong torque; both None where jumps forbid derivatives. `rotates` (nv,) are joints
-    that turn, `wraps` and `jumps` mark where (rows, nv) a position jumps by a turn, or by more than pi otherwise,
+    that turn, `jumps` marks after which rows (rows, nv) a position of these jumps by more than pi,
     `dropped` where a signal is 0 because it was not measured (interpolated in `mended`). `compared_noise` (nv,) is the
     standard deviation of the acceleration in `compared`, None where it is not known; `compared_cutoff` is that
     of its filter [Hz], and `sharper` the same behind a higher one, where the spectrum asks for one.
@@ -49,7 +49,6 @@ class CheckInput:
     log: Dataset
     even: Dataset
     mended: Dataset
-    wraps: Bool[np.ndarray, "rows nv"]
     jumps: Bool[np.ndarray, "rows nv"]
     rotates: Bool[np.ndarray, " nv"]
     robot: Robot
@@ -69,7 +68,7 @@ class CheckInput:
         nowhere = np.zeros(dataset.v.shape, dtype=bool)
         laws = tuple(law for law in model.laws if isinstance(law, JointLaw) and not law.learned)
         known: dict[str, Any] = {"robot": model.loaded_robot, "laws": laws, "contacts": len(model.contacts)}
-        same = {"log": dataset, "even": dataset, "mended": dataset, "wraps": nowhere, "jumps": nowhere}
+        same = {"log": dataset, "even": dataset, "mended": dataset, "jumps": nowhere}
         same["rotates"] = dataset.turns
         return cls(**same | known | more)
 
@@ -111,7 +110,7 @@ class CheckInput:
             raise InvalidInput("the rows are not in order of time (a sample of rows?); check the whole recording.")
         found = _mended(dataset)
         mended, jumps = found["mended"], found["jumps"]
-        found["even"] = even = _even(_unwrapped(mended, found["wraps"]), jumps)
+        found["even"] = even = _even(mended, jumps)
         if not jumps.any():
             shortest = min(np.ptp(even.time[even.episode == number]) for number in even.episodes)
             chosen = replace(preparation, every=1, delay=0.0, trim=0.0).resolved(even)
@@ -146,7 +145,7 @@ class CheckInput:
         if dataset.time_ordered:
             found |= _mended(dataset)
             mended, jump = found["mended"], found["jumps"].any()
-            rows, width = (mended, 1) if jump else _smoothed(_unwrapped(mended, found["wraps"]))
+            rows, width = (mended, 1) if jump else _smoothed(mended)
             found["compared"] = None if jump else rows
             if not jump:
                 seen = white_noise(mended, width)
@@ -158,7 +157,7 @@ class CheckInput:
 
 
 def _mended(dataset: Dataset) -> dict[str, Any]:
-    """The log with straight lines over its drop-outs, and where they are; rows after which an angle wraps, or jumps."""
+    """The log with straight lines over its drop-outs, and where they are; rows after which an angle jumps."""
     dropped, changed = {name: _drop_outs(dataset, name) for name in ("q", "v", "u", "a")}, dict[str, np.ndarray]()
     for name, lost in dropped.items():
         for joint in np.flatnonzero(lost.any(axis=0)):
@@ -168,9 +167,7 @@ def _mended(dataset: Dataset) -> dict[str, Any]:
     mended = replace(dataset, **changed, truth={}) if changed else dataset
     change = np.abs(np.diff(mended.q, axis=0, append=mended.q[-1:]))
     change[~consecutive(mended)] = 0.0
-    wraps = (np.abs(change - 2.0 * np.pi) < 0.5) & mended.turns
-    jumps = (change > np.pi) & mended.turns & ~wraps
-    return {"mended": mended, "dropped": dropped, "wraps": wraps, "jumps": jumps}
+    return {"mended": mended, "dropped": dropped, "jumps": (change > np.pi) & mended.turns}
 
 
 def _drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
@@ -207,16 +204,6 @@ def _earlier(dataset: Dataset) -> Mapping[str, Any]:
     while report and report.get("cutoff") is None:
         report = preparation_report({"preparation": report.get("earlier")})
     return report
-
-
-def _unwrapped(dataset: Dataset, wraps: np.ndarray) -> Dataset:
-    if not wraps.any():
-        return dataset
-    q = dataset.q.copy()
-    for number in dataset.episodes:
-        own = dataset.episode == number
-        q[own] = np.unwrap(q[own], axis=0)
-    return replace(dataset, q=q, truth={})
 
 
 def _few_stretches(dataset: Dataset) -> Dataset:

@@ -27,9 +27,8 @@ from forcegp.checks.torque_doubts import TOUCHES, held_points, torque_doubts, wi
 from forcegp.data import Dataset, Preparation, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
-from forcegp.doubts import LEVELS, Doubt, Doubts, listed, look, ok
+from forcegp.doubts import LEVELS, Doubt, Doubts, listed, look
 from forcegp.errors import InvalidInput, require_type
-from forcegp.evidence.bodies import base_parameters, excitation
 from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.summary import Summary, plain
@@ -198,25 +197,14 @@ MUCH = 0.2  # noise relative to the spread of the signal from which a filter is 
 
 
 def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
-    """Noise of the acceleration before and after the filter, in rad/s^2 or m/s^2."""
+    """Accelerations that are not filtered, and those that are noisy although they are."""
     if inputs.prepared is None:
         return
     cutoff, measured = inputs.price.get("cutoff"), inputs.price.get("acceleration_noise", {})
     if cutoff is None or any(len(measured.get(when, ())) != len(inputs.names) for when in ("before", "after")):
-        yield ok(about="noise", what="the positions show no noise worth a filter.")
-        return
+        return  # the positions show no noise worth a filter
     before, after = (np.array(measured[when], float) for when in ("before", "after"))
     spread = np.std(inputs.prepared.a, axis=0)
-    if np.isfinite(after).any():
-        when = " when this dataset was prepared" if inputs.cutoff is None else ""
-        worst = int(np.nanargmax(after / np.maximum(spread, 1e-300)))
-        unit, levels = "rad/s²" if inputs.rotates[worst] else "m/s²", f"{before[worst]:.3g} to {after[worst]:.2g}"
-        what = f"a filter at {cutoff:.3g} Hz{when} takes the noise of a of {inputs.names[worst]}, the worst"
-        yield ok(
-            about="noise",
-            what=f"{what}, from {levels} {unit}.",
-            numbers={"cutoff": cutoff, "before": plain(before), "after": plain(after)},
-        )
     with np.errstate(invalid="ignore"):
         loud, left = np.flatnonzero(before > MUCH * spread), np.flatnonzero(after > MUCH * spread)
     # a log may hold better accelerations than differences
@@ -236,8 +224,6 @@ def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
         yield look(about="noise", what=what, do=remedy, joints=names)
 
 
-WELL = 100.0  # condition number up to which identification is commonly called well excited (Gautier & Khalil 1992)
-BADLY = 1000.0
 HYSTERESIS = 0.1  # of the root mean square velocity, beyond which a sign counts
 FEWEST_CHANGES = 2
 HELD = 0.02  # range of a joint in one stretch, relative to its largest, below which it was held there
@@ -245,7 +231,7 @@ STILL = {True: 0.02, False: 0.002}  # range in rad or m below which a joint does
 
 
 def excitation_doubts(inputs: CheckInput) -> Iterator[Doubt]:
-    """Joints that hardly move or never turn back, and how well base parameters are determined."""
+    """Joints that hardly move or never turn back."""
     if inputs.prepared is None:
         return
     rows = inputs.prepared
@@ -273,7 +259,6 @@ def excitation_doubts(inputs: CheckInput) -> Iterator[Doubt]:
             said = f"{listed(joints)} {what}"
             yield look(about="excitation", what=said, do=remedy, joints=tuple(joints), numbers=numbers)
     yield from _held(inputs, still)
-    yield from _base_parameters(inputs)
 
 
 def _held(inputs: CheckInput, still: list[str]) -> Iterator[Doubt]:
@@ -298,26 +283,3 @@ def _held(inputs: CheckInput, still: list[str]) -> Iterator[Doubt]:
                 joints=(inputs.names[joint],),
                 numbers={"stretches": held.tolist(), "range": float(own[first])},
             )
-
-
-def _base_parameters(inputs: CheckInput) -> Iterator[Doubt]:
-    rows = inputs.rows()
-    try:
-        seen = excitation(inputs.robot, rows.q, rows.v, rows.a)
-    except InvalidInput:  # nothing moves and nothing weighs
-        return
-    every = base_parameters(inputs.robot)
-    numbers = {"condition": seen.condition, "seen": seen.rank, "base_parameters": every.rank}
-    size = f"condition number {seen.condition:.3g} of {seen.rank} base parameters"
-    quality = "well excited" if seen.condition <= WELL else "usable" if seen.condition <= BADLY else "poorly excited"
-    size_and_quality, remedy = f"{size}: {quality} (below {WELL:g} is good).", ""
-    if seen.rank < every.rank:
-        size_and_quality = f"{size}; {every.rank - seen.rank} more of this robot never show in this motion."
-        remedy = "Identify few parameters, or record a motion of all joints at once."
-    elif seen.condition > BADLY:
-        remedy = (
-            "Inertias of single links will be uncertain; record faster motion of all joints at once, and keep the "
-            "URDF's values where the data are not informative."
-        )
-    kind = look if remedy else ok
-    yield kind(about="excitation", what=size_and_quality, do=remedy, numbers=numbers)

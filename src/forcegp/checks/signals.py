@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from forcegp.checks.check_input import DEGREE, GAP, STEPS, CheckInput, resolution
+from forcegp.checks.check_input import DEGREE, STEPS, CheckInput, resolution
 from forcegp.checks.torques import needed_torques
 from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.delay import lowest
@@ -28,11 +28,11 @@ CLIPPED_ROWS = 10
 
 
 def signal_doubts(inputs: CheckInput) -> list[Doubt]:
-    """Constant, frozen and clipped channels, angles that wrap or jump."""
+    """Constant, frozen and clipped channels, angles that jump."""
     joints = range(inputs.log.nv)
     frozen = chain.from_iterable(_frozen(inputs, name, joint) for name in QUANTITY for joint in joints)
     clipped = chain.from_iterable(_clipped(inputs, joint) for joint in joints)
-    return [*_leaps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *clipped]
+    return [*_jumps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *clipped]
 
 
 FEWEST_VALUES, GAPS = 20, 8  # on either side of a gap, and how many gaps are looked at
@@ -103,24 +103,18 @@ def target_doubts(inputs: CheckInput) -> list[Doubt]:
     return []
 
 
-def _leaps(inputs: CheckInput) -> Iterator[Doubt]:
-    turn = "by a turn: the angle wraps", "Unwrap it (forcegp import --unwrap, or np.unwrap(q, axis=0))."
-    far = (
-        "by more than pi",
-        "Look at the raw log there; nothing could be differentiated, so motion and torque were not checked. Are the "
-        "units right (degrees for radians)?",
-    )
-    for places, (how, remedy) in ((inputs.wraps, turn), (inputs.jumps, far)):
-        if places.any():
-            row, joint = (int(index) for index in np.argwhere(places)[0])
-            yield wrong(
-                about="jumps",
-                what=f"the position of {inputs.names[joint]} jumps {how} after row {row} at {inputs.log.time[row]:.3f} "
-                f"s ({int(places.sum())} times in all).",
-                do=remedy,
-                joints=inputs.named(np.flatnonzero(places.any(axis=0))),
-                numbers={"row": row, "count": int(places.sum())},
-            )
+def _jumps(inputs: CheckInput) -> Iterator[Doubt]:
+    if inputs.jumps.any():
+        row, joint = (int(index) for index in np.argwhere(inputs.jumps)[0])
+        yield wrong(
+            about="jumps",
+            what=f"the position of {inputs.names[joint]} jumps by more than pi after row {row} at "
+            f"{inputs.log.time[row]:.3f} s ({int(inputs.jumps.sum())} times in all), so that motion and torques were "
+            "not checked.",
+            do="Unwrap angles (forcegp import --unwrap, or np.unwrap(q, axis=0)), or convert degrees to radians.",
+            joints=inputs.named(np.flatnonzero(inputs.jumps.any(axis=0))),
+            numbers={"row": row, "count": int(inputs.jumps.sum())},
+        )
 
 
 def _dropped(inputs: CheckInput) -> Iterator[Doubt]:
@@ -245,14 +239,11 @@ def _clipped(inputs: CheckInput, joint: int) -> Iterator[Doubt]:
             )
 
 
-LOST = 1.8  # median steps at which at least one sample is missing
-MUCH_LOST = 0.01  # share of the time in gaps that is a reason to look at the logger
-LITTLE_LOST = 1e-4  # share that every logger loses
 OFTEN_REPEATED = 0.02  # share of rows in motion that repeat the one before: the logger had no new values
 
 
 def sampling_doubts(inputs: CheckInput) -> Iterator[Doubt]:
-    """Rate and duration; lost samples and gaps; repeated rows."""
+    """Rate and duration; repeated rows."""
     log = inputs.log
     follows = consecutive(log)[:-1]
     steps = np.diff(log.time)[follows]
@@ -265,23 +256,6 @@ def sampling_doubts(inputs: CheckInput) -> Iterator[Doubt]:
         what=f"{len(log)} rows in {each}, {seconds:.1f} s in all, {1.0 / median:.4g} Hz.",
         numbers={"sample_rate": 1.0 / median, "seconds": seconds, "episodes": count, "rows": len(log)},
     )
-    long = steps > LOST * median
-    if long.any():
-        worst, gaps = int(np.flatnonzero(follows)[np.argmax(steps)]), int((steps > GAP * median).sum())
-        share = float((steps[long] - median).sum()) / seconds
-        some = bool(gaps) or share > LITTLE_LOST
-        yield Doubt(
-            level="wrong" if share > MUCH_LOST else "look" if some else "ok",
-            about="lost samples",
-            what=f"{int(long.sum())} steps are longer than {LOST} medians ({100.0 * share:.2g} % of the time is not "
-            f"recorded); the longest, {1e3 * steps.max():.3g} ms, is after row {worst} at {log.time[worst]:.3f} s"
-            + (f"; {gaps} of them are gaps of more than {GAP:g} steps." if gaps else "."),
-            do="A derivative across a gap is no acceleration: split the log there (forcegp import does), and look why "
-            "the logger loses samples."
-            if some
-            else "",
-            numbers={"count": int(long.sum()), "gaps": gaps, "share": share, "row": worst, "time": log.time[worst]},
-        )
     yield from _repeated(log, follows)
 
 

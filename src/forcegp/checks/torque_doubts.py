@@ -1,4 +1,4 @@
-"""Doubts of torques beside those of the search: dead channels, what is left, delay, stops."""
+"""Doubts of torques beside those of the search: dead channels, drift, delay, stops."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,17 +17,15 @@ from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.summary import plain
 
-UNEXPLAINED = 0.5
 LEAST_DELAY = 0.75  # time steps below which a delay is not reported
 MUCH = 0.5  # a delay that leaves less of what was unexplained is wrong to leave in
 HELD = 3.0  # of the dry friction and of what remains in motion, from which on no gear holds the joint
-HELD_ROWS = 1000
 RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
 
 
 def torque_doubts(inputs: CheckInput, found: Explanation) -> list[Doubt]:
-    """Dead torques, what remains unexplained, and delay, of a log whose errors were corrected."""
-    return [*_passive(inputs, found.log), *_unexplained(inputs, found), *_drift(found), *_delays(inputs, found.log)]
+    """Dead torques, friction that drifts, and delay, of a log whose errors were corrected."""
+    return [*_passive(inputs, found.log), *_drift(found), *_delays(inputs, found.log)]
 
 
 def _passive(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
@@ -43,17 +41,6 @@ def _passive(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
             joints=(inputs.names[joint],),
             numbers={"needed": float(needed[joint])},
         )
-
-
-def _unexplained(inputs: CheckInput, found: Explanation) -> Iterator[Doubt]:
-    """How well the torques fit at all."""
-    left = found.unexplained
-    if not np.isfinite(left).any():
-        return
-    worst = int(np.nanargmax(left))
-    if left[worst] <= UNEXPLAINED:
-        seen = f"inverse dynamics with a factor and friction leaves at most {100.0 * left[worst]:.2g} % of the variance"
-        yield ok(about="torque", what=f"{seen} of a torque unexplained ({inputs.names[worst]}).")
 
 
 def _drift(found: Explanation) -> Iterator[Doubt]:

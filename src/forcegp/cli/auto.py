@@ -350,7 +350,7 @@ def answer_lines(
     by = ", if thrust coefficients are right" if forcegp.data.thruster_columns(identified.model) else ""
     mass, error = values.total_mass
     errors = "; ".join(
-        f"{short_name(name)} {number(_motion(scores, name))} / {number(_acceleration(scores, name))}"
+        f"{short_name(name)} {number(_motion(scores, name))} / {number(_known(scores, 'nrmse', ACCELERATION, name))}"
         for name in scores.models
     )
     ahead = (f" after {scores.horizons[-1]:g} s" if scores.horizons else "") + f" [{'rad or m' if moving else q}]"
@@ -439,10 +439,6 @@ def _motion(scores: forcegp.scores.Scores, model: str) -> float | None:
     """Error of q at the longest horizon; None where all motions diverge, or none was scored."""
     quantity = f"position after {scores.horizons[-1]:g} s" if scores.horizons else ""
     return _known(scores, "rmse", quantity, model)
-
-
-def _acceleration(scores: forcegp.scores.Scores, model: str) -> float | None:
-    return _known(scores, "nrmse", "acceleration", model)
 
 
 def _known(scores: forcegp.scores.Scores, score: str, quantity: str, model: str) -> float | None:

@@ -144,14 +144,14 @@ class Monitor(Command):
     log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
     """The log to search, at the rate of its sensors."""
     out: Annotated[Path, arg(metavar="FOLDER")]
-    """The folder to write: contacts.csv, contacts.json and contacts.png."""
+    """The folder to write: contacts.csv and contacts.json."""
     free: Annotated[str, arg(metavar="S|FREE.h5")]
     """Motion of 40 s or more without contacts, not used for training: the first S seconds of LOG, which are not
     searched, or another log."""
     alarms: AlarmOptions = AlarmOptions()
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
-        """Calibrate, look, draw and show."""
+        """Calibrate, look and show."""
         try:
             seconds, other = float(self.free), None
         except ValueError:
@@ -189,12 +189,6 @@ class Monitor(Command):
                 table.writeheader()
                 for each in contacts:
                     table.writerow({k: spreadsheet_cell(x) if isinstance(x, str) else x for k, x in each.items()})
-            time, _, state = max(parts, key=lambda part: len(part[0]))
-            shown = [(each["start"], each["end"]) for each in contacts if time[0] <= each["start"] <= time[-1]]
-            arrays = time, state.distance.numpy(), monitor.threshold, state.torque.numpy()
-            figure = forcegp.scores.contacts_figure(*arrays, shown, log.joint_names, title)
-            forcegp.scores.save_figure(figure, folder / "contacts.png")
-        terminal.note(f"figure: {self.out / 'contacts.png'}")
         limit = monitor.threshold
         header = ["on", "from [s]", "to [s]", "force [N]", "distance /\nthreshold"]
         rows = [

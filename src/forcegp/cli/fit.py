@@ -312,9 +312,6 @@ def what_is_open(estimates: forcegp.posterior.Estimates) -> list[str]:
     if bodies:
         weak = ", ".join(f"{name} ({number} of 10)" for name, number in bodies.items())
         lines.append(f"Directions of single bodies that the prior decides: {weak}.")
-    if estimates.base is not None:
-        base = estimates.base
-        lines.append(f"{base.rank} base parameters, condition number {base.condition:.3g}.")
     if estimates.thickened:
         lines.append(f"Links that were lines, plates or points got some thickness: {', '.join(estimates.thickened)}.")
     return lines

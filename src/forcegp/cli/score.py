@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
@@ -64,8 +64,6 @@ class Score(Command):
     """How motions are predicted: rk4, symplectic-euler (as kuka-surface), implicit-midpoint (stiff friction)."""
     observe: Annotated[float, arg(metavar="S")] = 0.0
     """Seconds at the beginning of LOG that a RUN learns from, as a robot at work could; the rest is scored."""
-    system: Literal["model", "data"] = "model"
-    """Robot and contacts that a RUN predicts for: model, those that it was trained with; data, those of the log."""
     out: Annotated[Path | None, unless_given("FOLDER", "no folder")] = None
     """The folder of results: page, figures, numbers, models; of one RUN also report.html with the robot in motion. An
     unfinished run resumes."""
@@ -89,7 +87,9 @@ class Score(Command):
         start, raw = time.monotonic(), forcegp.Dataset.load(data)
         models: dict[str, Any] = {}
         for path in runs:
-            models[path.name if path.name not in models else str(path)] = self._loaded(terminal, path, raw, data)
+            posterior = forcegp.load_posterior(path)
+            require_same_joints(posterior, raw, data)
+            models[path.name if path.name not in models else str(path)] = posterior
         if self.observe:
             seen = raw.time < raw.time[0] + self.observe
             if fits or len(raw.episodes) > 1 or not 0 < seen.sum() < len(raw):
@@ -136,18 +136,6 @@ class Score(Command):
             terminal.note(f"{time.monotonic() - start:.0f} s; the page: {self.out / 'report.md'}")
         return {name: value for name, value in content.items() if name != "runs"}
 
-    def _loaded(self, terminal: Terminal, path: Path, log: forcegp.Dataset, data: Path) -> forcegp.posterior.Posterior:
-        """A fitted model for the chosen system; a robot that was identified stays, with contacts of the log."""
-        posterior = forcegp.load_posterior(path)
-        require_same_joints(posterior, log, data)
-        if self.system == "model":
-            return posterior
-        model = log.model
-        if posterior.parameters:
-            model = replace(posterior.model, contacts=model.contacts, baumgarte=model.baumgarte)
-            terminal.note("--system data: contacts of the data; the robot stays the identified one")
-        return posterior.with_model(model)
-
     def _prepared(
         self, terminal: Terminal, raw: forcegp.Dataset, data: Path
     ) -> tuple[forcegp.Dataset, forcegp.Dataset, forcegp.Model]:
@@ -180,10 +168,7 @@ class Score(Command):
     ) -> None:
         """What is shown and written of a single model."""
         name = next(iter(scores.models))
-        # what an observer reports is neither robot nor contact
-        trained, here = ({**each.to_dict(), "forces": None} for each in (posterior.trained, posterior.model))
-        where = ", carried to another robot or contacts" if trained != here else ""
-        title = f"{scores.models[name]['summary']}{where}; {len(rows)} rows of {self.paths[-1]}"
+        title = f"{scores.models[name]['summary']}; {len(rows)} rows of {self.paths[-1]}"
         if self.out is not None:
             posterior, rows = forcegp.posterior.observing(posterior, rows)
             with terminal.progress("writing the report"):

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 from forcegp.errors import printable
 from forcegp.progress import watched
@@ -27,9 +27,6 @@ _ARGUMENT = re.compile(r"`([a-z_.]+)(?:=([^`]*))?`")
 OTHERWISE = {"contacts": "contact", "folder": "out", "locked": "lock", "model": "robot"}
 """Options whose argument has another name in Python."""
 
-ELSEWHERE = {"`posterior.with_model(dataset.model)`": "--system data"}
-"""Calls of Python that an option stands for."""
-
 
 def with_option_names(message: str, options: Collection[str]) -> str:
     """The message with --points 5 for `points=5`, where the command has such an option; those of others stay."""
@@ -42,8 +39,6 @@ def with_option_names(message: str, options: Collection[str]) -> str:
         flag = f"--{name.replace('_', '-')}"
         return flag if value in ("", "True") else f"{flag}{'=' if value.startswith('-') else ' '}{value}"
 
-    for call, words in ELSEWHERE.items():
-        message = message.replace(call, words)
     return _ARGUMENT.sub(option, message)
 
 
@@ -51,13 +46,7 @@ PLAIN_SECONDS = 10.0  # between two lines about progress where there is no termi
 
 
 UNLIMITED = 10_000  # columns of a terminal that cuts nothing
-
-
-@runtime_checkable
-class ProgressCallback(Protocol):
-    """Called as `report(done, total)`, if wished with a note for people."""
-
-    def __call__(self, done: int, total: int, note: str = "", /) -> None: ...  # noqa: D102
+Report = Callable[..., None]  # of done, total, and a note for people if wished
 
 
 def _console(**how: Any) -> Console:
@@ -158,7 +147,7 @@ class Terminal:
         return with_option_names(text, self.options)
 
     @contextmanager
-    def progress(self, what: str) -> Iterator[ProgressCallback]:
+    def progress(self, what: str) -> Iterator[Report]:
         """A bar with the remaining time on a terminal, a line now and then elsewhere. Without a report: a spinner."""
         from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -178,7 +167,7 @@ class Terminal:
             with watched(report):
                 yield report
 
-    def _lines(self, what: str) -> ProgressCallback:
+    def _lines(self, what: str) -> Report:
         """Lines such as `simulating: 40 %`, at most one every few seconds."""
         reported = time.monotonic()
         if self.names_stages:

@@ -97,7 +97,7 @@ class BaseParameters:
 
     def __init__(self, model: Model, limits: np.ndarray) -> None:
         self.model, self.scale = replace(model, contacts=()), np.where(np.isinf(limits), 1.0, limits)
-        self.columns = list(base_parameters(model.robot).independent)
+        self.columns = list(base_parameters(model.robot))
 
     def torques(self, *states: Values) -> Values:
         """u (n, nv) in Nm or N of q, v and a, against known forces as they are without u."""

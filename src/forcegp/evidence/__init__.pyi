@@ -4,8 +4,7 @@ from .evidence import (
 )
 from .evidence import EVIDENCE as EVIDENCE, parse_evidence as parse_evidence
 from .bodies import (
-    BaseParameters as BaseParameters, base_parameters as base_parameters, excitation as excitation,
-    body_names as body_names, parameter_names as parameter_names, standard_parameters as standard_parameters,
+    base_parameters as base_parameters, body_names as body_names, standard_parameters as standard_parameters,
     torque_regressor as torque_regressor,
 )
 from .least_squares import ROUNDS as ROUNDS, NoiseLevels as NoiseLevels

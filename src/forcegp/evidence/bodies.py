@@ -6,7 +6,6 @@ every body has a positive density; |log F F^T| is the affine-invariant distance 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
@@ -15,7 +14,7 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 from torch import Tensor
 
-from forcegp.errors import InvalidInput, NonPhysicalInertia
+from forcegp.errors import NonPhysicalInertia
 from forcegp.forces import Body
 from forcegp.robots import Robot
 from forcegp.robots.inertia import (
@@ -26,16 +25,13 @@ from forcegp.robots.inertia import (
 )
 from forcegp.robots.urdf_file import replace_inertial
 
-PARAMETERS = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
-"""Names of the standard parameters of one body; mx = m cx."""
-
 
 def torque_regressor(
     robot: Robot, q: Float[Tensor, "*#rows nq"], v: Float[Tensor, "*#rows nv"], a: Float[Tensor, "*#rows nv"]
 ) -> Float[Tensor, "... nv columns"]:
     """Y (..., nv, 10 bodies) with ``Y @ standard_parameters(robot)`` the joint forces in Nm or N, without armature.
 
-    Columns are named by `parameter_names`. Raises InvalidInput for wrong shapes, dtypes or devices.
+    Columns of a body are m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz. Raises InvalidInput for wrong shapes, dtypes or devices.
     """
     return robot.kinematics(q, v).torque_regressor(a)[..., carrying(robot), :].flatten(-2)
 
@@ -62,58 +58,26 @@ def body_names(robot: Robot) -> tuple[str, ...]:
     return tuple(robot.layout.bodies[body].child for body in carrying(robot))
 
 
-def parameter_names(robot: Robot) -> tuple[str, ...]:
-    """Names of the regressor's columns: `LINK.m`, `LINK.mx`, ..., `LINK.Izz` for every body."""
-    return tuple(f"{body}.{parameter}" for body in body_names(robot) for parameter in PARAMETERS)
-
-
 RANK_TOLERANCE = 1e-9
 """Diagonal entries of R below this fraction of the largest are zero, for columns of norm 1."""
 RANDOM_ROWS = 50
 """Random states per joint that stand for every motion."""
 
 
-@dataclass(frozen=True)
-class BaseParameters:
-    """What a regressor (rows, p) identifies: columns that are `independent`, and their `condition` at norm 1."""
+def base_parameters(robot: Robot) -> tuple[int, ...]:
+    """Columns of the regressor that are base parameters: independent whatever the motion, and all others follow.
 
-    independent: tuple[int, ...]
-    condition: float
-
-    @classmethod
-    def of(cls, regressor: Float[np.ndarray, "rows p"]) -> "BaseParameters":
-        """From the stacked rows of a regressor. Raises InvalidInput where it is zero or not finite."""
-        if not np.isfinite(regressor).all():
-            raise InvalidInput("the regressor is not finite; check q, v and a for NaN and infinity.")
-        norms = np.linalg.norm(regressor, axis=0)
-        if norms.max() == 0.0:
-            raise InvalidInput("the regressor is zero: nothing moves and nothing weighs, so no parameter shows.")
-        seen = np.flatnonzero(norms > RANK_TOLERANCE * norms.max())
-        triangular, order = scipy.linalg.qr(regressor[:, seen] / norms[seen], mode="r", pivoting=True)
-        diagonal = np.abs(triangular.diagonal())
-        rank = int((diagonal > RANK_TOLERANCE * diagonal[0]).sum())
-        values = np.linalg.svd(triangular[:rank, :rank], compute_uv=False)
-        return cls(tuple(seen[order[:rank]].tolist()), float(values[0] / values[-1]))
-
-    @property
-    def rank(self) -> int:
-        """How many base parameters there are."""
-        return len(self.independent)
-
-
-def base_parameters(robot: Robot) -> BaseParameters:
-    """The base parameters of a robot, whatever the motion: from random states, the same ones every time."""
-    turns, v, a = np.random.default_rng(0).normal(0.0, 2.0, (3, RANDOM_ROWS * robot.nv, robot.nv))
-    q = robot.space.integrate(robot.space.neutral(), torch.tensor(turns, device=robot.device)).cpu().numpy()
-    return excitation(robot, q, v, a)
-
-
-def excitation(
-    robot: Robot, q: Float[np.ndarray, "rows nq"], v: Float[np.ndarray, "rows nv"], a: Float[np.ndarray, "rows nv"]
-) -> BaseParameters:
-    """What recorded states identify: `rank` below that of `base_parameters` means that something never showed."""
-    states = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, a))
-    return BaseParameters.of(torque_regressor(robot, *states).flatten(0, 1).cpu().numpy())
+    They are those of random states, the same ones every time.
+    """
+    drawn = np.random.default_rng(0).normal(0.0, 2.0, (3, RANDOM_ROWS * robot.nv, robot.nv))
+    turns, v, a = torch.tensor(drawn, device=robot.device)
+    q = robot.space.integrate(robot.space.neutral(), turns)
+    regressor = torque_regressor(robot, q, v, a).flatten(0, 1).cpu().numpy()
+    norms = np.linalg.norm(regressor, axis=0)
+    seen = np.flatnonzero(norms > RANK_TOLERANCE * norms.max())
+    triangular, order = scipy.linalg.qr(regressor[:, seen] / norms[seen], mode="r", pivoting=True)
+    diagonal = np.abs(triangular.diagonal())
+    return tuple(seen[order[: (diagonal > RANK_TOLERANCE * diagonal[0]).sum()]].tolist())
 
 
 # symmetric matrices Z = sum_k z_k E_k, orthonormal in the Frobenius norm

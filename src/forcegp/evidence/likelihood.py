@@ -126,14 +126,12 @@ def check_distance(model: Model, training: TrainingData) -> None:
                 f"more than {distance:.3g} m; {remedy}"
             )
         if distance > FAR_FROM_SURFACE:
-            _warn(
+            warnings.warn(
                 f"half of the training points lie more than {distance:.3g} m from {what}; {remedy}, or train on the "
-                "rows in contact only (forcegp.data.rows_in_contact)"
+                "rows in contact only (forcegp.data.rows_in_contact)",
+                DataWarning,
+                stacklevel=5,
             )
-
-
-def _warn(text: str) -> None:
-    warnings.warn(text, DataWarning, stacklevel=6)
 
 
 def checked_values(forces: UnknownForces, dynamics: ConstrainedDynamics) -> tuple[Tensor, tuple[Tensor, ...]]:

@@ -305,10 +305,6 @@ class ParameterSpace:
     def _estimated(self) -> dict[int, Law]:
         return {index: self.model.laws[index] for index in dict.fromkeys(term.law for term in self.terms)}
 
-    def is_estimated(self, law: Law) -> bool:
-        """Whether coefficients of this law are among the coordinates."""
-        return any(law is each for each in self._estimated.values())
-
     def added_inertia(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "nv nv"]:
         """What the rotors that are estimated add to the mass matrix."""
         total = np.zeros((self.model.robot.nv,) * 2)

@@ -196,10 +196,6 @@ class RecordedRows:
         Y = self.kinematics.torque_regressor(torch.as_tensor(np.array(a), device=self.kinematics.robot.device))
         return (Y.cpu().numpy() * self._stated).sum(-1)
 
-    def without_contacts(self, values: Float[np.ndarray, "rows nv *k"]) -> Float[np.ndarray, "rows nv *k"]:
-        """The part of joint forces (first axis after the rows) that no lambda can explain."""
-        return without(values, self.open.swapaxes(1, 2))
-
     def _terms(self, x: np.ndarray, a: Rows, load: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Torque of the laws that are estimated and its derivatives, under the measured load or one of all motors."""
         state = self.state
@@ -339,7 +335,8 @@ def kept_laws(space: ParameterSpace, any_contact: bool = False, sensed: Iterable
     if model.carries_known_forces:
         raise InvalidInput("the forces lack RigidBodies(); list it, since without gravity no number can be estimated.")
     skipped: Sequence[type[Law]] = (RigidBodies, *OBSERVED)
-    return tuple(law for law in model.laws if type(law) not in skipped and not space.is_estimated(law))
+    estimated = {term.law for term in space.terms}
+    return tuple(law for k, law in enumerate(model.laws) if type(law) not in skipped and k not in estimated)
 
 
 def slides(contact: Contact) -> bool:

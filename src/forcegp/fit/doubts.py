@@ -6,80 +6,59 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
-from forcegp.data import Dataset, contact_doubts, thruster_columns
+from forcegp.data import Dataset, contact_doubts
 from forcegp.data.strokes import motor_positions
 from forcegp.doubts import Doubt, Doubts, look
 from forcegp.errors import ContactWarning, InvalidInput
-from forcegp.evidence.bodies import carrying
-from forcegp.evidence.least_squares import Fit
 from forcegp.evidence.likelihood import CONSTANT, FAR_FROM_SURFACE, MarginalLikelihood, checked_values
 from forcegp.evidence.parameter_space import force_title
-from forcegp.evidence.recorded_rows import RecordedRows
-from forcegp.forces import Force, Normal, Offset, RigidBodies
+from forcegp.forces import Force, Normal, Offset
 from forcegp.model import Model
 from forcegp.summary import listed
 
-CLEARLY_MORE = 10.0  # nats
 MISLEADING = 0.1  # share of the rows in which the past of friction is not known
 INVISIBLE = 1e-9  # |H B_c| over |M^-1 B_c| below which accelerations show nothing of a latent: rounding, measured 1e-15
 ROUNDING = 1e-12  # |M^-1 B_c| relative to the largest of them below which a latent moves nothing
 
 
 def check_forces(likelihood: MarginalLikelihood) -> None:
-    """Refuse what cannot be learned at all, and warn of what cannot be learned in part.
+    """Refuse what cannot be learned at all, and warn (DataWarning) of latents that the contacts hide.
 
-    Raises InvalidInput for wrong shapes, forces that change no acceleration, and constant features. Warns
-    (DataWarning) of single features that are constant, and of latents that the contacts hide.
+    Raises InvalidInput for wrong shapes, forces that change no acceleration, and constant features.
     """
     dynamics, robot, unknown = likelihood.dynamics, likelihood.model.robot, likelihood.model.unknown
     B, features = checked_values(unknown, dynamics)
     names = unknown.latent_names(robot)
     if not names:
         return
-    doubts = [*_of_features(likelihood, names, features)]
+    _refuse_constant_features(likelihood, names, features)
     effect = likelihood.observed.matrix @ B
     terms = [number for number, which in enumerate(unknown.slices(robot)) for _ in range(which.stop - which.start)]
-    doubts += _of_effects(names, terms, dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B), effect)
-    Doubts(doubts).warn(stacklevel=5)
+    free = dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B)
+    Doubts(_hidden(names, terms, free, effect)).warn(stacklevel=5)
 
 
-def _of_features(likelihood: MarginalLikelihood, names: Sequence[str], features: Sequence[Tensor]) -> Iterator[Doubt]:
-    robot, unknown = likelihood.model.robot, likelihood.model.unknown
-    labels, scalings = unknown.feature_names(robot), unknown.scalings(robot)
-    idle: dict[tuple[str, ...], list[str]] = {}
+def _refuse_constant_features(likelihood: MarginalLikelihood, names: Sequence[str], features: Sequence[Tensor]) -> None:
+    labels = likelihood.model.unknown.feature_names(likelihood.model.robot)
     for index, (name, z) in enumerate(zip(names, features, strict=True)):
-        if not z.shape[-1]:
-            continue
         spread = z.var(0, correction=0).sqrt()
-        constant = spread <= CONSTANT * (1.0 + z.mean(0).abs())
-        known = tuple(f"feature {k}" for k in range(z.shape[-1])) if labels is None else labels[index]
-        which = tuple(label for label, flat in zip(known, constant.tolist(), strict=True) if flat)
-        if bool(constant.all()):
+        if z.shape[-1] and bool((spread <= CONSTANT * (1.0 + z.mean(0).abs())).all()):
+            which = [f"feature {k}" for k in range(z.shape[-1])] if labels is None else labels[index]
             values = ", ".join(f"{value:.4g}" for value in z[0].tolist()[:4])
             raise InvalidInput(
                 f"latent {name!r} depends on {', '.join(which)}, which is the same in all {len(z)} training rows "
                 f"({values}), so its function cannot be learned; give data in which it changes, or leave this "
                 "prior (or this joint) out"
             )
-        ways = scalings[index]
-        if which and any(way != "none" for way in ((ways,) if isinstance(ways, str) else ways)):
-            idle.setdefault(which, []).append(name)
-    for which, latents in idle.items():
-        yield look(
-            about="features",
-            what=f"{listed(which)} never changes in the training rows, so nothing is learned of how {_few(latents)} "
-            "depends on it;",
-            do="leave that input out (inputs=...), or give data in which it changes",
-        )
 
 
-def _of_effects(names: Sequence[str], terms: Sequence[int], free: Tensor, effect: Tensor) -> list[Doubt]:
+def _hidden(names: Sequence[str], terms: Sequence[int], free: Tensor, effect: Tensor) -> Iterator[Doubt]:
     """`free` is what each latent would do without the contacts, `effect` what it does."""
     size, shown = (part.square().sum(-2).mean(0).sqrt() for part in (free, effect))
-    absent, doubts = (size <= ROUNDING * size.max()).tolist(), list[Doubt]()
+    absent = (size <= ROUNDING * size.max()).tolist()
     for term in set(terms):
         own = [index for index, number in enumerate(terms) if number == term]
         if all(absent[index] for index in own):
@@ -87,11 +66,6 @@ def _of_effects(names: Sequence[str], terms: Sequence[int], free: Tensor, effect
                 f"{_few([names[index] for index in own])} exerts no force at any training row; check frame, point and "
                 "contact of the prior, or leave it out"
             )
-    if any(absent):
-        idle = _few([name for name, nothing in zip(names, absent, strict=True) if nothing])
-        what = f"{idle} moves no joint at any training row, so its posterior is its prior;"
-        remedy = "give data in other postures, or leave it out if the prior can do without"
-        doubts.append(look(about="effects", what=what, do=remedy))
     hidden = [not nothing and flat for nothing, flat in zip(absent, (shown <= INVISIBLE * size).tolist(), strict=True)]
     blind = [name for name, flat in zip(names, hidden, strict=True) if flat]
     remedy = "use axes='surface', which leaves out the normal direction, or leave that prior out"
@@ -103,8 +77,7 @@ def _of_effects(names: Sequence[str], terms: Sequence[int], free: Tensor, effect
     if blind:
         what = f"no data can identify {_few(blind)}: the contacts take that force, the acceleration shows none of it, "
         what += "and its posterior and that of the normal force are the prior;"
-        doubts.append(look(about="effects", what=what, do=remedy))
-    return doubts
+        yield look(about="effects", what=what, do=remedy)
 
 
 def _few(names: Sequence[str]) -> str:
@@ -146,48 +119,6 @@ def without_idle_offsets(model: Model, dataset: Dataset) -> Model:
     return model if bool(idle.all()) else replace(model, forces=tuple(map(kept, model.forces)))
 
 
-BRAKED = 0.4
-"""Correlation of missing accelerations of a base with its velocity: below .2 in logs of feet, wheels and rotors without
-drag, .45 to .83 with drag or ground friction."""
-OTHER_ROBOT = 2.0  # factor between the masses of log and file, or of what holds the robot up, from which one is wrong
-
-
-def doubts_of_base(
-    given: Model, found: Model, rows: RecordedRows, residual: Float[np.ndarray, "rows nv"]
-) -> Iterator[Doubt]:
-    """Log and file have different masses, the base lacks a force of the size of gravity, or something brakes it."""
-    robot, missing = given.robot, 0.0
-    own = carrying(robot)
-    if not any(isinstance(law, RigidBodies) and len(law.bodies(own, robot)) == len(own) for law in given.laws):
-        return
-    masses = [sum(each.robot.tree.inertias[carrying(each.robot), 3, 3, 0].tolist()) for each in (given, found)]
-    if robot.base == "floating":
-        rotation = rows.kinematics.frame_pose(robot.layout.moving[0])[:, :3, :3].cpu().numpy()
-        missing = float(np.linalg.norm((rotation @ residual[:, :3, None]).mean(0)))
-    wrong = ""
-    if not masses[0] / OTHER_ROBOT <= masses[1] <= masses[0] * OTHER_ROBOT:
-        wrong = f"by this log the robot weighs {masses[1]:.3g} kg, by its file {masses[0]:.3g} kg"
-    elif missing * OTHER_ROBOT > np.linalg.norm(robot.gravity.cpu().numpy()) > 0.0:
-        wrong = f"accelerations of the base are wrong by {missing:.3g} m/s^2 on average"
-    linear = {"floating": 3, "planar": 2}.get(robot.base, 0)
-    missed, v = residual[:, :linear], rows.v[:, :linear]
-    braked = -float((missed * v).sum()) / max(float(np.linalg.norm(missed) * np.linalg.norm(v)), 1e-300)
-    if wrong:
-        what, remedy = f"{wrong}: what holds it up is not what the log states.", "flags of stance, thrust coefficients"
-        yield look(about="base", what=what, do=f"Check {remedy} and the unit of u.")
-    elif braked > BRAKED:
-        remedy = "Weigh it, since thrust and mass look alike, and let forcegp fit learn the forces."
-        if not thruster_columns(given):
-            remedy = "forcegp fit --forces rigid-bodies:LINK,gp:joint,gp:joint-friction learns both."
-        what = f"what the model lacks brakes the base (correlation {braked:.2g} with its velocity): ground friction or "
-        yield look(about="base", what=f"{what}drag, which this regression takes for mass.", do=remedy)
-
-
-ALIKE = 5.0  # times the error of a mass without offsets
-RIGHT = 0.01  # residuals over a payload's torques below which it is right as it is
-LEAST = 0.05  # share of the squares that a payload leaves, which only numbers of no body explain
-
-
 def doubts_of_past(model: Model, log: Dataset, known: Bool[np.ndarray, " rows"]) -> Iterator[Doubt]:
     """That many rows do not know the past of friction that is estimated."""
     share, estimated = 1.0 - known.mean(), any(law.learned and law.memory_names(model.robot) for law in model.laws)
@@ -213,50 +144,3 @@ def doubts_of_reversals(model: Model, log: Dataset) -> Iterator[Doubt]:
                     f"{', '.join(names)}.",
                     do="Do not rely on sigma there, or record finer positions.",
                 )
-
-
-def doubts_of_offsets(
-    fit: Fit, offsets: Bool[np.ndarray, " terms"], slope: Float[np.ndarray, " 10"], own: slice
-) -> Iterator[Doubt]:
-    """Constant torques of joints look like the weight, since postures differ little; `slope` is that of the mass.
-
-    `own` are the coordinates of the payload, and the last ones those of `offsets`.
-    """
-    whole, seen = fit.information + fit.prior_information, np.zeros(len(fit.x))
-    seen[own] = slope
-    held = np.append(np.ones(len(seen) - len(offsets), dtype=bool), ~offsets)
-    known = whole[np.ix_(held, held)]
-    with_offsets, without = seen @ np.linalg.solve(whole, seen), seen[held] @ np.linalg.solve(known, seen[held])
-    if with_offsets > ALIKE**2 * without:
-        yield look(
-            about="payload",
-            what="constant torques of the joints ('offset') look like the payload's weight in these postures: with "
-            f"them its mass is {(with_offsets / without) ** 0.5:.0f} times as unsure, and small errors of the model "
-            "change it.",
-            do="Leave 'offset' out, or give a baseline, or a log of more postures.",
-        )
-
-
-def doubts_of_no_body(
-    fit: Fit, parameters: Float[np.ndarray, "10"], slopes: Float[np.ndarray, "10 10"], own: slice, link: str
-) -> Iterator[Doubt]:
-    """Ten free numbers in place of the payload's `parameters` explain much more: no body there does.
-
-    `own` are the coordinates of the payload, `slopes` derivatives of its parameters in them.
-    """
-    payload = fit.jacobian[..., own] @ np.linalg.inv(slopes)
-    white, others = fit.residual / fit.noise, np.delete(fit.jacobian, np.r_[own], axis=-1)
-    free = (np.concatenate([payload, others], axis=-1) / fit.noise[:, None]).reshape(white.size, -1)
-    free = free / np.linalg.norm(free, axis=0).clip(1e-300)
-    left = white.ravel() - free @ np.linalg.lstsq(free, white.ravel(), rcond=1e-10)[0]
-    cost = 0.5 * float((white**2).sum())
-    more = cost - 0.5 * float((left**2).sum())
-    rough = np.linalg.norm(fit.residual) > RIGHT * np.linalg.norm(payload @ parameters)
-    if rough and more > max(CLEARLY_MORE, LEAST * cost):
-        yield look(
-            about="payload",
-            what=f"no body on {link} explains the log: free numbers in place of its mass, centre and inertia leave "
-            f"{more / cost:.0%} less. The payload is on another link, or links weigh less or otherwise than the URDF "
-            "states.",
-            do="Give link, or a baseline (a log without the payload), or identify all links.",
-        )

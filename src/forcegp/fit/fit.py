@@ -39,7 +39,6 @@ from forcegp.fit.refinement import (
     require_memory_to_learn,
 )
 from forcegp.fit.search import (
-    LOG_VARIANCE_SPREAD,
     MOST_POINTS_FOR_RESTARTS,
     FitObjective,
     Search,
@@ -51,7 +50,7 @@ from forcegp.fit.search import (
 )
 from forcegp.fit.unseen import Unseen
 from forcegp.forces import UnknownForces
-from forcegp.forces.registry import described_force
+from forcegp.forces.kernels import LOG_VARIANCE_SPREAD
 from forcegp.inference import Engine, OptimizationResult, OptimizerOptions, engine_of
 from forcegp.model import Model
 from forcegp.noise import Noise
@@ -277,7 +276,6 @@ def _of_numbers(model: Model, logs: Sequence[Dataset], evidence: Any, rows: int 
     settings = described_rows(found.rows, logs[0]) | {
         "seed": seed,
         "evidence": str(evidence),
-        "forces": [described_force(force) for force in model.forces],
         "noise": found.noise.to_dict(),
         "doubts": list(found.doubts),
     }
@@ -407,8 +405,6 @@ class _Functions:
         check_forces(likelihood)
         require_memory_to_learn(likelihood)
         described = described_rows(rows, dataset) | {"noise": noise.to_dict()}
-        # before the search: a force of one's own may fail there
-        described["forces"] = [described_force(force) for force in model.forces]
         learned_noise, fixed = likelihood.split_noise
         kernels = likelihood.kernels
         if beside is not None:

@@ -14,7 +14,6 @@ from forcegp.errors import DatasetError, InvalidInput
 from forcegp.evidence.least_squares import Fit, Residual
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
-from forcegp.fit.doubts import CLEARLY_MORE, LEAST, RIGHT, doubts_of_no_body, doubts_of_offsets
 from forcegp.forces import Actuation, Payload
 from forcegp.model import Model
 from forcegp.posterior.fitted import STRETCHES
@@ -63,22 +62,35 @@ def with_payloads_placed(model: Model, logs: Sequence[Dataset]) -> Model:
     return replace(model, forces=tuple(placed if force is open_ones[0] else force for force in model.forces))
 
 
-def doubts_of_payloads(space: ParameterSpace, fit: Fit, averaged: bool) -> Iterator[Doubt]:
-    """Offsets that look like its weight, and a link on which no body explains the log, where that is `averaged`."""
+CLEARLY_MORE = 10.0  # nats
+RIGHT = 0.01  # residuals over a payload's torques below which it is right as it is
+LEAST = 0.05  # share of the squares that a payload leaves, which only numbers of no body explain
+
+
+def doubts_of_payloads(space: ParameterSpace, fit: Fit) -> Iterator[Doubt]:
+    """Ten free numbers in place of a payload's explain much more: no body on its link explains the log."""
+    number, white = len(space.carried), fit.residual / fit.noise
     for body, each in enumerate(space.carried):
         if each.payload is None:
             continue
-        own, column = space.bodies.slices[body], space.names.index(f"{each.name}.mass")
-        slope = space.number_slopes(fit.x)[column, own]
-        laws = [type(space.model.laws[term.law]).__name__ for term in space.terms for _ in term.size]
-        offsets = np.array([law == "Offset" for law in laws], dtype=bool)
-        yield from doubts_of_offsets(fit, offsets, slope, own)
-        if averaged:  # noise of single rows hides what is left
-            number = len(space.carried)
-            one = np.eye(10 * number)[10 * body : 10 * body + 10].reshape(10, 1, number, 10)
-            slopes = space.bodies.chained(fit.x[: space.bodies.size], one)[:, 0, own]
-            link = getattr(space.model.laws[each.payload], "link", "")
-            yield from doubts_of_no_body(fit, space.standard_parameters(fit.x)[body], slopes, own, link)
+        own, one = space.bodies.slices[body], np.eye(10 * number)[10 * body : 10 * body + 10].reshape(10, 1, number, 10)
+        slopes = space.bodies.chained(fit.x[: space.bodies.size], one)[:, 0, own]
+        payload = fit.jacobian[..., own] @ np.linalg.inv(slopes)
+        others = np.delete(fit.jacobian, np.r_[own], axis=-1)
+        free = (np.concatenate([payload, others], axis=-1) / fit.noise[:, None]).reshape(white.size, -1)
+        free = free / np.linalg.norm(free, axis=0).clip(1e-300)
+        left = white.ravel() - free @ np.linalg.lstsq(free, white.ravel(), rcond=1e-10)[0]
+        cost = 0.5 * float((white**2).sum())
+        more = cost - 0.5 * float((left**2).sum())
+        moves = payload @ space.standard_parameters(fit.x)[body]
+        if np.linalg.norm(fit.residual) > RIGHT * np.linalg.norm(moves) and more > max(CLEARLY_MORE, LEAST * cost):
+            yield look(
+                about="payload",
+                what=f"no body on {getattr(space.model.laws[each.payload], 'link', '')} explains the log: free numbers "
+                f"in place of its mass, centre and inertia leave {more / cost:.0%} less. The payload is on another "
+                "link, or links weigh less or otherwise than the URDF states.",
+                do="Give link, or a baseline (a log without the payload), or identify all links.",
+            )
 
 
 def changes_without_rests(

@@ -14,7 +14,7 @@ from forcegp.data.views import at_rest, one_row_per_rest, postures, rests_alone
 from forcegp.doubts import Doubt, Doubts, look
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence import Accelerations, Torques
-from forcegp.evidence.bodies import BaseParameters, thickened
+from forcegp.evidence.bodies import thickened
 from forcegp.evidence.least_squares import (
     LEAST,
     ROUNDS,
@@ -28,7 +28,6 @@ from forcegp.evidence.least_squares import (
 )
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, RecordedRows, sensed_of
-from forcegp.fit.doubts import doubts_of_base
 from forcegp.fit.payloads import changes_without_rests, doubts_of_payloads, misfit, with_payloads_placed
 from forcegp.fit.unseen import Unseen
 from forcegp.forces import Actuation, Payload
@@ -274,15 +273,15 @@ def fit_physical(
             fit = search(white, start=fit.x, progress=note)
     found = space.model_at(fit.x)
     residual = equations.a - equations.accelerations(fit.x)[0]
-    doubts = [*doubts_of_payloads(space, fit, equations.tell_bodies), *_doubts_of_memory(space, fit.x)]
+    doubts = list(_doubts_of_memory(space, fit.x))
+    if equations.tell_bodies:  # noise of single rows hides what is left
+        doubts += doubts_of_payloads(space, fit)
     cause = None
     means = equations.windows if equations.tell_bodies and not evidence.noisy_in_both else None
     if means is not None and not model.contacts and any(each.payload is not None for each in space.carried):
         cause = misfit(found, equations.parts, equations.each(equations.a), means.mean, fit)
     doubts += [] if cause is None else [cause[0]]
     estimates = _estimates(space, fit, equations, evidence, thick, changes, None if cause is None else cause[1])
-    if not robot.space.is_vector_space:
-        doubts += doubts_of_base(model, found, equations.parts[0], residual[: len(logs[0])])
     doubts += unseen.doubts(model)
     Doubts(doubts).warn(stacklevel=4)
     told = tuple(doubt.to_dict() for doubt in doubts)
@@ -333,11 +332,9 @@ def _estimates(
     """The numbers at the end of the search."""
     white = np.concatenate([fit.white_jacobian, fit.white[..., None]], axis=-1)
     prior = space.prior(fit.x)[1]
-    base, by_body = None, None
+    by_body = None
     everything = len(space.carried) == len(space.own) and all(each.payload is None for each in space.carried)
     if everything and space.carried:
-        Y = equations.parts[0].without_contacts(equations.measured[0].regressor)
-        base = BaseParameters.of(Y.reshape(-1, Y.shape[-2] * 10))
         by_body = _weak_directions(space, fit.information, prior.T @ prior)
     return Estimates.of_search(
         space.parameters,
@@ -349,7 +346,6 @@ def _estimates(
         changes,
         move,
         by_body=by_body,
-        base=base,
         evidence=str(evidence),
         rows=len(equations.a),
         evaluations=fit.evaluations,

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, FitError, InvalidInput, NumericalError, require_type, usable_arguments
-from forcegp.forces.kernels import register_log_normal_prior
+from forcegp.forces.kernels import LOG_VARIANCE_SPREAD, register_log_normal_prior
 from forcegp.inference import (
     LatentKernels,
     LatentPosterior,
@@ -179,10 +179,6 @@ def run_restarts(search: Callable[..., Outcome], restarts: int, patience: int, j
 def best_value(found: Sequence[OptimizationResult | FitError]) -> float:
     """The lowest objective that was found; infinite where there is none."""
     return min((each.value for each in found if isinstance(each, OptimizationResult)), default=math.inf)
-
-
-LOG_VARIANCE_SPREAD = 2.0
-"""Standard deviation of the prior on the logarithm of a latent's variance, where physical parameters are learned."""
 
 
 Starts = Callable[[int], Mapping[str, Tensor]]

@@ -24,7 +24,7 @@ from .registry import (
     split_outside as split_outside,
 )
 from .rigid_bodies import Payload as Payload, RigidBodies as RigidBodies
-from .link_forces import AerodynamicForce as AerodynamicForce, BaseWrench as BaseWrench, ToolForces as ToolForces
+from .link_forces import AerodynamicForce as AerodynamicForce, ToolForces as ToolForces
 from .unknown import (
     Scaling as Scaling, Unknown as Unknown, UnknownForces as UnknownForces, has_few_inputs as has_few_inputs,
 )

@@ -19,8 +19,6 @@ from forcegp.mechanics.gauss_principle import State
 from forcegp.robots import Robot
 from forcegp.robots.mjcf_model import Translation
 
-FADES = 0.25  # s
-
 
 @dataclass(frozen=True, eq=False)
 class Actuation(PerJointLaw):
@@ -190,8 +188,8 @@ class Thrusters(LinkForce):
 class ObservedWrench(LinkForce):
     """A slow force on link `frame` that an observer estimates from the past, as wind makes it; columns of u hold it.
 
-    `names`: a force [N] at the origin of the link along the world's axes; of six, a torque [Nm], too; of twelve, the
-    last six are the wrench that lasts, to which predicted motions fade within .25 s (`forcegp.posterior.observing`).
+    `names`: a force [N] at the origin of the link along the world's axes; of six, a torque [Nm], too
+    (`forcegp.posterior.observing`).
     """
 
     frame: str
@@ -200,14 +198,14 @@ class ObservedWrench(LinkForce):
     @override
     def bound_to(self, robot: Robot) -> "ObservedWrench":
         robot.frame(self.frame)
-        if len(self.names) not in (3, 6, 12) or len(set(self.names)) < len(self.names):
-            raise InvalidInput(f"ObservedWrench names are {self.names}; give 3, 6 or 12 different ones.")
+        if len(self.names) not in (3, 6) or len(set(self.names)) < len(self.names):
+            raise InvalidInput(f"ObservedWrench names are {self.names}; give 3 or 6 different ones.")
         return ObservedWrench(self.frame, tuple(self.names))
 
     @override
     def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
         u, axes = features
-        world = u[..., :6].unflatten(-1, (-1, 3))
+        world = u.unflatten(-1, (-1, 3))
         own = (axes.mT[..., None, :, :] @ world[..., None]).flatten(-3)
         return torch.cat([own, torch.zeros_like(own)], dim=-1) if len(self.names) == 3 else own
 

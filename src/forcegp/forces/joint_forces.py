@@ -137,7 +137,7 @@ class PerJoint(ExpressedKernels):
         if not joint_indices(self.joints, robot):
             raise InvalidInput(
                 f"{type(self).__name__} acts in joints, and {robot.name} has none but its base; leave it out, "
-                "or use base-wrench or aerodynamic."
+                "or use aerodynamic."
             )
 
     @override

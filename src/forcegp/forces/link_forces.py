@@ -222,35 +222,57 @@ def _along(axes: Float[Tensor, "*batch 3 k"], vector: Float[Tensor, "*batch 3"])
     return (axes.mT @ vector[..., None])[..., 0]
 
 
-BASE_INPUTS = ("velocity", "drag", "rotor-drag", "angular-velocity", "thrust", "actuation", "height", "attitude")
+AIR_INPUTS = ("velocity", "drag", "rotor-drag", "angular-velocity", "thrust", "height", "attitude")
 
 
 @dataclass(frozen=True)
-class BaseWrench(SharedInputs):
+class AerodynamicForce(SharedInputs):
     """Q_U = J^T E f(z): a force [N] and a torque [Nm] on a link, along the link's own axes E and about its origin.
+
+    By default what air does to a body that flies: drag, changes of thrust with the flow and near the ground, and wind.
+    A linear kernel of the inputs holds the usual laws (Faessler, Franchi & Scaramuzza, IEEE RA-L 2018).
 
     frame: the link; None stands for the first that moves freely, the trunk or body of the robot.
     inputs: "velocity" (along the link's axes), "drag" (|velocity| velocity), "rotor-drag" (the root of the thrust times
-        velocity), "angular-velocity", "actuation" (force and torque of all actuators on the free base) or "thrust"
-        (those along z and about all axes), "height" of the link, "attitude" (the world's axes in those of the link).
+        velocity), "angular-velocity", "thrust" (force of all actuators on the free base along z, and torques about all
+        axes), "height" of the link, "attitude" (the world's axes in those of the link). Velocities are those against
+        the air: the fit finds the wind of its rows.
     kernel: an expression of `forcegp.forces.kernel_of`.
+    observe: the time in s that the observer of the force that stays unexplained looks back
+        (`forcegp.posterior.observing`); None follows the recording, 0 observes nothing.
+    wind: [m/s, world] where u has no columns of an `ObservedWind`.
     """
 
     frame: str | None = None
-    inputs: tuple[str, ...] = ("velocity", "angular-velocity", "attitude")
-    kernel: str = "linear + squared-exponential"
-    allowed: ClassVar[tuple[str, ...]] = BASE_INPUTS
-    from_zero: ClassVar[tuple[str, ...]] = BASE_INPUTS[:-2]
+    inputs: tuple[str, ...] = AIR_INPUTS
+    kernel: str = "linear"
+    observe: float | None = None
+    wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    allowed: ClassVar[tuple[str, ...]] = AIR_INPUTS
+    from_zero: ClassVar[tuple[str, ...]] = AIR_INPUTS[:-2]
 
-    @usable_arguments("BaseWrench")
+    @usable_arguments("AerodynamicForce")
     def __post_init__(self) -> None:
         super().__post_init__()
         if not (self.frame is None or isinstance(self.frame, str)):
-            raise InvalidInput(f"{type(self).__name__} frame is {self.frame!r}; give the name of a link, or None.")
+            raise InvalidInput(f"AerodynamicForce frame is {self.frame!r}; give the name of a link, or None.")
+        wind = finite_numbers(self.wind)
+        if wind is None or len(wind) != 3:
+            raise InvalidInput(f"AerodynamicForce wind is {self.wind!r}; give its velocity along x, y and z in m/s.")
+        object.__setattr__(self, "wind", wind)
+        if self.observe is None:
+            return
+        try:  # files and commands hold text
+            seconds = float(self.observe)
+        except (TypeError, ValueError):
+            seconds = -1.0
+        if not 0.0 <= seconds < 1e6:
+            raise InvalidInput(f"AerodynamicForce observe is {self.observe!r}; give a time in s, 0, or None.")
+        object.__setattr__(self, "observe", seconds)
 
     @override
     def check(self, robot: Robot, contacts: Sequence[Contact]) -> None:
-        require_moving(type(self).__name__, self.link(robot), robot)
+        require_moving("AerodynamicForce", self.link(robot), robot)
 
     def link(self, robot: Robot) -> str:
         """The link that the force acts on. Raises InvalidInput where none is named and none moves freely."""
@@ -258,7 +280,7 @@ class BaseWrench(SharedInputs):
             return self.frame
         if not robot.layout.groups:
             raise InvalidInput(
-                f"{type(self).__name__} acts on a base that moves, and {robot.name} is fixed to the world; read it "
+                f"AerodynamicForce acts on a base that moves, and {robot.name} is fixed to the world; read it "
                 "with base='floating', or name a link: frame=..."
             )
         body = robot.layout.groups[0].bodies.stop - 1
@@ -296,14 +318,14 @@ class BaseWrench(SharedInputs):
             "rotor-drag": lambda: _root_of_thrust(state) * linear,
             "angular-velocity": lambda: angular,
             "thrust": lambda: state.delivered[..., _base_rows(state.robot)][..., _thrust(state.robot)],
-            "actuation": lambda: state.delivered[..., _base_rows(state.robot)],
             "height": lambda: where.position[..., 2:],
             "attitude": lambda: where.orientation.flatten(-2),
         }
 
-    def _flow(self, state: State) -> Tensor | float:
-        """The velocity of what the link moves through, along the axes of the world."""
-        return 0.0
+    def _flow(self, state: State) -> Tensor:
+        """The velocity of the air, along the axes of the world."""
+        wind = ObservedWind.at(state)
+        return state.v.new_tensor(self.wind) if wind is None else wind
 
     @override
     def labels(self, robot: Robot) -> dict[str, Sequence[str]]:
@@ -317,51 +339,12 @@ class BaseWrench(SharedInputs):
             "rotor-drag": [f"root of thrust times velocity of {link} along its {axis} [N^1/2 m/s]" for axis in "xyz"],
             "angular-velocity": [f"angular velocity of {link} about its {axis} [rad/s]" for axis in "xyz"],
             "thrust": pushes[_thrust(robot)],
-            "actuation": pushes,
             "height": [f"height of {link} [m]"],
             "attitude": [f"world {world} along {axis} of {link}" for world in AXES for axis in "xyz"],
         }
 
     def _point(self, dynamics: ConstrainedDynamics) -> ToolPoint:
         return ToolPoint.of(dynamics, self.link(dynamics.state.robot), (0.0, 0.0, 0.0))
-
-
-@dataclass(frozen=True)
-class AerodynamicForce(BaseWrench):
-    """What air does to a body that flies: drag, changes of thrust with the flow and near the ground, and wind.
-
-    A linear kernel of the inputs holds the usual laws (Faessler, Franchi & Scaramuzza, IEEE RA-L 2018). Velocities are
-    those against the air: the fit finds the wind of its rows, and where u has no columns of an `ObservedWind`, it is
-    `wind` [m/s, world]. `observe` is the time in s that the observer of the force that stays unexplained looks back
-    (`forcegp.posterior.observing`); None follows the recording, 0 observes nothing.
-    """
-
-    inputs: tuple[str, ...] = ("velocity", "drag", "rotor-drag", "angular-velocity", "thrust", "height", "attitude")
-    kernel: str = "linear"
-    observe: float | None = None
-    wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    @override
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        wind = finite_numbers(self.wind)
-        if wind is None or len(wind) != 3:
-            raise InvalidInput(f"AerodynamicForce wind is {self.wind!r}; give its velocity along x, y and z in m/s.")
-        object.__setattr__(self, "wind", wind)
-        if self.observe is None:
-            return
-        try:  # files and commands hold text
-            seconds = float(self.observe)
-        except (TypeError, ValueError):
-            seconds = -1.0
-        if not 0.0 <= seconds < 1e6:
-            raise InvalidInput(f"AerodynamicForce observe is {self.observe!r}; give a time in s, 0, or None.")
-        object.__setattr__(self, "observe", seconds)
-
-    @override
-    def _flow(self, state: State) -> Tensor | float:
-        wind = ObservedWind.at(state)
-        return state.v.new_tensor(self.wind) if wind is None else wind
 
 
 def _base_rows(robot: Robot) -> slice:

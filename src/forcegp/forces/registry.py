@@ -36,7 +36,6 @@ FORCES: dict[str, str | type[Force]] = {
     "joint-position": "joint_forces.JointPositionForces",
     "tool-forces": "link_forces.ToolForces",
     "contact-friction": "contact_friction.ContactFriction",
-    "base-wrench": "link_forces.BaseWrench",
     "aerodynamic": "link_forces.AerodynamicForce",
 }
 """Name -> class, or where in this package it is, so that only what is used is imported. Add yours."""
@@ -86,14 +85,6 @@ def force_name(force: Force) -> str:
 def force_to_dict(force: Force) -> dict[str, Any]:
     """Plain values that `force_from_dict` turns back. Raises InvalidInput for a force that is not in `FORCES`."""
     return {"type": force_name(force), **force.to_dict()}
-
-
-def described_force(force: Force) -> dict[str, Any]:
-    """`force_to_dict`, or the class alone of a force that is not in `FORCES`: only storing a model needs more."""
-    try:
-        return force_to_dict(force)
-    except InvalidInput:
-        return {"type": type(force).__name__}
 
 
 def force_from_dict(stored: object) -> Force:

@@ -355,23 +355,6 @@ def latent_calls(latent: LatentPosterior, compressed: CompressedCovariance | Non
     return tuple(found)
 
 
-def refreshed_calls(calls: Sequence[KernelSum], latent: LatentPosterior) -> tuple[KernelSum, ...]:
-    """The same C functions with the tables of another posterior with the same kernels. Raises InvalidInput if none."""
-    found: list[KernelSum] = []
-    for part in calls:
-        index = part.latents[0]
-        if isinstance(part, OneInputCall) and (form := one_input_form(latent, index)) is not None:
-            found.append(replace(part, functions=form))
-        elif not isinstance(part, OneInputCall) and part.level == (0.0,):  # else its program holds sums of the weights
-            found.append(replace(part, centers=latent.features[index], weights=latent.weights[index].detach()[None]))
-    if [part.c_source(1, True) for part in found] != [part.c_source(1, True) for part in calls]:
-        raise InvalidInput(
-            "the predictor's programs hold numbers of the posterior, as of squared exponential kernels of latents with "
-            "the same features; make a new one by posterior.predictor()."
-        )
-    return tuple(found)
-
-
 def drawn_calls(
     latent: LatentPosterior, calls: Sequence[KernelSum], samples: int, seed: int, widening: float
 ) -> list[tuple[KernelSum, ...]] | None:

@@ -24,7 +24,6 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import UnknownName, require_known
-from forcegp.evidence.bodies import BaseParameters
 from forcegp.evidence.likelihood import MarginalLikelihood, TrainingData
 from forcegp.forces import IndependentAccelerations, JointAccelerations, JointForces
 from forcegp.inference import (
@@ -94,8 +93,6 @@ class Estimates(Summary, Mapping[str, Estimate]):
     covariance: Float[np.ndarray, "n n"] | None = None
     by_body: Mapping[str, int] | None = None
     """Of ten directions of each body, how many the prior decides, where it decides any."""
-    base: BaseParameters | None = None
-    """Base parameters of the recorded motion, where all bodies were estimated."""
     evidence: str = ""
     rows: int = 0
     evaluations: int = 0
@@ -145,15 +142,13 @@ class Estimates(Summary, Mapping[str, Estimate]):
             "parameters": {each.name: each.to_dict() for each in self.entries},
             "covariance": None if self.covariance is None else self.covariance.tolist(),
             "by_body": None if self.by_body is None else dict(self.by_body),
-            "base_parameters": None if self.base is None else self.base.rank,
-            "condition_number": None if self.base is None else self.base.condition,
             **{name: getattr(self, name) for name in ("evidence", "rows", "evaluations", "settled")},
             "thickened": list(self.thickened),
         }
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> "Estimates":
-        """What `to_dict` gave, without base parameters."""
+        """What `to_dict` gave."""
         known = Estimate.__dataclass_fields__
         entries = tuple(Estimate(**{k: v for k, v in x.items() if k in known}) for x in stored["parameters"].values())
         covariance = None if stored["covariance"] is None else np.array(stored["covariance"], dtype=np.float64)

@@ -12,7 +12,6 @@ from forcegp.data import AirLaw, Dataset, find_wind, with_memory, with_wind
 from forcegp.data.filters import episodes_in_order, sums_before
 from forcegp.errors import InvalidInput
 from forcegp.forces import AerodynamicForce, ObservedWind, ObservedWrench
-from forcegp.forces.actuation import FADES
 from forcegp.model import Model
 from forcegp.posterior.prediction import ROWS_PER_BLOCK
 
@@ -20,24 +19,22 @@ Posterior = Any
 """A `Posterior`, whose module imports this one."""
 
 NAMES = tuple(f"observed_{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
-LASTING = tuple(name.replace("observed", "lasting") for name in NAMES)
 TRIED = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s
 MEMORY, LEAST = 1.0, 0.1  # s, of how much each time missed, and of the past that the first row needs
-SLOW, AHEAD, LEARNING = 4.0, 0.5, 10.0  # s: of the mean that stays, of what is foreseen, of how well it was
 
 
 def observing(
     posterior: Posterior, dataset: Dataset, *, seconds: float | None = None, whole: bool = False
 ) -> tuple[Posterior, Dataset]:
-    """The posterior and the recording with an `ObservedWrench`, in six or twelve more columns of u, and observed wind.
+    """The posterior and the recording with an `ObservedWrench`, in six more columns of u, and observed wind.
 
     Row k holds the mean of the wrench left unexplained over the rows before k of its episode, with weights that fall by
     e in `seconds`: what a first-order disturbance observer reports in flight (Chen et al., IEEE TIE 2016). Rows with a
     shorter past are left out unless `whole`. By default the prior's `AerodynamicForce` gives link and time; where it
-    leaves the time open, each component takes that of .02 to 1 s which missed least in the second before, and six more
-    columns hold what will last of it. What laws remember has its columns, too. Without such a prior both come back as
-    they are. Calibrated intervals go along unless `seconds` is given. Raises InvalidInput for a time that is not
-    positive, models that cannot carry their forces along, and recordings that are too short or not in order of time.
+    leaves the time open, each component takes that of .02 to 1 s which missed least in the second before. What laws
+    remember has its columns, too. Without such a prior both come back as they are. Calibrated intervals go along unless
+    `seconds` is given. Raises InvalidInput for a time that is not positive, models that cannot carry their forces
+    along, and recordings that are too short or not in order of time.
     """
     dataset = with_memory(dataset, posterior.model)
     own = next((term for term in posterior.trained.unknown_forces if isinstance(term, AerodynamicForce)), None)
@@ -55,10 +52,8 @@ def observing(
     posterior, dataset = _in_observed_wind(posterior, dataset)
     unexplained, effect = _unexplained(posterior, dataset, frame)
     wrench = np.einsum("nij,nj->ni", np.linalg.pinv(effect, rcond=1e-9), unexplained)
-    held = len(times) == 1 or _observes(posterior.model)
-    observed = _observed(wrench, dataset, times, held)
-    names = NAMES if held else NAMES + LASTING
-    model = replace(posterior.model, forces=(*posterior.model.forces, ObservedWrench(frame, names)))
+    observed = _observed(wrench, dataset, times)
+    model = replace(posterior.model, forces=(*posterior.model.forces, ObservedWrench(frame, NAMES)))
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
     seen = replace(dataset, u=np.concatenate([dataset.u, observed], axis=1), model=model, truth=truth)
     posterior = posterior.with_model(model)
@@ -159,41 +154,16 @@ def _unexplained(
 
 
 def _observed(
-    wrench: Float[np.ndarray, "rows 6"], dataset: Dataset, times: Sequence[float], held: bool
-) -> Float[np.ndarray, "rows columns"]:
-    """The wrench that the rows before each show, none at the first of an episode, and what lasts unless it is held."""
-    observed = np.zeros((len(wrench), 6 if held else 12))
+    wrench: Float[np.ndarray, "rows 6"], dataset: Dataset, times: Sequence[float]
+) -> Float[np.ndarray, "rows 6"]:
+    """The wrench that the rows before each show, none at the first of an episode."""
+    observed = np.zeros_like(wrench)
     for number, rows, _ in episodes_in_order(dataset):
         own = np.flatnonzero(dataset.episode == number)
         means = np.stack([_past_mean(wrench[own], rows.time, time) for time in times])  # (times, rows, 6)
         missed = np.stack([_past_mean(np.square(wrench[own] - mean), rows.time, MEMORY) for mean in means])
-        now = np.take_along_axis(means, missed.argmin(0)[None], axis=0)[0]
-        observed[own] = now if held else np.hstack([now, _lasting(wrench[own], now, rows.time)])
+        observed[own] = np.take_along_axis(means, missed.argmin(0)[None], axis=0)[0]
     return observed
-
-
-def _lasting(
-    wrench: Float[np.ndarray, "rows 6"], now: Float[np.ndarray, "rows 6"], time: Float[np.ndarray, " rows"]
-) -> Float[np.ndarray, "rows 6"]:
-    """What stays of the wrench `now`: the mean of the last 4 s, and a share of how far it is from that.
-
-    The share would have predicted the mean of the coming .5 s best in the rows before (least squares, drawn to one
-    half).
-    """
-    slow = _past_mean(wrench, time, SLOW)
-    count = max(1, round(AHEAD / float(np.median(np.diff(time))))) if len(time) > 1 else 1
-    fading = float(np.exp(-np.linspace(0.0, AHEAD, count, endpoint=False) / FADES).mean())
-    away = now - slow
-    explained = (1.0 - fading) * away
-    products = np.zeros((len(time), 12))
-    if (known := len(time) - count + 1) > 0:
-        total = np.cumsum(np.vstack([np.zeros(6), wrench]), axis=0)
-        coming = (total[count:] - total[:-count]) / count
-        missing = coming - (slow + fading * away)[:known]
-        products[count - 1 :] = np.hstack([missing * explained[:known], np.square(explained[:known])])
-    sums = sums_before(products, time, LEARNING)
-    drawn = count * _past_mean(np.square(explained), time, LEARNING) + 1e-300
-    return slow + np.clip((sums[:, :6] + 0.5 * drawn) / (sums[:, 6:] + drawn), 0.0, 1.0) * away
 
 
 def _past_mean(values: np.ndarray, time: np.ndarray, seconds: float) -> np.ndarray:

@@ -271,7 +271,7 @@ class Posterior(Fitted):
         model = replace(self.model, baumgarte=baumgarte)
         if self.model.held_inputs:
             check_time_step(dt)
-            u = self.model.foreseen(state_tensor("u", u, self.model.sizes[2], self.model.robot.device), dt)
+            u = self.model.foreseen(state_tensor("u", u, self.model.sizes[2], self.model.robot.device))
         samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
         method = integrator_named(integrator, model)
         require_type("grad", grad, bool)

@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -80,27 +80,6 @@ class Predictor(Summary):
         """What it predicts, and how long preparing took."""
         covariance = {"joints": self.nv, "covariance": self.kind, "device": self.device}
         return {**covariance, "prepared in": f"{self.prepare_seconds:.2g} s"}
-
-    def refreshed(self, posterior: Any) -> "Predictor":
-        """That of `posterior.update(...)` in milliseconds: the same programs with other tables.
-
-        Raises InvalidInput for other posteriors, compressed covariances, and kernels with numbers in the programs.
-        """
-        latent: Any = getattr(posterior, "latent", None)
-        same = latent and latent.kernels is self.latent.kernels and posterior.model is self.posterior.model
-        if not same or self.compressed is not None:
-            raise InvalidInput(
-                "refreshed takes what posterior.update(...) gave of the predictor's own posterior, and no compressed "
-                "covariance (covariance='none' or 'exact'); make a new one by posterior.predictor()."
-            )
-        code, made = self.code and self.code.refreshed(latent), {}
-        tables = code.tables() if code else []
-        for how, found in self._made.items():
-            if isinstance(how, str):
-                made[how] = found and found.with_tables(tables)
-            elif not how[1]:  # the mean
-                made[how] = found and [loop.with_tables(tables) for loop in found]
-        return replace(self, posterior=posterior, code=code, _made=made)
 
     @property
     def latent(self) -> LatentPosterior:

@@ -20,7 +20,7 @@ from forcegp.codegen.tracing import trace
 from forcegp.errors import InvalidInput
 from forcegp.evidence.likelihood import Standardization
 from forcegp.forces import Actuation, Law, RigidBodies, UnknownForces
-from forcegp.inference.one_input import drawn_calls, latent_calls, refreshed_calls
+from forcegp.inference.one_input import drawn_calls, latent_calls
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PADDING, CompressedCovariance, KernelSum
 from forcegp.integration.integrators import SPEED_LIMIT, check_time_step, integrator_named
@@ -354,11 +354,6 @@ class Programs:
         """What the C functions of the sums take, then for a covariance its roots."""
         found = [part.table() for part in self.sums]
         return [aligned(x) for x in found + [part.root_table() for part in self.sums if kind == "covariance"]]
-
-    def refreshed(self, latent: LatentPosterior) -> "Programs":
-        """Those of another posterior with the same kernels. Raises InvalidInput as `refreshed_calls`."""
-        given = self.traced, refreshed_calls(self.sums, latent)
-        return replace(self, latent=latent, given=given)
 
     def drawn(self, samples: int, seed: int) -> "Sequence[Programs] | None":
         """Those of each drawn function, whose texts are equal; None where one has no form in pieces."""

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from forcegp.data import Dataset
 from forcegp.errors import required_extra
-from forcegp.forces import Actuation, BaseWrench, ObservedWrench, RigidBodies, Rotor, Thrusters, Unknown
+from forcegp.forces import Actuation, AerodynamicForce, ObservedWrench, RigidBodies, Rotor, Thrusters, Unknown
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.posterior.joint_forces import joint_forces_given
 from forcegp.posterior.posterior import Posterior
@@ -171,7 +171,7 @@ def learned_forces(posterior: Posterior, dynamics: ConstrainedDynamics) -> list[
 
 def _place(term: Unknown, dynamics: ConstrainedDynamics) -> torch.Tensor:
     """World position (rows, 3) of the point at which a prior's force acts."""
-    frame = term.link(dynamics.state.robot) if isinstance(term, BaseWrench) else getattr(term, "frame", None)
+    frame = term.link(dynamics.state.robot) if isinstance(term, AerodynamicForce) else getattr(term, "frame", None)
     if frame is None:
         return dynamics.contacts[getattr(term, "contact", 0)].position(dynamics.state.kinematics)
     pose = dynamics.state.kinematics.frame_pose(frame)

@@ -1,6 +1,6 @@
 from .accuracy import unfinished_search as unfinished_search
 from .figures.model import (
-    contacts_figure as contacts_figure, curve_panels as curve_panels, friction_curves_figure as friction_curves_figure,
+    curve_panels as curve_panels, friction_curves_figure as friction_curves_figure,
     model_pictures as model_pictures, normal_force_figure as normal_force_figure,
     scores_pictures as scores_pictures,
 )

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from forcegp.data import Dataset, thruster_columns
+from forcegp.data import Dataset, thruster_columns, with_memory
 from forcegp.errors import FitError, InvalidInput
 from forcegp.evidence import Accelerations, ContactForces, Evidence, Motions, Torques, parse_evidence
 from forcegp.evidence.least_squares import correlation_time
@@ -173,7 +173,7 @@ def with_force_noise(model: Model, dataset: Dataset) -> Model:
     noise = model.noise
     if noise is None or not noise.learn or noise.force is not None or model.robot.nv == 1:
         return model
-    some = dataset.rows(slice(None, None, max(1, len(dataset) // RESIDUALS_OF_FORCES)))
+    some = with_memory(dataset, model).rows(slice(None, None, max(1, len(dataset) // RESIDUALS_OF_FORCES)))
     q, v, u, a = (torch.tensor(x, device=model.robot.device) for x in (some.q, some.v, some.u, some.a))
     dynamics = model.dynamics(q, v, u)
     residual = (a - dynamics.acceleration_map().offset)[..., None]
@@ -189,7 +189,7 @@ def allowing_for_correlation(posterior: Posterior, dataset: Dataset) -> tuple[Po
     Errors of filtered logs resemble each other over k rows, their integrated correlation time
     (`evidence.least_squares.correlation_time`). No row is left out, for friction changes within a few at a reversal.
     """
-    k, some = 1.0, dataset.rows(slice(RESIDUALS))
+    k, some = 1.0, with_memory(dataset, posterior.model).rows(slice(RESIDUALS))
     if dataset.time_ordered:
         residual = posterior.predict(some.q, some.v, some.u, covariance=False).mean.cpu().numpy() - some.a
         spread = residual.std(axis=0)

@@ -58,17 +58,12 @@ def page(scores: Scores, figures: Sequence[tuple[str, str]] = ()) -> str:
         if all(len(numbers) == len(scores.joint_names) for numbers in each.values()):
             rows = [[name, *(_cell(x, score, digits) for x in numbers)] for name, numbers in each.items()]
             by_joint.append((title, markdown_table(["model", *scores.joint_names], rows)))
-    differences = [[name, *("–" if x is None else x.numbers for x in each.values())]
-                   for name, each in scores.differences.items()]  # fmt: skip
     notes = [*scores.about.get("notes", ()), *(each for x in scores.about.get("splits", ()) for each in x["notes"])]
     return rendered(
         Path(__file__).with_name("report.md.jinja"),
         **{"source": {}, "preparation": [], "splits": [], "configuration": {}, **scores.about, "notes": notes},
         margin=MARGIN,
         taken=[[CRITERIA[name], f"**{each.model}**", each.sentence] for name, each in scores.winners.items()],
-        rival=scores.rival,
-        differences=differences,
-        criteria=[f"{words}, {'difference' if name == 'density' else 'ratio'}" for name, words in CRITERIA.items()],
         overall=markdown_table(*overall(scores)) if finished else "",
         by_joint=by_joint,
         figures=figures,

@@ -325,20 +325,6 @@ class Scores(Summary):
             raise FitError("these scores came without their models.")
         return self.fit(name)
 
-    @cached_property
-    def rival(self) -> str | None:
-        """What others must beat: the best identified model, without any the robot as given, else the best of all."""
-        kinds = (("identified",), ("given",), LEARNED)
-        return next((name for each in kinds for by in ORDER if (name := self.best_of(each, by)) is not None), None)
-
-    @cached_property
-    def differences(self) -> dict[str, dict[str, PairedDifference | None]]:
-        """Every other model against the rival, by criterion."""
-        others = [name for name in self.models if name != self.rival and self.finished(name)]
-        return {} if self.rival is None else {
-            name: {criterion: self.difference(criterion, name, self.rival) for criterion in CRITERIA} for name in others
-        }  # fmt: skip
-
     # ------------------------------------------------------------------ to show
 
     @property
@@ -385,17 +371,17 @@ class Scores(Summary):
                 for quantity, scores in self.quantities(name).items()
             }
             models[name] = {**model, "finished": len(self.finished(name)), "scores": table}
-        against = {name: {key: each and each.to_dict() for key, each in found.items()}
-                   for name, found in self.differences.items()}  # fmt: skip
         return {
             **self.about,
             "joint_names": list(self.joint_names),
             "units": dict(self.units),
             "models": models,
             "recommended": self.recommended,
-            "winners": {name: {"model": each.model, "why": each.sentence} for name, each in self.winners.items()},
-            "rival": self.rival,
-            "against_rival": against,
+            "winners": {
+                name: {"model": each.model, "why": each.sentence, "difference": pair and pair.to_dict()}
+                for name, each in self.winners.items()
+                for pair in [each.difference]
+            },
             "warnings": list(self.warnings),
             "failures": self.failures,
             "runs": {name: [dict(run) for run in runs] for name, runs in self.runs.items()},

@@ -84,14 +84,6 @@ def legend_entries(*axes: Axes) -> list[Artist]:
     return list(entries.values())
 
 
-def legend_above(figure: FigureBase, title: str, *axes: Axes, **more: Any) -> None:
-    """The entries of these axes in one row above all panels, under a bold title."""
-    handles = legend_entries(*axes)
-    more |= {"handles": handles, "ncols": max(1, len(handles)), "title": title, "alignment": "left"}
-    more |= {"title_fontproperties": {"size": LARGE, "weight": "bold"}}
-    figure.legend(loc="outside upper left", fontsize=NORMAL, frameon=False, **more)
-
-
 def legend_below(figure: FigureBase, *axes: Axes, columns: int | None = None, size: float = SMALL, **more: Any) -> None:
     """The entries of these axes below all panels, by default in one row."""
     more |= {"handles": (handles := legend_entries(*axes)), "ncols": columns or max(1, len(handles))}
