@@ -21,7 +21,7 @@ from forcegp import Dataset, Model, Robot, check
 
 pin: Any = untyped
 RATE, SECONDS, DEGREES = 200.0, 12.0, 180.0 / np.pi
-ASIDE = {"excitation", "noise", "held joint", "acceleration"}  # of the motion, not of what was planted
+ASIDE = {"excitation", "held joint", "acceleration"}  # of the motion, not of what was planted
 NAMES = ("waist", "shoulder", "elbow", "roll", "bend", "flange", "tool")
 #          axes, kinds, mass of the first link [kg], distance of joints [m]
 ROBOTS = {

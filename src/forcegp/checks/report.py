@@ -107,8 +107,7 @@ def check(dataset: Dataset, model: Model | None = None, *, preparation: Preparat
     dataset, registers = without_registers(dataset)
     inputs = CheckInput.of(dataset, model, preparation)
     doubts, comparison = _doubts(inputs, model, [*stops, *registers])
-    if inputs.prepared is not None:
-        doubts += [*excitation_doubts(inputs), *noise_doubts(inputs)]
+    doubts += excitation_doubts(inputs)
     return CheckReport(doubts=Doubts(doubts), inputs=inputs, comparison=comparison)
 
 
@@ -191,37 +190,6 @@ def _chain(names: Sequence[str]) -> Model:
         for k, name in enumerate(names)
     )
     return Model(Robot.from_urdf_text(f'<robot name="chain">{links}{joints}</robot>'))
-
-
-MUCH = 0.2  # noise relative to the spread of the signal from which a filter is worth its name
-
-
-def noise_doubts(inputs: CheckInput) -> Iterator[Doubt]:
-    """Accelerations that are not filtered, and those that are noisy although they are."""
-    if inputs.prepared is None:
-        return
-    cutoff, measured = inputs.price.get("cutoff"), inputs.price.get("acceleration_noise", {})
-    if cutoff is None or any(len(measured.get(when, ())) != len(inputs.names) for when in ("before", "after")):
-        return  # the positions show no noise worth a filter
-    before, after = (np.array(measured[when], float) for when in ("before", "after"))
-    spread = np.std(inputs.prepared.a, axis=0)
-    with np.errstate(invalid="ignore"):
-        loud, left = np.flatnonzero(before > MUCH * spread), np.flatnonzero(after > MUCH * spread)
-    # a log may hold better accelerations than differences
-    noisy = np.std(inputs.log.a, axis=0)[loud] > np.hypot(1.0, MUCH) * spread[loud]
-    if "preparation" not in inputs.log.metadata and noisy.any():
-        yield look(
-            about="noise",
-            what=f"the acceleration in this dataset is not filtered: its noise is up to "
-            f"{np.max(before[loud] / spread[loud]):.2g} times the acceleration itself.",
-            do=f"forcegp import DATA --cutoff {cutoff:.3g} --out prepared.h5 before learning from it.",
-            joints=inputs.named(loud),
-        )
-    if len(left):
-        names = inputs.named(left)
-        what = f"even filtered, noise makes up more than {100 * MUCH:.0f} % of the acceleration of {', '.join(names)}."
-        remedy = "Move faster, filter lower, or learn from torques instead of accelerations."
-        yield look(about="noise", what=what, do=remedy, joints=names)
 
 
 HYSTERESIS = 0.1  # of the root mean square velocity, beyond which a sign counts
