@@ -7,7 +7,7 @@ from tests.posterior.arm import URDF
 
 from forcegp import Robot
 from forcegp.errors import InvalidInput
-from forcegp.report import recording, shapes, still_scene
+from forcegp.report import RecordedScene, recording, shapes
 
 VISUAL = '<visual><origin xyz="{xyz}" rpy="{rpy}"/><geometry>{geometry}</geometry></visual>'
 
@@ -101,6 +101,8 @@ def test_a_box_without_size_is_drawn(tmp_path):
     trunk = URDF[URDF.index("<inertial>") : URDF.index("</inertial>")]
     path.write_text(URDF.replace('<link name="base"/>', f'<link name="base">{nothing}{trunk}</inertial></link>'))
     robot = Robot.from_urdf(path, base="floating")
-    scene = still_scene(robot, path)
-    assert not scene.doubts
+    found, doubts = shapes.link_shapes(robot, path)
+    assert not doubts
+    poses = np.tile(np.eye(4), (1, len(found), 1, 1))
+    scene = RecordedScene(robot, np.zeros(1), np.zeros((1, robot.nq)), found, poses, [], [], 1.0)
     assert "<html" in recording(scene).lower()

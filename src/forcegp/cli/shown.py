@@ -18,7 +18,7 @@ import forcegp.report
 from forcegp.cli.command import THERE, URDF, Command, unless_given
 from forcegp.cli.robot_options import RobotFileOptions
 from forcegp.cli.terminal import Terminal, columns, shown
-from forcegp.errors import InvalidInput, RobotFileWarning
+from forcegp.errors import InvalidInput, RobotFileWarning, require_known
 
 NONE = (math.inf, -math.inf)  # limits that there are not; JSON has no number for them
 
@@ -33,24 +33,26 @@ class Robot(Command):
     For example:
       forcegp robot arm.urdf
       forcegp robot dog.urdf --base floating
-      forcegp robot arm.urdf --inertias nearest --lock finger=0 --out arm.html
+      forcegp robot arm.urdf --inertias nearest --lock finger=0
       forcegp robot identified/identified.urdf --out arm.xml
     """
 
     robot: Annotated[Positional[Path], URDF, arg(metavar="FILE")]
     """The robot file."""
-    out: Annotated[Path | None, unless_given("FILE.html|xml|urdf", "no file")] = None
-    """A page with the robot in 3D, or the robot as MJCF (.xml, .mjcf) or URDF."""
+    out: Annotated[Path | None, unless_given("FILE.xml|urdf", "no file")] = None
+    """The robot as MJCF (.xml, .mjcf) or URDF."""
     reading: RobotFileOptions = RobotFileOptions()
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
-        """Read, show, and draw if asked to."""
+        """Read, show, and write if asked to."""
 
         def own(path: Path) -> bool:
             data = path.read_bytes()
-            return forcegp.report.is_page(path) or b"<mujoco" in data or b"<robot" in data
+            return b"<mujoco" in data or b"<robot" in data
 
-        self.require_free_file(self.out, own, "a page or a robot file")
+        if self.out is not None:
+            require_known("extension", self.out.suffix, "--out", (".xml", ".mjcf", ".urdf"))
+        self.require_free_file(self.out, own, "a robot file")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", RobotFileWarning)
             model = forcegp.Model.from_file(self.robot, inertias=self.reading.inertias, **self.reading.changes())
@@ -64,15 +66,9 @@ class Robot(Command):
         terminal.show(*_shown(robot, content))
         writers = {".xml": model.to_mjcf, ".mjcf": model.to_mjcf, ".urdf": robot.to_urdf}
         if self.out is not None:
-            if self.out.suffix in writers:
-                writers[self.out.suffix](self.out)
-                if model.loops and self.out.suffix == ".urdf":
-                    terminal.warn("URDF has no closed loops: the file holds the open chain.")
-            else:
-                scene = forcegp.report.still_scene(robot, self.robot)
-                drawn, title = forcegp.report.recording(scene), f"{robot.nv} joints"
-                page = forcegp.report.Page(robot.name, title, scene=drawn, scene_notes=scene.doubts)
-                forcegp.report.write_page(self.out, page)
+            writers[self.out.suffix](self.out)
+            if model.loops and self.out.suffix == ".urdf":
+                terminal.warn("URDF has no closed loops: the file holds the open chain.")
             content["written"] = str(self.out)
             terminal.note(f"wrote {self.out}")
         return content

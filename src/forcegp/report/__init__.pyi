@@ -1,6 +1,5 @@
 from .motion import (
     Arrows as Arrows, RecordedScene as RecordedScene, recorded_scene as recorded_scene, recording as recording,
-    still_scene as still_scene,
 )
 from .page import (
     Page as Page, Table as Table, is_page as is_page, write_page as write_page,

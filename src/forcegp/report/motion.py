@@ -124,16 +124,6 @@ def recorded_scene(
     return RecordedScene(model.robot, time, rows.q, drawn, poses, arrows, paths, reach(model.robot), doubts)
 
 
-def still_scene(robot: Robot, urdf: str | Path | None = None) -> RecordedScene:
-    """The robot at rest, as `link_shapes` draws it: at zero, or where limits exclude that, at the nearest limit."""
-    limits = np.array([(joint.lower, joint.upper) for joint in robot.joints])
-    step = torch.tensor(np.clip(np.zeros(robot.nv), limits[:, 0], limits[:, 1]))
-    q = robot.integrate(robot.neutral(), step)[None]
-    shapes, doubts = link_shapes(robot, urdf)
-    poses = poses_of_links(robot, q, [shape.link for shape in shapes])
-    return RecordedScene(robot, np.zeros(1), q.numpy(), shapes, poses, [], [], reach(robot), doubts)
-
-
 def learned_forces(posterior: Posterior, dynamics: ConstrainedDynamics) -> list[Arrows]:
     """What the model found at these states: joint forces, with the laws of its system, point and contact forces."""
     prior, robot = posterior.trained.unknown, posterior.model.robot
