@@ -1,4 +1,4 @@
-"""What people look at: one HTML file with the robot in motion, and the same live in a browser."""
+"""What people look at: one HTML file with the robot in motion."""
 
 import lazy_loader as lazy
 

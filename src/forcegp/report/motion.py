@@ -89,39 +89,28 @@ class RecordedScene:
 
 
 def recorded_scene(
-    dataset: Dataset,
-    posterior: Posterior | None = None,
-    *,
-    start: float = 0.0,
-    seconds: float = 10.0,
-    shapes: str | Path | None = None,
+    dataset: Dataset, posterior: Posterior, *, seconds: float = 10.0, shapes: str | Path | None = None
 ) -> RecordedScene:
-    """The motion of the first episode from `start` s on for `seconds`, at no more than 30 frames per second.
+    """The motion of the first `seconds` of the first episode, at no more than 30 frames per second.
 
-    Forces are those of the posterior: each of its priors by itself, and the friction laws of its system. Without one,
-    the recorded u. `shapes` is a URDF with visual elements (`link_shapes`).
+    Forces are those of the posterior: each of its priors by itself, and the friction laws of its system. `shapes` is a
+    URDF with visual elements (`link_shapes`).
 
-    Raises InvalidInput for a Dataset without rows in that time, MissingExtra without trimesh.
+    Raises MissingExtra without trimesh.
     """
-    model = dataset.model if posterior is None else posterior.model
-    rows = style.window(dataset, start, seconds)
+    robot, rows = posterior.model.robot, style.window(dataset, 0.0, seconds)
     first, last = rows.time[[0, -1]]
     steps = int(np.clip((last - first) * FRAMES_PER_SECOND, 1, min(MOST_FRAMES, len(rows) - 1) or 1))
     grid = np.linspace(first, last, steps + 1)
     rows = rows.rows(np.unique(np.searchsorted(rows.time, grid - 1e-9).clip(0, len(rows) - 1)))
     q, v, u = (torch.tensor(values) for values in (rows.q, rows.v, rows.u))
-    drawn, doubts = link_shapes(model.robot, shapes)
+    drawn, doubts = link_shapes(robot, shapes)
     with torch.no_grad():
-        if isinstance(posterior, Posterior):
-            dynamics = posterior.dynamics(q, v, u)
-            arrows = learned_forces(posterior, dynamics)
-        else:
-            dynamics = model.dynamics(q, v, u)
-            arrows = [_at_joints(model.robot, dynamics, "recorded u", dynamics.state.delivered, None)]
+        dynamics = posterior.dynamics(q, v, u)
+        arrows = learned_forces(posterior, dynamics)
         paths = [contact.position(dynamics.state.kinematics).cpu().numpy() for contact in dynamics.contacts]
-    poses = poses_of_links(model.robot, q, [shape.link for shape in drawn])
-    time = rows.time - rows.time[0]
-    return RecordedScene(model.robot, time, rows.q, drawn, poses, arrows, paths, reach(model.robot), doubts)
+    poses = poses_of_links(robot, q, [shape.link for shape in drawn])
+    return RecordedScene(robot, rows.time - rows.time[0], rows.q, drawn, poses, arrows, paths, reach(robot), doubts)
 
 
 def learned_forces(posterior: Posterior, dynamics: ConstrainedDynamics) -> list[Arrows]:
