@@ -127,7 +127,7 @@ def test_a_gear_reflects_inertia_damping_and_friction():
     )
     robot = Robot.from_urdf_text(spun + rotor + "</robot>")
     assert robot.joint_names == ("hinge",)
-    assert robot.link("rotor").joint == "gear"
+    assert robot.layout.bodies[robot.frame("rotor")[0]].name == "gear"
     assert robot.mass_matrix(torch.zeros(1).double()).item() == pytest.approx(0.1 + 400 * 0.01)
     assert (robot.joint("hinge").damping, robot.joint("hinge").friction) == pytest.approx((80.0, 10.0))
 

@@ -72,7 +72,8 @@ class Robot(Command):
 
 
 def _content(robot: forcegp.Robot) -> dict[str, Any]:
-    links = [robot.link(name) for name in robot.link_names]
+    masses, layout = {name: robot.link(name).mass for name in robot.link_names}, robot.layout
+    moved_by = {name: layout.bodies[layout.links[name].body].name for name in layout.moving}
     joints = [asdict(joint) | {"armature": x} for joint, x in zip(robot.joints, robot.armature.tolist(), strict=True)]
     for joint in joints:  # places are those of the file; what mimics stands below
         del joint["origin"], joint["mimics"]
@@ -84,11 +85,11 @@ def _content(robot: forcegp.Robot) -> dict[str, Any]:
     return {
         "name": robot.name,
         "base": robot.base,
-        "moving_mass": sum(link.mass for link in links if link.joint is not None),
+        "moving_mass": sum(masses[name] for name in layout.moving),
         "joints": [{name: None if value in NONE else value for name, value in joint.items()} for joint in joints],
         "mimics": mimics,
         "locked": robot.locked,
-        "links": [{"name": link.name, "mass": link.mass, "joint": link.joint} for link in links],
+        "links": [{"name": name, "mass": mass, "joint": moved_by.get(name)} for name, mass in masses.items()],
     }
 
 

@@ -294,8 +294,7 @@ def contact_points(robot: Robot) -> list[tuple[str, Float[Tensor, "3"]]]:
         ends = [origin[:3, 3] for origin, parent in zip(layout.origins, layout.parents, strict=True) if parent == body]
         ends += [placed.offset[:3, 3] for placed in layout.links.values() if placed.body == body]
         turn = layout.links[joint.child].offset[:3, :3]
-        inertial = robot.description.links[joint.child]
-        centre = [] if inertial is None else [np.asarray(inertial.center_of_mass)]
-        end = torch.from_numpy(max([turn.T @ end for end in ends] + centre, key=np.linalg.norm))
+        ends = [*(turn.T @ end for end in ends), robot.link(joint.child).center_of_mass]
+        end = torch.from_numpy(max(ends, key=np.linalg.norm))
         points += [(joint.child, end * k / (PLACES - 1)) for k in range(PLACES if bool(end.any()) else 1)]
     return points

@@ -264,9 +264,8 @@ def thickened(robot: Robot) -> tuple[Robot, tuple[str, ...]]:
         links = [name for name, place in robot.layout.links.items() if place.body == body]
         heaviest = max(links, key=lambda name: robot.link(name).mass)
         link = robot.link(heaviest)
-        inertia = np.array(link.inertia) + 2.0 * THICKNESS**2 * size * np.eye(3)  # of the isotropic second moment
-        center = np.array(link.center_of_mass)
-        text = replace_inertial(text, heaviest, link.mass, center, inertia, source=robot.source)
+        inertia = link.inertia + 2.0 * THICKNESS**2 * size * np.eye(3)  # of the isotropic second moment
+        text = replace_inertial(text, heaviest, link.mass, link.center_of_mass, inertia, source=robot.source)
         changed.append(heaviest if heaviest == joint.child else f"{heaviest} (of {joint.child})")
     return (robot.with_text(text) if changed else robot), tuple(changed)
 
@@ -291,14 +290,14 @@ def with_bodies(robot: Robot, wanted: Mapping[int, Float[np.ndarray, "4 4"]]) ->
     text = robot.urdf_text
     for name, placement in robot.layout.links.items():
         link, body = robot.link(name), placement.body
-        if link.joint is None or link.mass == 0.0 or body not in change:
+        if link.mass == 0.0 or body not in change:
             continue
         offset = np.linalg.inv(robot.layout.child_frames[body]) @ placement.offset
         there = np.linalg.inv(offset) @ change[body] @ offset
         # a congruence by [[A, t], [0, s]] moves the moments about the centre of mass by A alone: no cancellation
-        own_moments = pseudo_inertia(link.mass, np.zeros(3), np.array(link.inertia))[:3, :3]
+        own_moments = pseudo_inertia(link.mass, np.zeros(3), link.inertia)[:3, :3]
         A, shift, scale = there[:3, :3], there[:3, 3], there[3, 3]
-        center = (A @ np.array(link.center_of_mass) + shift) / scale
+        center = (A @ link.center_of_mass + shift) / scale
         second = A @ own_moments @ A.T
         inertia = np.trace(second) * np.eye(3) - second
         text = replace_inertial(text, name, link.mass * scale**2, center, inertia, source=robot.source)

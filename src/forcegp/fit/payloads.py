@@ -51,7 +51,7 @@ def with_payloads_placed(model: Model, logs: Sequence[Dataset]) -> Model:
     if len(open_ones) > 1:
         raise InvalidInput("forces list two payloads without a link, which no log tells apart; name their links.")
     named = [law.link for law in unknown if law.link is not None]
-    bodies = [model.robot.layout.links[model.robot.link(link).name].body for link in named]
+    bodies = [model.robot.frame(link)[0] for link in named]
     if len(set(bodies)) < len(bodies):
         raise InvalidInput(
             f"forces list two payloads on one body ({', '.join(named)}), which no log tells apart; leave one out."

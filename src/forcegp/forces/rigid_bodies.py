@@ -49,7 +49,7 @@ class RigidBodies(Law):
             return self
         bodies = given if isinstance(given, Mapping) else dict.fromkeys(given, Body())
         for link, body in bodies.items():
-            if robot.layout.links[robot.link(link).name].body < 0:
+            if robot.frame(link)[0] < 0:
                 raise InvalidInput(f"link {link!r} does not move, so nothing on it shows; give a moving one.")
             if not isinstance(body, Body):
                 raise InvalidInput(f"RigidBodies learn {link!r} is {body!r}; give Body(strength).")
@@ -118,7 +118,7 @@ class Payload(Law):
 
     @override
     def bound_to(self, robot: Robot) -> "Payload":
-        if self.link is not None and robot.layout.links[robot.link(self.link).name].body < 0:
+        if self.link is not None and robot.frame(self.link)[0] < 0:
             raise InvalidInput(f"link {self.link!r} does not move, so nothing on it shows; give a moving one.")
         return self
 
@@ -151,7 +151,7 @@ def carrying(robot: Robot, payloads: Iterable[Payload]) -> Robot:
     for payload in payloads:
         if payload.link is not None and payload.known:
             held = robot.link(payload.link)
-            own = pseudo_inertia(held.mass, np.array(held.center_of_mass), np.array(held.inertia))
+            own = pseudo_inertia(held.mass, held.center_of_mass, held.inertia)
             parts = physical_of_pseudo_inertia(own + payload.pseudo_inertia)
             robot = robot.with_text(replace_inertial(robot.urdf_text, payload.link, *parts, source=robot.source))
     return robot

@@ -167,7 +167,7 @@ def _capsules(robot: Robot) -> dict[str, Any]:
         ends[joint.parent].append(joint.origin[:3, 3])
     out = {}
     for name, places in ends.items():
-        center = np.array(robot.link(name).center_of_mass)
+        center = robot.link(name).center_of_mass
         if not places and robot.link(name).mass > 0.0:
             places = [2.0 * center]
         parts = [_capsule(radius, place) for place in places if np.linalg.norm(place) > SHORTEST]

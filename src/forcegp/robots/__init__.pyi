@@ -1,5 +1,4 @@
 from .arguments import usable_device as usable_device
 from .kinematics import Kinematics as Kinematics
-from .urdf import Joint as Joint
-from .structure import Link as Link
+from .urdf import Joint as Joint, Link as Link
 from .robot import Robot as Robot

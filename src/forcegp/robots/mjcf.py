@@ -134,7 +134,7 @@ class MjcfWriter:
         named = {joint.name for joint in robot.description.joints}
         if BASE in self.groups and BASE not in named:
             self._chain(free_joint(BASE, OUTSIDE, root), np.eye(4), 2)
-        elif root == "world" and not self._mass(root):
+        elif root == "world" and not robot.link(root).mass:
             self.lines += [f"    {site}" for site in self.sites.get(root, ())]
             self._below(root, 2)
         else:
@@ -154,17 +154,13 @@ class MjcfWriter:
             ]
         )
 
-    def _mass(self, link: str) -> float:
-        inertial = self.robot.description.links[link]
-        return inertial.mass if inertial else 0.0
-
     def _body(self, link: str, pose: np.ndarray, joints: Sequence[tuple[Joint, np.ndarray]], depth: int) -> None:
         """One body with its joints, which have poses in its frame, and what hangs on it."""
         space = "  " * depth
         self.lines.append(f"{space}<body name={quoteattr(link)}{_placed(pose)}>")
         self.lines += [f"{space}  {_jointed(joint, at)}" for joint, at in joints]
-        inertial = self.robot.description.links[link]
-        if inertial is not None and inertial.mass > 0.0:
+        inertial = self.robot.link(link)
+        if inertial.mass > 0.0:
             self.lines.append(f"{space}  {_inertial(inertial.mass, inertial.center_of_mass, inertial.inertia)}")
         self.lines += [f"{space}  {site}" for site in self.sites.get(link, ())]
         self._below(link, depth + 1)
@@ -180,7 +176,7 @@ class MjcfWriter:
             self._body(joint.child, pose @ joint_motion(joint, self.held.get(joint.name, 0.0)), [], depth)
             return
         joints = [(joint, np.eye(4))]
-        while not any(self._mass(name) > 0.0 for name in self._rigid(joint.child)):
+        while not any(self.robot.link(name).mass > 0.0 for name in self._rigid(joint.child)):
             below = self._next(joint.child)
             if len(below) != 1 or joint.type == "floating":
                 raise RobotModelError(

@@ -16,7 +16,7 @@ from forcegp.robots.arguments import JointValues, Positions, Vector, checked_ten
 from forcegp.robots.inertia import axis_inertia_vanishes, pseudo_inertia, skew, turns_with_inertia
 from forcegp.robots.layout import BASE, WORLD, BaseChoice, Layout
 from forcegp.robots.manifold import ConfigurationSpace, Group, pose
-from forcegp.robots.urdf import InertialDescription, Joint, RobotDescription
+from forcegp.robots.urdf import Joint, Link, RobotDescription
 from forcegp.summary import Summary, listed
 
 
@@ -140,7 +140,7 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
     )
 
 
-MASSLESS = InertialDescription(0.0, np.zeros(3), np.zeros((3, 3)))
+MASSLESS = Link(0.0, np.zeros(3), np.zeros((3, 3)))
 DOWN = ("down_x", "down_y", "down_z")
 
 
@@ -182,17 +182,6 @@ class RigidBodyDynamics(ABC):
     ) -> tuple[Float[Tensor, "... 4 4"], Float[Tensor, "... 6 nv"], Float[Tensor, "... 6"]]:
         """Pose of a ``frame``, and Jacobian and ``Jdot v`` of a ``point`` (3,) fixed in it (m), as of `Kinematics`."""
         return self._dynamics("frame_motion", q, v, frame, point)
-
-
-@dataclass(frozen=True)
-class Link:
-    """A link with the inertia that the URDF gives it; ``joint`` moves it (None: fixed in the world)."""
-
-    name: str
-    joint: str | None
-    mass: float  # kg; 0 for a massless frame
-    center_of_mass: tuple[float, float, float]  # m, in the link frame
-    inertia: tuple[tuple[float, float, float], ...]  # kg m^2 about the centre of mass, in the axes of the link frame
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -309,13 +298,9 @@ class RobotStructure(Summary):
         return sum(self.link(name).mass for name in self.link_names)
 
     def link(self, name: str) -> Link:
-        """One link by name."""
+        """One link by name; one that is a mere frame has mass 0."""
         require_known("link", name, self.name, self.layout.links, UnknownName)
-        body = self.layout.links[name].body
-        joint = None if body == WORLD else self.layout.bodies[body].name
-        inertial = self.description.links[name] or MASSLESS
-        rows = tuple(tuple(row) for row in inertial.inertia.tolist())
-        return Link(name, joint, inertial.mass, tuple(inertial.center_of_mass.tolist()), rows)
+        return self.description.links[name] or MASSLESS
 
     def joint(self, name: str) -> Joint:
         """One movable joint by name."""

@@ -75,7 +75,7 @@ MOVABLE = ("revolute", "continuous", "prismatic")
 
 
 @dataclass(frozen=True)
-class InertialDescription:
+class Link:
     """Mass (kg), centre of mass (m), inertia about it (kg m^2; NaN if not given), in the axes of the link frame."""
 
     mass: float
@@ -127,7 +127,7 @@ class RobotDescription:
 
     name: str
     source: str
-    links: dict[str, InertialDescription | None]
+    links: dict[str, Link | None]
     joints: tuple[Joint, ...]
     complete: bool = True
     """Whether every joint of the file could be read."""
@@ -145,7 +145,7 @@ def parse_urdf(text: str, problems: Problems) -> RobotDescription:
         problems.note("a <robot> without a name is called 'robot'", "<robot>")
     named, parts = (_named(element, kind, problems) for kind in ("link", "joint"))
     problems.raise_all()  # nothing can be said of what has no name
-    links: dict[str, InertialDescription | None] = dict.fromkeys(named)
+    links: dict[str, Link | None] = dict.fromkeys(named)
     for link, part in named.items():
         with problems.collected(link):
             links[link] = _inertial(_Part(part, f"link {link!r}", problems))
@@ -253,7 +253,7 @@ class _Part:
         return transform(rotation_from_rpy(rpy), xyz)
 
 
-def _inertial(link: _Part) -> InertialDescription | None:
+def _inertial(link: _Part) -> Link | None:
     element = link.child("inertial")
     text = element.child("mass").get("value")
     if element.element is None:
@@ -278,10 +278,10 @@ def _inertial(link: _Part) -> InertialDescription | None:
     origin = element.origin()
     if not np.array_equal(origin[:3, :3], np.eye(3)):
         moments = origin[:3, :3] @ moments @ origin[:3, :3].T
-    return InertialDescription(mass, origin[:3, 3], 0.5 * (moments + moments.T))
+    return Link(mass, origin[:3, 3], 0.5 * (moments + moments.T))
 
 
-def _joint(at: _Part, name: str, links: dict[str, InertialDescription | None]) -> Joint:
+def _joint(at: _Part, name: str, links: dict[str, Link | None]) -> Joint:
     kind, kinds = at.text("type"), (*MOVABLE, "fixed", "floating")
     if kind not in kinds:
         close = difflib.get_close_matches(kind, kinds, n=1)

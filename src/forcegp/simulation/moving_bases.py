@@ -65,7 +65,7 @@ def _loaded(robot: Robot, payload: float) -> Robot:
         return robot
     trunk = robot.link("trunk")
     size = payload / 12.0 * np.diag([0.1**2 + 0.1**2, 0.2**2 + 0.1**2, 0.2**2 + 0.1**2])
-    total = pseudo_inertia(trunk.mass, np.array(trunk.center_of_mass), np.array(trunk.inertia))
+    total = pseudo_inertia(trunk.mass, trunk.center_of_mass, trunk.inertia)
     total = total + pseudo_inertia(payload, np.array(PLACE), size)
     return robot.with_link("trunk", *physical_of_pseudo_inertia(total))
 
@@ -212,7 +212,7 @@ def _flight(robot: Robot, config: QuadrotorConfig, episode: int, steps: int) -> 
     """q, v, u, a and the wind of each row; u holds from its row to the next."""
     rng, dt = np.random.default_rng([config.seed, episode]), 1.0 / (RATE * FINE)
     body = robot.link("body")
-    mass, inertia, gravity = body.mass, np.array(body.inertia), robot.gravity.numpy()
+    mass, inertia, gravity = body.mass, body.inertia, robot.gravity.numpy()
     amplitude = PATH_SIZE * rng.uniform(0.3, 0.65, (2, 3))
     rate, phase = rng.uniform(*PATH_RATES, (2, 3)), rng.uniform(0.0, 2.0 * np.pi, (2, 3))
     turn = rng.uniform(0.2, 0.6), rng.uniform(0.0, 2.0 * np.pi)
