@@ -12,7 +12,7 @@ from forcegp import Model, Robot
 from forcegp.cli.main import parse_arguments
 from forcegp.errors import InvalidInput
 from forcegp.recordings import ColumnMapping, by_quantity, listed, open_source
-from forcegp.recordings.mapping import combined, expanded, guessed_columns, guessed_time, log_unit, parse_expression
+from forcegp.recordings.mapping import expanded, guessed_columns, guessed_time, log_unit, parse_expression
 from forcegp.recordings.signal_plan import signal_plan
 
 COLUMNS = ("theta1", "theta2", "theta", "a-b", "a", "b", "/js:position.j1", "x[0]", "1e3")
@@ -104,7 +104,7 @@ def test_patterns(pattern, names):
     ],
 )
 def test_braces_of_a_combination_go_on_together(pattern, texts):
-    assert combined(pattern, JOINTS, {"a-1-1"}) == texts
+    assert expanded(pattern, JOINTS, {"a-1-1"}) == texts
 
 
 @pytest.mark.parametrize("pattern", ["a{1..}", "a{", "a}", "a{b}", "a{}", "a{1..99999}", "{0..99}{0..99}"])

@@ -8,8 +8,9 @@ import ast
 import math
 import operator
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from itertools import product
 from numbers import Real
 from typing import Any
 
@@ -226,36 +227,28 @@ LONGEST_LIST = 4096
 JOINTS = "joints"
 
 
-def expanded(pattern: str, joints: Sequence[str]) -> list[str]:
+def expanded(pattern: str, joints: Sequence[str], names: Collection[str] = ()) -> list[str]:
     """Every text that a pattern stands for, in order; the braces furthest left change slowest.
 
     `{1..7}` counts (`{01..12}` with leading zeros, `{7..1}` downwards), `{a,b}` lists, `{joints}` is every joint name.
+    In a combination of columns, whose `names` are known, braces of equal length go on together.
     Raises InvalidInput for other braces, and for lists longer than 4096.
     """
-    found = BRACES.search(pattern)
-    if found is None:
-        if "{" in pattern or "}" in pattern:
-            raise InvalidInput(f"{pattern!r} has a brace without its partner; write for example pos{{1..7}}.")
-        return [pattern]
-    before, after = pattern[: found.start()], pattern[found.end() :]
-    rests = expanded(after, joints)
-    texts = [before + choice + rest for choice in _choices(pattern, found[1], joints) for rest in rests]
-    if len(texts) > LONGEST_LIST:
-        raise InvalidInput(f"{pattern!r} stands for more than {LONGEST_LIST} columns.")
-    return texts
-
-
-def combined(pattern: str, joints: Sequence[str], names: Collection[str]) -> list[str]:
-    """As `expanded`; in a combination of columns, whose `names` are known, braces of equal length go on together."""
     before, *others = BRACES.split(pattern)
     inside, after = others[::2], others[1::2]
+    if any(brace in text for text in (before, *after) for brace in "{}"):
+        raise InvalidInput(f"{pattern!r} has a brace without its partner; write for example pos{{1..7}}.")
     choices = [_choices(pattern, each, joints) for each in inside]
+
+    def written(rows: Iterable[Sequence[str]]) -> list[str]:
+        return [before + "".join(choice + text for choice, text in zip(row, after, strict=True)) for row in rows]
+
     joined = len(inside) > 1 and all(re.search(r"[-+*/()]", text) for text in after[:-1])
-    if not joined or len(set(map(len, choices))) > 1:
-        return expanded(pattern, joints)
-    rows = zip(*choices, strict=True)
-    texts = [before + "".join(choice + text for choice, text in zip(row, after, strict=True)) for row in rows]
-    return expanded(pattern, joints) if texts[0] in names else texts
+    if joined and len(set(map(len, choices))) == 1 and (texts := written(zip(*choices, strict=True)))[0] not in names:
+        return texts
+    if math.prod(map(len, choices)) > LONGEST_LIST:
+        raise InvalidInput(f"{pattern!r} stands for more than {LONGEST_LIST} columns.")
+    return written(product(*choices))
 
 
 COMMA = re.compile(r",(?![^{\[]*[}\]])(?=(?:[^`]*`[^`]*`)*[^`]*$)")

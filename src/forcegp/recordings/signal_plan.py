@@ -21,7 +21,7 @@ from forcegp.recordings.mapping import (
     ColumnMapping,
     Expression,
     LogUnit,
-    combined,
+    expanded,
     guessed_columns,
     guessed_time,
     log_unit,
@@ -254,7 +254,7 @@ def _expressions(patterns: Sequence[str], joints: Sequence[str], source: Source,
     names: list[str] = []
     columns, vectors = source.columns(), source.vectors
     for pattern in patterns:
-        for text in combined(pattern, joints, {*columns, *vectors}):
+        for text in expanded(pattern, joints, {*columns, *vectors}):
             by_name = [f"{text}.{joint}" for joint in joints]  # messages may list the joints in another order
             known = text not in columns and joints and set(by_name) <= set(vectors.get(text, ()))
             names += [text] if text in columns else by_name if known else vectors.get(text, (text,))
