@@ -206,7 +206,7 @@ FAULTS: dict[str, tuple[str, tuple[Fault, ...]]] = {
     "wrapped": ("registers", (registers(True),)),
     "targets": ("targets", (shifted("q", -20),)),
     "no torque": ("constant channel", (times("u", lambda _: 0.0),)),
-    "no torque of one": ("dead torque|constant channel", (times("u", one(0.0)),)),
+    "no torque of one": ("constant channel", (times("u", one(0.0)),)),
     "degrees": ("degrees", (DEG,)),
     "degrees, v rad/s": ("velocity|degrees|jumps", (times("q", turns(DEGREES)),)),
     "turns": ("turns|degrees", (times("qv", turns(0.5 / np.pi)),)),

@@ -257,7 +257,7 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "saturation": (lambda d: column(d, "u", 0, lambda x: np.clip(x, *np.quantile(x, [0.1, 0.9]))), "saturation"),
     "encoder zero off by .4": (lambda d: replace(d, q=d.q + np.array([0.0, 0.4])), "zero"),
     "frozen torque": (lambda d: column(d, "u", 0, held), "frozen"),
-    "torque channel dead": (lambda d: column(d, "u", 1, lambda x: 0 * x), "dead torque|constant"),
+    "torque channel dead": (lambda d: column(d, "u", 1, lambda x: 0 * x), "constant channel"),
     "registers of sign and magnitude": (lambda d: column(d, "u", 0, registers), "register"),
     "targets of the controller": (lambda d: replace(d, u=np.roll(d.q, -9, axis=0)), "targets"),
     "no torque": (lambda d: replace(d, u=0.0 * d.u), "no torque was measured"),

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import brentq
 from tests.checks.logs import RATE, arm, clean, column, pendulum
 
 from forcegp.checks import CheckReport, check, without_stops
@@ -13,6 +14,7 @@ from forcegp.data import Dataset, Preparation
 from forcegp.errors import InvalidInput
 from forcegp.forces import Coulomb
 from forcegp.mechanics import fixed_point
+from forcegp.model import Model
 
 SYSTEMS = {"arm": arm, "pendulum": pendulum}
 
@@ -103,6 +105,27 @@ def test_switches_of_a_foot_that_lifts_are_no_lost_rows():
     lost[25::100, 1] = 0.0
     (found,) = check(replace(lifted, u=lost)).doubts.of("drop-outs")
     assert found.joints == ("lift",)
+
+
+@pytest.mark.parametrize(("share", "level"), [(0.07, "look"), (0.14, "wrong")])
+def test_a_dead_torque_is_wrong_where_the_motion_needs_a_share_of_the_others(share, level):
+    data = clean(4, pendulum(), noise=0.0)
+    q, v, a = (torch.tensor(x) for x in (data.q, data.v, data.a))
+    lower = pendulum().robot.link("lower")
+
+    def lighter(scale):
+        robot = pendulum().robot.with_link("lower", scale * lower.mass, lower.center_of_mass, scale * lower.inertia)
+        return robot, robot.inverse_dynamics(q, v, a).numpy()
+
+    def above(scale):
+        needed = lighter(scale)[1].std(axis=0)
+        return needed[1] / needed[0] - share
+
+    robot, u = lighter(brentq(above, 1e-3, 10.0))
+    (found,) = check(column(replace(data, u=u, model=Model(robot)), "u", 1, np.zeros_like)).doubts.of(
+        "constant channel"
+    )
+    assert (found.level, found.joints) == (level, ("elbow",))
 
 
 def test_repeated_rows_are_told():

@@ -35,7 +35,7 @@ from forcegp.summary import Summary, plain
 
 BEFORE_A_FIT = frozenset(
     ("contact", "velocity", "acceleration", "delay", "torque unit", "torque constant", "masses", "lengths",
-     "joint zero", "gravity", "dead torque", "stop")
+     "joint zero", "gravity", "stop")
 )  # fmt: skip
 """Subjects that a fit reports also where a person should judge."""
 

@@ -21,6 +21,7 @@ ROUNDING = 1e-12  # of the largest value of any joint
 HELD_STEPS = 0.5  # share of equal successive values from which on a signal moves in steps, such as a held command
 FROZEN_SECONDS = 0.1
 FROZEN_ROWS = 10
+NEEDED = 0.1  # of the largest torque of the joints that have one: less is that of a wrong mass
 PASSIVE = 0.5  # of the inertial torque: a mechanism that swings by itself needs less
 MOVES = 0.2  # of its root mean square speed, above which a joint moves
 CLIPPED_RATIO = 8.0  # rows at the extreme value over rows in the next thousandth of the range: a smooth peak has 2.4
@@ -151,20 +152,24 @@ def _constant(inputs: CheckInput) -> Iterator[Doubt]:
             remedy = "Right for a passive mechanism; else the torque columns are missing."
         if passive and all_of_them:
             seen = "no torque was measured (every u is 0)."
-        driven = all_of_them and _driven(inputs)
+        driven = (name == "u" or all_of_them) and _driven(inputs, dead)
         calm = (passive or all_of_them) and not driven
         level: Level = "look" if calm or rests[dead].all() else "wrong"
         told = {"about": "constant channel", "what": seen, "do": remedy, "joints": names}
         yield Doubt(level=level, **told, numbers={"quantity": name})
 
 
-def _driven(inputs: CheckInput) -> bool:
-    """Whether the motion needs torques, unlike that of a mechanism that swings by itself."""
+def _driven(inputs: CheckInput, dead: np.ndarray) -> bool:
+    """Whether the motion needs torques at these joints, unlike that of a mechanism that swings by itself."""
     if inputs.compared is None or inputs.contacts:
         return False
     rows = inputs.rows()
-    needed, fixed = needed_torques(inputs.robot, rows), needed_torques(inputs.robot, replace(rows, a=0.0 * rows.a))
-    return bool((np.std(needed, axis=0) > PASSIVE * np.std(needed - fixed, axis=0)).any())
+    needed = needed_torques(inputs.robot, rows)
+    size = np.std(needed, axis=0)
+    if len(dead) < len(size):
+        return bool((size[dead] > NEEDED * np.delete(size, dead).max()).any())
+    fixed = needed_torques(inputs.robot, replace(rows, a=0.0 * rows.a))
+    return bool((size > PASSIVE * np.std(needed - fixed, axis=0)).any())
 
 
 def _still(log: Dataset, name: str) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Doubts of torques beside those of the search: dead channels, drift, delay, stops."""
+"""Doubts of torques beside those of the search: drift, delay, stops."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -24,23 +24,8 @@ RESTS = 0.05  # share of what the joints alone would move a point by, below whic
 
 
 def torque_doubts(inputs: CheckInput, found: Explanation) -> list[Doubt]:
-    """Dead torques, friction that drifts, and delay, of a log whose errors were corrected."""
-    return [*_passive(inputs, found.log), *_drift(found), *_delays(inputs, found.log)]
-
-
-def _passive(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
-    """Joints whose torque is zero throughout although the motion needs one."""
-    moves, needed = np.ptp(log.rows.u, axis=0) > 0.0, np.std(log.tau, axis=0)
-    dead = (np.ptp(inputs.log.u, axis=0) == 0.0) & (needed > 0.1 * needed[moves].max(initial=0.0))
-    for joint in np.flatnonzero(dead) if moves.any() else ():
-        yield wrong(
-            about="dead torque",
-            what=f"the torque of {inputs.names[joint]} is {log.rows.u[0, joint]:.4g} in every row, but the motion "
-            f"needs one of {needed[joint]:.3g} {'Nm' if inputs.rotates[joint] else 'N'} rms.",
-            do="The channel is dead, unless the joint has no motor and the URDF is wrong.",
-            joints=(inputs.names[joint],),
-            numbers={"needed": float(needed[joint])},
-        )
+    """Friction that drifts, and delay, of a log whose errors were corrected."""
+    return [*_drift(found), *_delays(inputs, found.log)]
 
 
 def _drift(found: Explanation) -> Iterator[Doubt]:
