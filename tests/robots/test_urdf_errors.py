@@ -65,7 +65,7 @@ WRONG = {
     "misspelt type": (
         changed('"revolute"', '"revolut"'),
         errors.RobotModelError,
-        ["joint 'hinge'", "'revolut'", "Did you mean 'revolute'"],
+        ["joint 'hinge'", "'revolut'", "did you mean 'revolute'"],
     ),
     "floating inside": (
         with_joint("swing", "arm", "tool", '<link name="tool"/>').replace('"fixed"', '"floating"'),

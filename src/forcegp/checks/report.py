@@ -192,40 +192,25 @@ def _chain(names: Sequence[str]) -> Model:
     return Model(Robot.from_urdf_text(f'<robot name="chain">{links}{joints}</robot>'))
 
 
-HYSTERESIS = 0.1  # of the root mean square velocity, beyond which a sign counts
-FEWEST_CHANGES = 2
 HELD = 0.02  # range of a joint in one stretch, relative to its largest, below which it was held there
-STILL = {True: 0.02, False: 0.002}  # range in rad or m below which a joint does not move
+STILL = 0.02, 0.002  # range in rad or m below which a joint does not move
 
 
 def excitation_doubts(inputs: CheckInput) -> Iterator[Doubt]:
-    """Joints that hardly move or never turn back."""
+    """Joints that hardly move."""
     if inputs.prepared is None:
         return
-    rows = inputs.prepared
-    still, one_way, motions = [], [], []
-    for joint, name in enumerate(inputs.names):
-        v = rows.v[:, joint]
-        size = float(np.sqrt(np.square(v).mean()))
-        signs = np.sign(v[np.abs(v) > HYSTERESIS * size])
-        changes = int((np.diff(signs) != 0).sum())
-        span = float(np.ptp(rows.q[:, joint]))
-        motions.append({"joint": name, "range": span, "rms_velocity": size, "sign_changes": changes})
-        if span < STILL[bool(inputs.rotates[joint])]:
-            still.append(name)
-        elif changes < FEWEST_CHANGES:
-            one_way.append(name)
-    whose = "its" if len(still) == 1 else "their"
-    idle = f"moved less than 0.02 rad (2 mm): {whose} friction and inertia do not show."
-    turned = "changed direction less than twice: friction of both directions cannot be separated from gravity."
-    for joints, what, remedy in (
-        (still, idle, "Move every joint that is to be learned, or lock it in the robot (`locked`)."),
-        (one_way, turned, "Record motion to and fro."),
-    ):
-        if joints:
-            numbers = {"joints": motions, "still": still}
-            said = f"{listed(joints)} {what}"
-            yield look(about="excitation", what=said, do=remedy, joints=tuple(joints), numbers=numbers)
+    spans = np.ptp(inputs.prepared.q, axis=0)
+    still = [*inputs.named(np.flatnonzero(spans < np.where(inputs.rotates, *STILL)))]
+    if still:
+        whose = "its" if len(still) == 1 else "their"
+        yield look(
+            about="excitation",
+            what=f"{listed(still)} moved less than 0.02 rad (2 mm): {whose} friction and inertia do not show.",
+            do="Move every joint that is to be learned, or lock it in the robot (`locked`).",
+            joints=tuple(still),
+            numbers={"ranges": spans.tolist(), "still": still},
+        )
     yield from _held(inputs, still)
 
 

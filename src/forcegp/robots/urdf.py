@@ -1,6 +1,5 @@
 """URDF text -> plain description (http://wiki.ros.org/urdf/XML). What could be silently wrong is a collected error."""
 
-import difflib
 import math
 import re
 from collections.abc import Iterable
@@ -11,7 +10,7 @@ import numpy as np
 from defusedxml import DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden
 from defusedxml import ElementTree as SafeElementTree
 
-from forcegp.errors import LARGEST, RobotModelError
+from forcegp.errors import LARGEST, RobotModelError, require_known
 from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import rotation_from_rpy, transform
 
@@ -283,20 +282,11 @@ def _inertial(link: _Part) -> Link | None:
 
 def _joint(at: _Part, name: str, links: dict[str, Link | None]) -> Joint:
     kind, kinds = at.text("type"), (*MOVABLE, "fixed", "floating")
-    if kind not in kinds:
-        close = difflib.get_close_matches(kind, kinds, n=1)
-        hint = f" Did you mean {close[0]!r}?" if close else ""
-        raise RobotModelError(f"{at} has the unknown type {kind!r}; allowed: {', '.join(kinds)}.{hint}")
+    require_known("type", kind, at.owner, kinds, RobotModelError)
     ends = {}
     for end in ("parent", "child"):
         ends[end] = at.child(end, needed=True).text("link")
-        if ends[end] not in links:
-            close = difflib.get_close_matches(ends[end], links, n=1)
-            hint = f" (did you mean {close[0]!r}?)" if close else ""
-            raise RobotModelError(
-                f"{at} names the {end} link {ends[end]!r}, which the file does not define{hint}",
-                f"; correct the name or add the link. Links: {', '.join(sorted(links))}",
-            )
+        require_known(f"{end} link", ends[end], at.owner, links, RobotModelError)
     origin, axis = at.origin(), at.child("axis").vector("xyz", (1.0, 0.0, 0.0))
     length, directed = float(np.linalg.norm(axis)), kind in MOVABLE
     if directed and not (math.isfinite(length) and length > 0.0):
