@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
+from forcegp.atomic_files import write_text
 from forcegp.errors import InvalidInput, RobotFileWarning, require_plausible, usable_arguments
 from forcegp.robots.arguments import (
     JointValues,
@@ -40,7 +41,6 @@ from forcegp.robots.urdf_file import (
     with_chosen_inertias,
     with_joint_values,
     with_limits,
-    write_text,
 )
 
 GRAVITY = (0.0, 0.0, -9.81)
@@ -259,7 +259,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
             warnings.warn(seen, RobotFileWarning, stacklevel=2)
         text = with_limits(self.urdf_text)
         if path is not None:
-            write_text(text, Path(path))
+            write_text(path, text)
         return text
 
     @usable_arguments("Robot.to_mjcf")
@@ -277,7 +277,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
             )
             warnings.warn(left_out, RobotFileWarning, stacklevel=3)
         if path is not None:
-            write_text(text, Path(path))
+            write_text(path, text)
         return text
 
     def kinematics(self, q: Positions, v: JointValues | None = None) -> Kinematics:

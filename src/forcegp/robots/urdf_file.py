@@ -1,4 +1,4 @@
-"""URDF files in the encoding that they declare; inertials, friction and impossible inertias replaced in the text."""
+"""URDF files: inertials, friction and impossible inertias replaced in the text."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -9,7 +9,6 @@ import numpy as np
 from defusedxml import minidom
 from jaxtyping import Float
 
-from forcegp.atomic_files import write_bytes
 from forcegp.errors import LARGEST, InvalidInput, NonPhysicalInertia, RobotModelError, UnknownName, required_extra
 from forcegp.robots.arguments import Problems, Vector, by_joint, finite_vector
 from forcegp.robots.inertia import physical_objection
@@ -45,30 +44,10 @@ def read_text(path: str | Path) -> str:
         raise RobotModelError(
             f"{path}: cannot be read ({error.strerror}); check the path and its permissions."
         ) from None
-    encoding = declared_encoding(data)
     try:
-        return data.decode(encoding)
-    except (ValueError, LookupError):  # codecs raise more than UnicodeDecodeError
-        raise RobotModelError(
-            f"{path}: is not {encoding} text; save the URDF as UTF-8, or declare its encoding in the first line "
-            '(<?xml version="1.0" encoding="..."?>).'
-        ) from None
-
-
-def declared_encoding(data: bytes) -> str:
-    """Encoding of an XML file from its byte-order mark or XML declaration; UTF-8 by default."""
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return "utf-16"
-    head = data.removeprefix(b"\xef\xbb\xbf")[:200].split(b"?>")[0].decode("ascii", errors="replace")
-    if head.startswith("<?xml") and "encoding" in head:
-        value = head.split("encoding", 1)[1].lstrip(" \t\r\n=")
-        return value[1:].split(value[:1], 1)[0] if value[:1] in "'\"" else "utf-8"
-    return "utf-8"
-
-
-def write_text(text: str, path: Path) -> None:
-    """Write URDF text in the encoding that it declares. Raises as `atomic_file`."""
-    write_bytes(path, text.encode(declared_encoding(text[:200].encode("utf-8"))))
+        return data.decode()
+    except UnicodeDecodeError:
+        raise RobotModelError(f"{path}: is not UTF-8 text; save the robot file as UTF-8.") from None
 
 
 def replace_inertial(
