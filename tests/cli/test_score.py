@@ -95,7 +95,7 @@ def test_a_raw_log_is_filtered_and_cut_into_blocks_with_a_guard(forcegp, folder)
     words += ["--cutoff", 15, "--trim", 0.1, "--every", 2, "--split", "blocks:4:2", "--guard", 0.01]
     done = forcegp(*words, folder=folder)
     assert done.returncode == 0, done.stderr
-    assert "--guard 0.01 s is shorter than two time constants of the filter (0.055 s)" in done.stderr
+    assert "--guard 0.01 s is shorter than two time constants of the filter (0.054 s)" in done.stderr
     assert re.search(r"given\s+\d+\.\d+", done.stdout)
     page = (folder / "raw" / "report.md").read_text()
     assert "Preparation: cutoff 15.0, " in page

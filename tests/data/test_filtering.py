@@ -64,14 +64,11 @@ def test_a_sine_comes_out_with_the_gain_of_the_filter(smooth, gain, accuracy, fr
 
 
 def test_the_memory_of_noise_is_where_its_autocorrelation_is_one_half():
-    memory = LowPass(20.0).memory(RATE)
-    assert memory == pytest.approx(1 / 62, rel=0.01)
-    noise = np.random.default_rng(0).normal(size=(200_000, 1))
-    behind = LowPass(20.0)(noise, np.arange(len(noise)) / RATE)[2000:-2000, 0]
-    at = memory * RATE
-    correlations = [behind[k:] @ behind[: len(behind) - k] for k in (0, int(at), int(at) + 1)]
-    share = correlations[1] + (at % 1) * (correlations[2] - correlations[1])
-    assert share / correlations[0] == pytest.approx(0.5, abs=0.03)
+    """By the theorem of Wiener and Khinchin, from the gain."""
+    rate = 1000.0
+    correlation = np.fft.irfft(LowPass(2.0).gain(np.linspace(0.0, 0.5 * rate, 2**15 + 1), rate) ** 2)
+    at = np.interp(LowPass(2.0).memory * rate, np.arange(400), correlation[:400] / correlation[0])
+    assert at == pytest.approx(0.5, abs=1e-4)
 
 
 @pytest.mark.parametrize("cutoff", [50.0, 0.0, np.nan])

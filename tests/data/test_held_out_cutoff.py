@@ -16,9 +16,9 @@ from forcegp.forces import RigidBodies
 STEP = 0.004
 
 
-def raw(seed, noise, late=0.0):
+def raw(seed, noise, late=0.0, seconds=10.0):
     """The motion at 250 Hz with noise of the positions, and torques that are logged late."""
-    rows = log(TEXT, seed, seconds=30.0)
+    rows = log(TEXT, seed, seconds=seconds)
     time = np.arange(rows.time[0], rows.time[-1], STEP)
     rng = np.random.default_rng(seed)
     from scipy.interpolate import CubicSpline
@@ -33,7 +33,7 @@ def raw(seed, noise, late=0.0):
 @pytest.mark.nightly
 def test_a_spectrum_that_shows_too_low_a_cutoff_is_overruled():
     """From a tenth of the right cut-off the search comes to where friction is not smeared."""
-    rows = raw(2, 1e-5)
+    rows = raw(2, 1e-5, seconds=30.0)
     low = 1.2
     best, shares = held_out_cutoff(rows, low)
     assert best > 1.9 * low

@@ -48,7 +48,7 @@ def test_kept_rows_lie_apart_and_every_other_row_is_near_an_earlier_one(seed, ep
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         kept = independent_rows(log)
-    apart = LowPass(CUTOFF).memory(100.0 * CUTOFF) - 1e-9
+    apart = LowPass(CUTOFF).memory - 1e-9
     rows = [int(np.flatnonzero(log.time == time)[0]) for time in kept.time]
     near = (np.abs(log.time[:, None] - log.time) < apart) & (log.episode[:, None] == log.episode)
     assert near[np.ix_(rows, rows)].sum() == len(rows)

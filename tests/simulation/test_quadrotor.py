@@ -17,7 +17,7 @@ from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
 @pytest.fixture(scope="module")
 def train():
-    return simulate_quadrotor(QuadrotorConfig(seconds=20.0, seed=1))
+    return simulate_quadrotor(QuadrotorConfig(seconds=12.0, seed=1))
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def acting(dataset, lag=0.06):
 def posterior(train):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return fit(train.model.with_forces(AerodynamicForce()), acting(train), points=80, restarts=1)
+        return fit(train.model.with_forces(AerodynamicForce()), acting(train), points=50, restarts=1)
 
 
 def test_velocities_and_accelerations_are_derivatives(test):
@@ -135,7 +135,7 @@ def test_intervals_of_motions_are_those_of_observed_wind(posterior, train):
     rows = acting(train).rows(np.arange(480))
     widened = calibrated(posterior, rows, (0.1,))
     assert widened.motion_intervals is None
-    seeing, seen = observing(widened, acting(train).rows(np.arange(2400, 3200)))
+    seeing, seen = observing(widened, acting(train).rows(np.arange(1600, 2400)))
     assert seeing.motion_intervals.inputs == seen.model.inputs
     moved = recorded_motions(seen, 30, 0.1)
     found = seeing.rollout(moved.q[:, 0], moved.v[:, 0], moved.u, moved.dt, integrator="rk4")
@@ -150,7 +150,7 @@ def test_intervals_of_motions_are_those_of_observed_wind(posterior, train):
 
 def test_without_columns_the_air_moves_as_in_the_training(posterior, train):
     """So rows of the same wind are predicted without an observer, and the model can be fitted again."""
-    rows = acting(train).rows(np.arange(0, 4000, 20))
+    rows = acting(train).rows(np.arange(0, 2760, 15))
     a = posterior.predict(rows.q, rows.v, rows.u, covariance=False).mean.numpy()
     assert np.sqrt(np.square(a - rows.a).mean()) < 0.5 * np.sqrt(np.square(rows.a).mean())
     assert posterior.model.unknown_forces[0].wind == posterior.settings["air"]["wind"]

@@ -156,9 +156,9 @@ class Auto(Command):
         mistakes, robot = list[Doubt](), self.robot
         for _ in range(MOST_CORRECTIONS):
             try:
-                with terminal.progress("importing") as progress:
-                    how: dict[str, Any] = {"model": model, "options": self.columns.options(), "report": progress}
-                    dataset, undecided = forcegp.import_recordings(self.logs, mapping, **how), None
+                with terminal.progress("importing"):
+                    options, undecided = self.columns.options(), None
+                    dataset = forcegp.import_recordings(self.logs, mapping, model=model, options=options)
             except MistakenUnit as error:
                 correction = {"unit": {error.quantity: (error.unit,)}}
                 what = str(error).partition(" Is ")[0]

@@ -159,8 +159,8 @@ class ColumnOptions:
 
     def options(self) -> forcegp.recordings.ImportOptions:
         """How rows come of columns. Raises InvalidInput."""
-        same = ("gap", "start", "end", "unwrap", "bad_rows", "beyond_limits")
-        given: dict[str, Any] = {name: getattr(self, name) for name in same} | {"rate": self.rate}
+        own = {item.name for item in fields(forcegp.recordings.ImportOptions)} - {"stance"}
+        given: dict[str, Any] = {name: getattr(self, name) for name in own}
         if self.rate not in ("auto", "log"):
             complaint = f"--rate is {self.rate!r}; give rows per second, auto or log."
             [given["rate"]] = numbers_of(self.rate, complaint, one=True)

@@ -150,7 +150,7 @@ class Score(Command):
         cutoff = forcegp.data.preparation_report(rows.metadata).get("cutoff")
         if cutoff is not None and not preparation.changes_nothing and (self.split or "auto")[0] in "ab":
             # a filter mixes what lies on both sides of a border
-            memory = 2.0 * forcegp.data.LowPass(float(cutoff)).time_constant
+            memory = 2.5 * forcegp.data.LowPass(float(cutoff)).memory  # two time constants
             if self.guard < memory:
                 terminal.warn(
                     f"--guard {self.guard:g} s is shorter than two time constants of the filter ({memory:.2g} s), so "

@@ -53,28 +53,15 @@ class Delay:
     std: Float[np.ndarray, " nv"]
     remains: float
 
-    def _showing(self, seconds: float) -> np.ndarray:
-        """Delays of the joints that show this one, to within three standard deviations or a half of it."""
-        each, std = (x[np.isfinite(self.seconds)] for x in (self.seconds, self.std))
-        near = np.abs(each - seconds) <= np.maximum(SIGNIFICANT * np.nan_to_num(std), 0.5 * abs(seconds))
-        return each[near] if 2 * near.sum() > len(near) else each[:0]
-
     @property
     def significant(self) -> float:
-        """The delay that most joints show, if it is more than three standard deviations from zero, else 0.
-
-        It is the common one, or else the median of the joints: where friction dominates, noise of v looks like a delay.
-        """
-        each = self.seconds[np.isfinite(self.seconds)]
-        if not (np.isfinite(self.common) and len(each)):
+        """The common delay if most joints show it and it is more than three standard deviations from zero, else 0."""
+        each, std = (x[np.isfinite(self.seconds)] for x in (self.seconds, self.std))
+        near = np.abs(each - self.common) <= np.maximum(SIGNIFICANT * np.nan_to_num(std), 0.5 * abs(self.common))
+        if 2 * near.sum() <= len(near) or self.remains >= WORTH:
             return 0.0
-        median = float(np.median(each))
-        for seconds, remains in ((self.common, self.remains), (median, 0.0)):
-            showing = self._showing(seconds)
-            spread = max(self.common_std, float(np.std(showing)) / len(showing) ** 0.5 if len(showing) else np.inf)
-            if abs(seconds) > max(SIGNIFICANT * spread, LEAST_DELAY) and remains < WORTH:
-                return seconds
-        return 0.0
+        spread = max(self.common_std, float(np.std(each[near])) / near.sum() ** 0.5)
+        return self.common if abs(self.common) > max(SIGNIFICANT * spread, LEAST_DELAY) else 0.0
 
     @property
     def reason(self) -> str:
@@ -82,12 +69,8 @@ class Delay:
         if not np.isfinite(self.common):
             return "the torques show no common delay"
         size, used = f"{1e3 * self.common:.1f} ms ± {1e3 * self.common_std:.1f} ms", self.significant
-        if used == self.common:
-            return f"{size}, which leaves {100.0 * self.remains:.0f} % of what inverse dynamics does not explain"
         if used:
-            return (
-                f"{1e3 * used:.1f} ms, which most joints show (all together {size}, by joints that are mostly friction)"
-            )
+            return f"{size}, which leaves {100.0 * self.remains:.0f} % of what inverse dynamics does not explain"
         ends = (self.common - 2.0 * self.common_std, self.common + 2.0 * self.common_std)
         low, high = 1e3 * np.clip(ends, -LARGEST_DELAY, LARGEST_DELAY)
         if high - low > 1e3 * APART:

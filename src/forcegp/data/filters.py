@@ -21,7 +21,7 @@ Values = Float[np.ndarray, "rows *columns"]
 
 TRANSIENT = 1e-3  # what is left of a filter's transient at the ends of a recording; sets the length of the padding
 PASSED = 3.0  # rows in a period of a cut-off, of which more repeat their neighbours (`LowPass.memory`)
-FREQUENCIES = 2**15 + 1
+HALF = 0.32434  # periods of a cut-off in which the autocorrelation of white noise behind it falls to one half
 
 
 @dataclass(frozen=True)
@@ -61,21 +61,10 @@ class LowPass:
             warped = np.tan(np.pi * frequency / rate) / np.tan(np.pi * self.cutoff / rate)
             return 1.0 / (1.0 + np.abs(warped) ** (2 * self.order))
 
-    def memory(self, rate: float) -> float:
-        """Time [s] in which the autocorrelation of white noise at this rate [Hz] falls to one half behind the filter.
-
-        Rows that are closer count as one. By the theorem of Wiener and Khinchin, from the gain.
-        """
-        correlation = np.fft.irfft(self.gain(np.linspace(0.0, 0.5 * rate, FREQUENCIES), rate) ** 2)
-        correlation /= correlation[0]
-        after = int(np.argmax(correlation < 0.5))
-        above, below = correlation[[after - 1, after]]
-        return float(after - (0.5 - below) / (above - below)) / rate
-
     @property
-    def time_constant(self) -> float:
-        """Of its slowest pole [s]."""
-        return 1.0 / (2.0 * np.pi * self.cutoff * np.sin(0.5 * np.pi / self.order))
+    def memory(self) -> float:
+        """Time [s] within which rows repeat their neighbours, and count as one, where their rate is far higher."""
+        return HALF / self.cutoff
 
 
 def lagged(values: Values, time: Float[np.ndarray, " rows"], seconds: float) -> Values:

@@ -30,7 +30,6 @@ from forcegp.robots.arguments import whole_number
 from forcegp.summary import plain
 
 FEW = 2_000  # rows of a whole log
-FAR_ABOVE = 100.0  # a cut-off: where the memory of a filter does not depend on the rate
 SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
 
 
@@ -105,6 +104,10 @@ class Preparation:
                 reasons["delay"] = f"u is taken to be on time: {error}"
         return replace(chosen, why=reasons)
 
+    def rows(self, dataset: Dataset) -> Dataset:
+        """The prepared rows without their price, as `apply` gives them but with the metadata of `dataset`."""
+        return _prepared(self.resolved(dataset), dataset)[0]
+
     def apply(self, dataset: Dataset) -> Dataset:
         """The prepared Dataset, with its price under "preparation" in the metadata.
 
@@ -123,7 +126,7 @@ class Preparation:
 def memory(metadata: Mapping[str, Any]) -> float:
     """Time in s within which rows of a filtered log repeat their neighbours; 0 where the metadata name no filter."""
     cutoff = preparation_report(metadata).get("cutoff")
-    return 0.0 if cutoff is None else LowPass(float(cutoff)).memory(FAR_ABOVE * float(cutoff))
+    return 0.0 if cutoff is None else LowPass(float(cutoff)).memory
 
 
 def preparation_report(metadata: Mapping[str, Any]) -> Mapping[str, Any]:

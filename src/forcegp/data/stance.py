@@ -206,7 +206,7 @@ def _bearing(force: np.ndarray, moves: np.ndarray) -> Float[np.ndarray, " 2"]:
         cost = 2.0 * (shares * np.log(widths / shares)).sum()
         apart = means[1] - means[0] > APART * widths.sum()
         if cost < best and apart:
-            between = np.linspace(*means, 200)
+            between = np.linspace(means[0], means[1], 200)
             density = np.log(shares / widths) - 0.5 * np.square((between[:, None] - means) / widths)
             likelier = density[:, 1] - density[:, 0]
             sure = np.log(CERTAIN)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -38,15 +36,6 @@ class AirLaw:
     coefficients: tuple[tuple[float, ...], ...]
     deviations: tuple[float, ...]
     wind: tuple[float, float, float]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, for `from_dict`."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, stored: Mapping[str, Any]) -> AirLaw:
-        """From what `to_dict` gave."""
-        return cls(tuple(map(tuple, stored["coefficients"])), tuple(stored["deviations"]), tuple(stored["wind"]))
 
     def wind_before(self, dataset: Dataset, seconds: float = SECONDS) -> Float[np.ndarray, "rows 3"]:
         """The wind [m/s, world] that the rows before each one of its episode show; at the first, that of the law.

@@ -1,7 +1,7 @@
 """Wind, and a slow force that no feature explains: observed from the past rows of a recording, then known."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -75,7 +75,7 @@ def in_air(model: Model, dataset: Dataset) -> tuple[Mapping[str, Any], Dataset] 
         return None
     law, wind = found
     windy = (replace(x, wind=law.wind) if isinstance(x, AerodynamicForce) else x for x in model.forces)
-    return {"air": law.to_dict()}, with_wind(replace(rows, model=replace(model, forces=tuple(windy))), wind)
+    return {"air": asdict(law)}, with_wind(replace(rows, model=replace(model, forces=tuple(windy))), wind)
 
 
 def _observes(model: Model) -> bool:
@@ -134,7 +134,7 @@ def _in_observed_wind(posterior: Posterior, dataset: Dataset) -> tuple[Posterior
     if stored is None or _observes(posterior.model):
         return posterior, dataset
     rows = replace(dataset, model=posterior.model)
-    seen = with_wind(rows, AirLaw.from_dict(stored).wind_before(rows))
+    seen = with_wind(rows, AirLaw(**stored).wind_before(rows))
     return posterior.with_model(seen.model), seen
 
 

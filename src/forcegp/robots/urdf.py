@@ -60,13 +60,9 @@ def refuse_xacro(root: Element, source: str) -> None:
     owners = [owner for owner in root if owner.tag in ("link", "joint")]
     read = [*owners, *(inner for owner in owners for part in owner if part.tag in MECHANICS for inner in part.iter())]
     left = DEFINITIONS if root.find("link") is not None else ()
-    macros = [
-        element
-        for owner in (root, *owners)
-        for element in owner
-        if "xacro}" in element.tag and not element.tag.endswith(left)
-    ]
-    for element in (*macros, *(each for each in read if re.search(r"\$[{(]", " ".join(each.attrib.values())))):
+    macros = (element for owner in (root, *owners) for element in owner if "xacro}" in element.tag)
+    found = [element for element in macros if not element.tag.endswith(left)]
+    for element in (*found, *(each for each in read if re.search(r"\$[{(]", " ".join(each.attrib.values())))):
         raise RobotModelError(
             f"{source}: is an unexpanded xacro file (see <{element.tag.rsplit('}', 1)[-1]}>); "
             "name it .xacro, or run xacro first: xacro robot.urdf.xacro > robot.urdf."
