@@ -23,7 +23,7 @@ from forcegp.posterior import Posterior, c_files
 from forcegp.posterior.c_export import rounding
 from forcegp.posterior.c_files import identifier
 
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1")
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 DT = 0.02
 
 pytestmark = pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
@@ -36,9 +36,9 @@ def fitted(*forces, **more) -> Posterior:
         return fit(arm_model().with_forces(*forces, **more), arm_data(30, 0), **options)
 
 
-def compiled(folder: Path, *files: str) -> ctypes.CDLL:
+def compiled(folder: Path, *files: str, optimized: int = 0) -> ctypes.CDLL:
     """The files as a library, without a warning."""
-    command = ["cc", *STRICT, "-shared", "-fPIC", *files, "-o", "lib.so", "-lm"]
+    command = ["cc", *STRICT, f"-O{optimized}", "-shared", "-fPIC", *files, "-o", "lib.so", "-lm"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return ctypes.CDLL(str(folder / "lib.so"))
@@ -90,7 +90,7 @@ def complete(posterior, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def library(complete) -> ctypes.CDLL:
-    return compiled(complete, "arm.c", "arm_external.c")
+    return compiled(complete, "arm.c", "arm_external.c", optimized=1)  # some warnings need it
 
 
 @pytest.fixture(scope="module")
@@ -246,16 +246,17 @@ def test_the_self_test_the_example_and_the_commands_of_the_readme_work(complete,
     commands = [line.partition("#")[0] for line in (folder / "README.txt").read_text().splitlines() if "cc " in line]
     assert len(commands) == 3
     for command in commands:
-        done = subprocess.run(command, shell=True, cwd=folder, capture_output=True, text=True, check=False)
+        quick = command.replace("-O2", "-O0")
+        done = subprocess.run(quick, shell=True, cwd=folder, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
     assert (folder / "libarm_external.so").exists()
     for program in ("example.c", "self_test.c"):
-        subprocess.run(["cc", *STRICT, "-O0", program, "arm.c", "-o", "x", "-lm"], cwd=folder, check=True)
+        subprocess.run(["cc", *STRICT, program, "arm.c", "-o", "x", "-lm"], cwd=folder, check=True)
     text = (folder / "arm.c").read_text()
     first = text.index("table0[]")
     place = text.index("0x1.", first)
     (folder / "arm.c").write_text(f"{text[:place]}-{text[place:]}")  # one weight or centre of the model
-    subprocess.run(["cc", *STRICT, "-O0", "self_test.c", "arm.c", "-o", "x", "-lm"], cwd=folder, check=True)
+    subprocess.run(["cc", *STRICT, "self_test.c", "arm.c", "-o", "x", "-lm"], cwd=folder, check=True)
     broken = subprocess.run(["./x"], cwd=folder, capture_output=True, text=True, check=False)
     assert broken.returncode == 1
     assert "differs by" in broken.stdout
