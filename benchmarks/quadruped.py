@@ -12,8 +12,9 @@ import argparse
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
-import mujoco
+import mujoco as untyped
 import numpy as np
 import torch
 from scipy.signal import butter, sosfiltfilt
@@ -25,6 +26,7 @@ from forcegp.cli.main import main as command
 from forcegp.data import Preparation
 from forcegp.mechanics import fixed_point
 
+mujoco: Any = untyped  # its stubs lack what is called here
 LEGS = {"FL": (1, 1), "FR": (1, -1), "RL": (-1, 1), "RR": (-1, -1)}
 TRUNK, LENGTH, STEP, EVERY = 6.0, 0.21, 0.0005, 4  # kg, m, s, steps per row
 LOAD = '<body pos=".05 .01 .08"><inertial pos="0 0 0" mass="2" diaginertia=".004 .006 .008"/></body>'

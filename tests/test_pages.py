@@ -190,7 +190,7 @@ def test_the_page_on_deploying_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "deploy.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     files, agree = run_example(example, tmp_path).splitlines()
-    assert "lbr_iiwa_acados.c" in files
+    assert "lbr_iiwa_external.c" in files
     assert agree == "True"
     commands, build, planner = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     for command in (commands + planner).splitlines():

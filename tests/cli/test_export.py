@@ -16,7 +16,6 @@ FILES = {
     "arm.h",
     "arm.hpp",
     "arm_external.c",
-    "arm_acados.c",
     "CMakeLists.txt",
     "example.c",
     "self_test.c",

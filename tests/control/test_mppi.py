@@ -82,16 +82,12 @@ def test_torques_keep_their_limits_and_repeat_with_the_seed(predictor):
     assert not np.array_equal(played(prepared(controller(predictor, torque_limits=[1.5], seed=2)), 20)[1], torques)
 
 
-def test_without_a_finite_cost_it_raises_or_holds(predictor):
+def test_without_a_finite_cost_it_raises(predictor):
     def broken_later(q, v, u):
         return cost(q, v, u) * (float("nan") if float(q[..., 0, 0].max()) > 5.0 else 1.0)
 
     with pytest.raises(NumericalError, match="none of 128 sequences"):
         controller(predictor, cost=broken_later)([6.0], [0.0])
-    holding = controller(predictor, cost=broken_later, on_failure="hold")
-    safe = holding([1.0], [0.0])
-    assert torch.equal(holding([6.0], [0.0]), safe)
-    assert holding.held == 1
 
 
 @pytest.mark.parametrize(("damping", "wanted"), [(15.0, "rk4"), (15.0 * 1.8, "implicit-midpoint")])

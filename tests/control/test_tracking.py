@@ -154,7 +154,6 @@ def test_models_with_and_without_contacts(touching):
         ({"stiffness": [1.0, 2.0, 3.0]}, r"stiffness has shape \(3,\)"),
         ({"damping": np.nan}, "damping"),
         ({"torque_limits": 0.0}, "torque_limits are zero"),
-        ({"on_failure": "zero"}, "hold, raise"),
     ],
 )
 def test_settings_that_mean_nothing(changes, message):
@@ -172,25 +171,12 @@ def test_references_and_states_that_cannot_be():
         control([np.nan, 0.0], *STILL, *STILL)
 
 
-def test_it_raises_or_holds_but_never_gives_nan():
-    stiff = {"stiffness": 1e308, "damping": 0.0}
+def test_it_raises_and_keeps_the_last_torques():
     still = [0.0, 0.0]
-    with pytest.raises(NumericalError):
-        ComputedTorque(URDF_ALONE, **stiff)([2.9, 0.0], still, [-2.9, 0.0], still, still)
-    control = ComputedTorque(URDF_ALONE, **stiff, on_failure="hold")
+    control = ComputedTorque(URDF_ALONE, stiffness=1e308, damping=0.0)
     safe = control(STILL[0], still, STILL[0], still, [1.0, 0.0])
-    assert torch.equal(control([2.9, 0.0], still, [-2.9, 0.0], still, still), safe)
-    assert control.held == 1
-    assert control.held == 1
-
-
-def test_a_broken_sensor_is_held():
-    control = ComputedTorque(URDF_ALONE, **GAINS, torque_limits=0.5, on_failure="hold")
-    q_d = [0.1, -0.1]
-    safe = control(*STILL, q_d, [0.0, 0.0], [0.0, 0.0])
-    assert control.saturated.any()
-    assert torch.equal(control([np.nan, 0.0], [0.0, 0.0], q_d, [0.0, 0.0], [0.0, 0.0]), safe)
-    assert control.held == 1
-    assert not control.saturated.any()
+    with pytest.raises(NumericalError):
+        control([2.9, 0.0], still, [-2.9, 0.0], still, still)
     with pytest.raises(InvalidInput, match="give 2 finite numbers"):
-        control([0.0], [0.0, 0.0], q_d, [0.0, 0.0], [0.0, 0.0])
+        control([np.nan, 0.0], still, *STILL, still)
+    assert torch.equal(control.last, safe)

@@ -172,7 +172,6 @@ TRACKING = {
     "stiffness": 10.0,
     "damping": None,
     "torque_limits": 50.0,
-    "on_failure": "hold",
 }
 FIT = {"points": 6, "restarts": 1, "seed": 0, "options": QUICK}
 SURFACES = {"normal": (0.0, 0.0, 1.0), "offset": 0.1}
@@ -340,7 +339,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         forcegp.ComputedTorque,
         lambda kind, **k: kind(arm_model(0), **k)(*STATE[:2], *STATE),
         "",
-        lambda: {**TRACKING, "on_failure": "raise"},
+        lambda: TRACKING,
     ),
     "ContactMonitor": _call(
         forcegp.ContactMonitor,
@@ -351,7 +350,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "MPPI": _call(
         forcegp.MPPI,
         lambda kind, **k: kind(INPUTS.predictor, _cost, **k)(*STATE[:2]),
-        "noise functions seed on_failure",
+        "noise functions seed",
         lambda: {"dt": 0.01, "steps": 2, "torque_limits": 5.0, "samples": 3, "integrator": "rk4"},
     ),
     "excitation": _call(

@@ -63,21 +63,16 @@ def picture(page, place):
     return np.asarray(image.resize(COARSE, Image.Resampling.BOX), dtype=float)
 
 
-def test_the_page_opens_without_network_and_without_errors_and_the_robot_moves(browser, report, tmp_path):
+def test_the_page_opens_without_network_looks_as_before_and_the_robot_moves(browser, report, tmp_path):
     page, complaints = opened(browser, report)
     frame = page.frame_locator("iframe").locator("canvas").first
-    seen = []
+    found, seen = picture(page, tmp_path / "page.png"), []
     for number in range(3):
         frame.screenshot(path=tmp_path / f"{number}.png")
         seen.append(np.asarray(Image.open(tmp_path / f"{number}.png").convert("L"), dtype=float))
         page.wait_for_timeout(1_200)
     assert not complaints
     assert max(np.abs(seen[0] - seen[1]).max(), np.abs(seen[1] - seen[2]).max()) > 50.0
-
-
-def test_the_page_looks_as_before(browser, report, tmp_path):
-    page, _ = opened(browser, report)
-    found = picture(page, tmp_path / "page.png")
     if os.environ.get("FORCEGP_NEW_GOLDENS"):
         Image.fromarray(found.astype(np.uint8)).save(GOLDENS / "report.png")
     golden = np.asarray(Image.open(GOLDENS / "report.png").convert("L"), dtype=float)

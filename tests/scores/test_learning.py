@@ -108,11 +108,11 @@ def test_noise_of_forces_is_learned_where_rows_show_it():
 
 
 def test_many_equations_are_learned_through_inducing_points():
-    """So many rows that a search takes its 2,800 equations, and no more than its restarts afford."""
-    assert all_rows_at_once(400, 7) == {}
-    found = all_rows_at_once(401, 7)
-    assert found["learning_points"] == 400
-    assert found["engine"].tolerance == 1.0 / 401
+    """So many rows that a search takes its 1,400 equations, and no more than its restarts afford."""
+    assert all_rows_at_once(200, 7) == {}
+    found = all_rows_at_once(201, 7)
+    assert found["learning_points"] == 200
+    assert found["engine"].tolerance == 1.0 / 201
     assert all_rows_at_once(1000, 2)["learning_points"] < 1000
 
 

@@ -4,14 +4,14 @@ import math
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, require_known, require_number, require_type
+from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, require_number, require_type
 from forcegp.integration.integrators import check_time_step
 from forcegp.model import Model
 from forcegp.posterior.prediction import JointForces, require_actuated
@@ -21,20 +21,16 @@ from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, real_tensor, whole_number
 from forcegp.robots.compiled import CompiledRobot
 
-OnFailure = Literal["raise", "hold"]
-
 
 class Controller:
-    """Limits the torques of a call, and raises or holds the last ones where it cannot compute any.
+    """Limits the torques of a call, and raises where it cannot compute any.
 
-    `saturated` (nv,) are the joints limited in the last call, `held` counts the calls that repeated `last` (nv,), 0 at
-    first.
+    `last` (nv,) are those of the last call that had some, 0 at first, `saturated` (nv,) the joints limited in it.
     """
 
-    def __init__(self, robot: Robot, torque_limits: Any, on_failure: OnFailure) -> None:
-        require_known("on_failure", on_failure, type(self).__name__, ("raise", "hold"))
+    def __init__(self, robot: Robot, torque_limits: Any) -> None:
         robot.require_vectors("controllers")
-        self.robot, self.on_failure = robot, on_failure
+        self.robot = robot
         stated = [joint.effort_limit for joint in robot.joints]
         self.torque_limits = per_joint("torque_limits", stated if torque_limits is None else torque_limits, robot.nv)
         if not bool(self.torque_limits.any()):
@@ -47,33 +43,18 @@ class Controller:
     def restart(self) -> None:
         """Forget earlier calls."""
         self.last = torch.zeros(self.robot.nv, dtype=torch.float64)
-        self.saturated = torch.zeros(self.robot.nv, dtype=torch.bool)
-        self.held = 0
+        self.saturated: Bool[Tensor, " nv"] = torch.zeros(self.robot.nv, dtype=torch.bool)
 
     def vectors(self, **given: Any) -> list[Tensor]:
-        """Vectors (nv,), within `limited`. InvalidInput for others, NumericalError for not finite ones to hold."""
-        try:
-            return [torch.as_tensor(finite_vector(name, x, self.robot.nv)) for name, x in given.items()]
-        except InvalidInput as error:
-            shapes = {real_tensor(name, x, torch.device("cpu")).shape for name, x in given.items()}
-            if self.on_failure == "hold" and shapes == {(self.robot.nv,)}:
-                raise NumericalError(str(error)) from None
-            raise
+        """Finite vectors (nv,). Raises InvalidInput for others."""
+        return [torch.as_tensor(finite_vector(name, x, self.robot.nv)) for name, x in given.items()]
 
-    def limited(self, compute: Callable[[], Tensor]) -> Float[Tensor, " nv"]:
-        """The torques (nv,) of `compute` within limits. NumericalError where one is not finite, unless held."""
-        try:
-            asked = compute()
-            if not bool(asked.isfinite().all()):
-                raise NumericalError("the torques of this controller are not finite; check its gains and the state.")
-        except NumericalError:
-            if self.on_failure == "raise":
-                raise
-            self.held += 1
-            self.saturated = torch.zeros_like(self.saturated)
-            return self.last.clone()
+    def limited(self, asked: Float[Tensor, " nv"]) -> Float[Tensor, " nv"]:
+        """These torques (nv,) within limits. Raises NumericalError where one is not finite."""
+        if not bool(asked.isfinite().all()):
+            raise NumericalError("the torques of this controller are not finite; check its gains and the state.")
         self.last = torch.minimum(torch.maximum(asked, -self.torque_limits), self.torque_limits)
-        self.saturated: Bool[Tensor, " nv"] = self.last != asked
+        self.saturated = self.last != asked
         return self.last.clone()
 
 
@@ -101,7 +82,6 @@ class TrackingController(Controller):
 
     * stiffness Kp in 1/s^2 and damping Kd in 1/s, numbers or one per joint; None damps critically.
     * torque_limits: largest absolute torques in Nm (N); None takes the efforts of the URDF.
-    * on_failure: "raise", or "hold" for the last torque where none can be computed or an input is not finite.
 
     Raises InvalidInput for arguments that do not fit and references out of range, NumericalError where no torque is
     found.
@@ -114,9 +94,8 @@ class TrackingController(Controller):
         stiffness: Any,
         damping: Any = None,
         torque_limits: Any = None,
-        on_failure: OnFailure = "raise",
     ) -> None:
-        super().__init__(robot, torque_limits, on_failure)
+        super().__init__(robot, torque_limits)
         self.stiffness = per_joint("stiffness", stiffness, robot.nv)
         self.damping = 2.0 * self.stiffness.sqrt() if damping is None else per_joint("damping", damping, robot.nv)
         ends = [(joint.lower, joint.upper) for joint in robot.joints]
@@ -124,7 +103,7 @@ class TrackingController(Controller):
 
     def __call__(self, q: Any, v: Any, q_d: Any, v_d: Any, a_d: Any) -> Float[Tensor, " nv"]:
         """The torques (nv,) in Nm (N) at the state q, v under this reference, in rad, rad/s, rad/s^2 (m, ...)."""
-        return self.limited(lambda: self._asked(*self.vectors(q=q, v=v, q_d=q_d, v_d=v_d, a_d=a_d)))
+        return self.limited(self._asked(*self.vectors(q=q, v=v, q_d=q_d, v_d=v_d, a_d=a_d)))
 
     def _asked(self, q: Tensor, v: Tensor, q_d: Tensor, v_d: Tensor, a_d: Tensor) -> Tensor:
         """Before limits, under a reference that the joints can reach."""
@@ -345,7 +324,7 @@ class MPPI(Controller):
     * cost: costs (...) of whole motions q, v (..., T+1, nv) under u (..., T, nv), the last state included.
     * torque_limits: largest absolute torques in Nm (N), a number or one per joint; None takes the efforts of the URDF.
     * noise: largest standard deviation around the plan, None for half the limits; it falls to a twentieth from sequence
-      to sequence. on_failure: "raise", or "hold" for the last torque.
+      to sequence.
     * integrator: of the motions; None takes `usual_integrator`. The attribute `integrator` says which it is.
 
     Raises InvalidInput for arguments that do not fit, NumericalError where no sequence has a finite cost.
@@ -365,7 +344,6 @@ class MPPI(Controller):
         integrator: str | None = None,
         seed: int = 0,
         threads: int | None = 1,
-        on_failure: OnFailure = "raise",
     ) -> None:
         require_type("predictor", predictor, Predictor)
         if not callable(cost):
@@ -375,7 +353,7 @@ class MPPI(Controller):
         self.dt, self.steps = float(dt), whole_number("steps", steps, 1)
         self.samples, self.functions = whole_number("samples", samples, 2), whole_number("functions", functions, 0)
         self._seed = whole_number("seed", seed, 0)
-        super().__init__(predictor.posterior.model.robot, torque_limits, on_failure)
+        super().__init__(predictor.posterior.model.robot, torque_limits)
         self.noise = per_joint("noise", 0.5 * self.torque_limits if noise is None else noise, nv)
         if not bool(self.noise.isfinite().all()):
             raise InvalidInput("noise is infinite where torque_limits are; give noise in Nm or N, or finite limits.")
@@ -399,13 +377,9 @@ class MPPI(Controller):
 
     def __call__(self, q: Any, v: Any) -> Float[Tensor, " nv"]:
         """The torques (nv,) in Nm (N) for the next `dt` seconds from the state q, v (nv,) in rad, rad/s (m, m/s)."""
-
-        def first() -> Tensor:
-            plan = self.improved(self.plan, *self.vectors(q=q, v=v))
-            self.plan, self._best = (torch.cat([x[1:], x[-1:]]) for x in (plan, self._best))
-            return plan[0]
-
-        return self.limited(first)
+        plan = self.improved(self.plan, *self.vectors(q=q, v=v))
+        self.plan, self._best = (torch.cat([x[1:], x[-1:]]) for x in (plan, self._best))
+        return self.limited(plan[0])
 
     def improved(self, plan: Tensor, q: Tensor, v: Tensor) -> Float[Tensor, "steps nv"]:
         """The plan (steps, nv) after one round of random sequences from the state q, v (nv,)."""
@@ -430,7 +404,7 @@ class MPPI(Controller):
         if not math.isfinite(best):
             raise NumericalError(
                 f"none of {self.samples} sequences of torques has a finite cost from here; check cost(q, v, u), give a "
-                "smaller dt, less noise or fewer steps, or on_failure='hold'."
+                "smaller dt, less noise or fewer steps."
             )
         self._best = torques[costs.argmin()]
         temperature = max(SHARE_OF_MEDIAN * float(costs[costs.isfinite()].median() - best), 1e-12)

@@ -252,7 +252,6 @@ class Posterior(Fitted):
         feedback: Feedback | None = None,
         samples: int = 0,
         seed: int = 0,
-        grad: bool = False,
     ) -> Rollout:
         """Where the robot goes from (q0, v0) under the forces u: the integrated mean acceleration.
 
@@ -261,10 +260,10 @@ class Posterior(Fitted):
         order, as in PyBullet and the paper), "rk4" (fourth order) or "implicit-midpoint" (second order, for stiff
         friction); `baumgarte` stabilises instead of the model's, None: not at all. feedback(k, q, v) -> (..., nv) adds
         to u, asked at the beginning of step k, with the batch dimensions of the motions. `samples` functions drawn from
-        the posterior with `seed` are integrated, too. `grad` keeps the graph in q0, v0, u and what `feedback` adds.
+        the posterior with `seed` are integrated, too.
 
         A motion that diverges is NaN from then on, `diverged_at` holds the row, and a NumericalWarning is given. Raises
-        InvalidInput for arguments that do not fit, and tensors that require a gradient without `grad`.
+        InvalidInput for arguments that do not fit, and tensors that require a gradient, which no motion keeps.
         """
         if baumgarte is not None and not self.model.contacts:
             raise InvalidInput("baumgarte was given, but the model has no contacts; give baumgarte=None.")
@@ -274,22 +273,20 @@ class Posterior(Fitted):
             u = self.model.foreseen(state_tensor("u", u, self.model.sizes[2], self.model.robot.device))
         samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
         method = integrator_named(integrator, model)
-        require_type("grad", grad, bool)
-        remedy = None if grad else "give grad=True"
-        q, v, forces, batch = checked_start(model.sizes, model.robot.device, q0, v0, u, remedy)
+        q, v, forces, batch = checked_start(model.sizes, model.robot.device, q0, v0, u)
         time = dt * torch.arange(len(forces) + 1, dtype=q.dtype, device=q.device)
 
         def run(copies: int, what: str) -> Rollout:
             shape, count = ((copies,) if copies else ()) + batch, max(1, copies)
             given = q.repeat(count, 1), v.repeat(count, 1), forces.repeat(1, count, 1), dt
             loops, added = None, None if feedback is None else flat_feedback(feedback, shape, forces.shape[-1])
-            if feedback is None and not grad:
+            if feedback is None:
                 loops = loops_for(self, model, integrator, len(forces), copies, seed)
             work = accelerations(self, model, copies, seed)
             found = moved(shape, loops, method, work, model, *given, feedback=added, what=what)
             return Rollout(time, *found[:4], integrator, model)
 
-        with torch.set_grad_enabled(grad), blas_threads(0):
+        with torch.no_grad(), blas_threads(0):
             mean = run(0, "rollouts")
             drawn = run(samples, "sampled rollouts") if samples else None
         return replace(mean, samples=drawn, intervals=self.motion_intervals)

@@ -197,9 +197,7 @@ class Predictor(Summary):
         """
         threads = None if threads is None else whole_number("threads", threads, 1)
         functions, seed = whole_number("functions", functions, 0), whole_number("seed", seed, 0)
-        start, v, forces, batch = checked_start(
-            self.sizes, self.device, q0, v0, u, "call posterior.rollout(..., grad=True)"
-        )
+        start, v, forces, batch = checked_start(self.sizes, self.device, q0, v0, u)
         method = integrator_named(integrator, self.posterior.model)
         check_time_step(dt)
         loops, acceleration = None, self.mean

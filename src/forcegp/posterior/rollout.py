@@ -265,16 +265,16 @@ def flat_feedback(feedback: Feedback, batch: Sequence[int], size: int) -> Feedba
 
 
 def checked_start(
-    sizes: tuple[int, int, int], device: torch.device, q0: Any, v0: Any, u: Any, remedy: str | None
+    sizes: tuple[int, int, int], device: torch.device, q0: Any, v0: Any, u: Any
 ) -> tuple[Tensor, Tensor, Tensor, torch.Size]:
-    """q0, v0 (n, size), u (T, n, size), and the batch; InvalidInput, with `remedy` also for tensors with gradients."""
+    """q0, v0 (n, size), u (T, n, size), and the batch; InvalidInput also for tensors with gradients."""
     given = {}
     for size, (name, values) in zip(sizes, (("q0", q0), ("v0", v0), ("u", u)), strict=True):
         tensor = given[name] = state_tensor(name, values, size, device).to(device)
-        if tensor.requires_grad and torch.is_grad_enabled() and remedy is not None:
+        if tensor.requires_grad and torch.is_grad_enabled():
             raise InvalidInput(
-                f"{name} requires a gradient, which a rollout drops unless asked to keep it; {remedy}, or "
-                f"{name}.detach()."
+                f"{name} requires a gradient, which a rollout drops; multiply the A and B of steps, "
+                f"predictor.linearize_step, and give {name}.detach()."
             )
         if name == "u" and tensor.dim() < 2:
             raise InvalidInput(f"u has shape {tuple(tensor.shape)}; it must be (..., T, {size}), one row per step.")

@@ -29,7 +29,11 @@ def require_joint_friction(name: Any) -> None:
     from forcegp.forces.joint_law import JointLaw  # torch, which lists of options do without
     from forcegp.forces.registry import parse_forces
 
-    if not all(isinstance(law, JointLaw) for law in parse_forces(name)):
+    try:
+        laws = parse_forces(name)
+    except InvalidInput as error:
+        raise InvalidInput(f"joint_friction: {error}") from None
+    if not all(isinstance(law, JointLaw) for law in laws):
         raise InvalidInput(f"joint_friction is {name!r}; give laws of joints such as viscous,stribeck, or none.")
 
 
