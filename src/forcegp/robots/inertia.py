@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 Array = np.ndarray
@@ -23,14 +24,7 @@ def skew(vector: Sequence[float] | Array) -> Array:
 
 def rotation_from_rpy(rpy: Sequence[float] | Array) -> Array:
     """Rotation ``Rz(yaw) Ry(pitch) Rx(roll)`` in rad: URDF's fixed-axis convention, shape (3, 3)."""
-    (sr, sp, sy), (cr, cp, cy) = np.sin(rpy), np.cos(rpy)
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
+    return Rotation.from_euler("xyz", rpy).as_matrix()
 
 
 def rpy_from_rotation(rotation: Array) -> Array:
@@ -41,9 +35,8 @@ def rpy_from_rotation(rotation: Array) -> Array:
 
 
 def rotation_about(axis: Sequence[float] | Array, angle: float) -> Array:
-    """Rotation by ``angle`` rad about a unit ``axis`` (Rodrigues' formula), shape (3, 3)."""
-    cross = skew(axis)
-    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
+    """Rotation by ``angle`` rad about a unit ``axis``, shape (3, 3)."""
+    return Rotation.from_rotvec(angle * np.asarray(axis)).as_matrix()
 
 
 def rotation_of_z_onto(axis: Sequence[float] | Array) -> Array:

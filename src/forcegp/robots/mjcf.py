@@ -11,6 +11,7 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from forcegp.errors import RobotModelError, required_extra
 from forcegp.robots.arguments import Problems
@@ -252,8 +253,6 @@ def _jointed(joint: Joint, pose: np.ndarray) -> str:
 
 def _placed(pose: np.ndarray) -> str:
     """Attributes pos and quat, where they are not the default."""
-    from scipy.spatial.transform import Rotation
-
     quaternion = np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)
     position = f' pos="{numbers(pose[:3, 3])}"' if pose[:3, 3].any() else ""
     return position + ("" if np.array_equal(pose[:3, :3], np.eye(3)) else f' quat="{numbers(quaternion)}"')
