@@ -63,7 +63,6 @@ def test_contact_arrows_are_the_predicted_force(on_plane):
     np.testing.assert_allclose(contact.half[:, 0], 1.959963984540054 * std.numpy(), rtol=1e-6)
     position = on_plane.model.contacts[0].position(on_plane.model.robot.kinematics(q[chosen])).numpy()
     np.testing.assert_allclose(contact.start[:, 0], position, atol=1e-12)
-    np.testing.assert_allclose(scene.paths[0], position, atol=1e-12)
 
 
 def test_arrows_are_drawn_to_scale(swinging, friction):

@@ -104,5 +104,5 @@ def test_a_box_without_size_is_drawn(tmp_path):
     found, doubts = shapes.link_shapes(robot, path)
     assert not doubts
     poses = np.tile(np.eye(4), (1, len(found), 1, 1))
-    scene = RecordedScene(robot, np.zeros(1), np.zeros((1, robot.nq)), found, poses, [], [], 1.0)
+    scene = RecordedScene(robot, np.zeros(1), np.zeros((1, robot.nq)), found, poses, [], 1.0)
     assert "<html" in recording(scene).lower()

@@ -68,8 +68,7 @@ class RecordedScene:
     """Rows of a recording, ready to be drawn.
 
     `time` (rows,) in s from the first; `q` (rows, nq); `poses` (rows, links, 4, 4) of `shapes` in the world; `arrows`;
-    `paths` (contacts, rows, 3) of the contact points in m; `size` the reach of the robot in m; `doubts` what could not
-    be drawn.
+    `size` the reach of the robot in m; `doubts` what could not be drawn.
     """
 
     robot: Robot
@@ -78,7 +77,6 @@ class RecordedScene:
     shapes: list[LinkShape]
     poses: Float[np.ndarray, "rows links 4 4"]
     arrows: list[Arrows]
-    paths: list[Float[np.ndarray, "rows 3"]]
     size: float
     doubts: list[str] = field(default_factory=list)
 
@@ -108,9 +106,8 @@ def recorded_scene(
     with torch.no_grad():
         dynamics = posterior.dynamics(q, v, u)
         arrows = learned_forces(posterior, dynamics)
-        paths = [contact.position(dynamics.state.kinematics).cpu().numpy() for contact in dynamics.contacts]
     poses = poses_of_links(robot, q, [shape.link for shape in drawn])
-    return RecordedScene(robot, rows.time - rows.time[0], rows.q, drawn, poses, arrows, paths, reach(robot), doubts)
+    return RecordedScene(robot, rows.time - rows.time[0], rows.q, drawn, poses, arrows, reach(robot), doubts)
 
 
 def learned_forces(posterior: Posterior, dynamics: ConstrainedDynamics) -> list[Arrows]:
@@ -191,7 +188,6 @@ COLORS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159
 """Okabe and Ito (2008), as the figures, for groups of arrows."""
 PALE = 0.55
 """How far the colour of an interval goes towards white."""
-PATH = (150, 155, 162)
 OPACITY = 0.6
 """Of links: arrows along the axes of joints begin inside of them."""
 
@@ -240,10 +236,6 @@ class SceneNodes:
             for place, shape in enumerate(recorded.shapes)
         ]
         self.arrows = [_arrows(scene, place, recorded) for place in range(len(recorded.arrows))]
-        for place, path in enumerate(recorded.paths):
-            if len(path) > 1:
-                segments = np.stack([path[:-1], path[1:]], axis=1).astype(np.float32)
-                scene.add_line_segments(f"/paths/{place}", segments, colors=PATH)
         self.show(0)
 
     def show(self, row: int) -> None:
