@@ -30,6 +30,18 @@ def test_a_fit_prints_one_json_object(installed, folder):
     assert (folder / "new" / "model.json").stat().st_size > 0
 
 
+def test_a_recording_becomes_a_page_in_the_browser(forcegp, folder, monkeypatch):
+    pytest.importorskip("viser")
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    for words in (("--out", "seen.html"), ()):
+        done = forcegp("view", "arm.h5", "--seconds", 0.2, *words, "--json", folder=folder)
+        assert done.returncode == 0, done.stderr
+        assert "<iframe" in (folder / json.loads(done.stdout)["html"]).read_text()
+    assert len(opened) == 1
+    assert opened[0].startswith("file:///")
+
+
 def test_a_mistake_is_one_line_on_stderr_and_exit_code_2(installed, folder):
     done = installed("fit", "missing.h5", "--out", "never", folder=folder)
     assert (done.returncode, done.stdout) == (2, "")

@@ -40,6 +40,7 @@ VALID = {
     "score": "score carried train.h5 --starts 1 --horizon 0.02",
     "monitor": "monitor carried train.h5 --free 0.1 --out out",
     "export": "export carried --to c --unchecked --out out",
+    "view": "view train.h5 --out nowhere/scene.html",
     "excite": "excite carried --tries 2 --seconds 1 --out out.csv",
     "simulate": "simulate none-such --out out.h5",
     "reproduce": "reproduce --preset none-such",

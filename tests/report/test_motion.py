@@ -14,8 +14,8 @@ from forcegp.report import recorded_scene, scene_notes
 from forcegp.report.motion import LONGEST_ARROW, PALE, _arrows
 
 
-def test_poses_are_pinocchios(swinging, friction):
-    scene = recorded_scene(swinging, friction, seconds=1.0)
+def test_poses_are_pinocchios(swinging):
+    scene = recorded_scene(swinging, seconds=1.0)
     model = pinocchio.buildModelFromXML(swinging.model.robot.urdf_text)
     data = model.createData()
     for row in (0, len(scene.time) - 1):
@@ -26,12 +26,19 @@ def test_poses_are_pinocchios(swinging, friction):
             np.testing.assert_allclose(scene.poses[row, place], pose, atol=1e-12)
 
 
-def test_frames_are_even_in_time_and_not_more_than_thirty_a_second(swinging, friction):
-    scene = recorded_scene(swinging, friction, seconds=2.0)
+def test_frames_are_even_in_time_and_not_more_than_thirty_a_second(swinging):
+    scene = recorded_scene(swinging, start=1.0, seconds=2.0)
     assert 58 <= len(scene.time) <= 61
     assert scene.time[0] == 0.0
     assert scene.time[-1] == pytest.approx(2.0, abs=0.01)
-    np.testing.assert_array_equal(scene.q[0], swinging.q[0])
+    first = np.searchsorted(swinging.time - swinging.time[0], 1.0 - 1e-9)
+    np.testing.assert_array_equal(scene.q[0], swinging.q[first])
+
+
+def test_without_a_model_the_recorded_torques_are_shown(swinging):
+    (arrows,) = recorded_scene(swinging, seconds=0.5).arrows
+    assert (arrows.title, arrows.unit, arrows.names) == ("recorded u", "Nm", swinging.joint_names)
+    assert not arrows.half.any()
 
 
 def test_joint_arrows_are_laws_and_learned_part_together(swinging, friction):

@@ -31,11 +31,12 @@ COMMANDS: Mapping[str, str] = {
     "demo": "simulate, learn, score and report, in a minute",
     "simulate": "make a dataset with ground truth",
     "import": "make a dataset from logs (CSV, ROS bags, ...), and filter it",
-    "robot": "show a robot file: tree, limits, masses and repairs",
+    "robot": "show a robot file: tree, limits, masses, repairs, and a picture",
     "check": "find mistakes in a log, with the correction of each",
     "fit": "find what a model leaves open: coefficients, bodies, unknown forces",
     "payload": "estimate mass, centre of mass and inertia of a payload",
     "score": "score and compare models on time that they have not seen",
+    "view": "show a recording and its learned forces in 3D, in the browser",
     "monitor": "find contacts in a log without a force sensor: time, link and force",
     "excite": "the most informative motion to record next",
     "export": "write a fitted model as a C program",
@@ -44,6 +45,7 @@ COMMANDS: Mapping[str, str] = {
 """A new command is an entry here, and a subclass of Command of that name."""
 MODULES = {
     "logs": ("import", "check"),
+    "shown": ("robot", "view"),
     "deploy": ("export", "monitor", "excite"),
     "simulated": ("simulate", "demo", "reproduce"),
 }

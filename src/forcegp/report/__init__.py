@@ -1,4 +1,4 @@
-"""What people look at: one HTML file with the robot in motion."""
+"""What people look at: one HTML file with the robot in motion, and the same live in a browser."""
 
 import lazy_loader as lazy
 

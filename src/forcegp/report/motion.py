@@ -87,27 +87,38 @@ class RecordedScene:
 
 
 def recorded_scene(
-    dataset: Dataset, posterior: Posterior, *, seconds: float = 10.0, shapes: str | Path | None = None
+    dataset: Dataset,
+    posterior: Posterior | None = None,
+    *,
+    start: float = 0.0,
+    seconds: float = 10.0,
+    shapes: str | Path | None = None,
 ) -> RecordedScene:
-    """The motion of the first `seconds` of the first episode, at no more than 30 frames per second.
+    """The motion of the first episode from `start` s on for `seconds`, at no more than 30 frames per second.
 
-    Forces are those of the posterior: each of its priors by itself, and the friction laws of its system. `shapes` is a
-    URDF with visual elements (`link_shapes`).
+    Forces are those of the posterior: each of its priors by itself, and the friction laws of its system. Without one,
+    the recorded u. `shapes` is a URDF with visual elements (`link_shapes`).
 
-    Raises MissingExtra without trimesh.
+    Raises InvalidInput for a Dataset without rows in that time, MissingExtra without trimesh.
     """
-    robot, rows = posterior.model.robot, style.window(dataset, 0.0, seconds)
+    model = dataset.model if posterior is None else posterior.model
+    rows = style.window(dataset, start, seconds)
     first, last = rows.time[[0, -1]]
     steps = int(np.clip((last - first) * FRAMES_PER_SECOND, 1, min(MOST_FRAMES, len(rows) - 1) or 1))
     grid = np.linspace(first, last, steps + 1)
     rows = rows.rows(np.unique(np.searchsorted(rows.time, grid - 1e-9).clip(0, len(rows) - 1)))
     q, v, u = (torch.tensor(values) for values in (rows.q, rows.v, rows.u))
-    drawn, doubts = link_shapes(robot, shapes)
+    drawn, doubts = link_shapes(model.robot, shapes)
     with torch.no_grad():
-        dynamics = posterior.dynamics(q, v, u)
-        arrows = learned_forces(posterior, dynamics)
-    poses = poses_of_links(robot, q, [shape.link for shape in drawn])
-    return RecordedScene(robot, rows.time - rows.time[0], rows.q, drawn, poses, arrows, reach(robot), doubts)
+        if isinstance(posterior, Posterior):
+            dynamics = posterior.dynamics(q, v, u)
+            arrows = learned_forces(posterior, dynamics)
+        else:
+            dynamics = model.dynamics(q, v, u)
+            arrows = [_at_joints(model.robot, dynamics, "recorded u", dynamics.state.delivered, None)]
+    poses = poses_of_links(model.robot, q, [shape.link for shape in drawn])
+    time = rows.time - rows.time[0]
+    return RecordedScene(model.robot, time, rows.q, drawn, poses, arrows, reach(model.robot), doubts)
 
 
 def learned_forces(posterior: Posterior, dynamics: ConstrainedDynamics) -> list[Arrows]:

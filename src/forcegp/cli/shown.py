@@ -1,9 +1,11 @@
-"""`forcegp robot`: what a robot file says."""
+"""`forcegp robot` and `view`: what a robot file says, and a recording in 3D."""
 
 from __future__ import annotations
 
 import math
+import tempfile
 import warnings
+import webbrowser
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,10 +14,11 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 import forcegp
-from forcegp.cli.command import URDF, Command, unless_given
+import forcegp.report
+from forcegp.cli.command import THERE, URDF, Command, unless_given
 from forcegp.cli.robot_options import RobotFileOptions
 from forcegp.cli.terminal import Terminal, columns, shown
-from forcegp.errors import RobotFileWarning, require_known
+from forcegp.errors import InvalidInput, RobotFileWarning, require_known
 
 NONE = (math.inf, -math.inf)  # limits that there are not; JSON has no number for them
 
@@ -120,3 +123,53 @@ def _shown(robot: forcegp.Robot, content: Mapping[str, Any]) -> list[Any]:
     loops = [f"closed loop: {first} and {second} are held together" for first, second in content["loops"]]
     inputs = [f"u: {', '.join(content['inputs']) or 'none'}"] if tuple(content["inputs"]) != robot.joint_names else []
     return [tree, *loops, *inputs, columns(title, ["joint", *header], rows, long_names=True)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class View(Command):
+    """Show a recording in 3D in the browser, with the forces of a model as arrows, or the recorded torques.
+
+    The page is one file, which can be sent around. It plays the motion; a slider chooses the time.
+
+    For example:
+      forcegp view run test.h5 --shapes arm.urdf
+      forcegp view log.h5 --out log.html
+    """
+
+    paths: Annotated[Positional[tuple[Path, ...]], THERE, arg(metavar="[RUN] LOG", help_behavior_hint="")]
+    """A dataset (HDF5), and before it, if wished, the folder of a model."""
+    shapes: Annotated[Path | None, URDF, unless_given("ROBOT.urdf", "capsules")] = None
+    """What the links look like: a URDF with visual elements, its meshes beside it."""
+    start: Annotated[float, arg(metavar="S")] = 0.0
+    """Where in the recording to begin, in s."""
+    seconds: Annotated[float, arg(metavar="S")] = 10.0
+    """How much of it to show."""
+    out: Annotated[Path | None, unless_given("FILE.html", "a temporary one, opened in the browser", Path)] = None
+    """The page to write; it is not opened then."""
+
+    def run(self, terminal: Terminal) -> Mapping[str, Any]:
+        """Write, and open."""
+        if len(self.paths) not in (1, 2):
+            raise InvalidInput(f"{len(self.paths)} paths were given; give a dataset, or a model and a dataset.")
+        *runs, log = self.paths
+        self.require_free_file(self.out, forcegp.report.is_page, "a report")
+        posterior = forcegp.load_posterior(runs[0]) if runs else None
+        recorded = forcegp.report.recorded_scene(
+            forcegp.Dataset.load(log), posterior, start=self.start, seconds=self.seconds, shapes=self.shapes
+        )
+        for doubt in recorded.doubts:
+            terminal.warn(doubt)
+        of = f", with the forces of {runs[0].name}" if runs else ""
+        page = forcegp.report.Page(
+            f"{log.name}, {recorded.time[-1]:.3g} s{of}",
+            recorded.robot.name,
+            scene=forcegp.report.recording(recorded),
+            scene_notes=forcegp.report.scene_notes(recorded),
+        )
+        out = self.out or Path(tempfile.mkdtemp(prefix="forcegp-"), f"{log.stem}.html")
+        forcegp.report.write_page(out, page, overwrite=self.overwrite)
+        terminal.note(f"page: {out}")
+        if self.out is None:
+            webbrowser.open(out.resolve().as_uri())
+        forces = [{"name": each.title, "unit": each.unit, "arrows": list(each.names)} for each in recorded.arrows]
+        return {"rows": len(recorded.time), "seconds": float(recorded.time[-1]), "forces": forces, "html": str(out)}
