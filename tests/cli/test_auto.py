@@ -140,7 +140,7 @@ def test_the_printed_command_keeps_every_option():
     others += " --forces given --forces gp:joint,viscous --out here"
     words = ["auto", "a.txt", "b.txt", *columns.split(), *others.split()]
     command = parse_arguments(words)
-    mapping = command.columns.mapped()
+    mapping = command.columns.mapped([], Terminal(json=False))
     again = parse_arguments(shlex.split(command._command(mapping, command.robot))[1:])
     assert again == command
 

@@ -29,13 +29,27 @@ def test_what_cannot_be_imported_is_one_line_and_leaves_nothing(forcegp, folder,
     log = broken.make(folder)
     before = sorted(folder.rglob("*"))
     done = forcegp("import", log.relative_to(folder), *broken.words.split(), "--out", "log_out.h5", folder=folder)
-    lines = done.stderr.splitlines()
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("the columns are mapped by")]
     assert done.returncode == 2, done.stderr
     assert done.stdout == ""
     assert len(lines) == 1, done.stderr
     assert lines[0].startswith("forcegp: ")
     assert broken.told in lines[0]
     assert sorted(folder.rglob("*")) == before
+
+
+def test_a_mapping_beside_the_log_is_found_and_changed_by_flags(forcegp, folder):
+    write_text(folder / "log.csv", table(motion()))
+    (folder / "log.yaml").write_text("time: time\nq: q_{joints}\nv: v_{joints}\nu: u_{joints}\n")
+    for name, words in (("a", FLAGS), ("b", FLAGS[-2:]), ("c", (*FLAGS[-2:], "--sign=u=-1", "--unit", "q=deg"))):
+        done = forcegp("import", "log.csv", *words, "--out", f"{name}.h5", folder=folder)
+        assert done.returncode == 0, done.stderr
+        assert "the columns are mapped by log.yaml" in done.stderr
+    a, b, c = (Dataset.load(folder / f"{name}.h5") for name in "abc")
+    for name in ("q", "v", "u", "a", "time", "episode"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    np.testing.assert_array_equal(c.u, -a.u)
+    np.testing.assert_allclose(c.q, np.deg2rad(a.q), rtol=1e-15)
 
 
 def test_an_existing_file_is_kept_unless_told_otherwise(forcegp, folder):

@@ -3,6 +3,7 @@
 import pytest
 
 from forcegp.cli.main import parse_arguments
+from forcegp.cli.terminal import Terminal
 from forcegp.recordings import ColumnMapping
 
 JOINTS = ("pan", "lift", "bend")
@@ -54,4 +55,4 @@ def test_an_order_names_the_columns_that_were_read():
 )
 def test_flags_state_the_mapping(mapping):
     command = parse_arguments(["import", "log.csv", *mapping.flags(), "--out", "log.h5"])
-    assert command.columns.mapped() == mapping
+    assert command.columns.mapped([], Terminal(json=True)) == mapping

@@ -10,6 +10,7 @@ from tests.recordings.log_files import JOINTS, motion, table, write_text
 
 from forcegp import Model, Robot
 from forcegp.cli.main import parse_arguments
+from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 from forcegp.recordings import ColumnMapping, by_quantity, listed, open_source
 from forcegp.recordings.mapping import expanded, guessed_columns, guessed_time, log_unit, parse_expression
@@ -156,13 +157,18 @@ def test_units(quantity, name, given, si):
 )
 def test_flags_that_mean_nothing_are_refused(flags):
     with pytest.raises(InvalidInput):
-        parse_arguments(["import", "log.csv", *flags.split(), "--out", "o.h5"]).columns.mapped()
+        parse_arguments(["import", "log.csv", *flags.split(), "--out", "o.h5"]).columns.mapped([], Terminal(json=True))
 
 
 def test_short_forms_of_the_command_line():
     assert by_quantity("unit", "q=deg,m,time=ms") == {"q": ("deg", "m"), "time": ("ms",)}
     for flag, signs in (("u=1,-1", {"u": (1.0, -1.0)}), ("1,-1", dict.fromkeys("qvua", (1.0, -1.0)))):
-        assert parse_arguments(["import", "x.csv", f"--sign={flag}", "--out", "o.h5"]).columns.mapped().sign == signs
+        assert (
+            parse_arguments(["import", "x.csv", f"--sign={flag}", "--out", "o.h5"])
+            .columns.mapped([], Terminal(json=True))
+            .sign
+            == signs
+        )
 
 
 def test_names_are_guessed_only_where_nothing_else_can_be_meant(tmp_path):

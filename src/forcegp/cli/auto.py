@@ -48,8 +48,8 @@ class Auto(Command):
 
     For example:
       forcegp auto run.csv --time t --q 'pos{1..6}' --u 'tau{1..6}' --robot arm.urdf --out answer
-      forcegp auto walk.mcap --q /odom:pose,/joints:position --robot dog.urdf --base floating --feet FL,FR --out answer
-      forcegp auto flight.csv --q x,y,z,qx,qy,qz,qw --u 'rotor{1..4}' --identified drone.json --out answer
+      forcegp auto walk.csv --mapping columns.yaml --robot dog.urdf --base floating --feet FL_foot,FR_foot --out answer
+      forcegp auto flight.csv --mapping columns.yaml --identified drone.json --out answer
     """
 
     interrupted = "finished pieces are kept, and the same command resumes"
@@ -85,7 +85,7 @@ class Auto(Command):
             raise InvalidInput(f"{self.out} was not written by forcegp auto; choose another name.")
         if not self.out.parent.is_dir():
             raise InvalidInput(f"the folder {self.out.parent} does not exist; create it first.")
-        model, mapping = self.columns.model(self.robot), self.columns.mapped()
+        model, mapping = self.columns.model(self.robot), self.columns.mapped(self.logs, terminal)
         for note in forces_of(model):
             terminal.note(note)
         dataset, done, mapping, mistakes, robot = self._imported(terminal, model, mapping)
@@ -185,7 +185,7 @@ class Auto(Command):
 
     def _command(self, mapping: forcegp.recordings.ColumnMapping, robot: RobotOptions) -> str:
         """The same command with the columns, units and signs of the mapping, and this robot."""
-        stated = {item.name for item in fields(mapping)} | {"logs", "out"}
+        stated = {item.name for item in fields(mapping)} | {"mapping", "logs", "out"}
         others = [name for name in options_of(Auto) if name not in stated]
         words = ["forcegp", "auto", *map(str, self.logs), *mapping.flags(), *replace(self, robot=robot).words(*others)]
         return shlex.join([*words, "--out", str(self.out)])

@@ -88,6 +88,7 @@ class InputPath:
 
 CONFIG = "config.json"
 LIBRARIES = ("forcegp", "torch", "gpytorch", "numpy", "scipy")
+MAPPING = InputPath(" is not a file; give --mapping a YAML file.")
 DATASET = InputPath(" is not a file; give the path of a dataset written by forcegp (.h5).")
 MODEL = InputPath(" does not exist; give the folder that `forcegp fit --out` wrote", Path.exists)
 URDF = InputPath(": no such file; give the path of a URDF file.", Path.exists)

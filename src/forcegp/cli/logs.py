@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,7 +14,7 @@ import forcegp.checks
 import forcegp.data
 import forcegp.recordings
 from forcegp.atomic_files import atomic_file
-from forcegp.cli.command import DATASET, LOG, NUMBERS, Command, listed, numbers_of, options_of, unless_given
+from forcegp.cli.command import DATASET, LOG, MAPPING, NUMBERS, Command, listed, numbers_of, options_of, unless_given
 from forcegp.cli.robot_options import FEET, RobotOptions, parse_feet
 from forcegp.cli.terminal import Terminal, columns, doubts_table, facts, shown
 from forcegp.errors import DatasetError, InvalidInput
@@ -98,6 +98,10 @@ class ColumnOptions:
     """Frames, or points of them, that stand on the ground at times: 1 or 0 in columns of u after those of the
     actuators, in this order. Without these columns motion and forces decide; rows that leave it open are dropped.
     FRAME:flat is a foot that does not turn while it stands, FRAME:ball=RADIUS (m) a ball that rolls on level ground."""
+    mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "log.yaml or forcegp.yaml beside it", Path)] = (
+        None
+    )
+    """What the columns mean; flags replace its entries."""
     time: Columns = None
     """Time stamps; of a bag with several topics, those of the messages that become rows."""
     step: Annotated[float | None, unless_given("S", "by the time stamps", float)] = None
@@ -173,8 +177,28 @@ class ColumnOptions:
             raise InvalidInput("--identified brings its contacts along; leave --feet out.")
         return model.with_contacts((*touching, *model.loops))
 
-    def mapped(self) -> forcegp.recordings.ColumnMapping:
-        """What the flags state. Raises InvalidInput."""
+    def mapped(self, logs: Sequence[Path], terminal: Terminal) -> forcegp.recordings.ColumnMapping:
+        """What the flags state, and for those that are not given the file. Raises InvalidInput, FileFormatError."""
+        path = self.mapping
+        if path is None:
+            found = {forcegp.recordings.beside(log) for log in logs} - {None}
+            if len(found) > 1:
+                several = ", ".join(sorted(map(str, found)))
+                raise InvalidInput(f"the logs have different mappings beside them ({several}); give --mapping.")
+            path = next(iter(found), None)
+            if path is not None:
+                terminal.note(f"the columns are mapped by {path}")
+        if path is None:
+            return self._stated()
+        names = [item.name for item in fields(forcegp.recordings.ColumnMapping)]
+        stored = forcegp.recordings.read_mapping(path, names)
+        left = {name: value for name, value in stored.items() if getattr(self, name) in (None, False)}
+        try:
+            return replace(self, **left)._stated()
+        except InvalidInput as error:
+            raise InvalidInput(f"{path} and the flags: {error}") from None
+
+    def _stated(self) -> forcegp.recordings.ColumnMapping:
         given: dict[str, Any] = {
             item.name: getattr(self, item.name) for item in fields(forcegp.recordings.ColumnMapping)
         }
@@ -200,7 +224,8 @@ class Import(Command):
     """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, JSON, npz, MATLAB, HDF5, ROS bags.
 
     State which columns are the time, the positions, velocities and forces of the joints (or of a base that moves), and
-    their units. COLUMNS are names, patterns such as pos{1..7}, or combinations: "theta2 - theta1, 0.5*b + pi".
+    their units: by flags, or in a YAML file. One beside the log, log.yaml or forcegp.yaml, is found by itself. COLUMNS
+    are names, patterns such as pos{1..7}, or combinations: "theta2 - theta1, 0.5*b + pi".
 
     With a --cutoff, --delay, --lag, --stance, --every or --trim, rows are filtered, aligned and thinned out, and what
     that costs is reported; LOG may then be a dataset, too. The low-pass filter runs forwards and backwards, so that
@@ -210,6 +235,7 @@ class Import(Command):
       forcegp import run.csv --time t --q 'pos{1..2}' --u 'tau{1..2}' --robot arm.urdf --out log.h5
       forcegp import run.mcap --q /joint_states:position --u /joint_states:effort --robot arm.urdf --out log.h5
       forcegp import walk.mcap --q '/odom:pose,/joints:position.{joints}' --robot dog.urdf --base floating --out log.h5
+      forcegp import walk.csv --mapping dog.yaml --robot dog.urdf --base floating --feet FL_foot,FR_foot --out log.h5
       forcegp import log.h5 --cutoff auto --delay auto --every 10 --out data.h5
     """
 
@@ -232,7 +258,7 @@ class Import(Command):
         if forcegp.data.is_dataset(self.logs[0]):
             raw, done = self._dataset(preparation), {}
         else:
-            mapping = self.columns.mapped()
+            mapping = self.columns.mapped(self.logs, terminal)
             given = {"model": self.columns.model(self.robot), "options": self.columns.options()}
             with terminal.progress("importing"):
                 raw = forcegp.import_recordings(self.logs, mapping, **given)
