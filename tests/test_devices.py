@@ -25,7 +25,7 @@ PRIORS = (
     "gp:joint",
     "gp:load-friction,gp:joint-friction",
     "gp:tool-friction",
-    "gp:joint-ripple",
+    "gp:joint-position",
     "gp:joint:kernel=matern-3/2",
 )
 
@@ -126,8 +126,8 @@ def test_the_likelihood_waits_for_a_few_flags_whatever_the_number_of_rows(prior)
         for name, slope in slopes.items():
             torch.testing.assert_close(numbers(slope), plain[1][name], rtol=1e-6, atol=1e-6)
     assert counts[0] == counts[1] <= 6
-    # y^T K^-1 y by two orders of the same operations: eps cond(K), times 10 for their number. The ripple cannot explain
-    # these accelerations, so that its value rests on the noise alone, at cond(K) of 1e7.
+    # y^T K^-1 y by two orders of the same operations: eps cond(K), times 10 for their number. Positions alone
+    # do not explain these accelerations, so that their value rests on the noise, with a large cond(K).
     for (there, here), condition in zip(values, conditions, strict=True):
         bound = 10.0 * torch.finfo(torch.float64).eps * condition
         assert float(there) == pytest.approx(float(here), rel=max(bound, 1e-12))

@@ -97,12 +97,12 @@ def test_a_term_that_moves_no_joint_is_refused(data):
     [
         (JointFriction(), r"latent 'lift' depends on velocity of lift \[rad/s\], which is the same in all 12"),
         (
-            (JointPositionForces(period=6.0), JointForces(("u",))),
-            "latent 'joint-ripple lift' depends on position of",
+            (JointPositionForces(), JointForces(("u",))),
+            "latent 'joint-position-forces lift' depends on position of",
         ),
         ((JointFriction(), ContactFriction()), "latent 'joint-friction lift'"),
     ],
-    ids=["friction", "ripple", "sum"],
+    ids=["friction", "position", "sum"],
 )
 def test_a_joint_that_never_moves_teaches_nothing_of_its_own(data, prior, message):
     free = data.model.with_contacts([])

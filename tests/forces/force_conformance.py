@@ -197,7 +197,7 @@ class UnknownConformance:
         assert_close(J.mT @ force[..., pushes], self.prior.direction(dynamics)[..., pushes], 1e-12)
 
     def test_sums_with_another_prior(self, model):
-        other = JointPositionForces(period=0.7)
+        other = JointPositionForces(kernel="matern-1/2")
         total = UnknownForces((self.prior, other))
         dynamics = model.dynamics(*some_states(4))
         parts = (self.prior, other)
@@ -211,7 +211,7 @@ class UnknownConformance:
         ]
         names = total.latent_names(model.robot)
         assert len(set(names)) == len(names) == count + 3
-        assert names[count].startswith("joint-ripple")
+        assert names[count].startswith("joint-position-forces")
         assert names[count].endswith(" pan")
         assert len(set(total.term_names)) == len(total.terms)
         assert total.latent_units(model.robot)[:count] == self.prior.latent_units(model.robot)

@@ -1,7 +1,5 @@
 """Every unknown force, with several options, passes the suite of all; so does one that forcegp does not bring."""
 
-from math import pi
-
 import pytest
 from tests.forces.force_conformance import UnknownConformance
 from tests.forces.third_party_unknown import AirDrag
@@ -97,10 +95,6 @@ class TestContactFrictionUnderLoadWithJointFriction(UnknownConformance):
 
 class TestJointPositionForces(UnknownConformance):
     prior = JointPositionForces(("lift",), "matern-5/2")
-
-
-class TestJointRipple(UnknownConformance):
-    prior = JointPositionForces(("lift",), period=pi / 6)
 
 
 class TestAirDrag(UnknownConformance):

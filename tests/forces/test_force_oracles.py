@@ -16,7 +16,6 @@ from forcegp.forces import (
     ContactFriction,
     Coulomb,
     JointFriction,
-    JointPositionForces,
     LoadFriction,
     Payload,
     RigidBodies,
@@ -24,7 +23,6 @@ from forcegp.forces import (
     ToolForces,
     Viscous,
 )
-from forcegp.inference import LatentKernels
 from forcegp.mechanics import Contact, ImplicitSurface, Plane
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -199,50 +197,6 @@ def test_joint_friction_is_positive_against_positive_velocity(dynamics, rows):
     expected[:, order] = torch.tensor([-2.0, -3.0], dtype=torch.float64)
     assert torch.equal(force, expected)
     assert torch.equal(torch.cat(prior.features(dynamics), -1), rows[1][:, order])
-
-
-def test_periodic_forces_repeat(dynamics):
-    """Functions of the kernel at q and at q + k periods are perfectly correlated; in between they are not."""
-    prior = JointPositionForces(period=0.3)
-    robot = dynamics.state.robot
-    z = prior.features(dynamics)
-    later = [one + 0.3 * torch.arange(ROWS).double()[:, None] for one in z]
-    half = [one + 0.15 for one in z]
-    kernels = LatentKernels(prior.kernels(robot, (1,) * robot.nv, torch.arange(1.0, 1.0 + robot.nv).double()))
-    with torch.no_grad():
-        for c, kernel in enumerate(kernels):
-            K = kernel(z[c], later[c]).to_dense()
-            torch.testing.assert_close(K, kernel(z[c], z[c]).to_dense(), rtol=1e-9, atol=1e-9)
-            torch.testing.assert_close(K.diagonal(), (c + 1.0) * torch.ones(ROWS).double(), rtol=1e-9, atol=0.0)
-            assert float(kernel(z[c], half[c]).to_dense().diagonal().max()) < 0.5 * (c + 1.0)
-
-
-def test_a_periodic_kernel_starts_at_the_median_of_its_prior(dynamics):
-    robot = dynamics.state.robot
-    for kernel in JointPositionForces(period=0.3).kernels(robot, (1,) * robot.nv, torch.ones(robot.nv).double()):
-        assert kernel.base_kernel.lengthscale.item() == pytest.approx(1.0)
-        assert kernel.base_kernel.period_length.item() == pytest.approx(0.3)
-
-
-def test_a_period_is_searched_in_spreads_of_its_prior(dynamics):
-    """A unit step of the search, such as a restart takes, is one standard deviation of the prior: 2 %."""
-    given = torch.tensor(0.3, dtype=torch.float64)
-    robot = dynamics.state.robot
-    kernels = LatentKernels(
-        JointPositionForces(period=0.3).kernels(robot, (1,) * robot.nv, torch.ones(robot.nv).double())
-    )
-    start = kernels.initial_parameters()
-    name = "kernels.1.base_kernel.raw_period_length"
-    torch.testing.assert_close(start[name], torch.zeros(1, 1).double(), rtol=0.0, atol=1e-9)
-    moved = {name: torch.full((1, 1), 1.5, dtype=torch.float64, requires_grad=True)}
-    there = list(kernels.at(start | moved))[1].base_kernel
-    torch.testing.assert_close(there.period_length[0, 0], given * math.exp(1.5 * 0.02), rtol=1e-12, atol=0.0)
-    there.period_length = 0.9 * there.period_length  # by value, as start values are
-    torch.testing.assert_close(there.period_length[0, 0], 0.9 * given * math.exp(1.5 * 0.02), rtol=1e-12, atol=0.0)
-    density = kernels.log_prior(start | moved)
-    torch.testing.assert_close(density - kernels.log_prior(start), torch.tensor(-0.5 * 1.5**2).double())
-    density.backward()
-    torch.testing.assert_close(moved[name].grad, torch.full((1, 1), -1.5, dtype=torch.float64), rtol=1e-9, atol=0.0)
 
 
 def test_dry_friction_of_a_file_goes_where_another_law_of_it_is_added():

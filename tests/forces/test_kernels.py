@@ -10,7 +10,7 @@ from tests.inference.kernel_functions import kernel_cross, kernel_matrix
 from tests.inference.problems import normal
 
 from forcegp.errors import InvalidInput
-from forcegp.forces.kernels import KERNELS, checked_kernel, kernel_of, periodic
+from forcegp.forces.kernels import KERNELS, checked_kernel, kernel_of
 from forcegp.inference import LatentKernels
 
 
@@ -100,15 +100,6 @@ def test_linear_against_its_formula():
     kernel.variance = variances
     z = normal(6, 3)
     torch.testing.assert_close(matrix(kernel, z), z @ torch.diag(variances[0]) @ z.mT, rtol=1e-13, atol=1e-14)
-
-
-def test_periodic_against_its_formula_and_after_a_period():
-    kernel = periodic(1.3, 2.0)
-    kernel.base_kernel.lengthscale = float64([[0.7]])
-    z = normal(6, 1)
-    expected = 1.3 * torch.exp(-2.0 * torch.sin(math.pi * (z - z.mT) / 2.0).square() / 0.7)
-    torch.testing.assert_close(matrix(kernel, z), expected, rtol=1e-13, atol=1e-14)
-    torch.testing.assert_close(kernel_cross(kernel, z + 6.0, z).detach(), expected, rtol=1e-12, atol=1e-13)
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,6 @@ SURFACE_FORCES = ToolForces(inputs=("velocity", "position"), kernel="squared-exp
 NAMES = {
     "bodies": RigidBodies("all"),
     "gp:joint": JointForces(),
-    "gp:joint-ripple": JointPositionForces(period=2.0 * math.pi),
     "gp:joint-position:joints=pan": JointPositionForces(("pan",)),
     "gp:tool-friction": ToolForces(),
     "gp:tool-forces": SURFACE_FORCES,
@@ -69,7 +68,6 @@ EXPRESSIONS = {
     "gp:joint:v": JointForces(("v",)),
     "viscous:transmission=lift+pan/pan-0.5*lift": Viscous(transmission="lift+pan/pan-0.5*lift"),
     "gp: joint-friction : joints = lift / pan ": JointFriction(("lift", "pan")),
-    "gp:joint-ripple:period=0.5:joints=pan": JointPositionForces(("pan",), period=0.5),
     "gp:tool-forces:frame=hand:point=0/-0.1/2e-1:axes=world": ToolForces(
         "hand", (0.0, -0.1, 0.2), axes="world", inputs=SURFACE_FORCES.inputs, kernel=SURFACE_FORCES.kernel
     ),
@@ -98,8 +96,6 @@ MISTAKES = {
     "gp:load-friction:load=yes": "force 'load-friction' has load=yes; give true or false",
     "gp:contact-friction:contact=first": "force 'contact-friction' has contact=first; give a whole number",
     "gp:contact-friction:contact=-1": "a contact's number from 0",
-    "gp:joint-ripple:period=fast": "force 'joint-ripple' has period=fast; give a number",
-    "gp:joint-ripple:period=nan": "JointPositionForces period is nan; give a positive number",
     "gp:tool-friction:point=0/0": "a point of three numbers",
     "gp:tool-friction:point=0/0/x": r"force 'tool-friction' has point=0/0/x; give numbers as in 0.0/0.0/0.0",
     "gp:tool-friction:axes=sideways": "give axes 'world' or 'tool' or 'surface'",
@@ -142,7 +138,6 @@ def test_mistakes_are_explained(expression):
     ("expression", "error", "message"),
     [
         ("gp:joint-friction:joints=elbow", UnknownName, "no joint 'elbow' in arm"),
-        ("gp:joint-ripple:joints=pna", UnknownName, "did you mean 'pan'"),
         ("payload:hnad", UnknownName, "did you mean 'hand'"),
         ("gp:tool-friction:contact=1", InvalidInput, "contact 1, but the model has only contact 0"),
         ("gp:joint,gp:joint", InvalidInput, "'joint-forces' twice"),
@@ -159,13 +154,15 @@ def test_people_add_their_own(monkeypatch):
         limits: tuple[float, float] = (0.0, 1.0)
         count: int = 3
 
-    def faster(period: float = 1.0, joints: tuple[str, ...] | None = None) -> JointPositionForces:
-        return JointPositionForces(joints, period=0.5 * period)
+    def rough(nu: int = 3, joints: tuple[str, ...] | None = None) -> JointPositionForces:
+        return JointPositionForces(joints, f"matern-{nu}/2")
 
     monkeypatch.setitem(FORCES, "slow", Slow)
-    monkeypatch.setitem(FORCES, "faster", faster)
+    monkeypatch.setitem(FORCES, "rough", rough)
     assert parse_forces("gp:slow:v:limits=-1/2.5:count=4") == (Slow(("v",), limits=(-1.0, 2.5), count=4),)
-    assert parse_forces("gp:faster:period=3:joints=pan/lift") == (JointPositionForces(("pan", "lift"), period=1.5),)
+    assert parse_forces("gp:rough:nu=5:joints=pan/lift") == (
+        JointPositionForces(("pan", "lift"), "matern-5/2"),
+    )
 
 
 @pytest.mark.parametrize(
@@ -183,8 +180,6 @@ def test_people_add_their_own(monkeypatch):
         (lambda: ToolForces(frame=3), "frame is 3"),
         (lambda: ToolForces(contact="0"), "contact '0'"),
         (lambda: ContactFriction(contact=True), "contact True"),
-        (lambda: JointPositionForces(period=-1.0), "period is -1.0"),
-        (lambda: JointPositionForces(period="long"), "period is 'long'"),
         (lambda: Payload(mass=2.0), "no link; name the link that carries it"),
         (lambda: Payload("hand", -1.0), "mass is -1.0"),
     ],

@@ -84,7 +84,7 @@ def test_a_panel_shows_the_curve_its_band_the_training_velocities_and_the_truth(
 
 
 def test_large_models_say_how_many_curves_are_shown(monkeypatch):
-    model = fitted(JointFriction(), JointPositionForces(period=1.0), iterations=1)
+    model = fitted(JointFriction(), JointPositionForces(), iterations=1)
     monkeypatch.setattr("forcegp.scores.figures.model.LARGEST_GRID", 2)
     figure = friction_curves_figure(model)
     assert len(figure.axes) == 2

@@ -2,17 +2,16 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import torch
-from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, UnknownName, require_known, require_number, usable_arguments
+from forcegp.errors import InvalidInput, UnknownName, require_known, usable_arguments
 from forcegp.forces.force import joint_unit, slides
-from forcegp.forces.kernels import checked_kernel, periodic
+from forcegp.forces.kernels import checked_kernel
 from forcegp.forces.unknown import ExpressedKernels, Scaling, SharedInputs, as_names
 from forcegp.mechanics import ConstrainedDynamics, Contact, State
 from forcegp.robots import Robot
@@ -198,36 +197,8 @@ class JointFriction(PerJoint):
 
 @dataclass(frozen=True)
 class JointPositionForces(PerJoint):
-    """Q_U,j = f_j(q_j): what pushes joint j where it is, such as springs and cables; `joints`: of some joints only.
-
-    With a `period` (rad, or m) the functions repeat, whatever the kernel: s exp(-2 sin^2(pi (q - q') / period) / l). It
-    is fitted near the value given: a motor with 12 pole pairs has 2 pi / 12, behind a gear of ratio 100 it is 2 pi /
-    1200.
-    """
+    """Q_U,j = f_j(q_j): what pushes joint j where it is, such as springs and cables; `joints`: of some joints only."""
 
     joints: tuple[str, ...] | None = None
     kernel: str = "squared-exponential"
-    period: float | None = None
     depends_on: ClassVar[Literal["q", "v"]] = "q"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.period is not None:
-            require_number("JointPositionForces period", self.period, "give a positive number in rad")
-            object.__setattr__(self, "period", float(self.period))
-
-    @property
-    @override
-    def title(self) -> str:
-        return "joint-position-forces" if self.period is None else "joint-ripple"
-
-    @override
-    def scalings(self, robot: Robot) -> tuple[Scaling, ...]:
-        how: Any = "standardize" if self.period is None else "none"  # the period is in rad
-        return (how,) * len(self.latent_names(robot))
-
-    @override
-    def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
-        if self.period is None:
-            return super().kernels(robot, dimensions, variances)
-        return tuple(periodic(variance, self.period) for variance in variances)

@@ -14,7 +14,6 @@ from gpytorch.kernels import (
     Kernel,
     LinearKernel,
     MaternKernel,
-    PeriodicKernel,
     ProductKernel,
     RBFKernel,
     ScaleKernel,
@@ -59,9 +58,6 @@ def _log_parameter(name: str, module: Module) -> Tensor:
 LOG_LENGTHSCALE_SHIFT = 3.0
 LOG_LENGTHSCALE_SPREAD = 2.0
 
-PERIOD_SPREAD = 0.02
-"""Standard deviation of the prior on the logarithm of a period: likelihoods of periods have many narrow optima."""
-
 
 def squared_exponential(dimension: int, variance: float | Tensor) -> ScaleKernel:
     """k = variance exp(-r^2 / 2), r^2 = sum_d (z_d - z'_d)^2 / l_d^2; smooth forces. Starts at l = sqrt(dimension).
@@ -79,31 +75,6 @@ def matern(dimension: int, variance: float | Tensor, *, smoothness: float) -> Sc
     """
     base = MaternKernel(smoothness, ard_num_dims=dimension, lengthscale_constraint=log_scale())
     return _scaled(base, variance)
-
-
-def periodic(variance: float | Tensor, period: float) -> ScaleKernel:
-    """k = variance exp(-2 sin^2(pi (z - z') / p) / l) of one feature (MacKay 1998, eq. 47; l not squared).
-
-    p is sought near `period`, in standard deviations of its prior; l starts at 1 with log l ~ N(0, 2^2).
-    """
-    near = Positive(partial(_period, period), partial(_spreads, period))  # type: ignore[arg-type]  # stubs
-    base = PeriodicKernel(ard_num_dims=1, lengthscale_constraint=log_scale(), period_length_constraint=near)
-    kernel = ScaleKernel(base, outputscale_constraint=log_scale()).double()
-    base.lengthscale = torch.ones(1, 1, dtype=torch.float64)
-    base.period_length = torch.full((1, 1), period, dtype=torch.float64)
-    kernel.outputscale = float64(variance)
-    # without it, what has no ripple would run off to a constant of boundless variance
-    register_log_normal_prior(base, "lengthscale", 1.0, LOG_LENGTHSCALE_SPREAD)
-    register_log_normal_prior(base, "period_length", period, PERIOD_SPREAD)
-    return kernel
-
-
-def _period(given: float, spreads: Tensor) -> Tensor:
-    return given * (PERIOD_SPREAD * spreads).exp()
-
-
-def _spreads(given: float, period: Tensor) -> Tensor:
-    return (period / given).log() / PERIOD_SPREAD
 
 
 def _scaled(base: Kernel, variance: float | Tensor) -> ScaleKernel:

@@ -4,7 +4,6 @@ Options are FIELD=VALUE, as in viscous, stribeck:level=1.2, payload:tool0, gp:jo
 """
 
 import difflib
-import math
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from inspect import Parameter, signature
@@ -45,7 +44,6 @@ SHORT: dict[str, tuple[str, Mapping[str, Any]]] = {
     "bodies": ("rigid-bodies", {"learn": "all"}),
     "gain": ("actuation", {"gain": None}),
     "joint": ("joint-forces", {}),
-    "joint-ripple": ("joint-position", {"period": 2.0 * math.pi}),
     "tool-friction": ("tool-forces", {}),
     "tool-forces": ("tool-forces", {"inputs": ("velocity", "position"), "kernel": "squared-exponential"}),
     "load-friction": ("contact-friction", {"load": True}),

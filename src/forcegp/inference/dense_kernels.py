@@ -1,7 +1,7 @@
 """Kernels of all latents: matrices of GPyTorch kernels, exact and lean, and their parameters by name.
 
-A kernel class of anybody may have `squared_exponential_embedding(z)` (n, e), for k = exp(-1/2 |e - e'|^2),
-`matern_embedding(z)` and `nu`, or `weight_features(z)` (n, p), for k = phi . phi'. Every other kernel is called.
+A kernel class of anybody may have `matern_embedding(z)` (n, e) and `nu` (inf: k = exp(-1/2 |e - e'|^2)), or
+`weight_features(z)` (n, p), for k = phi . phi'. Every other kernel is called.
 """
 
 import math
@@ -18,7 +18,6 @@ from gpytorch.kernels import (
     Kernel,
     LinearKernel,
     MaternKernel,
-    PeriodicKernel,
     ProductKernel,
     RBFKernel,
     ScaleKernel,
@@ -38,11 +37,6 @@ def embedding(kernel: Kernel) -> tuple[PointMap, float] | None:
     if type(kernel) in (RBFKernel, MaternKernel):
         smoothness = kernel.nu if isinstance(kernel, MaternKernel) else math.inf
         return partial(scaled, kernel), float(smoothness)
-    squared_exponential = getattr(kernel, "squared_exponential_embedding", None)
-    if type(kernel) is PeriodicKernel:
-        squared_exponential = partial(_circles, kernel)
-    if squared_exponential is not None:
-        return squared_exponential, math.inf
     matern = getattr(kernel, "matern_embedding", None)
     return None if matern is None else (matern, float(cast(float, kernel.nu)))
 
@@ -54,12 +48,6 @@ def weight_features(kernel: Kernel) -> PointMap | None:
     if type(kernel) is ConstantKernel:
         return lambda z: kernel.constant.sqrt().reshape(1, 1).expand(len(z), 1)
     return getattr(kernel, "weight_features", None)
-
-
-def _circles(kernel: PeriodicKernel, z: Tensor) -> Tensor:
-    """e(x) = (cos, sin)(2 pi x / p) / sqrt l, for which 1/2 |e(x) - e(y)|^2 = 2 sin^2(pi (x - y) / p) / l."""
-    angle = (2.0 * math.pi) * z / kernel.period_length.reshape(-1)
-    return torch.cat([angle.cos(), angle.sin()], dim=-1) / lengthscale_of(kernel).sqrt().expand(z.shape[-1]).repeat(2)
 
 
 def squared_exponential_parameters(kernel: Kernel) -> tuple[Tensor, Tensor] | None:

@@ -85,9 +85,8 @@ def kernel_terms(kernel: Kernel) -> list[KernelTerm]:
     kind = f"{type(kernel).__name__}{'' if whole else ' with active_dims or a batch'}"
     raise InvalidInput(
         f"no functions can be drawn for a {kind}; they can for sums and products of squared exponential, Matern, "
-        "periodic, linear and constant kernels, and of those that have the method "
-        "`squared_exponential_embedding`, `matern_embedding` or `weight_features`, all without active_dims; use such "
-        "kernels, or ask for no samples."
+        "linear and constant kernels, and of those that have the method `matern_embedding` or `weight_features`, all "
+        "without active_dims; use such kernels, or ask for no samples."
     )
 
 
