@@ -61,9 +61,9 @@ def everything(x: torch.Tensor, y: torch.Tensor) -> list[torch.Tensor]:
     place = (torch.tensor([-0.5, 0.0, 0.5], dtype=torch.float64) < x.detach()[..., None]).sum(-1).clamp(1, 3)
     weights = torch.tensor([[0.0, 1.0, 2.0], [3.0, 0.0, -1.0]], dtype=torch.float64)
     return [
-        inside.asin() + inside.acos() + x.sin() * y.cos() + x.tan() + x.atan() - x.asinh(),
+        inside + x.sin() * y.cos() + x.tan() - x.asinh(),
         positive.log() + positive.sqrt() + positive.rsqrt() + positive.reciprocal(),
-        torch.log1p(positive) + torch.expm1(x) + x.sinh() - y.cosh() + torch.erf(x) + torch.sigmoid(y),
+        torch.log1p(positive) + torch.expm1(x) - y.tanh(),
         x.abs() + y.sign() * x + torch.atan2(x, positive) + x**2 + x**3 + positive**-1.0 + positive**1.7,
         torch.where((x < y) | (x > 2.0 * y), x, y * x) + torch.where(~(x <= 0.0) & (y != 0.1), x.square(), y),
         x.clamp(-0.3, 0.4) + torch.maximum(x, y) + torch.minimum(x, 2.0 * y) + x.clamp_min(0.1),

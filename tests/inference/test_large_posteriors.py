@@ -4,12 +4,9 @@ import pytest
 import torch
 from tests.inference.problems import Problem, normal, problem
 
-from forcegp.inference import ExactPosterior, negative_log_likelihood
+from forcegp.inference import ExactPosterior
 from forcegp.inference.inducing import (
     InducingPosterior,
-    WeightSpace,
-    collapsed_bound,
-    inducing_pivots,
     pivoted_cholesky,
 )
 from forcegp.inference.likelihood import Terms
@@ -96,29 +93,6 @@ def test_drawn_functions_of_inducing_points_have_the_posterior_moments():
     scale = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     assert ((values.mean(0) - mean).abs() < 5.0 * scale / samples**0.5 + 1e-9).all()
     assert ((sampled - covariance).abs() < 0.05 * scale[..., :, None] * scale[..., None, :]).all()
-
-
-@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
-def test_the_bound_is_the_likelihood_with_all_points_and_above_it_with_few(shape):
-    given = made(**shape)
-    parameters = given.kernels.initial_parameters()
-
-    def bound(points: int, k: int = 1) -> float:
-        """Of rows that are repeated k times, k of which count as one."""
-        pivots = inducing_pivots(given.kernels, given.features, given.terms.deflated().C, points)
-        inside = [z[p] for z, p in zip(given.features, pivots, strict=True)]
-        W, residual, noise = (x if len(x) == 1 else x.repeat_interleave(k, 0) for x in given.data)
-        rows = Terms([z.repeat_interleave(k, 0) for z in given.features], W, residual, k * noise)
-        deflation = rows.deflated()
-        with torch.no_grad():
-            space = WeightSpace.of(given.kernels, rows.features, inside, deflation.C, deflation.t)
-        return collapsed_bound(rows, space, k)
-
-    expected = float(negative_log_likelihood(*given.data, given.kernels.matrices(parameters, given.features)))
-    assert bound(COUNT) == pytest.approx(expected, abs=1e-3)
-    values = [bound(points) for points in (4, 12, 25)]
-    assert values[0] > values[1] > values[2] > expected
-    assert bound(12, 3) == pytest.approx(values[1], rel=1e-9)
 
 
 @torch.no_grad()

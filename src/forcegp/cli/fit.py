@@ -230,7 +230,7 @@ def fit_summary(posterior: forcegp.posterior.Posterior, wall_seconds: float) -> 
         "learning_points": settings.get("learning_points", len(posterior.training)),
         "objective_is": "negative log likelihood with hyperpriors [nats]",
         "objective": result.value,
-        "nll": posterior.negative_log_likelihood,
+        "nll": posterior.negative_log_likelihood if posterior.engine.name == "exact" else None,
         "iterations": len(result.history) - 1,
         "converged": result.converged,
         "status": result.status,
@@ -252,7 +252,7 @@ def fit_report(run: Path, posterior: Any, found: Mapping[str, Any]) -> list[Any]
     told = with_option_names(found["status"], ("iterations",))
     values = {
         "engine": settings.get("engine_reason"),
-        "negative log likelihood": f"{found['nll']:.1f} nats",
+        "negative log likelihood": None if found["nll"] is None else f"{found['nll']:.1f} nats",
         "search": f"{found['iterations']} iterations; {'' if found['converged'] else 'not converged: '}{told}",
         "noise std": _per_joint(found["noise_std"]),
         "noise std of forces": found["force_noise_std"] and _per_joint(found["force_noise_std"]),

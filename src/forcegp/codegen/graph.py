@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.special import erf
 
 from forcegp.errors import InvalidInput
 
@@ -20,12 +19,11 @@ Slopes = Mapping[tuple[int, int], int]
 ZERO, ONE = 0, 1
 """Numbers of the nodes that hold these constants."""
 
-CIRCULAR = ("sin", "cos", "tan", "asin", "acos", "atan")
-OTHERS = ("sqrt", "sinh", "cosh", "tanh", "asinh", "exp", "log", "log1p", "expm1", "erf")
+NAMED = ("sin", "cos", "tan", "sqrt", "tanh", "asinh", "exp", "log", "log1p", "expm1")
 UNARY: dict[str, Callable[[float], float]] = {
     "negate": operator.neg,
     "absolute": abs,
-    **{name: getattr(math, name) for name in (*CIRCULAR, *OTHERS)},
+    **{name: getattr(math, name) for name in NAMED},
 }
 ARITHMETIC = {"add": operator.add, "subtract": operator.sub, "multiply": operator.mul, "divide": operator.truediv}
 COMPARED = {"less": operator.lt, "at_most": operator.le, "equal": operator.eq}
@@ -208,12 +206,11 @@ def _folded(operation: str, operands: Sequence[float | None]) -> float:
 
 
 FUNCTIONS: dict[str, Any] = {
-    **{name: getattr(np, name) for name in ("absolute", "sqrt", "sin", "cos", "tan", "sinh", "cosh", "tanh", "exp")},
+    **{name: getattr(np, name) for name in ("absolute", "sqrt", "sin", "cos", "tan", "tanh", "exp")},
     **{name: getattr(np, name) for name in ("log", "log1p", "expm1", "add", "subtract", "multiply", "divide", "power")},
-    **{name: getattr(np, f"arc{name[1:]}") for name in ("asin", "acos", "atan", "asinh", "atan2")},
+    **{name: getattr(np, f"arc{name[1:]}") for name in ("asinh", "atan2")},
     **{name: lambda x, y, compared=compared: np.where(compared(x, y), 1.0, 0.0) for name, compared in COMPARED.items()},
     "negate": np.negative,
-    "erf": erf,
     "choose": lambda m, x, y: np.where(m != 0.0, x, y),
     "look up": lambda table, place: np.asarray(table)[np.asarray(place).astype(int)],
 }
@@ -281,10 +278,6 @@ def partials(graph: Graph, node: int) -> list[tuple[int, Callable[[], int]]]:
         return _slopes_of_call(graph, node)
     apply, constant, x = graph.apply, graph.constant, operands[0]
 
-    def inverse_root(sign: float, inner: int) -> int:
-        """sign / sqrt(1 + inner)."""
-        return apply("divide", constant(sign), apply("sqrt", apply("add", ONE, inner)))
-
     def square(y: int) -> int:
         return apply("multiply", y, y)
 
@@ -295,18 +288,12 @@ def partials(graph: Graph, node: int) -> list[tuple[int, Callable[[], int]]]:
         "sin": lambda: apply("cos", x),
         "cos": lambda: apply("negate", apply("sin", x)),
         "tan": lambda: apply("add", ONE, square(node)),
-        "asin": lambda: inverse_root(1.0, apply("negate", square(x))),
-        "acos": lambda: inverse_root(-1.0, apply("negate", square(x))),
-        "atan": lambda: apply("divide", ONE, apply("add", ONE, square(x))),
-        "sinh": lambda: apply("cosh", x),
-        "cosh": lambda: apply("sinh", x),
         "tanh": lambda: apply("subtract", ONE, square(node)),
-        "asinh": lambda: inverse_root(1.0, square(x)),
+        "asinh": lambda: apply("divide", ONE, apply("sqrt", apply("add", ONE, square(x)))),
         "exp": lambda: node,
         "log": lambda: apply("divide", ONE, x),
         "log1p": lambda: apply("divide", ONE, apply("add", ONE, x)),
         "expm1": lambda: apply("add", ONE, node),
-        "erf": lambda: apply("multiply", constant(2.0 / math.sqrt(math.pi)), apply("exp", apply("negate", square(x)))),
     }
     if operation in slopes:
         return [(x, slopes[operation])]

@@ -419,11 +419,6 @@ HANDLERS: dict[str, Callable[..., Any]] = {
     "rsqrt": lambda graph, x: _power(graph, x, -0.5),
     "square": lambda graph, x: _power(graph, x, 2.0),
     "sign": lambda graph, x: _binary("subtract")(graph, HANDLERS["gt"](graph, x, 0.0), HANDLERS["lt"](graph, x, 0.0)),
-    "sigmoid": lambda graph, x: _elementwise(
-        graph,
-        lambda a: graph.apply("divide", ONE, graph.apply("add", ONE, graph.apply("exp", graph.apply("negate", a)))),
-        x,
-    ),
     "pow": _power,
     **dict.fromkeys(("clamp", "clamp_min", "maximum"), _clamp),
     **dict.fromkeys(("clamp_max", "minimum"), lambda graph, x, high: _clamp(graph, x, None, high)),

@@ -4,7 +4,7 @@ from .engines import (
     ProblemSize as ProblemSize, choose_engine as choose_engine, engine_from_dict as engine_from_dict,
     engine_of as engine_of,
 )
-from .inducing import InducingPosterior as InducingPosterior, collapsed_bound as collapsed_bound
+from .inducing import InducingPosterior as InducingPosterior
 from .likelihood import Terms as Terms, negative_log_likelihood as negative_log_likelihood
 from .memory import require_memory as require_memory
 from .optimization import (

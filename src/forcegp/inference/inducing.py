@@ -4,7 +4,6 @@ Weights w with k_c ~ phi_c . phi_c', phi_c(z) = L_c^-1 k_c(p_c, z), of precision
 (2009). N times `left_out` bounds, in nats, what it costs (Burt, Rasmussen & van der Wilk 2020, theorem 4).
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -16,7 +15,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.inference.dense_kernels import DenseKernel, LatentKernels
-from forcegp.inference.likelihood import CholeskyFactor, Terms, factorize, whiten
+from forcegp.inference.likelihood import CholeskyFactor, Terms, factorize
 from forcegp.inference.posterior import BLOCK_BYTES, LatentPosterior
 
 ROUNDING = 1e-13
@@ -218,16 +217,3 @@ def inducing_pivots(
         candidates[pivoted_cholesky(kernel, z[candidates], relevance[:, c], points, share)]
         for c, (kernel, z) in enumerate(zip(kernels.dense, features, strict=True))
     ]
-
-
-def collapsed_bound(terms: Terms, space: WeightSpace, k: float = 1.0) -> float:
-    """An upper bound of `negative_log_likelihood` through inducing points, in nats; time O(N P^2).
-
-    `space` is conditioned on these rows. Where k rows count as one, the noise of `terms` is k times that of a row, and
-    densities have the power 1/k.
-    """
-    with torch.no_grad():
-        _, y, log_noise = whiten(terms.W, terms.residual, terms.noise)
-        explained = (space.precision.lower.tril().mT @ space.mean).square().sum()
-        quadratic = y.square().sum() - explained + space.precision.log_determinant() + len(y) * space.left_out
-        return float(0.5 * quadratic + (log_noise + 0.5 * y.numel() * math.log(2.0 * math.pi / k)) / k)

@@ -29,11 +29,10 @@ from forcegp.forces import IndependentAccelerations, JointAccelerations, JointFo
 from forcegp.inference import (
     Engine,
     Exact,
-    InducingPosterior,
     LatentKernels,
     LatentPosterior,
     OptimizationResult,
-    collapsed_bound,
+    exact,
 )
 from forcegp.model import Model
 from forcegp.noise import ACCELERATION
@@ -350,11 +349,9 @@ class Fitted(Summary):
 
     @cached_property
     def negative_log_likelihood(self) -> float:
-        """-log p(a | q, v, u) of the training data in nats, without hyperpriors; of inducing points the bound."""
+        """-log p(a | q, v, u) of the training data in nats, without hyperpriors; InvalidInput for inducing points."""
+        exact(self.latent, "the likelihood of all rows")
         with torch.no_grad():
-            if isinstance(self.latent, InducingPosterior):
-                terms = self.likelihood.terms(self.hyperparameters)
-                return collapsed_bound(terms, self.latent.space, self.training.correlated_rows)
             return float(self.likelihood(self.kernels, self.hyperparameters))
 
     @override
