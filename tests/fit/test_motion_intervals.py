@@ -77,7 +77,9 @@ def test_without_calibration_the_samples_decide(log):
     q, v, u = log.q[:1, :], log.v[:1, :], log.u[None, :20]
     sampled = plain.rollout(q, v, u, 0.01, samples=8)
     low, high = sampled.interval()
-    torch.testing.assert_close(torch.stack([low, high]), sampled.quantiles((0.025, 0.975)))
+    torch.testing.assert_close(
+        torch.stack([low, high]), sampled.samples.q.quantile(torch.tensor([0.025, 0.975]).double(), dim=0)
+    )
     with pytest.raises(InvalidInput, match="0 samples"):
         plain.rollout(q, v, u, 0.01).interval()
 

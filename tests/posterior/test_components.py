@@ -224,12 +224,12 @@ def test_what_cannot_move_is_refused(posterior, train):
     heavier = Robot.from_urdf_text(URDF.replace('mass value="0.6"', 'mass value="1.4"'))
     renamed = Robot.from_urdf_text(URDF.replace('"pan"', '"yaw"'))
     with pytest.raises(InvalidInput, match=r"pan, lift, bend.*yaw, lift, bend"):
-        posterior.with_robot(renamed)
+        posterior.with_model(posterior.model.with_robot(renamed))
     handless = Robot.from_urdf_text(URDF.replace('"hand"', '"claw"'))
     with pytest.raises(UnknownName, match="hand"):
         posterior.with_model(arm_model(contacts=0).with_robot(handless))
     once = OptimizerOptions(iterations=1)
     zero = fit(train.model.with_forces(JointForces()).without_mean(), train, restarts=1, options=once)
     with pytest.raises(InvalidInput, match=r"no rigid bodies.* fit a model with RigidBodies\(\)"):
-        zero.with_robot(heavier)
+        zero.with_model(zero.model.with_robot(heavier))
     assert zero.with_contacts([]).predict(train.q, train.v, train.u).multiplier.mean.shape == (16, 0)

@@ -44,8 +44,7 @@ def check_forces(likelihood: MarginalLikelihood) -> None:
 def _refuse_constant_features(likelihood: MarginalLikelihood, names: Sequence[str], features: Sequence[Tensor]) -> None:
     labels = likelihood.model.unknown.feature_names(likelihood.model.robot)
     for index, (name, z) in enumerate(zip(names, features, strict=True)):
-        spread = z.var(0, correction=0).sqrt()
-        if z.shape[-1] and bool((spread <= CONSTANT * (1.0 + z.mean(0).abs())).all()):
+        if z.shape[-1] and bool((z.var(0, correction=0).sqrt() <= CONSTANT * (1.0 + z.mean(0).abs())).all()):
             which = [f"feature {k}" for k in range(z.shape[-1])] if labels is None else labels[index]
             values = ", ".join(f"{value:.4g}" for value in z[0].tolist()[:4])
             raise InvalidInput(

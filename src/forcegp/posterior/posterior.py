@@ -57,7 +57,6 @@ from forcegp.posterior.rollout import (
     moved,
 )
 from forcegp.posterior.update import learn_more_rows
-from forcegp.robots import Robot
 from forcegp.robots.arguments import whole_number
 
 
@@ -350,10 +349,6 @@ class Posterior(Fitted):
         Forces of a contact follow the contact with their number. Raises InvalidInput as `with_model`.
         """
         return self.with_model(self.model.known.with_contacts(contacts))
-
-    def with_robot(self, robot: Robot) -> "Posterior":
-        """The same on another robot with the same joints, as with a known tool. InvalidInput as `with_model`."""
-        return self.with_model(self.model.with_robot(robot))
 
     def to(self, device: torch.device | str) -> "Posterior":
         """The same, conditioned on another device, such as "cuda". InvalidInput for one that is not there."""

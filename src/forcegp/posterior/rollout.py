@@ -162,7 +162,7 @@ class Rollout:
         is neither.
         """
         if self.intervals is None:
-            low, high = self.quantiles((0.025, 0.975), quantity)
+            low, high = self._sampled(quantity, least=1).quantile(self.time.new_tensor([0.025, 0.975]), dim=0)
             return low, high
         center, enough = getattr(self, quantity), self.samples is not None and len(self.samples.q) > 1
         if quantity == "q" and not self.space.is_vector_space:
@@ -173,16 +173,6 @@ class Rollout:
     def std(self, quantity: Quantity = "q") -> Tensor:
         """Standard deviation over two samples or more, NaN from where one diverged; of steps where a base moves."""
         return self._sampled(quantity, least=2).std(0)
-
-    def quantiles(self, levels: Sequence[float] = (0.025, 0.5, 0.975), quantity: Quantity = "q") -> Tensor:
-        """Quantiles (levels, ...) over the samples, NaN from where one diverged.
-
-        InvalidInput for levels not in 0 to 1.
-        """
-        if not all(0.0 <= level <= 1.0 for level in levels):
-            raise InvalidInput(f"quantile levels are {tuple(levels)}; each must be from 0 to 1.")
-        values = self._sampled(quantity, least=1)
-        return torch.quantile(values, torch.tensor(levels, dtype=values.dtype, device=values.device), dim=0)
 
     def _sampled(self, quantity: Quantity, least: int) -> Tensor:
         count = 0 if self.samples is None else self.samples.q.shape[0]
