@@ -160,9 +160,7 @@ def test_people_add_their_own(monkeypatch):
     monkeypatch.setitem(FORCES, "slow", Slow)
     monkeypatch.setitem(FORCES, "rough", rough)
     assert parse_forces("gp:slow:v:limits=-1/2.5:count=4") == (Slow(("v",), limits=(-1.0, 2.5), count=4),)
-    assert parse_forces("gp:rough:nu=5:joints=pan/lift") == (
-        JointPositionForces(("pan", "lift"), "matern-5/2"),
-    )
+    assert parse_forces("gp:rough:nu=5:joints=pan/lift") == (JointPositionForces(("pan", "lift"), "matern-5/2"),)
 
 
 @pytest.mark.parametrize(
