@@ -5,10 +5,9 @@ Feet are balls with MuJoCo's own contacts and friction; joints have dry and visc
 stay, flags that are right, the load by `fit` and by `payload` with 95 % intervals, and forces of the feet predicted on
 another motion from q, v and u, beside MuJoCo's. For docs/how-to/moving-bases.md.
 
-    python -m benchmarks.quadruped [--runs N]
+    python -m benchmarks.quadruped
 """
 
-import argparse
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -96,7 +95,7 @@ def recorded(model: Model, seed: int, seconds: float = 24.0) -> tuple[Dataset, n
         mujoco.mj_step(plant, data)
     q, u = np.split(np.array(rows), [19], axis=1)
     turned = Rotation.from_quat(q[:, [4, 5, 6, 3]]) * Rotation.from_rotvec(1e-3 * rng.standard_normal((len(q), 3)))
-    noise = np.concatenate([np.full(3, 5e-4), np.full(12, 1e-4)])
+    noise = np.repeat([5e-4, 1e-4], [3, 12])
     places = np.concatenate([q[:, :3], q[:, 7:]], axis=1) + noise * rng.standard_normal((len(q), 15))
     q = np.concatenate([places[:, :3], turned.as_quat(), places[:, 3:]], axis=1)
     u = np.concatenate([u + 0.05 * rng.standard_normal(u.shape), np.zeros((len(u), 4))], axis=1)
@@ -128,8 +127,7 @@ def main(runs: int) -> None:
         with TemporaryDirectory() as folder, redirect_stdout(None), redirect_stderr(None):
             loads = found(Path(folder), rows)
             posterior = load_posterior(Path(folder) / "fit")
-        stands = logs[seed - 1][2][kept, :, 2] > 1.0
-        right = (rows.u[:, -4:] == stands).mean()
+        right = (rows.u[:, -4:] == (logs[seed - 1][2][kept, :, 2] > 1.0)).mean()
         told = ", ".join(f"{name} {x:.3f} ({low:.3f} to {high:.3f}) kg" for name, (x, low, high) in loads.items())
         _, test, forces = logs[seed % runs]
         cutoff = test.metadata["preparation"]["cutoff"]
@@ -138,15 +136,10 @@ def main(runs: int) -> None:
         q, v, u = (torch.tensor(x[::10]) for x in (test.q, test.v, test.u))
         with torch.no_grad():
             predicted = posterior.dynamics(q, v, u).multiplier_map().offset.reshape(-1, 4, 3).numpy()
-        error = np.sqrt(np.square(predicted - smooth[::10]).mean(axis=(0, 1)))
-        size = np.sqrt(np.square(smooth[::10, :, 2]).mean())
-        print(
-            f"{seed}: rows {len(rows) / len(log):.0%}, flags right {right:.2%}; {told}; forces of feet off by", end=" "
-        )
-        print(f"{error[2]:.2f} N of {size:.0f} along z, {np.hypot(*error[:2]):.2f} N across", flush=True)
+        error, size = (np.sqrt(np.square(x[..., 2]).mean()) for x in (predicted - smooth[::10], smooth[::10]))
+        print(f"{seed}: rows {len(rows) / len(log):.0%}, flags right {right:.2%}; {told}; forces of feet off by")
+        print(f"   {error:.2f} N of {size:.0f} along z", flush=True)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--runs", type=int, default=4)
-    main(parser.parse_args().runs)
+    main(runs=4)

@@ -18,7 +18,6 @@ from __future__ import annotations
 import argparse
 import hashlib
 import re
-import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -40,7 +39,6 @@ from forcegp.robots.urdf_file import read_robot_file
 
 mujoco: Any = untyped
 CLOSE = 1e-9
-ASKED = "not bolted"  # what the message says where nobody said how the base is held, also beside other problems
 SUFFIXES = (".urdf", ".xacro", ".xml", ".mjcf")
 
 
@@ -55,38 +53,32 @@ class File:
     outcome: str
     """ "as it is", "one round", or the class of the error after it."""
     remedy: Mapping[str, Any]
-    asked: bool
-    """Whether the base was asked for."""
     message: str
     error: float
     """Largest difference from the oracle, relative."""
-    seconds: float
-    """To read it, both rounds."""
 
 
 def measured(path: Path, *, mjcf: bool) -> File:
     """Read one file, and compare."""
     kind, compared = _mujoco(path) if mjcf else _pinocchio(path)
-    robot, remedy, message, asked, outcome = None, {}, "", False, "as it is"
-    started = time.perf_counter()
+    robot, remedy, message, outcome = None, {}, "", "as it is"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RobotFileWarning)
         try:
             robot = Robot.from_file(path)
         except ForceGPError as first:
             remedy, outcome = getattr(first, "remedy", {}), type(first).__name__
-            message, asked = str(first), ASKED in str(first)
+            message = str(first)
             if remedy:
                 try:
                     robot, outcome = Robot.from_file(path, **remedy), "one round"
                 except ForceGPError as second:
                     outcome, message = f"{type(second).__name__} after one round", str(second)
-    seconds = time.perf_counter() - started
     wrong = np.nan
     if robot is not None and kind in ("robot", "massless"):
         theirs = compared(robot)
         wrong, message = _difference(robot, theirs), f"condition of M {np.linalg.cond(theirs[0]):.1e}"
-    return File(path, "MJCF" if mjcf else "URDF", kind, outcome, remedy, asked, message, wrong, seconds)
+    return File(path, "MJCF" if mjcf else "URDF", kind, outcome, remedy, message, wrong)
 
 
 Numbers = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -236,9 +228,9 @@ def report(files: list[File], *, each: bool) -> None:
     for form in sorted({file.format for file in files}):
         _counts([file for file in files if file.format == form], "MuJoCo" if form == "MJCF" else "Pinocchio")
     for file in files:
-        if file.oracle in ("robot", "massless") and (each or file.error > CLOSE or file.seconds > 3.0):
-            told = f"{'base?' if file.asked else '     '} {file.error:8.1e} {file.seconds:5.2f} s {file.path}"
-            print(f"{file.outcome:10} {told} {dict(file.remedy)} {file.message if file.outcome in LOADED else ''}")
+        if file.oracle in ("robot", "massless") and (each or file.error > CLOSE):
+            told = file.message if file.outcome in LOADED else ""
+            print(f"{file.outcome:10} {file.error:8.1e} {file.path} {dict(file.remedy)} {told}")
     for file in files:
         if file.outcome not in LOADED and file.oracle != "still" and (each or file.oracle == "robot"):
             print(f"{file.oracle}: {file.outcome}: {file.message[:300]}")
@@ -259,8 +251,7 @@ def _counts(files: list[File], oracle: str) -> None:
     beyond = sum(error > CLOSE for error in errors)
     worst = max(errors, default=0.0)
     print(f"compared with {oracle}: {len(errors)}, of which beyond {CLOSE:g}: {beyond}; largest {worst:.2g}")
-    print(f"asked for their base: {sum(file.asked for file in robots)}")
-    print(f"seconds to read: up to {max((file.seconds for file in robots), default=0.0):.2f}\n")
+    print()
 
 
 def robot_files(folders: list[Path]) -> dict[str, tuple[Path, bool]]:
