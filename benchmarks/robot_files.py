@@ -250,8 +250,7 @@ def _counts(files: list[File], oracle: str) -> None:
     errors = [file.error for file in files if np.isfinite(file.error)]
     beyond = sum(error > CLOSE for error in errors)
     worst = max(errors, default=0.0)
-    print(f"compared with {oracle}: {len(errors)}, of which beyond {CLOSE:g}: {beyond}; largest {worst:.2g}")
-    print()
+    print(f"compared with {oracle}: {len(errors)}, of which beyond {CLOSE:g}: {beyond}; largest {worst:.2g}\n")
 
 
 def robot_files(folders: list[Path]) -> dict[str, tuple[Path, bool]]:
