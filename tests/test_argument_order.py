@@ -43,7 +43,7 @@ CALLS = [
     (lambda d, p: p.update((d.q, d.v, d.u, d.a)), "rows is a tuple; give a Dataset, for example"),
     (lambda d, p: p.with_contacts(arm_model(1).contacts[0]), "contacts is .*; give a sequence of Contact"),
     (lambda d, p: d.model.with_contacts(5), "contacts is 5; give a sequence of Contact"),
-    (lambda d, p: p.with_robot(d.model), "robot is a Model; give a Robot"),
+    (lambda d, p: d.model.with_robot(d.model), "robot is a Model; give a Robot"),
     (lambda d, p: p.with_model(d.model.robot), "model is a Robot; give a Model"),
     (lambda d, p: Model("arm.urdf"), r"robot is a str; give a Robot, for example Robot.from_urdf"),
     (lambda d, p: save_posterior("run", p), "posterior is a str; give a Posterior"),

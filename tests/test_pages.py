@@ -59,6 +59,7 @@ def test_the_page_on_moving_bases_runs(repository: Path, tmp_path: Path):
     assert len(re.findall(r"-?\d+\.\d+", force)) == 3
 
 
+@pytest.mark.nightly
 def test_the_page_on_scoring_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "scoring.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
@@ -91,6 +92,7 @@ def test_the_page_on_motions_runs(repository: Path, tmp_path: Path):
     assert float(rms.strip("[]")) < 1e-3
 
 
+@pytest.mark.nightly
 def test_the_page_on_identification_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "identification.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
@@ -118,12 +120,11 @@ def test_the_commands_of_the_page_on_identification_run(repository: Path, tmp_pa
 def test_the_page_on_rollouts_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "rollouts.md").read_text(encoding="utf-8")
     printed = run_example("\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL)), tmp_path)
-    states, more, diverged, free, held, gradient = printed.splitlines()[-6:]
+    states, more, diverged, free, held = printed.splitlines()[-5:]
     assert states == "torch.Size([2, 241, 7]) torch.Size([2, 241, 7]) torch.Size([2, 240, 7])"
     assert more == "torch.Size([2, 241, 1]) torch.Size([10, 2, 241, 7])"
     assert diverged == "tensor([-1, -1])"
     assert float(held.split()[0]) < 0.5 * float(free.split()[0])
-    assert gradient == "torch.Size([20, 7])"
 
 
 @pytest.mark.nightly

@@ -86,10 +86,12 @@ def test_a_step_is_the_acceleration_of_pinocchio(data):
 def test_the_robot_is_the_original_with_another_tool_and_no_files():
     original, changed = Robot.from_urdf(kuka_file()), kuka_robot(KukaSurfaceConfig(tool_mass=3.5))
     assert changed.joints == original.joints
-    kept = [f"lbr_iiwa_link_{number}" for number in range(1, 7)]
-    assert all(changed.link(name) == original.link(name) for name in kept)
+    for number in range(1, 7):
+        links = [robot.link(f"lbr_iiwa_link_{number}") for robot in (changed, original)]
+        for one, other in zip(*(vars(link).values() for link in links), strict=True):
+            np.testing.assert_array_equal(one, other)
     tool = changed.link(TOOL_LINK)
-    assert (tool.mass, tool.center_of_mass) == (3.5, (0.0, 0.0, 0.02))
+    assert (tool.mass, *tool.center_of_mass) == (3.5, 0.0, 0.0, 0.02)
     np.testing.assert_allclose(tool.inertia, np.diag([0.005, 0.0036, 0.0047]))
     assert "mesh" not in changed.urdf_text.partition("<robot")[2]
     for text in (changed.urdf_text, kuka_file().read_text()):

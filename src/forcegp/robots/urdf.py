@@ -73,7 +73,7 @@ LIGHTEST = 1e-20  # kg; what is lighter is a slip, and divides badly
 MOVABLE = ("revolute", "continuous", "prismatic")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Link:
     """Mass (kg), centre of mass (m), inertia about it (kg m^2; NaN if not given), in the axes of the link frame."""
 
