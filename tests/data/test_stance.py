@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import brentq
 
 from forcegp import Dataset, Model, Robot
 from forcegp.data import Preparation, estimate_stance, motion_spectrum
+from forcegp.data.stance import _bearing
 from forcegp.errors import ContactError, DatasetError, InvalidInput
 from forcegp.mechanics import fixed_point
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
@@ -170,3 +172,25 @@ def test_what_stance_needs_is_named():
     sliding = replace(estimate_stance(wild), flags=np.full((len(log), 4), np.nan))
     with pytest.raises(DatasetError, match="leave the stance open in all"):
         sliding.written(wild)
+
+
+@pytest.mark.parametrize(("low", "high"), [(1.0, 3.5), (1.0, 2.6)])  # logarithms of newtons
+def test_forces_fall_into_their_two_classes(low, high):
+    """Of normal logarithms a foot stands from where that is 20 times likelier; the rest of the cut tails is a tenth."""
+    rng, width, share = np.random.default_rng(0), 0.4, 0.2
+    force = np.exp(np.concatenate([rng.normal(low, width, 4000), rng.normal(high, width, 16000)]))[:, None]
+    free, bears = _bearing(force, np.arange(20000)[:, None] < 4000)
+
+    def odds(x: float) -> float:
+        return np.log((1.0 - share) / share) + (np.square(x - low) - np.square(x - high)) / (2.0 * width**2)
+
+    bounds = [np.exp(brentq(lambda x, s=s: odds(x) - s * np.log(20.0), low, high)) for s in (-1.0, 1.0)]
+    assert free <= bounds[0]
+    assert 0.9 * bounds[1] < bears < 0.97 * bounds[1]
+
+
+@pytest.mark.parametrize(("noise", "decides"), [(0.1, True), (0.3, False)])
+def test_velocities_that_are_as_loud_as_steps_decide_nothing(noise, decides):
+    log, _ = walk(5, noise)
+    found = estimate_stance(replace(log, u=0.0 * log.u, a=np.random.default_rng(0).normal(0.0, 100.0, log.a.shape)))
+    assert (found.flags == 1.0).any() == decides

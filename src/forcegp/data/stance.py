@@ -126,7 +126,7 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
         noise[k] = max(_noise(smooth, episodes, [times * width for width in widths]) for times in (1, 2))
     slow = np.maximum(SLOW, DEVIATIONS * noise)
     rests, moves = (speed <= slow) & (slow <= LOUD), speed >= CLEARLY * slow
-    bearing = _bearing(force, moves)
+    bearing = _bearing(force, moves, quiet=bool((slow <= LOUD).all()))
     bears, unloaded = (force >= bearing[1], force <= bearing[0]) if np.isfinite(bearing).all() else (rests, moves)
     flags = np.full(force.shape, np.nan)
     flags[~moves & bears], flags[unloaded] = 1.0, 0.0
@@ -184,17 +184,20 @@ def _noise(values: Float[np.ndarray, "rows m"], episodes: list[np.ndarray], stri
     return float(np.linalg.norm(each))
 
 
-def _bearing(force: np.ndarray, moves: np.ndarray) -> Float[np.ndarray, " 2"]:
+def _bearing(force: np.ndarray, moves: np.ndarray, quiet: bool = True) -> Float[np.ndarray, " 2"]:
     """Forces up to which nothing bears, and from which a foot stands [N]; NaN where they do not differ.
 
     Logarithms of forces in two normal classes, split with the least error (Kittler & Illingworth 1986); in between
-    neither class is `CERTAIN` times as likely. Where hardly a foot moves, shares of what feet at rest carry.
+    neither class is `CERTAIN` times as likely. Where hardly a foot moves, which `quiet` velocities tell or two classes,
+    shares of what feet carry.
     """
     carried = np.sort(force[~moves])  # by what they carry: of a foot that swings most of the time, rest is rare
     half = np.searchsorted(carried.cumsum(), 0.5 * carried.sum())
     standing = float(carried[half]) if len(carried) else 0.0
-    if moves.sum() < FEW:
-        return np.array([LEAST, BEARS]) * standing if standing > 0.0 else np.full(2, np.nan)
+    few = moves.sum() < FEW
+    usual = np.array([LEAST, BEARS]) * standing if standing > 0.0 else np.full(2, np.nan)
+    if few and quiet:
+        return usual
     logs = np.sort(np.log(np.maximum(force.ravel(), 1e-3 * standing + 1e-12)))
     best, limits = np.inf, np.full(2, np.nan)
     for count in np.unique(np.linspace(0.02 * len(logs), 0.98 * len(logs), 99).astype(int)):
@@ -212,9 +215,9 @@ def _bearing(force: np.ndarray, moves: np.ndarray) -> Float[np.ndarray, " 2"]:
             sure = np.log(CERTAIN)
             if (likelier < -sure).any() and (likelier > sure).any():
                 best, limits = cost, np.exp([between[likelier < -sure][-1], between[likelier > sure][0]])
-    if not (limits[0] <= BEARS * standing and np.median(force[moves]) < limits[1]):
+    if not (limits[0] <= BEARS * standing and (few or np.median(force[moves]) < limits[1])):
         return np.full(2, np.nan)
-    return np.array([min(limits[0], np.quantile(force[moves], FREE)), limits[1]])
+    return usual if few else np.array([min(limits[0], np.quantile(force[moves], FREE)), limits[1]])
 
 
 def _between(flags: np.ndarray, time: Float[np.ndarray, " rows"]) -> np.ndarray:
