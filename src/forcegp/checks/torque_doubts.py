@@ -76,6 +76,7 @@ def held_points(inputs: CheckInput) -> list[Doubt]:
     """The link that stays where it is although joints move that carry it: something holds it, and no model says so."""
     rows, robot = inputs.rows(), inputs.robot
     q, moved = torch.tensor(rows.q, device=robot.device), rows.q - rows.q.mean(axis=0)
+    moved = np.where(inputs.rotates, moved.clip(-1.0, 1.0), moved)  # rad: a lever moves nothing farther than its length
     kinematics, found = robot.kinematics(q), list[tuple[float, str, np.ndarray]]()
     for link in robot.layout.links:
         position = kinematics.frame_pose(link)[:, :3, 3].cpu().numpy()
