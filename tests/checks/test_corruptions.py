@@ -32,6 +32,7 @@ from forcegp.checks.torque_doubts import held_points
 from forcegp.data import Dataset
 from forcegp.model import Model
 from forcegp.robots import Robot
+from forcegp.simulation.kuka_surface import kuka_file
 
 
 def log_of(place: int):
@@ -228,6 +229,15 @@ def test_a_foot_that_stays_is_no_wrong_sign_or_unit(held):
     if held:
         assert "--contact foot:held" in found[0].do
         assert found[0].joints == ("z", "hip", "knee")
+
+
+def test_positions_in_degrees_are_no_link_that_stays():
+    """As radians they turn levers by far more than a turn, which moves no link farther than the lever is long."""
+    robot, time = Robot.from_urdf(kuka_file()), np.arange(0.0, 8.0, 0.01)
+    q = np.rad2deg(0.8 * np.sin(time[:, None] * np.linspace(0.7, 1.9, 7) + np.arange(7.0)))
+    rest = np.zeros_like(q)
+    log = Dataset(q=q, v=rest, u=rest, a=rest, time=time, model=Model(robot))
+    assert held_points(CheckInput.as_recorded(log, log.model, compared=log)) == []
 
 
 @pytest.mark.parametrize(("slips", "held"), [(0.0, True), (0.02, True), (0.04, False)])

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 from forcegp import Dataset, Model, Robot
 from forcegp.data import Preparation, estimate_stance, motion_spectrum
-from forcegp.data.stance import _bearing
+from forcegp.data.stance import _bearing, _between
 from forcegp.errors import ContactError, DatasetError, InvalidInput
 from forcegp.mechanics import fixed_point
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
@@ -194,3 +194,9 @@ def test_velocities_that_are_as_loud_as_steps_decide_nothing(noise, decides):
     log, _ = walk(5, noise)
     found = estimate_stance(replace(log, u=0.0 * log.u, a=np.random.default_rng(0).normal(0.0, 100.0, log.a.shape)))
     assert (found.flags == 1.0).any() == decides
+
+
+def test_rows_within_fifteen_milliseconds_of_a_change_are_open():
+    time = 0.001 * np.arange(1000)
+    filled = _between((time >= 0.5).astype(float)[:, None], time)
+    assert 0.029 <= 0.001 * np.isnan(filled).sum() <= 0.032

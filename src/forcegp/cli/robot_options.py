@@ -240,7 +240,7 @@ def parse_contact(text: str) -> tuple[forcegp.Contact, ...]:
 
 
 def parse_feet(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
-    """Points `FRAME@x,y,z`, balls `FRAME:ball=RADIUS` and flat feet `FRAME:flat`, with switches. Or InvalidInput."""
+    """Points `FRAME@x,y,z`, balls `FRAME:ball=RADIUS`, flat feet `FRAME:flat`, all switched. Raises InvalidInput."""
     feet: dict[str, tuple[forcegp.Contact, ...]] = {}
     for text in texts:
         complaint = (
