@@ -214,7 +214,7 @@ def test_the_page_on_robots_runs_from_files_to_learned_forces(repository: Path, 
     for command in re.findall(r"^forcegp .*$", commands, re.MULTILINE):
         done = run_here(*command.split()[1:], folder=tmp_path)
         assert done.returncode == 0, f"{command}: {done.stderr}"
-    for name in ("arm", "gripper", "dog", "drone", "fourbar"):
+    for name in ("arm", "gripper", "dog", "drone"):
         test = "test.h5" if name == "drone" else f"{name}_test.h5"
         scores = json.loads(run_here("score", name, test, "--json", folder=tmp_path).stdout)
         errors = scores["models"][name]["scores"]["acceleration"]

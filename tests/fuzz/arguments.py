@@ -16,7 +16,7 @@ from tests.fuzz.made import INPUTS, QUICK
 from tests.fuzz.oracle import DefectError, Target, allowed
 from tests.fuzz.values import words
 from tests.posterior.arm import URDF, arm_model
-from tests.robots.mjcf_models import FOUR_BAR
+from tests.robots.mjcf_models import OPEN_BARS
 
 import forcegp
 import forcegp.control
@@ -280,7 +280,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         Robot.from_mjcf_text,
         _shown,
         given=lambda: {
-            "text": FOUR_BAR,
+            "text": OPEN_BARS,
             **dict.fromkeys(("gravity", "armature", "locked", "base")),
             "inertias": "strict",
         },

@@ -246,9 +246,9 @@ class HybridForce(TrackingController):
     def __init__(self, predictor: Predictor, **settings: Any) -> None:
         self.predictor = require_type("predictor", predictor, Predictor, " : posterior.predictor()")
         self.model = predictor.posterior.model
-        if not self.model.touching or self.model.loops:
+        if not self.model.contacts:
             raise InvalidInput(
-                "HybridForce wants a force against a contact, and this model has none, or a closed loop; name it in "
+                "HybridForce wants a force against a contact, and this model has none; name it in "
                 "posterior.with_contacts([...]), or use ComputedTorque."
             )
         require_actuated(predictor.posterior)

@@ -13,7 +13,7 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput, usable_arguments
 from forcegp.forces.actuation import ObservedWind
 from forcegp.forces.unknown import SharedInputs
-from forcegp.mechanics import ConstrainedDynamics, Contact, LoopClosure, State, surface_axes
+from forcegp.mechanics import ConstrainedDynamics, Contact, State, surface_axes
 from forcegp.mechanics.gauss_principle import placed
 from forcegp.robots import Robot
 from forcegp.robots.manifold import VELOCITIES
@@ -72,8 +72,7 @@ def is_contact_number(value: object) -> bool:
 
 def require_contact(force: str, contact: int, contacts: Sequence[Contact]) -> None:
     """Raise InvalidInput if there is no such contact to slide on."""
-    sliding = (not isinstance(each, LoopClosure) for each in contacts)
-    numbers = [index for index, slides in enumerate(sliding) if slides]
+    numbers = range(len(contacts))
     if contact not in numbers:
         have = f"only contact {', '.join(map(str, numbers))}" if numbers else "no contact with a surface to slide on"
         raise InvalidInput(

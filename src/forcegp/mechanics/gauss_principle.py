@@ -7,17 +7,17 @@
 constraints included: (A M^-1 A^T)^+ = (A~^+)^T A~^+, H = L^-T (I - A~^+ A~) L^-1.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import ContactError, InvalidInput, NumericalError, require_number
-from forcegp.mechanics.surfaces import Held, Surface
+from forcegp.mechanics.surfaces import Held, Surface, surface_from_dict, surface_to_dict
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import broadcast_batch, checked_tensor, finite_vector
 
@@ -82,6 +82,15 @@ class Contact:
         require_number("Contact radius", self.radius, "give that of a ball in m, 0 for a point", 0.0, 1e3)
         if self.radius and not isinstance(self.surface, Held):
             raise InvalidInput("Contact radius is of a ball that rolls on level ground; its surface must be a Held.")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers and names. Raises ContactError for a surface that holds code."""
+        return vars(self) | {"point": list(self.point), "surface": surface_to_dict(self.surface)}
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> "Contact":
+        """What `to_dict` gave. Raises FileFormatError, InvalidInput, KeyError or TypeError for anything else."""
+        return cls(**{**stored, "surface": surface_from_dict(stored["surface"])})
 
     def check(self, robot: Robot) -> None:
         """Raise UnknownName for a frame that is not there, ContactError where the contact constrains nothing."""
