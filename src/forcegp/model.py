@@ -244,10 +244,10 @@ class Model(Summary):
         """Sizes of q, v and u."""
         return self.robot.nq, self.robot.nv, len(self.inputs)
 
-    def state(self, q: Tensor, v: Tensor, u: Tensor, bodies: Float[Tensor, "bodies 10"] | None = None) -> State:
+    def state(self, q: Tensor, v: Tensor, u: Tensor) -> State:
         """Checked states (q, v, u), each with its own size. Raises InvalidInput."""
         by = None if self._u_is_delivered else self._delivered
-        return State.of(self.loaded_robot, q, v, u, bodies, self.inputs, by)
+        return State.of(self.loaded_robot, q, v, u, self.inputs, by)
 
     @cached_property
     def _u_is_delivered(self) -> bool:
@@ -261,18 +261,9 @@ class Model(Summary):
         pushing = (force.delivered(state) for force in self.laws if isinstance(force, Thrusters))
         return sum(pushing, self.actuation.delivered(state))
 
-    def dynamics(
-        self,
-        q: Positions,
-        v: JointValues,
-        u: Float[Tensor, "*#batch nu"],
-        bodies: Float[Tensor, "bodies 10"] | None = None,
-    ) -> ConstrainedDynamics:
-        """A, b, H and Q_K at states (q, v, u), each (..., nv), from one kinematics pass; differentiable.
-
-        `bodies` are standard parameters in the place of the robot's; no inertial parameter moves contact points.
-        """
-        state = self.state(q, v, u, bodies)
+    def dynamics(self, q: Positions, v: JointValues, u: Float[Tensor, "*#batch nu"]) -> ConstrainedDynamics:
+        """A, b, H and Q_K at states (q, v, u), each (..., nv), from one kinematics pass; differentiable."""
+        state = self.state(q, v, u)
         Q_K = torch.zeros_like(state.v)
         for force in self.laws:
             Q_K = Q_K + force.force(state)

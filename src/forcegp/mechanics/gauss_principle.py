@@ -173,7 +173,7 @@ def fixed_frame(frame: str, switch: str | None = None, size: float = 0.1) -> tup
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Positions, velocities and inputs of equal batch, and the standard parameters of `bodies` (None: the robot's).
+    """Positions, velocities and inputs of equal batch.
 
     `inputs` names the columns of u, `delivered` are the joint forces (..., nv) of its actuators, `strokes` the
     displacements of each joint (or motor, for laws at motors) from reversal to reversal before the state, the last one
@@ -184,7 +184,6 @@ class State:
     v: Float[Tensor, "*batch nv"]
     u: Float[Tensor, "*batch nu"]
     robot: Robot
-    bodies: Float[Tensor, "bodies 10"] | None = None
     inputs: tuple[str, ...] = ()
     delivered_by: "Callable[[State], Tensor] | None" = None
     strokes: Float[Tensor, "*batch nv strokes"] | None = None
@@ -207,18 +206,12 @@ class State:
     @cached_property
     def mass_matrix(self) -> Float[Tensor, "*batch nv nv"]:
         """M of the robot, with its armature."""
-        return self._dynamics[0]
+        return self.kinematics.mass_matrix()
 
     @cached_property
     def bias(self) -> Float[Tensor, "*batch nv"]:
         """Coriolis, centrifugal and gravity forces."""
-        return self._dynamics[1]
-
-    @cached_property
-    def _dynamics(self) -> tuple[Tensor, Tensor]:
-        if self.bodies is None:
-            return self.kinematics.mass_matrix_and_bias()
-        return self.kinematics.dynamics_of_bodies(self.bodies)
+        return self.kinematics.bias_forces()
 
     @property
     def delivered(self) -> Float[Tensor, "*batch nv"]:
@@ -232,7 +225,6 @@ class State:
         q: Tensor,
         v: Tensor,
         u: Tensor,
-        bodies: Float[Tensor, "bodies 10"] | None = None,
         inputs: tuple[str, ...] = (),
         delivered_by: "Callable[[State], Tensor] | None" = None,
     ) -> "State":
@@ -244,7 +236,7 @@ class State:
             u = checked_tensor("u", u, len(inputs), f"one value per input: {', '.join(inputs)}", robot.device)
         batch = broadcast_batch({"q": q.shape[:-1], "v": v.shape[:-1], "u": u.shape[:-1]})
         q, v, u = (value.expand(*batch, -1) for value in (q, v, u))
-        return cls(q, v, u, robot, bodies, inputs, delivered_by)
+        return cls(q, v, u, robot, inputs, delivered_by)
 
 
 REDUNDANCY_TOLERANCE = 1e-9
