@@ -169,11 +169,13 @@ def test_predictions_given_accelerations_are_those_of_one_large_gaussian():
     gain = whole[:, 3:, :3] @ torch.linalg.inv(seen)
     expected = mean[:, 3:] + (gain @ (a - mean[:, :3])[..., None])[..., 0]
     spread = whole[:, 3:, 3:] - gain @ whole[:, :3, 3:]
-    found = posterior.predict(*states, a=a, of=[ContactForces("hand")])[0]
+    found = posterior.predict(*states, a=a).force_at("hand")
     torch.testing.assert_close(found.mean, expected, rtol=0.0, atol=1e-8)
     torch.testing.assert_close(found.covariance, spread, rtol=0.0, atol=1e-8)
-    with pytest.raises(InvalidInput, match="no contact there"):
-        posterior.predict(*states, of=[ContactForces("fore")])
+    with pytest.raises(InvalidInput, match=r"no contact at 'fore'.*; there is hand"):
+        posterior.predict(*states).force_at("fore")
+    several = posterior.with_contacts(fixed_point("hand")).predict(*states)
+    torch.testing.assert_close(several.force_at("hand").mean, several.contact_force.mean.unflatten(-1, (3, 3)).sum(-2))
     with pytest.raises(InvalidInput, match="a has shape"):
         posterior.predict(*states, a=a[:, :2])
 
@@ -321,7 +323,7 @@ def test_a_real_leg_tells_its_contact_force_without_the_sensor_after_a_calibrati
             points = 150 if evidence == Accelerations() else None
             posterior = fit(model.with_forces(*forces), train, evidence, points=points, restarts=1)
         rows = with_memory(test, posterior.model)
-        found = posterior.predict(rows.q, rows.v, rows.u, a=rows.a, of=[ContactForces("contact")])[0]
+        found = posterior.predict(rows.q, rows.v, rows.u, a=rows.a).force_at("contact")
         error = found.mean[:, 2].numpy() - test.measured[name][:, 2]
         return np.sqrt((error**2).mean()), (abs(error) < 1.96 * found.std[:, 2].numpy()).mean()
 
