@@ -35,15 +35,6 @@ class Baumgarte:
             require_number(f"Baumgarte {name}", getattr(self, name), words, 0.0, 1e15)
 
 
-class Row(NamedTuple):
-    """One constraint c(q) = 0 at a batch of states: c (...), A (..., nv), s_p (..., 3) and A' v (...) or None."""
-
-    value: Tensor
-    A: Tensor
-    gradient: Tensor
-    drift: Tensor | None
-
-
 def placed(
     kinematics: Kinematics, frame: str, point: Sequence[float]
 ) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch 3"]]:
@@ -108,21 +99,6 @@ class Contact:
         """c(q) = s(p(q)): 0 where the constraint holds."""
         return self.surface.value(self.position(kinematics))
 
-    def row(self, kinematics: Kinematics, v: Float[Tensor, "*batch nv"] | None = None) -> "Row":
-        """c(q), A = s_p J_p and s_p; with velocities also A' v = s_p Jdot_p v + (J_p v)^T s_pp (J_p v)."""
-        p = self.position(kinematics)
-        J = self._touching(kinematics.frame_jacobian(self.frame, self.point))
-        gradient = self.surface.gradient(p)
-        A = (gradient[..., None, :] @ J)[..., 0, :]
-        drift = None
-        if v is not None:
-            bias = kinematics.frame_bias_acceleration(self.frame, self.point)
-            bias_acceleration = self._touching(bias[..., None])[..., 0]
-            velocity = (J @ v[..., None])[..., 0]
-            curvature = (velocity[..., None, :] @ self.surface.hessian(p) @ velocity[..., None])[..., 0, 0]
-            drift = (gradient * bias_acceleration).sum(-1) + curvature
-        return Row(self.surface.value(p), A, gradient, drift)
-
     def _touching(self, twist: Float[Tensor, "*batch 6 k"]) -> Float[Tensor, "*batch 3 k"]:
         """v + w x r of what touches the ground, r = -`radius` z (Featherstone 2008, section 3.5)."""
         linear, angular = twist[..., :3, :], twist[..., 3:, :]
@@ -136,13 +112,20 @@ class Contact:
     ) -> tuple[Float[Tensor, "*batch nv"], Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """One row of A (..., nv), one entry of b (...), and the surface gradient s_p (..., 3), with A a = b.
 
-        b = -A' v - 2 zeta omega A v - omega^2 c (Rath et al. 2021, section 2).
+        A = s_p J_p, A' v = s_p Jdot_p v + (J_p v)^T s_pp (J_p v), b = -A' v - 2 zeta omega A v - omega^2 c (Rath et al.
+        2021, section 2).
         """
-        c, A, gradient, drift = self.row(state.kinematics, state.v)
-        assert drift is not None, "velocities are given"
-        b = -drift
+        p, v = self.position(state.kinematics), state.v
+        J = self._touching(state.kinematics.frame_jacobian(self.frame, self.point))
+        gradient = self.surface.gradient(p)
+        A = (gradient[..., None, :] @ J)[..., 0, :]
+        bias = state.kinematics.frame_bias_acceleration(self.frame, self.point)
+        velocity = (J @ v[..., None])[..., 0]
+        curvature = (velocity[..., None, :] @ self.surface.hessian(p) @ velocity[..., None])[..., 0, 0]
+        b = -(gradient * self._touching(bias[..., None])[..., 0]).sum(-1) - curvature
         if baumgarte is not None:
-            b = b - 2.0 * baumgarte.zeta * baumgarte.omega * (A * state.v).sum(-1) - baumgarte.omega**2 * c
+            c = self.surface.value(p)
+            b = b - 2.0 * baumgarte.zeta * baumgarte.omega * (A * v).sum(-1) - baumgarte.omega**2 * c
         if self.switch is None:
             return A, b, gradient
         acts = (state.u[..., state.inputs.index(self.switch)] > 0.5).to(b.dtype)
