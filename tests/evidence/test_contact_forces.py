@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tests.forces.world_forces import WorldForces
 from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import Accelerations, ContactForces, Torques, fit, load_posterior, save_posterior
@@ -19,6 +20,7 @@ from forcegp.fit.fit import with_sensor
 from forcegp.fit.physical import typical_sizes
 from forcegp.fit.unseen import OF_TORQUE, PUSHED, Unseen
 from forcegp.forces import (
+    FORCES,
     Actuation,
     Coulomb,
     GearFriction,
@@ -27,7 +29,6 @@ from forcegp.forces import (
     LogNormal,
     Offset,
     Payload,
-    ToolForces,
     Viscous,
 )
 from forcegp.inference import OptimizerOptions
@@ -198,9 +199,9 @@ def test_what_contacts_hide_is_in_the_interval_of_their_force():
     assert "hidden_force" not in sensed.settings
 
 
-def test_a_sensor_shows_forces_along_the_normal(tmp_path):
+def test_a_sensor_shows_forces_along_the_normal(tmp_path, monkeypatch):
     """Something pulls the tool onto the plane, the more the faster it moves: no acceleration shows it."""
-    seen = ToolForces("hand", point=(0.0, 0.0, 0.2), axes="world")
+    monkeypatch.setitem(FORCES, "world-forces", WorldForces)  # so that files carry it
     at = measured(on_plane(), on_plane(), rows=160)
     kinematics = on_plane().robot.kinematics(*tensors(at, "q", "v"))
     J = kinematics.frame_jacobian("hand", (0.0, 0.0, 0.2))[:, :3].numpy()
@@ -211,7 +212,7 @@ def test_a_sensor_shows_forces_along_the_normal(tmp_path):
     states, truth = tensors(test, "q", "v", "u"), test.measured[SENSOR] @ NORMAL
     error, hold = {}, {}
     for evidence in (Accelerations(),), (Accelerations(), ContactForces(noise=0.1)):
-        posterior = fit(on_plane(seen).with_forces(noise=Noise(0.05, learn=True)), train, evidence, restarts=1)
+        posterior = fit(on_plane(WorldForces()).with_forces(noise=Noise(0.05, learn=True)), train, evidence, restarts=1)
         found = posterior.predict(*states).multiplier
         error[len(evidence)] = np.sqrt(np.mean((found.mean[:, 0].numpy() - truth) ** 2))
         hold[len(evidence)] = np.mean(abs(found.mean[:, 0].numpy() - truth) < 1.96 * found.std[:, 0].numpy())
