@@ -327,7 +327,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "parse_forces": _call(forces.parse_forces, given=lambda: {"expression": "gp:joint"}),
     "parse_evidence": _call(parse_evidence, given=lambda: {"words": "torques:mean=.4"}),
     "JointFriction": _call(forcegp.JointFriction, _prior, "joints kernel"),
-    "ToolForces": _call(forcegp.ToolForces, _prior, "point axes inputs contact kernel", lambda: {"frame": "hand"}),
+    "ToolForces": _call(forcegp.ToolForces, _prior, "inputs contact kernel"),
     "ContactFriction": _call(forcegp.ContactFriction, _prior, "contact load kernel"),
     "Preparation": _call(
         forcegp.data.Preparation,

@@ -68,7 +68,7 @@ def require_contact(force: str, contact: int, contacts: Sequence[Contact]) -> No
         have = f"only contact {', '.join(map(str, numbers))}" if numbers else "no contact with a surface to slide on"
         raise InvalidInput(
             f"{force} acts at contact {contact}, but the model has {have}; give the contact (`contacts`), or use a "
-            "force that needs none, such as JointFriction or ToolForces(frame=..., axes='world')."
+            "force that needs none, such as JointFriction or AerodynamicForce(frame=...)."
         )
 
 
