@@ -350,7 +350,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "MPPI": _call(
         forcegp.MPPI,
         lambda kind, **k: kind(INPUTS.predictor, _cost, **k)(*STATE[:2]),
-        "noise functions seed",
+        "noise seed",
         lambda: {"dt": 0.01, "steps": 2, "torque_limits": 5.0, "samples": 3, "integrator": "rk4"},
     ),
     "excitation": _call(
