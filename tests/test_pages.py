@@ -191,7 +191,7 @@ def test_the_page_on_deploying_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "deploy.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     files, agree = run_example(example, tmp_path).splitlines()
-    assert "lbr_iiwa_external.c" in files
+    assert "lbr_iiwa.c" in files
     assert agree == "True"
     commands, build, planner = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     for command in (commands + planner).splitlines():
@@ -199,9 +199,7 @@ def test_the_page_on_deploying_runs(repository: Path, tmp_path: Path):
         assert done.returncode == 0, done.stderr
     for command in build.splitlines():
         subprocess.run(command, shell=True, cwd=tmp_path / "controller", check=True)
-    assert "lbr_iiwa_acceleration" in page
     assert {"lbr_iiwa.casadi", "lbr_iiwa_step.casadi"} <= {file.name for file in (tmp_path / "planner").iterdir()}
-    assert "lbr_iiwa_acceleration(" in (tmp_path / "controller" / "lbr_iiwa_external.c").read_text()
 
 
 @pytest.mark.nightly
