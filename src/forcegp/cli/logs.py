@@ -175,7 +175,7 @@ class ColumnOptions:
             return model
         if robot.identified is not None:
             raise InvalidInput("--identified brings its contacts along; leave --feet out.")
-        return model.with_contacts((*touching, *model.loops))
+        return model.with_contacts(touching)
 
     def mapped(self, logs: Sequence[Path], terminal: Terminal) -> forcegp.recordings.ColumnMapping:
         """What the flags state, and for those that are not given the file. Raises InvalidInput, FileFormatError."""

@@ -95,7 +95,7 @@ class RobotOptions(RobotFileOptions):
             model = model.with_forces(
                 *(law for law in own.laws if not any(law.takes_the_place_of(each) for each in there))
             )
-        return model.with_contacts((*model.touching, *own.loops)) if own.loops else model
+        return model
 
     def chosen_model(self, dataset: forcegp.Dataset, path: Path) -> forcegp.Model:
         """The dataset's own system, with what is replaced. Raises InvalidInput where joints differ."""

@@ -22,8 +22,8 @@ ALONG_NORMAL, CREEP = 0.02, 2e-3
 def rows_in_contact(dataset: Dataset) -> Dataset:
     """The rows in which the points of all contacts of `dataset.model` move along their surfaces, from q and v alone.
 
-    A point at rest or gliding just above cannot be told from one in contact. A closed loop acts in every row, a contact
-    with a switch where its flag is. Raises ContactError for a contact off its surface, and where no row is left.
+    A point at rest or gliding just above cannot be told from one in contact. A contact with a switch acts
+    where its flag is. Raises ContactError for a contact off its surface, and where no row is left.
     """
     with torch.no_grad():
         touching, off = _on_surfaces(dataset, dataset.model.to("cpu"), _noise(dataset), flagged=False)
@@ -87,11 +87,11 @@ def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> Doub
     """What the rows of `dataset` contradict about the contacts of `model` (default: its own); empty where nothing.
 
     Looks at 240 rows, in order of the file, for motion that leaves a surface. Fewer than 10 rows say nothing. Not for
-    closed loops, nor models without `RigidBodies`.
+    models without `RigidBodies`.
     """
     model = dataset.model if model is None else model
     few = len(dataset) < FEWEST_ROWS or not dataset.u.any()
-    if few or not model.contacts or model.loops or model.carries_known_forces:
+    if few or not model.contacts or model.carries_known_forces:
         return Doubts()
     rows = dataset.rows(evenly(dataset, MOST_ROWS))
     with torch.no_grad():
@@ -114,7 +114,7 @@ def _on_surfaces(
     touching = np.ones(len(rows), dtype=bool)
     motions = point_motions(rows, model, noise_seen)
     for index, (contact, motion) in enumerate(zip(model.contacts, motions, strict=True)):
-        if isinstance(contact, forcegp.mechanics.LoopClosure) or (contact.switch is not None and not flagged):
+        if contact.switch is not None and not flagged:
             continue
         acts = np.ones(len(rows), bool)
         if contact.switch is not None:

@@ -21,7 +21,6 @@ from forcegp.data import Dataset, repeated_rows, time_blocks, with_memory
 from forcegp.data.views import in_blocks
 from forcegp.doubts import Doubt, look
 from forcegp.errors import NumericalError
-from forcegp.evidence import ContactForces
 from forcegp.evidence.recorded_rows import sensed_of
 from forcegp.inference.memory import blas_threads
 from forcegp.model import Model
@@ -106,7 +105,8 @@ def predict_rows(posterior: Posterior, dataset: Dataset) -> PredictedRows:
         if prediction.unknown_force is not None:
             found["carried_force"] = own.Q_K if posterior.carries_known_forces else torch.zeros_like(own.Q_K)
         if frames:
-            forces = posterior.predict(q, v, u, a=a, of=[ContactForces(frame) for frame in frames])
+            given = posterior.predict(q, v, u, a=a)
+            forces = [given.force_at(frame) for frame in frames]
             found |= {"sensed": torch.cat([x.mean for x in forces], -1)}
             found |= {"sensed_variance": torch.cat([x.variance for x in forces], -1)}
         names, done = list(found), done + len(q)

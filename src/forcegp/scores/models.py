@@ -69,7 +69,7 @@ def usual_forces(model: Model) -> str:
     jointed = bool(model.robot.single_joint_names)
     if thruster_columns(model):
         return "gp:joint-friction+gp:aerodynamic" if jointed else "gp:aerodynamic"
-    if any(slides(contact) for contact in model.touching):
+    if any(slides(contact) for contact in model.contacts):
         return "gp:tool-friction"
     return "gp:joint-friction" if jointed else "gp:joint"
 

@@ -16,7 +16,7 @@ from forcegp.data import Dataset, evenly
 from forcegp.errors import ForceGPError, InvalidInput
 from forcegp.evidence.recorded_rows import sensed_of
 from forcegp.forces import Actuation, JointFriction, LoadFriction, Offset, RigidBodies, Rotor, Unknown
-from forcegp.mechanics import Contact, Held, LoopClosure
+from forcegp.mechanics import Contact, Held
 from forcegp.model import Model
 from forcegp.posterior.posterior import Posterior
 from forcegp.progress import part
@@ -226,8 +226,6 @@ def _contact_labels(contact: Contact) -> tuple[str, str]:
         return f"{type(contact.surface).__name__.lower()} at {contact.frame}", "normal force [N]"
     axis = " ".join(f"{x:.2g}" for x in contact.surface.normal)
     axis = {"1 0 0": "x", "0 1 0": "y", "0 0 1": "z"}.get(axis, f"({axis})")
-    if isinstance(contact, LoopClosure) and contact.turning:
-        return f"{contact.frame} about {axis}", "torque [Nm]"
     return f"{contact.frame} along {axis}", "force [N]"
 
 
