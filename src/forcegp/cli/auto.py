@@ -33,7 +33,7 @@ from forcegp.scores.accuracy import ACCELERATION, TORQUE
 from forcegp.scores.page import number
 
 MOST_CORRECTIONS = 8
-SCORES = ("models", "joint_names", "units", "recommended", "winners", "failures")
+SCORES = ("models", "joint_names", "units", "recommended", "winner", "failures")
 """What the answer holds of the scores."""
 
 

@@ -316,23 +316,6 @@ def white_noise(log: Dataset, width: int = 1, signal: str = "a") -> Float[np.nda
         return np.where((noise[0] < MOTION * noise[1]) & (noise[1] > 0.0), noise[1], np.nan)
 
 
-def time_blocks(
-    time: Float[np.ndarray, " rows"], episode: Int[np.ndarray, " _"], seconds: float
-) -> tuple[tuple[int, ...], ...]:
-    """Row numbers in blocks: rows of one episode in one stretch of `seconds` form a block, in order of time.
-
-    `time` [s] and `episode` may come in any order. Stretches are counted from the first of these rows in every episode;
-    every row is in exactly one.
-    """
-    blocks: dict[tuple[int, int], list[int]] = {}
-    first = {int(number): float(time[episode == number].min()) for number in np.unique(episode)}
-    for row in np.lexsort((time, episode)):
-        number = int(episode[row])
-        stretch = int((time[row] - first[number]) / seconds)
-        blocks.setdefault((number, stretch), []).append(int(row))
-    return tuple(tuple(rows) for rows in blocks.values())
-
-
 def repeated_rows(trained: tuple[np.ndarray, np.ndarray, np.ndarray], test: Dataset) -> Int[np.ndarray, " repeated"]:
     """Numbers of the rows of `test` whose (q, v, u) is exactly one of those in `trained`, each (rows, k)."""
     # -0.0 becomes 0.0: equal numbers have equal bytes

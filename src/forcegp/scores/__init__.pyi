@@ -11,8 +11,7 @@ from .models import (
 )
 from .page import (
     model_table as model_table, overall as overall, unit_of as unit_of,
-    winner_table as winner_table,
 )
 from .score import score as score
-from .scores import CRITERIA as CRITERIA, PairedDifference as PairedDifference, Scores as Scores
+from .scores import PairedDifference as PairedDifference, Scores as Scores
 from .held_out import Split as Split, split_named as split_named
