@@ -105,7 +105,7 @@ def test_without_truth_only_measurements_are_scored_and_the_rest_is_named(poster
 def test_without_analytical_mean_the_processes_answer_for_the_known_forces_too(without_mean, test_data):
     predicted = predict_rows(without_mean, test_data)
     known = arm_model().dynamics(*(torch.tensor(x) for x in (test_data.q, test_data.v, test_data.u))).Q_K.numpy()
-    expected = np.abs(predicted.unknown_force - known - test_data.truth["Q_U"]).mean(axis=0)
+    expected = np.abs(predicted["unknown_force"] - known - test_data.truth["Q_U"]).mean(axis=0)
     np.testing.assert_allclose(scored(without_mean, test_data).columns("mae", "unknown force"), expected, rtol=1e-9)
 
 
@@ -118,7 +118,7 @@ def test_blocks_of_rows_join_seamlessly(posterior):
     rows = [0, BLOCK - 1, BLOCK, len(data) - 1]
     ends = predict_rows(posterior, data.rows(rows))
     for name in ("mean", "variance", "negative_log_density", "residual"):
-        np.testing.assert_allclose(getattr(whole, name)[rows], getattr(ends, name), rtol=1e-8, atol=1e-9)
+        np.testing.assert_allclose(whole[name][rows], ends[name], rtol=1e-8, atol=1e-9)
 
 
 # ---------------------------------------------------------------- known physics alone, in closed form

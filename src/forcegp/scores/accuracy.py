@@ -2,8 +2,7 @@
 
 import statistics
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -41,35 +40,16 @@ CONSTANT = 1e-6  # of the largest standard deviation: less is rounding
 ROUNDING = 1e-9  # relative to the size of the truth: widths of intervals below it are none
 
 
-@dataclass(frozen=True, eq=False)
-class PredictedRows:
-    """What a model predicts for every row, and the mechanics there.
+def predict_rows(posterior: Posterior, dataset: Dataset) -> dict[str, np.ndarray]:
+    """What a model predicts for every row, and the mechanics there; the constraint is that of the Dataset's own system.
 
     `mean` and `variance` of the acceleration without noise, `measurement_variance` with that of the model, or of the
     Dataset where that is larger; `negative_log_density` of the measured rows [nats]; `known_physics`, the acceleration
     of the known forces alone; `residual` |A a - b| of the mean; the mass matrix `mass`. Of models with forces Q_U
-    (`unknown_force`), what of it is known (`carried_force`, Q_K without an analytical mean, else 0), and lambda.
-    `sensed` are forces at frames with a force sensor, x, y and z of each, given the accelerations that were measured.
+    (`unknown_force`), what of it is known (`carried_force`, Q_K without an analytical mean, else 0), and lambda
+    (`multiplier`). `sensed` are forces at frames with a force sensor, x, y and z of each, given the accelerations that
+    were measured. Variances of forces are called `unknown_force_variance` and so on.
     """
-
-    mean: Rows
-    variance: Rows
-    measurement_variance: Rows
-    negative_log_density: Float[np.ndarray, " rows"]
-    known_physics: Rows
-    residual: Float[np.ndarray, "rows c"]
-    mass: Matrices
-    unknown_force: Rows | None = None
-    unknown_force_variance: Rows | None = None
-    multiplier: Float[np.ndarray, "rows m"] | None = None
-    multiplier_variance: Float[np.ndarray, "rows m"] | None = None
-    carried_force: Rows | None = None
-    sensed: Float[np.ndarray, "rows axes"] | None = None
-    sensed_variance: Float[np.ndarray, "rows axes"] | None = None
-
-
-def predict_rows(posterior: Posterior, dataset: Dataset) -> PredictedRows:
-    """Predict all rows, some at a time. The constraint is that of the Dataset's own system."""
     dataset = with_memory(dataset, posterior.model)
     device, held, done = posterior.model.robot.device, list(posterior.model.held_inputs), 0
     names: list[str] = []
@@ -112,7 +92,7 @@ def predict_rows(posterior: Posterior, dataset: Dataset) -> PredictedRows:
 
     with blas_threads(posterior.training.q.numel()):
         arrays: Any = in_blocks(dataset, predicted, device)
-    return PredictedRows(**dict(zip(names, arrays, strict=True)))
+    return dict(zip(names, arrays, strict=True))
 
 
 def negative_log_density(
@@ -147,27 +127,28 @@ def row_scores(
     it is the same for every model that is compared, None takes the model's own.
     """
     rows = predict_rows(posterior, test)
-    mass = rows.mass if mass is None else mass
+    mass = rows["mass"] if mass is None else mass
     pairs = _pairs(rows, test, mass) | _of_sensors(rows, test, sensed_frames(posterior, test))
     table = {name: metrics(*each) for name, each in pairs.items() if each[0].shape == each[2].shape and each[2].size}
-    table[ALL_JOINTS] = {"nlpd": [float(rows.negative_log_density.mean())]}
+    table[ALL_JOINTS] = {"nlpd": [float(rows["negative_log_density"].mean())]}
     measured = table[ACCELERATION]
     whole = test if whole is None else whole
     measured["nrmse"] = plain(np.array(measured["rmse"], dtype=float) / _spread(whole.a))
     if len(test.model.actuators) == test.nv and not posterior.is_black_box:
         # of the torques that the model needs for the measured motion; a share of 1 is no better than their mean
-        rms = np.sqrt(np.square(force_errors(rows.mean, test.a, rows.mass)).mean(axis=0))
+        rms = np.sqrt(np.square(force_errors(rows["mean"], test.a, rows["mass"])).mean(axis=0))
         table[TORQUE] = {"rmse": plain(rms), "share": plain(rms / _spread(whole.u[:, : test.nv]))}
-    density = norm.logpdf(test.a, rows.mean, np.sqrt(rows.measurement_variance))
+    density = norm.logpdf(test.a, rows["mean"], np.sqrt(rows["measurement_variance"]))
     measured["nlpd"] = plain(-np.asarray(density).mean(axis=0))
     measured["noise_std"] = plain(posterior.noise_std.detach().cpu().numpy())
     if test.noise_std is not None:
         measured["noise_floor"] = plain(test.noise_std * np.sqrt(2.0 / np.pi))
     for name in {ACCELERATION, TRUE_ACCELERATION} & set(table):
-        table[name]["known_physics_mae"] = plain(np.abs(rows.known_physics - pairs[name][2]).mean(axis=0))
-    return table, by_stretch(np.square(force_errors(rows.mean, test.a, mass)).mean(axis=1), test)
+        table[name]["known_physics_mae"] = plain(np.abs(rows["known_physics"] - pairs[name][2]).mean(axis=0))
+    return table, by_stretch(np.square(force_errors(rows["mean"], test.a, mass)).mean(axis=1), test)
 
 
+Predicted = Mapping[str, np.ndarray]
 Pair = tuple[np.ndarray, np.ndarray | None, np.ndarray]
 """Mean and variance of a prediction, and what was there; all (rows, columns)."""
 
@@ -178,36 +159,37 @@ def sensed_frames(posterior: Posterior, dataset: Dataset) -> list[str]:
     return [] if posterior.is_black_box else [name for name in sensed_of(dataset) if name in own]
 
 
-def _of_sensors(rows: PredictedRows, test: Dataset, frames: Sequence[str]) -> dict[str, Pair]:
+def _of_sensors(rows: Predicted, test: Dataset, frames: Sequence[str]) -> dict[str, Pair]:
     """Forces at each frame by axis, which sensors measured."""
-    if rows.sensed is None or rows.sensed_variance is None:
+    if "sensed" not in rows:
         return {}
+    mean, variance = rows["sensed"], rows["sensed_variance"]
     names = [f"{AT_SENSOR} {frame}, {axis}" for frame in frames for axis in "xyz"]
     there = np.concatenate([sensed_of(test)[frame] for frame in frames], axis=1)
     return {
-        name: (rows.sensed[:, [k]], rows.sensed_variance[:, [k]], there[:, [k]])
+        name: (mean[:, [k]], variance[:, [k]], there[:, [k]])
         for k, name in enumerate(names)
-        if rows.sensed_variance[:, k].max()
-        > CONSTANT**2 * np.square(there[:, k]).mean()  # no motion of the robot pushes along the others
+        if variance[:, k].max() > CONSTANT**2 * np.square(there[:, k]).mean()  # no motion pushes along the others
     }
 
 
-def _pairs(rows: PredictedRows, test: Dataset, mass: Matrices) -> dict[str, Pair]:
+def _pairs(rows: Predicted, test: Dataset, mass: Matrices) -> dict[str, Pair]:
     """What is compared: measured accelerations, what their errors are as joint forces, A a with b; and known truth."""
-    truth, mean = test.truth, rows.mean
-    zero, still = np.zeros_like(mean), np.zeros_like(rows.residual)
+    truth, mean = test.truth, rows["mean"]
+    zero, still = np.zeros_like(mean), np.zeros_like(rows["residual"])
     pairs: dict[str, Pair] = {
-        ACCELERATION: (mean, rows.measurement_variance, test.a),
+        ACCELERATION: (mean, rows["measurement_variance"], test.a),
         FORCE: (force_errors(mean, test.a, mass), None, zero),
-        CONSTRAINT: (rows.residual, None, still),
+        CONSTRAINT: (rows["residual"], None, still),
     }
     if "a" in truth:
-        pairs[TRUE_ACCELERATION] = mean, rows.variance, truth["a"]
-        pairs[TRUE_FORCE] = force_errors(mean, truth["a"], rows.mass), None, zero
-    if "Q_U" in truth and rows.unknown_force is not None:
-        pairs[UNKNOWN_FORCE] = rows.unknown_force, rows.unknown_force_variance, truth["Q_U"] + rows.carried_force
-    if "lambda" in truth and rows.multiplier is not None:
-        pairs[CONTACT_FORCE] = rows.multiplier, rows.multiplier_variance, truth["lambda"]
+        pairs[TRUE_ACCELERATION] = mean, rows["variance"], truth["a"]
+        pairs[TRUE_FORCE] = force_errors(mean, truth["a"], rows["mass"]), None, zero
+    if "Q_U" in truth and "unknown_force" in rows:
+        there = truth["Q_U"] + rows["carried_force"]
+        pairs[UNKNOWN_FORCE] = rows["unknown_force"], rows["unknown_force_variance"], there
+    if "lambda" in truth and "multiplier" in rows:
+        pairs[CONTACT_FORCE] = rows["multiplier"], rows["multiplier_variance"], truth["lambda"]
     return pairs
 
 
