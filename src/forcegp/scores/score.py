@@ -176,8 +176,7 @@ def _runs_of(
 
 def _split_facts(experiment: Experiment, split: Split) -> dict[str, Any]:
     (train, test), motions = split.apply(experiment.rows), experiment.motions(split)
-    count = 0 if motions.motions is None else len(motions.motions.q)
-    sides = {"training_rows": len(train), "test_rows": len(test), "motions": count, "notes": list(motions.notes)}
+    sides = {"training_rows": len(train), "test_rows": len(test), "motions": len(motions), "notes": list(motions.notes)}
     return split.to_dict() | sides
 
 
