@@ -249,7 +249,6 @@ class Auto(Command):
             page = forcegp.report.model_page(
                 posterior,
                 recording,
-                pictures=forcegp.scores.scores_pictures(scores),
                 title=f"forcegp auto {' '.join(path.name for path in self.logs)}, {posterior.model.robot.name}",
                 best=content["best"],
                 findings=answer,

@@ -65,7 +65,7 @@ class Score(Command):
     observe: Annotated[float, arg(metavar="S")] = 0.0
     """Seconds at the beginning of LOG that a RUN learns from, as a robot at work could; the rest is scored."""
     out: Annotated[Path | None, unless_given("FOLDER", "no folder")] = None
-    """The folder of results: page, figures, numbers, models; of one RUN also report.html with the robot in motion. An
+    """The folder of results: page, numbers, models; of one RUN also report.html with the robot in motion. An
     unfinished run resumes."""
     models: CandidateOptions = CandidateOptions()
     search: SearchOptions = SearchOptions(points=100)

@@ -80,11 +80,10 @@ def model_page(
     posterior: Posterior,
     dataset: Dataset,
     *,
-    pictures: Sequence[Picture] = (),
     shapes: str | Path | None = None,
     **texts: Any,
 ) -> Page:
-    """A page of `texts`, with the robot in motion, these pictures, and those of the model (`scores.model_pictures`).
+    """A page of `texts`, with the robot in motion, and pictures of the model (`scores.model_pictures`).
 
     What cannot be drawn is named on the page with the reason. `shapes` is a URDF with visual elements.
     """
@@ -94,7 +93,7 @@ def model_page(
         scene, notes = recording(recorded), scene_notes(recorded)
     except MissingExtra as error:
         scene, notes = "", [f"The robot is not shown: {error}."]
-    return Page(**texts, scene=scene, scene_notes=[*notes, *missing], pictures=[*pictures, *drawn])
+    return Page(**texts, scene=scene, scene_notes=[*notes, *missing], pictures=drawn)
 
 
 def scene_notes(recorded: RecordedScene) -> list[str]:

@@ -2,7 +2,6 @@ from .accuracy import unfinished_search as unfinished_search
 from .figures.model import (
     curve_panels as curve_panels, friction_curves_figure as friction_curves_figure,
     model_pictures as model_pictures, normal_force_figure as normal_force_figure,
-    scores_pictures as scores_pictures,
 )
 from .figures.style import Picture as Picture, save_figure as save_figure
 from .models import (

@@ -49,8 +49,8 @@ def rendered(template: Path, **values: Any) -> str:
 Column = tuple[str, str, str, int]  # title, quantity, score and decimals; of a coverage in percent
 
 
-def page(scores: Scores, figures: Sequence[tuple[str, str]] = ()) -> str:
-    """Markdown: what was done, the model to take, tables, and what failed; `figures` have names and captions."""
+def page(scores: Scores) -> str:
+    """Markdown: what was done, the model to take, tables, and what failed."""
     finished, by_joint = [name for name in scores.models if scores.finished(name)], []
     for title, quantity, score, digits in columns_of(scores) if finished else ():
         of = ACCELERATION if quantity == ALL_JOINTS else quantity  # densities of each joint alone
@@ -66,7 +66,6 @@ def page(scores: Scores, figures: Sequence[tuple[str, str]] = ()) -> str:
         winner=scores.winner,
         overall=markdown_table(*overall(scores)) if finished else "",
         by_joint=by_joint,
-        figures=figures,
         listed=[[name, each["kind"], each["summary"], str(len(scores.finished(name)))]
                 for name, each in scores.models.items()],
         failures=scores.failures,
