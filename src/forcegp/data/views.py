@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from forcegp.data.dataset import Dataset
-from forcegp.errors import DatasetError, InvalidInput
+from forcegp.errors import InvalidInput
 from forcegp.model import Model
 from forcegp.robots.arguments import whole_number
 
@@ -322,26 +322,6 @@ def repeated_rows(trained: tuple[np.ndarray, np.ndarray, np.ndarray], test: Data
     known, rows = (np.hstack(each) + 0.0 for each in (trained, (test.q, test.v, test.u)))
     found = {row.tobytes() for row in known}
     return np.array([number for number, row in enumerate(rows) if row.tobytes() in found], dtype=np.int64)
-
-
-def require_disjoint(train: Dataset, test: Dataset) -> None:
-    """Refuse a pair of Datasets in which the test repeats the training.
-
-    Raises DatasetError if a row `(q, v, u)` of `test` is also in `train`, or if both have the same `metadata` and share
-    an episode: two samples of one trajectory.
-    """
-    repeated = repeated_rows((train.q, train.v, train.u), test)
-    if repeated.size:
-        raise DatasetError(
-            f"{repeated.size} of {len(test)} test rows are also training rows (the first: test row {repeated[0]}). "
-            "Test on another trajectory: another episode, recording or seed."
-        )
-    shared = sorted(set(train.episodes) & set(test.episodes))
-    if train.metadata and train.metadata == test.metadata and shared:
-        raise DatasetError(
-            f"training and test rows come from the same trajectory: equal metadata, episodes {shared} in both. "
-            "Test on another episode, recording or seed."
-        )
 
 
 ROUNDING = 1e-13  # standard deviation, relative to the largest entry, below which a column is constant but for rounding

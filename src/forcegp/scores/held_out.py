@@ -6,16 +6,16 @@ Neighbouring rows are nearly equal, and filters mix them, so a split of single r
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool
 
-from forcegp.data import Dataset, require_disjoint
+from forcegp.data import Dataset, repeated_rows
 from forcegp.data.views import EVEN_STEPS, RecordedMotions, recorded_motions
-from forcegp.errors import InvalidInput, require_type, usable_arguments
+from forcegp.errors import DatasetError, InvalidInput, require_type, usable_arguments
 from forcegp.posterior import Posterior, observing
 from forcegp.posterior.drift import in_its_record
 from forcegp.robots.arguments import whole_number
@@ -72,11 +72,14 @@ class Split:
                     f"split {self.name!r} leaves no row to {side}; the dataset has episodes {list(dataset.episodes)} "
                     f"and the guard is {self.guard} s."
                 )
-        sides = dataset.rows(train), dataset.rows(test)
-        whole = all(math.isinf(begin) and math.isinf(end) for _, begin, end in self.held_out)
-        # Blocks of one episode have equal metadata by nature; of those only repeated rows are refused.
-        require_disjoint(sides[0] if whole else replace(sides[0], metadata={}), sides[1])
-        return sides
+        known, unseen = dataset.rows(train), dataset.rows(test)
+        again = repeated_rows((known.q, known.v, known.u), unseen)
+        if again.size:
+            raise DatasetError(
+                f"{again.size} of {len(unseen)} test rows are also training rows (the first: test row {again[0]}). "
+                "Test on another trajectory: another episode, recording or seed."
+            )
+        return known, unseen
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values; None where a stretch goes to the end of the recording."""
