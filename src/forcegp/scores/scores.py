@@ -290,14 +290,13 @@ class Scores(Summary):
         """The model to take, by motions, else forces; None where no model was scored."""
         return None if self.winner is None else self.winner.model
 
-    def fitted_on_all_rows(self, model: str | None = None) -> Posterior:
-        """The recommended model (or another one by name) from all rows. Raises FitError if there is none."""
-        name = self.recommended if model is None else self._named(model)
-        if name is None:
+    def fitted_on_all_rows(self) -> Posterior:
+        """The recommended model from all rows. Raises FitError if there is none."""
+        if self.recommended is None:
             raise FitError(f"no model was fitted: {'; '.join(self.failures)}.")
         if self.fit is None:
             raise FitError("these scores came without their models.")
-        return self.fit(name)
+        return self.fit(self.recommended)
 
     # ------------------------------------------------------------------ to show
 
