@@ -18,14 +18,8 @@ from forcegp.posterior.posterior import Posterior
 from forcegp.report.motion import RecordedScene, recorded_scene, recording
 from forcegp.scores import Picture, Scores, model_pictures, overall, unit_of
 
-
-@dataclass(frozen=True)
-class Table:
-    """Rows of text under a header."""
-
-    title: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
+Table = tuple[str, Sequence[str], Sequence[Sequence[str]]]
+"""Title, header, and rows of text."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,4 +115,4 @@ def scores_table(scores: Scores, names: Mapping[str, str] | None = None) -> Tabl
     """Models side by side, by these names if given."""
     header, rows = overall(scores)
     shown = [[(names or {}).get(name, name), *(cell.partition(" (")[0] for cell in cells)] for name, *cells in rows]
-    return Table("Models on time that none of them has seen", header, shown)
+    return "Models on time that none of them has seen", header, shown
