@@ -16,6 +16,7 @@ TABLE = "--time time --q q_{joints} --v v_{joints} --u u_{joints} --robot pair.u
 ARRAYS = "--time time --q q --v v --u u --robot pair.urdf"
 FLAGS = {
     "log.csv": TABLE,
+    "log.parquet": TABLE,
     "log.npz": ARRAYS,
     "log.mat": ARRAYS.replace("time", "log.time", 2).replace("--log.time", "--time"),
     "log73.mat": ARRAYS,

@@ -16,6 +16,7 @@ from tests.recordings.log_files import (
     write_hdf5,
     write_matlab5,
     write_matlab73,
+    write_parquet,
     write_text,
 )
 from tests.robots.mjcf_models import OPEN_BARS, QUADROTOR
@@ -35,7 +36,7 @@ MODELS = ("structured", "carried", "independent")
 QUICK = OptimizerOptions(iterations=2)
 INPUTS: Any = SimpleNamespace(folder=None)
 """`folder` with the files below, `data`, `posterior`, `predictor`; filled by `make`."""
-LOGS = ("log.csv", "log.npz", "log.mat", "log73.mat", "log.h5", "log.mcap")
+LOGS = ("log.csv", "log.npz", "log.mat", "log73.mat", "log.h5", "log.parquet", "log.mcap")
 
 PAIR = model("continuous").robot.urdf_text
 """The robot of the logs."""
@@ -74,6 +75,7 @@ def make(folder: Path) -> None:
     write_matlab5(folder / "log.mat", rows)
     write_matlab73(folder / "log73.mat", rows)
     write_hdf5(folder / "log.h5", rows)
+    write_parquet(folder / "log.parquet", table(rows))
     next(write_bag2(folder / "bag", rows).glob("*.mcap")).rename(folder / "log.mcap")
     INPUTS.folder, INPUTS.data, INPUTS.posterior, INPUTS.free = folder, data, plain, free
     INPUTS.other = dataset()

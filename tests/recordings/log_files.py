@@ -46,6 +46,21 @@ def write_text(path: Path, columns: dict[str, np.ndarray], *, delimiter: str = "
     return path
 
 
+def write_parquet(path: Path, columns: dict[str, np.ndarray]) -> Path:
+    """Arrays (rows,) as columns, (rows, k) as columns of lists; several row groups."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    made = {
+        name: pa.array(values)
+        if values.ndim == 1
+        else pa.FixedSizeListArray.from_arrays(values.ravel(), values.shape[1])
+        for name, values in columns.items()
+    }
+    parquet.write_table(pa.table(made), path, row_group_size=70)
+    return path
+
+
 def write_hdf5(path: Path, data: dict[str, np.ndarray]) -> Path:
     with h5py.File(path, "w") as file:
         for name, values in data.items():

@@ -16,6 +16,7 @@ from tests.recordings.log_files import (
     write_hdf5,
     write_matlab5,
     write_matlab73,
+    write_parquet,
     write_text,
 )
 from tests.recordings.source_conformance import SourceConformance
@@ -136,6 +137,19 @@ def test_lines_of_other_widths_and_texts_for_numbers_are_left_out_if_asked_for(t
     (tmp_path / "log.csv").write_text("\n".join(["t,q", *rows, ""]))
     with pytest.raises(FileFormatError, match="3 lines have other than 2 fields"):
         source.read(["q"])
+
+
+class TestParquet(Tables):
+    def write(self, folder):
+        return write_parquet(folder / "log.parquet", table(motion()))
+
+
+class TestParquetOfLists(Tables):
+    def write(self, folder):
+        return write_parquet(folder / "log.parquet", motion())
+
+    def expected(self):
+        return arrays("")
 
 
 def arrays(prefix):
@@ -326,7 +340,7 @@ def test_a_name_of_a_column_that_is_too_long_is_refused(tmp_path):
 
 def test_options_of_other_formats_are_refused(tmp_path):
     with pytest.raises(InvalidInput, match="`headerless` means nothing to"):
-        open_source(write_hdf5(tmp_path / "log.h5", motion(10)), headerless=7)
+        open_source(write_parquet(tmp_path / "log.parquet", table(motion(10))), headerless=7)
     with pytest.raises(InvalidInput, match="means nothing to"):
         open_source(write_text(tmp_path / "log.csv", table(motion(10))), within="run1")
 

@@ -209,7 +209,7 @@ class ColumnOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class Import(Command):
-    """Turn logs into a dataset: CSV, TSV and text (also .gz), JSON, npz, MATLAB, HDF5, ROS bags.
+    """Turn logs into a dataset: CSV, TSV and text (also .gz), Parquet, JSON, npz, MATLAB, HDF5, ROS bags.
 
     State which columns are the time, the positions, velocities and forces of the joints (or of a base that moves), and
     their units: by flags, or in a YAML file. One beside the log, log.yaml or forcegp.yaml, is found by itself. COLUMNS

@@ -1,4 +1,4 @@
-"""Files that hold arrays by name: NumPy archives (.npz), HDF5 of any layout, MATLAB of all versions, JSON."""
+"""Files that hold arrays by name: NumPy archives (.npz), HDF5 of any layout, MATLAB of all versions, Parquet, JSON."""
 
 import fnmatch
 import json
@@ -14,7 +14,10 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.lib import format as npy
+from pyarrow import parquet, types
 from typing_extensions import override
 
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput
@@ -22,8 +25,10 @@ from forcegp.recordings.source import (
     LONGEST_VECTOR,
     Columns,
     Source,
+    arrow_numbers,
     element_names,
     reading,
+    require_distinct,
     require_plausible_size,
 )
 from forcegp.recordings.tables import seconds_of
@@ -276,11 +281,54 @@ def _numbers(value: Any, name: str) -> Iterator[tuple[str, np.ndarray]]:
                 yield from ((f"{name}/{number}{key}", own) for key, own in part.items())
 
 
+PARQUET = "a Parquet file"
+LISTS = (types.is_list, types.is_large_list, types.is_fixed_size_list)
+
+
+def parquet_arrays(path: Path) -> Arrays:
+    """Of a Parquet file: numeric columns, and columns of lists of equal length, that of the first row."""
+
+    def content(name: str, width: int | None) -> np.ndarray:
+        with reading(path, PARQUET, pa.ArrowException), parquet.ParquetFile(path, pre_buffer=False) as file:
+            column = file.read(columns=[name]).column(name).combine_chunks()
+            if width is None:
+                return arrow_numbers(column)
+            lengths = pc.call_function("list_value_length", [column]).fill_null(0).to_numpy(zero_copy_only=False)
+            for row in np.flatnonzero(lengths != width)[:1]:
+                raise FileFormatError(
+                    f"{path}: column {name!r} has {lengths[row]} elements at row {row}, {width} before; lists must be "
+                    "of one length."
+                )
+            return arrow_numbers(column.flatten()).reshape(len(column), width)
+
+    widths: dict[str, int | None] = {}
+    with reading(path, PARQUET, pa.ArrowException), parquet.ParquetFile(path, pre_buffer=False) as file:
+        rows = file.metadata.num_rows
+        if not rows:
+            raise FileFormatError(f"{path} has columns but no rows.")
+        for field in file.schema_arrow:
+            if types.is_floating(field.type) or types.is_integer(field.type):
+                widths[field.name] = None
+            elif any(is_list(field.type) for is_list in LISTS):
+                first = next(file.iter_batches(1, columns=[field.name])).column(0)[0]
+                kind = field.type.value_type
+                if first.is_valid and len(first) and (types.is_floating(kind) or types.is_integer(kind)):
+                    widths[field.name] = len(first)
+        elements = [name for own, width in widths.items() for name in (element_names(own, width) if width else [own])]
+        require_distinct(path, [*(name for name in file.schema_arrow.names if name not in widths), *elements])
+    return {
+        name: ((rows,) if width is None else (rows, width), lambda name=name, width=width: content(name, width))
+        for name, width in widths.items()
+    }
+
+
 ARRAYS: dict[str, Callable[[Path], Arrays]] = {
     ".npz": numpy_arrays,
     ".mat": matlab_arrays,
     ".h5": hdf5_arrays,
     ".hdf5": hdf5_arrays,
+    ".parquet": parquet_arrays,
+    ".pq": parquet_arrays,
     ".json": json_arrays,
     ".jsonl": json_arrays,
     ".ndjson": json_arrays,

@@ -40,6 +40,7 @@ TURNED = ("y", "z", "qy", "qz", "sin", "ry", "rz", "pitch", "yaw")
 LACKING = Expression("derive", {}, ast.Constant(0.0), ())
 """This very object: an entry of v or a that the log lacks, which is differentiated, or a switch of a contact."""
 LACKS = re.compile(r"derive\d*")
+EPISODE = "episode_index"  # numbers the episodes where nothing else is stated, as in datasets of LeRobot
 MOST_NAMES = 40  # of columns in a message
 
 
@@ -201,8 +202,9 @@ def signal_plan(
     )
     signals += tuple(item for frame in mapping.force for item in _sensor(mapping, frame, source, model))
     lacking = {name: [x.expression is LACKING for x in signals if x.signal == name != "u"] for name in found}
-    if mapping.episode is not None:
-        require_known("column", mapping.episode, str(source.path), source.columns(), FileFormatError)
+    episode = mapping.episode or (EPISODE if EPISODE in source.columns() else None)
+    if episode is not None:
+        require_known("column", episode, str(source.path), source.columns(), FileFormatError)
     # stamps of ROS are whole nanoseconds; everything else is taken for seconds
     stamps = time is not None and time.is_column and next(iter(time.weights)).endswith((":header.stamp", ":log_time"))
     [time_unit, *_] = mapping.unit.get("time", ("ns" if stamps else "s",))
@@ -214,7 +216,7 @@ def signal_plan(
         time=time,
         time_unit=log_unit("time", time_unit),
         step=mapping.step,
-        episode=mapping.episode,
+        episode=episode,
         guessed=tuple(guessed),
     )
 

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -104,11 +104,17 @@ def as_column(values: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
+def arrow_numbers(column: Any) -> np.ndarray:
+    """A column of pyarrow; a missing value is NaN."""
+    values = column.to_numpy(zero_copy_only=False)
+    return values.astype(np.float64) if values.dtype == object or column.null_count else values
+
+
 @contextmanager
 def reading(path: Path, what: str, *errors: type[BaseException]) -> Iterator[None]:
     """Turn what a library meets in a damaged file into a FileFormatError that names the path.
 
-    `what` names the expected format ("a MATLAB file"); `errors` are those of the library beyond the usual ones.
+    `what` names the expected format ("a Parquet file"); `errors` are those of the library beyond the usual ones.
     """
     try:
         yield

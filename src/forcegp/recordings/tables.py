@@ -1,4 +1,4 @@
-"""Tables: CSV, TSV and other text with one row per line, also compressed (.gz), read by pyarrow."""
+"""Tables: CSV, TSV and other text with one row per line, also compressed (.gz), and Parquet, read by pyarrow."""
 
 import codecs
 import csv
@@ -24,6 +24,7 @@ from forcegp.recordings.source import (
     MOST_LOST,
     Columns,
     Source,
+    arrow_numbers,
     reading,
     require_distinct,
     require_plausible_size,
@@ -183,7 +184,7 @@ class DelimitedText(Source):
         wanted = stored if stacked else list(names)
         kinds = dict.fromkeys(stored, pa.float64()) | dict.fromkeys(self._long_integers, pa.int64())
         table = self._parsed(stored, wanted, kinds | dict.fromkeys(self._clocks, pa.string()))
-        columns = {name: _numbers(table.column(name)) for name in {*wanted} - self._clocks}
+        columns = {name: arrow_numbers(table.column(name)) for name in {*wanted} - self._clocks}
         columns |= {name: seconds_of(table.column(name).to_pylist()) for name in self._clocks.intersection(wanted)}
         if not stacked:
             return columns
@@ -254,12 +255,6 @@ class DelimitedText(Source):
         elif found := _RAGGED.search(text):
             text = f"{line(found[1])} has {found[3]} fields instead of {found[2]}. {_REMEDY}"
         return FileFormatError(f"{self.path}: {text}")
-
-
-def _numbers(column: Any) -> np.ndarray:
-    """A column of pyarrow; a missing value is NaN."""
-    values = column.to_numpy(zero_copy_only=False)
-    return values.astype(np.float64) if values.dtype == object or column.null_count else values
 
 
 def _encoding(first: bytes) -> str:
