@@ -23,7 +23,7 @@ from forcegp.checks.signals import (
     target_doubts,
     without_registers,
 )
-from forcegp.checks.torque_doubts import TOUCHES, held_points, torque_doubts, without_stops
+from forcegp.checks.torque_doubts import TOUCHES, elastic_doubts, held_points, torque_doubts, without_stops
 from forcegp.data import Dataset, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
@@ -149,6 +149,8 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
             sharp, heard = search(replace(inputs, compared=inputs.sharper))
             if not heard or heard[-1].about != UNKNOWN:
                 found, said = sharp, heard
+        if said and said[-1].about == UNKNOWN:
+            said = [*said, *elastic_doubts(inputs, found.log)]
         doubts, comparison = [*doubts, *said, *torque_doubts(inputs, found)], found
     return doubts, comparison
 
