@@ -19,7 +19,6 @@ from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.preparation import rows_for
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, real_tensor, whole_number
-from forcegp.robots.compiled import CompiledRobot
 
 
 class Controller:
@@ -124,18 +123,6 @@ class TrackingController(Controller):
     @abstractmethod
     def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
         """Before limits."""
-
-
-class PDGravity(TrackingController):
-    """u = M(q) (Kd (v_d - v) + Kp (q_d - q)) + g(q): masses alone; `robot` may be `robot.compile()`."""
-
-    def __init__(self, robot: Robot | CompiledRobot, **settings: Any) -> None:
-        self._dynamics = robot
-        super().__init__(robot.robot if isinstance(robot, CompiledRobot) else robot, **settings)  # type: ignore[arg-type]  # it is a Robot
-
-    @override
-    def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
-        return self._dynamics.mass_matrix(q) @ self.feedback(e, e_v) + self._dynamics.gravity_forces(q)
 
 
 class ComputedTorque(TrackingController):

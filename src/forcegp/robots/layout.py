@@ -189,15 +189,6 @@ class Layout:
         """Pose (bodies, 4, 4) of each body's child link in its frame."""
         return np.stack([self.links[joint.child].offset for joint in self.bodies])
 
-    def require_moving(self, link: str, robot: str) -> None:
-        """Raise where ``link`` has no inertia that matters: it does not exist, or it is fixed in the world."""
-        require_known("link", link, robot, self.links, UnknownName)
-        if self.links[link].body == WORLD:
-            raise InvalidInput(
-                f"link {link!r} of {robot} is fixed in the world, so its inertia never enters the dynamics and "
-                f"cannot be a parameter; name a moving link: {', '.join(self.moving)}"
-            )
-
 
 def lay_out(
     description: RobotDescription, locked: Mapping[str, float], base: BaseChoice | None, problems: Problems
