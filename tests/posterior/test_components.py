@@ -120,7 +120,7 @@ def test_components_are_those_of_dense_conditioning(posterior, dense, states, co
     for gaussian, affine, spread in (
         (predicted.multiplier, dynamics.multiplier_map(), whole),
         (predicted.contact_force, dynamics.contact_force_map(), whole),
-        (predicted.acceleration, dynamics.acceleration_map(), learned),
+        (predicted, dynamics.acceleration_map(), learned),
     ):
         close(gaussian.mean, affine(total.mean))
         close(gaussian.covariance, affine.matrix @ spread @ affine.matrix.mT)

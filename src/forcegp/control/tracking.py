@@ -328,7 +328,6 @@ class MPPI(Controller):
         noise: Any = None,
         integrator: str | None = None,
         seed: int = 0,
-        threads: int | None = 1,
     ) -> None:
         require_type("predictor", predictor, Predictor)
         if not callable(cost):
@@ -346,7 +345,6 @@ class MPPI(Controller):
         self._colour = torch.linalg.cholesky(CORRELATION ** (apart[:, None] - apart).abs())
         self._scales = torch.logspace(math.log10(SMALLEST_SCALE), 0.0, self.samples, dtype=torch.float64)
         self.integrator = integrator or usual_integrator(predictor, self.dt)
-        self._how: dict[str, Any] = {"integrator": self.integrator, "threads": threads}
 
     @override
     def restart(self) -> None:
@@ -371,7 +369,7 @@ class MPPI(Controller):
         torques = torch.minimum(torch.maximum(torques, -self.torque_limits), self.torque_limits)
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore", NumericalWarning)  # of sequences that diverge: they cost infinitely much
-            motions = self.predictor.rollouts(q, v, torques, self.dt, **self._how)
+            motions = self.predictor.rollouts(q, v, torques, self.dt, integrator=self.integrator, threads=1)
             costs = torch.as_tensor(self.cost(motions.q, motions.v, torques.expand_as(motions.a)))
         if costs.shape != motions.diverged_at.shape:
             raise InvalidInput(

@@ -277,7 +277,7 @@ def check_tree(layout: Layout, loops: Sequence[tuple[str, str, str]], problems: 
                 RobotModelError(
                     f"{problems.source}: {name} closes a loop, from link {links[0]!r} to {links[1]!r}",
                     "; a robot is a tree here, which would move in another way. Lock the joints between these links "
-                    f"({', '.join(layout.bodies[body].name for body in between)}) by `locked` or --lock, or take the "
+                    f"({', '.join(layout.bodies[body].name for body in between)}) by `locked`, or take the "
                     "equality out of the file where nothing holds them together.",
                 )
             )
