@@ -14,6 +14,7 @@ import torch
 from matplotlib.axes import Axes
 from PIL import Image
 
+from benchmarks.pd_gravity import PDGravity
 from benchmarks.tracking import (
     CONFIG,
     GAINS,
@@ -28,7 +29,6 @@ from benchmarks.tracking import (
     task_of,
 )
 from forcegp import Model, Robot
-from forcegp.control import PDGravity
 from forcegp.posterior import Posterior
 from forcegp.scores.figures.style import (
     IDENTIFIED,

@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from scipy.stats import spearmanr
 
+from benchmarks.pd_gravity import PDGravity
 from benchmarks.tracking import (
     CONFIG,
     GAINS,
@@ -39,7 +40,6 @@ from benchmarks.tracking import (
     task_of,
 )
 from forcegp import ComputedTorque, Dataset, JointFriction, Model, excitation, fit
-from forcegp.control import PDGravity
 from forcegp.control.informative_motions import Excitation, LearnedForces, Motion
 from forcegp.errors import ContactWarning
 from forcegp.simulation.kuka_surface import joint_friction_of

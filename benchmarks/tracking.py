@@ -22,8 +22,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from benchmarks.pd_gravity import PDGravity
 from forcegp import ComputedTorque, Coulomb, Dataset, JointFriction, KukaSurfaceConfig, Model, Robot, Viscous, fit
-from forcegp.control import PDGravity
 from forcegp.data import farthest_rows
 from forcegp.evidence import Accelerations
 from forcegp.forces import GearFriction, Offset, RigidBodies, Rotor

@@ -15,6 +15,7 @@ from forcegp.forces import Body, JointForces, RigidBodies, ToolForces
 from forcegp.inference import OptimizerOptions
 from forcegp.jobs import JobStore
 from forcegp.model import Model
+from forcegp.robots.urdf_file import replace_inertial
 from forcegp.simulation.kuka_surface import TOOL_LINK
 
 MODELS = {"s-gp": "S-GP + analytical mean", "s-gp-tool": "the same, tool friction"}
@@ -51,4 +52,7 @@ def wrong_model(model: Model) -> Model:
     """The same with a tool that is too heavy and has its centre of mass elsewhere; its inertia stays."""
     link = model.robot.link(TOOL_LINK)
     moved = np.array(link.center_of_mass) + np.array(CENTER_OFFSET)
-    return model.with_robot(model.robot.with_link(TOOL_LINK, link.mass + MASS_OFFSET, moved, link.inertia))
+    text = replace_inertial(
+        model.robot.urdf_text, TOOL_LINK, link.mass + MASS_OFFSET, moved, link.inertia, source=model.robot.source
+    )
+    return model.with_robot(model.robot.with_text(text))

@@ -371,11 +371,8 @@ class Model(Summary):
         return json.dumps(self.to_dict())
 
     @classmethod
-    def from_dict(cls, stored: Mapping[str, Any], contacts: Sequence[Contact] | None = None) -> "Model":
-        """The model that `to_dict` stored; `contacts` replaces the stored ones.
-
-        Raises FileFormatError for anything else.
-        """
+    def from_dict(cls, stored: Mapping[str, Any]) -> "Model":
+        """The model that `to_dict` stored. Raises FileFormatError for anything else."""
         if stored.get("format") != FORMAT_VERSION:
             raise FileFormatError(
                 f"stored model has format {stored.get('format')!r}; this forcegp reads {FORMAT_VERSION}"
@@ -385,8 +382,7 @@ class Model(Summary):
                 if not isinstance(stored[key], kind):
                     raise FileFormatError(f"stored model is damaged: {key} is {stored[key]!r}")
             robot = Robot.from_stored(stored)
-            if contacts is None:
-                contacts = [Contact.from_dict(entry) for entry in stored["contacts"]]
+            contacts = [Contact.from_dict(entry) for entry in stored["contacts"]]
             baumgarte = None if stored["baumgarte"] is None else Baumgarte(**stored["baumgarte"])
             forces = tuple(force_from_dict(entry) for entry in stored["forces"])
             noise = None if stored["noise"] is None else Noise.from_dict(stored["noise"])

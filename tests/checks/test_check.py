@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy.optimize import brentq
 from tests.checks.logs import RATE, arm, clean, column, pendulum
+from tests.robots.robot_models import with_link
 
 from forcegp.checks import CheckReport, check, without_stops
 from forcegp.data import Dataset, Preparation
@@ -115,7 +116,7 @@ def test_a_dead_torque_is_wrong_where_the_motion_needs_a_share_of_the_others(sha
     lower = pendulum().robot.link("lower")
 
     def lighter(scale):
-        robot = pendulum().robot.with_link("lower", scale * lower.mass, lower.center_of_mass, scale * lower.inertia)
+        robot = with_link(pendulum().robot, "lower", scale * lower.mass, lower.center_of_mass, scale * lower.inertia)
         return robot, robot.inverse_dynamics(q, v, a).numpy()
 
     def above(scale):

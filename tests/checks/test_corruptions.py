@@ -23,6 +23,7 @@ from tests.checks.corruptions import (
 )
 from tests.checks.logs import clean as filtered_log
 from tests.posterior.arm import arm_model
+from tests.robots.robot_models import with_link
 
 from forcegp.checks import check, quick_check
 from forcegp.checks.check_input import CheckInput
@@ -265,7 +266,7 @@ def test_turned_torques_are_named_though_all_masses_are_wrong(sign):
     data = filtered_log(5, arm_model(contacts=0))
     robot = data.model.robot
     for link, mass, along in (("upper", 3.0, -0.3), ("fore", 0.3, 0.4), ("hand", 4.0, -0.2)):
-        robot = robot.with_link(link, mass=mass, center_of_mass=(0.1, along, along), inertia=0.05 * np.eye(3))
+        robot = with_link(robot, link, mass, np.array((0.1, along, along)), 0.05 * np.eye(3))
     wrong_masses = replace(data, u=sign * data.u, model=Model(robot))
     found = [each for each in said(wrong_masses) if each.about == "torque sign"]
     assert len(found) == (sign < 0.0)

@@ -9,7 +9,6 @@ import torch
 from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import ComputedTorque, HybridForce, Model, Robot, Viscous, fit
-from forcegp.control import PDGravity
 from forcegp.errors import ContactError, ContactWarning, InvalidInput, NumericalError
 from forcegp.forces import Actuation, ContactFriction, Coulomb, JointForces, JointFriction, RigidBodies
 from forcegp.inference import OptimizerOptions
@@ -46,13 +45,6 @@ def test_the_torque_is_that_of_inverse_dynamics_with_friction():
     control = ComputedTorque(TRUE, stiffness=[100.0, 50.0], damping=[3.0, 4.0])
     wanted = a_d + np.array([100.0, 50.0]) * (q_d - q) + np.array([3.0, 4.0]) * (v_d - v)
     np.testing.assert_allclose(control(q, v, q_d, v_d, a_d), rnea(q, v_d, wanted) + VISCOUS * v_d, rtol=1e-9)
-
-
-def test_gravity_compensation_is_that_of_a_robot_at_rest():
-    q, v, q_d, v_d, a_d = np.random.default_rng(1).uniform(-1.0, 1.0, (5, 2))
-    expected = rnea(q, 0 * q, 100.0 * (q_d - q) + 20.0 * (v_d - v))  # M (...) + g, since h(q, 0) = g
-    for robot in (ROBOT, ROBOT.compile()):
-        np.testing.assert_allclose(PDGravity(robot, **GAINS)(q, v, q_d, v_d, a_d), expected, rtol=1e-9)
 
 
 def test_torques_keep_their_limits():

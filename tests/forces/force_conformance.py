@@ -227,7 +227,7 @@ class UnknownConformance:
         dynamics = data.model.dynamics(*map(torch.tensor, states))
         violation = (dynamics.A @ prediction.mean[..., None])[..., 0] - dynamics.b
         assert float(violation.abs().max()) < 1e-8
-        for gaussian in (prediction.acceleration, prediction.unknown_force):
+        for gaussian in (prediction, prediction.unknown_force):
             smallest = torch.linalg.eigvalsh(gaussian.covariance)[..., 0]
             assert bool((smallest > -1e-9 * (1.0 + gaussian.covariance.abs().amax((-2, -1)))).all())
         save_posterior(fitted, tmp_path / "run")

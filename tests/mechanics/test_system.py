@@ -153,4 +153,4 @@ def test_a_surface_that_holds_code_cannot_be_stored_but_given_again():
     with pytest.raises(ContactError, match="a Surface of your own with numbers as fields"):
         built.to_json()
     stored = built.with_contacts(()).to_dict()
-    assert_same_dynamics(Model.from_dict(stored, contacts=waves), built)
+    assert_same_dynamics(Model.from_dict(stored).with_contacts(waves), built)

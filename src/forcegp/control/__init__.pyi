@@ -1,5 +1,5 @@
 from .monitor import ContactMonitor as ContactMonitor
 from .informative_motions import Excitation as Excitation, excitation as excitation
 from .tracking import (
-    MPPI as MPPI, ComputedTorque as ComputedTorque, HybridForce as HybridForce, PDGravity as PDGravity,
+    MPPI as MPPI, ComputedTorque as ComputedTorque, HybridForce as HybridForce,
 )

@@ -49,7 +49,6 @@ class RobotVectorEnv(VectorEnv):
         terminated: Callable[..., np.ndarray] | None = None,
         start: Callable[..., tuple[np.ndarray, np.ndarray]] | None = None,
         integrator: str | None = None,
-        threads: int | None = 1,
     ) -> None:
         model = load_posterior(model) if isinstance(model, str | Path) else model
         if not isinstance(model, Predictor):
@@ -63,7 +62,6 @@ class RobotVectorEnv(VectorEnv):
         robot.require_vectors("environments")
         require_number("dt", float(dt), f"one step lasts {LONGEST:g} s at most", below=LONGEST * (1.0 + 1e-9))
         self.integrator = integrator or usual_integrator(model, dt)
-        self._how = {"integrator": self.integrator, "threads": threads}
         limits = [joint.effort_limit for joint in robot.joints] if torque_limits is None else torque_limits
         self._limits = limits = per_joint("torque_limits", limits, robot.nv).numpy()
         if not limits.any() or not np.isfinite(limits).all():
@@ -93,7 +91,7 @@ class RobotVectorEnv(VectorEnv):
         """One step of `dt`; robots whose episode had ended begin a new one instead, with reward 0."""
         u = np.clip(np.asarray(actions, float).reshape(self.q.shape), -self._limits, self._limits)
         anew, q, v = self._ended, self.q, self.v
-        motion = self.predictor.rollouts(q, v, u[:, None], self.dt, **self._how)
+        motion = self.predictor.rollouts(q, v, u[:, None], self.dt, integrator=self.integrator, threads=1)
         q_next, v_next = motion.q[:, 1].numpy(), motion.v[:, 1].numpy()
         lasted = anew | np.isfinite(q_next + v_next).all(axis=1)
         self.q, self.v = q_next, v_next

@@ -28,7 +28,6 @@ from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.preparation import rows_for
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, real_tensor, whole_number
-from forcegp.robots.compiled import CompiledRobot
 
 
 class Controller:
@@ -133,18 +132,6 @@ class TrackingController(Controller):
     @abstractmethod
     def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
         """Before limits."""
-
-
-class PDGravity(TrackingController):
-    """u = M(q) (Kd (v_d - v) + Kp (q_d - q)) + g(q): masses alone; `robot` may be `robot.compile()`."""
-
-    def __init__(self, robot: Robot | CompiledRobot, **settings: Any) -> None:
-        self._dynamics = robot
-        super().__init__(robot.robot if isinstance(robot, CompiledRobot) else robot, **settings)  # type: ignore[arg-type]  # it is a Robot
-
-    @override
-    def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
-        return self._dynamics.mass_matrix(q) @ self.feedback(e, e_v) + self._dynamics.gravity_forces(q)
 
 
 class ComputedTorque(TrackingController):
@@ -385,7 +372,6 @@ class MPPI(Controller):
         noise: Any = None,
         integrator: str | None = None,
         seed: int = 0,
-        threads: int | None = 1,
     ) -> None:
         require_type("predictor", predictor, Predictor)
         if not callable(cost):
@@ -403,7 +389,6 @@ class MPPI(Controller):
         self._colour = torch.linalg.cholesky(CORRELATION ** (apart[:, None] - apart).abs())
         self._scales = torch.logspace(math.log10(SMALLEST_SCALE), 0.0, self.samples, dtype=torch.float64)
         self.integrator = integrator or usual_integrator(predictor, self.dt)
-        self._how: dict[str, Any] = {"integrator": self.integrator, "threads": threads}
 
     @override
     def restart(self) -> None:
@@ -428,7 +413,7 @@ class MPPI(Controller):
         torques = torch.minimum(torch.maximum(torques, -self.torque_limits), self.torque_limits)
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore", NumericalWarning)  # of sequences that diverge: they cost infinitely much
-            motions = self.predictor.rollouts(q, v, torques, self.dt, **self._how)
+            motions = self.predictor.rollouts(q, v, torques, self.dt, integrator=self.integrator, threads=1)
             costs = torch.as_tensor(self.cost(motions.q, motions.v, torques.expand_as(motions.a)))
         if costs.shape != motions.diverged_at.shape:
             raise InvalidInput(

@@ -100,7 +100,7 @@ def on_all_rows(fitted: Posterior, rows: Dataset, engine: Engine | None, describ
         if training is not reference or not isinstance(choice.engine, Exact):
             latent = likelihood.condition(fitted.kernels, fitted.hyperparameters, choice.engine)
         left_out = latent.left_out if isinstance(latent, InducingPosterior) else 0.0
-        if engine is None and isinstance(choice.engine, Inducing) and left_out > choice.engine.tolerance:
+        if engine is None and isinstance(choice.engine, Inducing) and left_out > ENOUGH:
             choice = choose_engine(size, training.q.device, inducing=False)
             short = f"fewer inducing points leave out {left_out:.2g} of the noise variance of a row"
             choice = Choice(choice.engine, f"{choice.reason}; {short}")
@@ -108,8 +108,7 @@ def on_all_rows(fitted: Posterior, rows: Dataset, engine: Engine | None, describ
         settings = {**fitted.settings, **described, "learning_points": len(reference.q)}
         settings |= {"engine": choice.engine.to_dict(), "engine_reason": choice.reason}
         posterior = replace(fitted, likelihood=likelihood, settings=settings, latent=latent, engine=choice.engine)
-    tolerance = choice.engine.tolerance if isinstance(choice.engine, Inducing) else 0.0
-    if isinstance(latent, InducingPosterior) and latent.left_out > max(ENOUGH, tolerance):
+    if isinstance(latent, InducingPosterior) and latent.left_out > ENOUGH:
         warnings.warn(
             f"{sum(map(len, latent.features))} inducing points leave out {latent.left_out:.2g} of the noise variance "
             "of a row, so that the posterior is an approximation with wider intervals than the exact one; give more "

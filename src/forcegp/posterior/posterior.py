@@ -185,7 +185,7 @@ class Posterior(Fitted):
         `components(q, v, u)["joint-friction"].joint_force` is a `Gaussian` (..., nv) in Nm or N. Raises as `predict`.
         """
         require_type("covariance", covariance, bool)
-        states, batch = self.checked_states(q, v, u)
+        states, batch = state_rows(self.model, q, v, u)
         dynamics = self.dynamics(*(x.reshape(*batch, x.shape[-1]) for x in states))
         latents = self.latents(dynamics, covariance)
         return components_of(self.trained.unknown, dynamics, latents)
@@ -210,10 +210,6 @@ class Posterior(Fitted):
         InvalidInput for arguments out of range and models that cannot be compiled.
         """
         return prepared_predictor(self, covariance, compile)
-
-    def checked_states(self, q: Array, v: Array, u: Array) -> tuple[list[Tensor], torch.Size]:
-        """States as float64 rows on the model's device, and their batch; InvalidInput for shapes, not finite values."""
-        return state_rows(self.model, q, v, u)
 
     def programs(self, model: Model | None = None, compressed: CompressedCovariance | None = None) -> Programs:
         """What is compiled and exported, in another model if one is given.

@@ -15,6 +15,7 @@ from forcegp.forces import Actuation, UnknownForces
 from forcegp.integration.integrators import find_roots, rows_jacobian
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.model import Model
+from forcegp.posterior.fitted import DEVIATIONS
 from forcegp.robots.arguments import broadcast_batch, real_tensor, require_finite
 from forcegp.summary import Summary, listed
 
@@ -111,11 +112,6 @@ class Prediction(Gaussian):
         return facts
 
     @property
-    def acceleration(self) -> Gaussian:
-        """`mean` and `covariance` under their full name."""
-        return Gaussian(self.mean, self.covariance)
-
-    @property
     def measurement(self) -> Gaussian:
         """The acceleration as a sensor with the model's noise would report it."""
         return Gaussian(self.mean, None if self.covariance is None else self.covariance + self.noise_covariance)
@@ -197,7 +193,10 @@ class JointForces(NamedTuple):
 
 
 def state_rows(model: Model, q: Array, v: Array, u: Array, past: bool = True) -> tuple[list[Tensor], torch.Size]:
-    """What `Posterior.checked_states` documents; without `past` u lacks what laws remember."""
+    """States as float64 rows on the model's device, and their batch; without `past` u lacks what laws remember.
+
+    InvalidInput for shapes, and values that are not finite.
+    """
     nq, nv, nu = model.sizes
     named = zip("qvu", (q, v, u), (nq, nv, nu if past else nu - len(model.memory.names)), strict=True)
     given = [state_tensor(name, values, size, model.robot.device) for name, values, size in named]
@@ -269,12 +268,9 @@ class Curve:
     std: Float[Tensor, " n"]
     visited: Float[Tensor, "2 d"]
 
-    def interval(self, probability: float = 0.95) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-        """Lower and upper end of the central interval of this probability."""
-        if not 0.0 < probability < 1.0:
-            raise InvalidInput(f"probability is {probability}; give a number between 0 and 1")
-        quantile = torch.special.ndtri(torch.tensor(0.5 * (1.0 + probability), dtype=torch.float64))
-        return self.mean - quantile * self.std, self.mean + quantile * self.std
+    def interval(self) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+        """Lower and upper end of the 95 % interval."""
+        return self.mean - DEVIATIONS * self.std, self.mean + DEVIATIONS * self.std
 
 
 def joint_force(posterior: Any, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv"]:

@@ -37,8 +37,6 @@ STEPS_TO_COMPILE = 2000
 ROWS_PER_BLOCK = 4096
 """States whose constraint is evaluated at once."""
 
-Quantity = Literal["q", "v", "a", "constraint"]
-
 AccelerationFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(q, v, u) -> a, all of one shape."""
 
@@ -174,11 +172,11 @@ class Rollout:
         half = self.intervals.half_width(quantity, self.time, self.std(quantity) if enough else None)
         return center - half, center + half
 
-    def std(self, quantity: Quantity = "q") -> Tensor:
+    def std(self, quantity: Literal["q", "v"] = "q") -> Tensor:
         """Standard deviation over two samples or more, NaN from where one diverged; of steps where a base moves."""
         return self._sampled(quantity, least=2).std(0)
 
-    def _sampled(self, quantity: Quantity, least: int) -> Tensor:
+    def _sampled(self, quantity: Literal["q", "v"], least: int) -> Tensor:
         count = 0 if self.samples is None else self.samples.q.shape[0]
         if count < least:
             raise InvalidInput(

@@ -189,15 +189,6 @@ class Layout:
         """Pose (bodies, 4, 4) of each body's child link in its frame."""
         return np.stack([self.links[joint.child].offset for joint in self.bodies])
 
-    def require_moving(self, link: str, robot: str) -> None:
-        """Raise where ``link`` has no inertia that matters: it does not exist, or it is fixed in the world."""
-        require_known("link", link, robot, self.links, UnknownName)
-        if self.links[link].body == WORLD:
-            raise InvalidInput(
-                f"link {link!r} of {robot} is fixed in the world, so its inertia never enters the dynamics and "
-                f"cannot be a parameter; name a moving link: {', '.join(self.moving)}"
-            )
-
 
 def lay_out(
     description: RobotDescription, locked: Mapping[str, float], base: BaseChoice | None, problems: Problems
@@ -286,7 +277,7 @@ def check_tree(layout: Layout, loops: Sequence[tuple[str, str, str]], problems: 
                 RobotModelError(
                     f"{problems.source}: {name} closes a loop, from link {links[0]!r} to {links[1]!r}",
                     "; a robot is a tree here, which would move in another way. Lock the joints between these links "
-                    f"({', '.join(layout.bodies[body].name for body in between)}) by `locked` or --lock, or take the "
+                    f"({', '.join(layout.bodies[body].name for body in between)}) by `locked`, or take the "
                     "equality out of the file where nothing holds them together.",
                 )
             )

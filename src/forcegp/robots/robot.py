@@ -36,7 +36,6 @@ from forcegp.robots.urdf_file import (
     InertiaChoice,
     read_robot_file,
     read_text,
-    replace_inertial,
     with_armature,
     with_chosen_inertias,
     with_joint_values,
@@ -210,17 +209,6 @@ class Robot(RobotStructure, RigidBodyDynamics):
         scale = own.rsqrt().where(own > SINGULAR * own.max(), 0.0)  # less is rounding
         values, vectors = torch.linalg.eigh(scale[:, None] * M * scale)
         return set((vectors[:, values <= SINGULAR].abs() > 1e-6).any(1).nonzero()[:, 0].tolist())
-
-    def with_link(self, name: str, mass: float, center_of_mass: Vector, inertia: Any) -> "Robot":
-        """A robot whose moving link has this mass (kg), centre (3,) (m) and inertia (3, 3) about it (kg m^2).
-
-        Axes are those of the link. Raises UnknownName, InvalidInput for a fixed link, NonPhysicalInertia for what no
-        body has.
-        """
-        self.layout.require_moving(name, self.name)
-        center = finite_vector("center_of_mass", center_of_mass, 3)
-        moments = finite_vector("inertia", np.ravel(inertia), 9, ", shape (3, 3)").reshape(3, 3)
-        return self.with_text(replace_inertial(self.urdf_text, name, float(mass), center, moments, source=self.source))
 
     def with_armature(self, armature: Vector | Mapping[str, float | int]) -> "Robot":
         """A robot with other rotor inertias (kg m^2 or kg), one per joint or by joint name (the others keep theirs)."""

@@ -15,12 +15,12 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.errors import NumericalError
-from forcegp.forces import Actuation, RigidBodies, Thrusters
+from forcegp.forces import Actuation, Payload, RigidBodies, Thrusters
+from forcegp.forces.rigid_bodies import carrying
 from forcegp.mechanics import fixed_point
 from forcegp.model import Model
 from forcegp.progress import tell
 from forcegp.robots import Robot
-from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia
 from forcegp.simulation.joint_friction import LawsOfJoints
 from forcegp.simulation.scenarios import QuadrotorConfig, QuadrupedConfig
 from forcegp.simulation.trajectory import RATE, recorded
@@ -61,13 +61,8 @@ def simulate_quadruped(config: QuadrupedConfig) -> Dataset:
 
 def _loaded(robot: Robot, payload: float) -> Robot:
     """The robot with a box of this mass on its trunk."""
-    if not payload:
-        return robot
-    trunk = robot.link("trunk")
     size = payload / 12.0 * np.diag([0.1**2 + 0.1**2, 0.2**2 + 0.1**2, 0.2**2 + 0.1**2])
-    total = pseudo_inertia(trunk.mass, trunk.center_of_mass, trunk.inertia)
-    total = total + pseudo_inertia(payload, np.array(PLACE), size)
-    return robot.with_link("trunk", *physical_of_pseudo_inertia(total))
+    return carrying(robot, [Payload("trunk", payload, PLACE, size.tolist())]) if payload else robot
 
 
 def _episode(robot: Robot, model: Model, config: QuadrupedConfig, episode: int, steps: int) -> tuple[Tensor, ...]:
