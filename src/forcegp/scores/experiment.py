@@ -231,14 +231,11 @@ def _score(
     posterior = experiment.fitted(work, train, split.apply(experiment.recording)[0], identified, spec["seed"])
     seconds = before + time.process_time() - start
     model, _ = identified_before(store, spec["mass_matrix"])
-    whose = f"the model identified from all training rows ({experiment.identifies})"
-    if isinstance(model, str):
-        whose = f"the model as given, because its identification failed ({model.rstrip('.')})"
     mass = mass_matrices(test, experiment.model if isinstance(model, str) else model)
     known = isinstance(work.given, Posterior)
     how: dict[str, Any] = {"fitted_here": not known, "whole": experiment.rows}
     found = scored(posterior, test, experiment.motions(split), experiment.integrator, mass, **how)
-    return {"cpu_seconds": seconds, "mass_matrix": whose, "training_rows": experiment.points, **found}
+    return {"cpu_seconds": seconds, "training_rows": experiment.points, **found}
 
 
 def identified_before(store: JobStore, name: str) -> tuple[Model | str, float]:
