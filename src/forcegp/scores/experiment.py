@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from forcegp.data import Dataset, contact_doubts, farthest_rows, with_strokes
 from forcegp.data.dataset import require_rows
-from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, require_type
+from forcegp.errors import ForceGPError, InvalidInput, require_type
 from forcegp.fit import fit
 from forcegp.integration import integrator_named
 from forcegp.jobs import Job, JobStore
@@ -188,10 +188,8 @@ def job_name(split: Split, seed: int, kind: str, name: str) -> str:
 
 
 def kept(store: JobStore, name: str) -> dict[str, Any]:
-    """What a finished job found, or why it failed, with its warnings. Raises FileFormatError for a damaged file."""
+    """What a finished job found, or why it failed, with its warnings. Raises as `JobStore.load`."""
     stored = store.load(name)
-    if not {"split", "seed", "error", "warnings"} <= set(stored["result"]):
-        raise FileFormatError(f"{store.place(name)} is damaged; delete it and run the same command again.")
     warned = [*stored["result"]["warnings"], *stored["warnings"]]
     return {**stored["result"], "warnings": warned, **{key: stored[key] for key in ("machine", "wall_seconds")}}
 
