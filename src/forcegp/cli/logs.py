@@ -377,13 +377,8 @@ def _shown(terminal: Terminal, data: Path, report: forcegp.checks.CheckReport) -
     told = [heading, doubts_table(report.doubts, terminal.worded)]
     if report.comparison is not None:
         rows = [
-            [
-                each["joint"],
-                shown(each["unexplained"], "{:.2g} %", 100.0),
-                shown(each["residual"]),
-                shown(each["factor"]),
-            ]
-            for each in content["joints"]
+            [name, shown(left, "{:.2g} %", 100.0), shown(rms), shown(factor)]
+            for name, left, rms, factor in (each.values() for each in content["joints"])
         ]
         unit = report.inputs.log.units["u"]
         title = f"Torque of every joint; in {unit if isinstance(unit, str) else 'the unit of each joint'}"
