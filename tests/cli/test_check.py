@@ -30,7 +30,7 @@ def test_a_clean_log_is_told_so(forcegp, folder):
     done = forcegp("check", "clean.h5", "--robot", "arm.urdf", "--strict", folder=folder)
     assert done.returncode == 0, done.stderr
     assert "clean.h5: 0 wrong, 0 to look at" in done.stdout
-    assert "Every joint; in Nm and rad/s²" in done.stdout
+    assert "Torque of every joint; in Nm" in done.stdout
     line = next(line for line in done.stdout.splitlines() if line.strip().startswith("lift"))
     assert line.split()[2] == "%"
 

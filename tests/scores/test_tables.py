@@ -40,7 +40,7 @@ def scores() -> Scores:
         "ls": [run(0, 2.0), run(1, 2.2), run(2, 2.4, diverged=1)],
         "gp": [run(0, 0.5), run(1, 0.0, error="no luck"), run(2, 0.6)],
     }
-    about = {"rows": 100, "seeds": [0, 1, 2], "mass_matrix": ["M"], "machine": "here", "forcegp": "0"}
+    about = {"rows": 100, "seeds": [0, 1, 2], "machine": "here", "forcegp": "0"}
     return Scores(models=models, runs=runs, joint_names=("a", "b"), units=UNITS, about=about)
 
 

@@ -92,13 +92,6 @@ class CheckInput:
         return data.rows(slice(None, None, max(1, -(-len(data) // self.most_rows))))
 
     @property
-    def price(self) -> Mapping[str, Any]:
-        """What the filter of the check did, or an earlier one where this one filters nothing; empty without rows."""
-        if self.prepared is None:
-            return {}
-        return preparation_report(self.prepared.metadata) if self.cutoff is not None else _earlier(self.log)
-
-    @property
     def cutoff(self) -> float | None:
         """Of the filter of the check [Hz]."""
         return None if self.prepared is None else preparation_report(self.prepared.metadata)["cutoff"]

@@ -59,18 +59,14 @@ class CheckReport(Summary):
     def per_joint(self) -> list[dict[str, Any]]:
         """What was measured of every joint; None where it is not known.
 
-        "unexplained" share of the torque's variance, "residual" in Nm or N and "factor" of the fit to inverse dynamics;
-        "noise_before" and "noise_after" the filter of the acceleration in rad/s^2 or m/s^2.
+        "unexplained" share of the torque's variance, "residual" in Nm or N and "factor" of the fit to inverse dynamics.
         """
         nothing: list[Any] = [None] * self.inputs.log.nv
-        names = ("unexplained", "residual", "factor", "noise_before", "noise_after")
-        columns = {"joint": list(self.inputs.names), **dict.fromkeys(names, nothing)}
+        columns = {"joint": list(self.inputs.names), "unexplained": nothing, "residual": nothing, "factor": nothing}
         if self.comparison is not None:
             left, spread = self.comparison.unexplained, np.std(self.comparison.log.rows.u, axis=0)
             columns["unexplained"], columns["residual"] = plain(left), plain(np.sqrt(left) * spread)
             columns["factor"] = plain(self.comparison.factors)
-        if (noise := self.inputs.price.get("acceleration_noise")) is not None:
-            columns["noise_before"], columns["noise_after"] = noise["before"], noise["after"]
         return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
     def to_dict(self) -> dict[str, Any]:
@@ -79,7 +75,6 @@ class CheckReport(Summary):
         return {
             "level": self.doubts.level,
             "counts": counts,
-            "cutoff": self.inputs.price.get("cutoff"),
             "joints": self.per_joint(),
             "doubts": [doubt.to_dict() for doubt in self.doubts],
         }

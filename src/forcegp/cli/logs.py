@@ -374,23 +374,13 @@ def _shown(terminal: Terminal, data: Path, report: forcegp.checks.CheckReport) -
     content = report.to_dict()
     counts = content["counts"]
     heading = Text(f"{data}: {counts['wrong']} wrong, {counts['look']} to look at, {counts['ok']} ok", style="bold")
-    measured = any(value is not None for each in content["joints"] for name, value in each.items() if name != "joint")
-    numbers = [_numbers(report, content)] if measured else []
-    return [heading, doubts_table(report.doubts, terminal.worded), *numbers]
-
-
-def _numbers(report: forcegp.checks.CheckReport, content: Mapping[str, Any]) -> Any:
-    cutoff = content["cutoff"]
-    filtered = "not\nfiltered" if cutoff is None else f"filtered\nat {cutoff:.3g} Hz"
-    header = ["joint", "torque un-\nexplained", "rms", "factor", "noise of a\nas logged", filtered]
-    rows = [
-        [
-            each["joint"],
-            shown(each["unexplained"], "{:.2g} %", 100.0),
-            *(shown(each[name]) for name in ("residual", "factor", "noise_before", "noise_after")),
+    told = [heading, doubts_table(report.doubts, terminal.worded)]
+    if report.comparison is not None:
+        rows = [
+            [name, shown(left, "{:.2g} %", 100.0), shown(rms), shown(factor)]
+            for name, left, rms, factor in (each.values() for each in content["joints"])
         ]
-        for each in content["joints"]
-    ]
-    units = report.inputs.log.units
-    unit = f"{units['u']} and {units['a']}" if isinstance(units["u"], str) else "the units of each joint"
-    return columns(f"Every joint; in {unit}".replace("^2", "²"), header, rows)
+        unit = report.inputs.log.units["u"]
+        title = f"Torque of every joint; in {unit if isinstance(unit, str) else 'the unit of each joint'}"
+        told.append(columns(title, ["joint", "unexplained", "rms", "factor"], rows))
+    return told

@@ -212,11 +212,6 @@ class RecordedMotions:
     v: Float[np.ndarray, "motions rows nv"]
     u: Float[np.ndarray, "motions steps nu"]
 
-    @property
-    def time(self) -> Float[np.ndarray, " rows"]:
-        """Seconds since the beginning of each motion."""
-        return self.dt * np.arange(self.q.shape[1])
-
 
 def recorded_motions(dataset: Dataset, starts: int | Sequence[int], seconds: float) -> RecordedMotions:
     """The motions of that length that begin at the given rows, or at so many rows spread evenly over the recording.

@@ -15,6 +15,7 @@ from jaxtyping import Bool
 
 from forcegp.data import Dataset, repeated_rows
 from forcegp.data.views import EVEN_STEPS, RecordedMotions, recorded_motions
+from forcegp.doubts import listed
 from forcegp.errors import DatasetError, InvalidInput, require_type, usable_arguments
 from forcegp.posterior import Posterior, observing
 from forcegp.posterior.drift import in_its_record
@@ -140,7 +141,8 @@ def _episodes_apart(known: Sequence[int], episodes: Sequence[int]) -> Split:
     """Whole episodes."""
     _require_some("episodes", episodes, known)
     rest = [number for number in known if number not in episodes]
-    words = f"trained on whole episodes ({_listed(rest)}), tested on others ({_listed(episodes)})"
+    sides = [listed([*map(str, each)]) for each in (rest, episodes)]
+    words = "trained on whole episodes ({}), tested on others ({})".format(*sides)
     held_out = tuple((number, -math.inf, math.inf) for number in episodes)
     return Split(f"episodes-{'-'.join(map(str, episodes))}", words, held_out)
 
@@ -158,14 +160,9 @@ def _blocks_apart(dataset: Dataset, blocks: int, numbers: Sequence[int], guard: 
     each = "the recording" if len(dataset.episodes) == 1 else "every episode"
     words = (
         f"{each} cut into {blocks} consecutive blocks of equal duration, block{'s' if len(numbers) > 1 else ''} "
-        f"{_listed(numbers)} held out, and training rows within {guard:g} s of them left out"
+        f"{listed([*map(str, numbers)])} held out, and training rows within {guard:g} s of them left out"
     )
     return Split(f"blocks-{blocks}-{'-'.join(map(str, numbers))}", words, tuple(stretches), guard)
-
-
-def _listed(numbers: Sequence[int]) -> str:
-    *first, last = map(str, numbers)
-    return f"{', '.join(first)} and {last}" if first else last
 
 
 HORIZONS = (0.1, 0.2, 0.5, 1.0)

@@ -162,7 +162,7 @@ def _runs_of(
     for place, (name, posterior) in enumerate(given.items()):
         require_rows("log", log, posterior.joint_names, "the model")
         integrator_named(integrator, posterior.model)
-        run = {"split": "all rows", "seed": 0, "error": None, "cpu_seconds": None, "mass_matrix": "the model itself"}
+        run = {"split": "all rows", "seed": 0, "error": None, "cpu_seconds": None}
         run |= {"training_rows": len(posterior.training)}
         with part(place, len(given), name):
             runs[name] = [run | scored(posterior, log, motions, integrator)]
@@ -182,13 +182,12 @@ def _scores(
     about: Mapping[str, Any],
     fit: Callable[[str], Posterior],
 ) -> Scores:
-    used = sorted({run["mass_matrix"] for each in runs.values() for run in each if run["error"] is None})
     units = {name: log.units[name] for name in ("q", "v", "u", "a")}
     return Scores(
         models={name: {"kind": each.kind, "summary": each.summary} for name, each in models.items()},
         runs=runs,
         joint_names=tuple(log.joint_names),
         units={name: unit if isinstance(unit, str) else list(unit) for name, unit in units.items()},
-        about={**about, "mass_matrix": used},
+        about=about,
         fit=fit,
     )

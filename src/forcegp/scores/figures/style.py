@@ -14,7 +14,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.text import Text
-from PIL import Image
 
 from forcegp.atomic_files import atomic_file
 from forcegp.data import Dataset
@@ -98,16 +97,12 @@ class Picture:
 
     @cached_property
     def png(self) -> bytes:
-        """The figure in 256 colours of its own: a third of the bytes, and no difference to the eye."""
-        canvas, stream = self.figure.canvas, io.BytesIO()
+        """The figure as a file."""
+        stream = io.BytesIO()
         for text in self.figure.findobj(Text):
             text.set_parse_math(False)  # type: ignore[attr-defined]  # a Text; "$" in the name of a joint is no formula
         with rc_context({"text.parse_math": False}):  # of ticks that are made now
-            canvas.draw()
-        pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[attr-defined]  # every figure here has an Agg canvas
-        image = Image.fromarray(pixels[..., :3].copy())
-        few = image.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-        few.save(stream, format="png", optimize=True)
+            self.figure.savefig(stream, format="png")
         return stream.getvalue()
 
     def save(self, folder: Path) -> None:
