@@ -217,7 +217,6 @@ BROKEN = {
     "no such group": Broken(archive, "no array or group", f"{ARRAYS} --episodes run*"),
     "external link": Broken(linked, "links to other files are not followed", ARRAYS),
     "hollow HDF5": Broken(hollow, "shrinks so far", ARRAYS),
-    "cut bag": Broken(cut(mcap), "log.mcap lacks its end, as where a recorder was killed: `mcap recover`"),
     "two topics": Broken(
         mcap,
         "several topics are joined by their stamps",

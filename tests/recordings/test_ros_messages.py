@@ -5,7 +5,7 @@ import pytest
 from tests.data.samples import model
 from tests.recordings.log_files import EPOCH, joint_states, motion
 
-from forcegp.errors import FileFormatError
+from forcegp.errors import DataWarning, FileFormatError
 from forcegp.recordings import ColumnMapping, import_recordings, open_source
 from forcegp.recordings.ros_bag import numbers
 
@@ -91,3 +91,31 @@ def test_messages_come_in_the_order_of_time(tmp_path, order):
     times, positions = open_source(tmp_path / "log").read(names).values()
     np.testing.assert_array_equal(times, EPOCH + np.round(motion()["time"] * 1e9).astype(np.int64))
     np.testing.assert_array_equal(positions, motion()["q"][:, 1])
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("share", [0.1, 0.6])
+def test_whole_messages_before_a_cut_are_read_with_a_warning(tmp_path, packed, share):
+    """Several chunks of 1 MiB; which messages are whole is seen in the bytes, or of packed ones estimated."""
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+    bag = Writer(tmp_path / "log", version=9, storage_plugin=StoragePlugin.MCAP)
+    if packed:
+        bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    sent = []
+    with bag:
+        connection = bag.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=ROS2)
+        for stamp, message in joint_states(motion(), ROS2, ros1=False):
+            message.header.frame_id = np.random.default_rng(stamp).bytes(10_000).hex()
+            sent.append(ROS2.serialize_cdr(message, connection.msgtype))
+            bag.write(connection, stamp, sent[-1])
+    file = tmp_path / "log" / "log.mcap"
+    content = file.read_bytes()[: int(share * file.stat().st_size)]
+    file.write_bytes(content)
+    expected = range(int(200 * share) - 15, 200) if packed else [sum(bytes(each) in content for each in sent)]
+    for place in (tmp_path / "log", file):
+        with pytest.warns(DataWarning, match=r"record: the \d+ whole messages before are read"):
+            read = open_source(place).read(["/joint_states:position.elbow"])["/joint_states:position.elbow"]
+        assert len(read) in expected
+        np.testing.assert_array_equal(read, motion()["q"][: len(read), 1])
+        (tmp_path / "log" / "metadata.yaml").unlink(missing_ok=True)  # as a recorder leaves it that was killed

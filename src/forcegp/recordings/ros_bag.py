@@ -1,6 +1,10 @@
 """Bags of ROS 1 and 2, .mcap and .db3, read with `rosbags` (extra "logs"); several topics on one clock."""
 
 import re
+import shutil
+import tempfile
+import warnings
+import weakref
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -13,13 +17,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 from typing_extensions import override
 
-from forcegp.errors import DatasetError, FileFormatError, InvalidInput, required_extra
+from forcegp.errors import DatasetError, DataWarning, FileFormatError, InvalidInput, required_extra
+from forcegp.recordings.cut_mcap import is_cut, whole_copy
 from forcegp.recordings.signal_plan import SignalPlan
 from forcegp.recordings.source import LONGEST_VECTOR, Columns, Source, element_names, reading, require_plausible_size
 from forcegp.robots.manifold import QUATERNION
 
 LOG_TIME = "log_time"
-MAGIC = b"\x89MCAP0\r\n"
 ROWS_AT_A_TIME = 2**16  # numbers of Python take ten times the memory of those in an array
 STAMP = "header.stamp"
 LOOKED_AT = 100  # messages of each topic that decide which columns there are: publishers may share a topic
@@ -50,12 +54,18 @@ class RosBag(Source):
         self._left_out = 0
         self.ros1 = path.suffix.lower() == ".bag"
         own = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
-        for file in own:
-            if _is_cut(file):
-                raise FileFormatError(f"{file} lacks its end, as where a recorder was killed: `mcap recover` mends it.")
-        self._read = [path] if (path / "metadata.yaml").is_file() else own
+        cut = [file for file in own if is_cut(file)]
+        self._read = own if cut or not (path / "metadata.yaml").is_file() else [path]
+        if cut:
+            copies = Path(tempfile.mkdtemp())
+            weakref.finalize(self, shutil.rmtree, copies)
+            self._read = [whole_copy(file, copies) if file in cut else file for file in own]
         if not self.columns():
             raise FileFormatError(f"{path} holds no messages with numbers.")
+        if cut:
+            with self._open() as reader:
+                whole = f"the {reader.message_count} whole messages before are read"
+            warnings.warn(f"{path} ends in the middle of a record: {whole}.", DataWarning, stacklevel=2)
 
     @contextmanager
     def _open(self) -> Iterator[Any]:
@@ -162,14 +172,6 @@ class RosBag(Source):
                 for name, column in zip(names, zip(*table, strict=True), strict=False):
                     pieces[name].append(np.array(column))
         return {name: np.concatenate(own[1:] or own) for name, own in pieces.items()}
-
-
-def _is_cut(path: Path) -> bool:
-    """Whether an MCAP file lacks its end."""
-    with path.open("rb") as file:
-        begins = file.read(len(MAGIC)) == MAGIC
-        file.seek(max(0, path.stat().st_size - len(MAGIC)))
-        return begins and file.read() != MAGIC
 
 
 def numbers(
