@@ -85,7 +85,7 @@ def elastic_doubts(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
             about="elastic joint",
             what="the torque grows with the square of the frequency, as behind an elastic gear with a resonance near "
             f"{', '.join(f'{hertz:.2g} Hz ({name})' for name, hertz in found.items())}.",
-            do="No rigid model predicts motions near it: learn from slower ones, by forcegp import --cutoff a third of it.",
+            do="No rigid model predicts motions near it: filter by forcegp import --cutoff, at a third of it.",
             joints=tuple(found),
             numbers={"resonance": found},
         )
