@@ -15,8 +15,8 @@ from forcegp.errors import DatasetError, DataWarning, InvalidInput
 from forcegp.evidence.likelihood import MarginalLikelihood, TrainingData
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
-from forcegp.fit.fit import with_sensor
 from forcegp.fit.physical import typical_sizes
+from forcegp.fit.sensors import with_sensor_noise
 from forcegp.fit.unseen import OF_TORQUE, PUSHED, Unseen
 from forcegp.forces import (
     Actuation,
@@ -73,7 +73,7 @@ def on_plane(*forces):
 
 
 def likelihood_of(model, log):
-    return MarginalLikelihood(model, TrainingData.of(log, torch.device("cpu"), ["hand"]))
+    return MarginalLikelihood(model, TrainingData.of(log, torch.device("cpu"), [SENSOR]))
 
 
 def test_stacked_rows_have_the_density_of_one_large_gaussian():
@@ -106,7 +106,7 @@ def test_slopes_of_stacked_residuals_are_those_of_finite_differences(contact):
     model = contact(Viscous(), Offset(), Payload("hand"))
     log = measured(contact(Viscous(0.4)), contact(), rows=6)
     space = ParameterSpace(model, typical_sizes(model, [log]))
-    rows = RecordedRows(space, log.q, log.v, log.u, any_contact=True, sensed={"hand": log.measured[SENSOR]})
+    rows = RecordedRows(space, log.q, log.v, log.u, any_contact=True, sensed=log.measured)
     x = 0.3 + 0.1 * np.random.default_rng(1).standard_normal(space.size)
 
     def residual(x):
@@ -219,7 +219,7 @@ def test_a_sensor_shows_forces_along_the_normal(tmp_path):
     again = load_posterior(tmp_path / "run")
     assert torch.equal(again.predict(*states).multiplier.mean, found.mean)
     updated = again.update(test)
-    assert len(updated.training.sensed["hand"]) == 160
+    assert len(updated.training.sensed[SENSOR]) == 160
     with pytest.raises(InvalidInput, match="a force sensor at 'hand', which these rows do not have"):
         again.update(replace(test, measured={}))
 
@@ -245,9 +245,9 @@ def test_a_joint_that_something_pushes_teaches_nothing(force, found):
 
 def test_noise_that_nobody_states_begins_at_two_per_cent():
     log = measured(on_plane(), on_plane(), rows=20)
-    noise = with_sensor(Noise(0.1), log, None)
+    noise = with_sensor_noise(Noise(0.1), log, {}, log.model)
     assert noise.sensor == pytest.approx(0.02 * np.sqrt((log.measured[SENSOR] ** 2).mean()))
-    assert with_sensor(Noise(0.1), log, 0.7).sensor == 0.7
+    assert with_sensor_noise(Noise(0.1), log, {SENSOR: 0.7}, held()).sensor == (0.7,) * 3
     typical = np.array([1.0, 2.0, 3.0])
     assert Unseen(typical, (), 0.0 * typical, None).with_pushes(noise).force == pytest.approx(0.02 * typical)
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import ClassVar, Literal
 
-from forcegp.data.dataset import FORCE, Dataset
+from forcegp.data.dataset import FORCE, IMU, Dataset
 from forcegp.errors import InvalidInput, require_known, require_number, usable_arguments
 from forcegp.forces.registry import called
 
@@ -94,7 +94,39 @@ class Motions(Evidence):
 
 
 @dataclass(frozen=True)
-class ContactForces(Evidence):
+class Sensor(Evidence):
+    """A sensor of the log at `frame` ("": all), beside accelerations or torques; `noise` as a standard deviation."""
+
+    kind: ClassVar[str]
+    unit: ClassVar[str]
+    example: ClassVar[str]
+    frame: str = ""
+    noise: float | None = None
+
+    @usable_arguments("Sensor")
+    def __post_init__(self) -> None:
+        if self.noise is not None:
+            own = type(self).__name__
+            require_number(f"{own} noise", self.noise, f"give a standard deviation in {self.unit}, or None")
+
+    def names(self, dataset: Dataset) -> list[str]:
+        """Of its sensors in `Dataset.measured`."""
+        own = {name: name.removeprefix(self.kind) for name in dataset.measured if name.startswith(self.kind)}
+        return [name for name, place in own.items() if self.frame in ("", place, place.partition("@")[0])]
+
+    def check(self, dataset: Dataset) -> None:
+        """Raise InvalidInput where the log has no such sensor."""
+        if not self.names(dataset):
+            has = [name.removeprefix(self.kind) for name in dataset.measured if name.startswith(self.kind)]
+            what = "force sensor" if self.kind == FORCE else "IMU"
+            raise InvalidInput(
+                f"the log has no {what}{f' at {self.frame!r}' * bool(self.frame)}; it has {', '.join(has) or 'none'}: "
+                f"name its columns, as in `forcegp import --force {self.example}`."
+            )
+
+
+@dataclass(frozen=True)
+class ContactForces(Sensor):
     """What a force sensor measured, beside accelerations or torques: the force on the robot at `frame` ("": at all).
 
     Where the model has a contact there, its multipliers are seen; elsewhere, beside torques, it is a force that is
@@ -102,22 +134,30 @@ class ContactForces(Evidence):
     """
 
     name: ClassVar[str] = "contact-forces"
-    frame: str = ""
-    noise: float | None = None
+    kind: ClassVar[str] = FORCE
+    unit: ClassVar[str] = "N"
+    example: ClassVar[str] = "foot=fx,fy,fz"
 
-    @usable_arguments("ContactForces")
+
+@dataclass(frozen=True)
+class FrameAcceleration(Sensor):
+    """What an IMU on the link of `frame` measured ("": all): R^T (J a + Jdot v - g), beside accelerations or torques.
+
+    Torques are then `Torques(noisy="both")`, whose accelerations it makes better. `noise` [m/s^2]; None: 2 % of what it
+    measured, which holds offset and scale. With `mounting` "estimated" a small turn of the sensor is found first.
+    """
+
+    name: ClassVar[str] = "frame-acceleration"
+    kind: ClassVar[str] = IMU
+    unit: ClassVar[str] = "m/s^2"
+    example: ClassVar[str] = "imu:hand=ax,ay,az"
+    mounting: Literal["known", "estimated"] = "known"
+
+    @usable_arguments("FrameAcceleration")
     def __post_init__(self) -> None:
-        if self.noise is not None:
-            require_number("ContactForces noise", self.noise, "give a standard deviation in N, or None")
-
-    def check(self, dataset: Dataset) -> None:
-        """Raise InvalidInput where the log has no such sensor."""
-        frames = [name.removeprefix(FORCE) for name in dataset.measured]
-        if not frames or self.frame not in ("", *frames):
-            raise InvalidInput(
-                f"the log has no force sensor{f' at {self.frame!r}' * bool(self.frame)}; it has "
-                f"{', '.join(frames) or 'none'}: name its columns, as in `forcegp import --force foot=fx,fy,fz`."
-            )
+        super().__post_init__()
+        if self.mounting not in ("known", "estimated"):
+            raise InvalidInput(f"FrameAcceleration mounting is {self.mounting!r}; give 'known' or 'estimated'.")
 
 
 EVIDENCE: dict[str, type[Evidence]] = {
@@ -125,6 +165,7 @@ EVIDENCE: dict[str, type[Evidence]] = {
     "torques": Torques,
     "motions": Motions,
     "contact-forces": ContactForces,
+    "frame-acceleration": FrameAcceleration,
 }
 """Kinds by the name that commands and files have for them. Add yours: EVIDENCE["mine"] = Mine."""
 

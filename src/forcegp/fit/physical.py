@@ -1,6 +1,6 @@
 """The numbers of laws and bodies from all rows of a log: Gauss-Newton steps of weighted least squares."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -27,7 +27,7 @@ from forcegp.evidence.least_squares import (
     without,
 )
 from forcegp.evidence.parameter_space import ParameterSpace
-from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, RecordedRows, sensed_of
+from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, RecordedRows
 from forcegp.fit.payloads import changes_without_rests, doubts_of_payloads, misfit, with_payloads_placed
 from forcegp.fit.unseen import Unseen
 from forcegp.forces import Actuation, Payload
@@ -47,12 +47,12 @@ class Equations:
         logs: Sequence[Dataset],
         evidence: Torques | Accelerations,
         pushed: Sequence[int] = (),
+        sensor_noise: Mapping[str, float | None] | None = None,
     ) -> None:
         self.space, self.evidence, self.logs = space, evidence, logs
+        own: dict[str, Any] = {"pushed": pushed, "sensor_noise": sensor_noise}
         self.parts = [
-            RecordedRows(
-                space, log.q, log.v, log.u, loaded=not k, strokes=log.strokes, sensed=sensed_of(log), pushed=pushed
-            )
+            RecordedRows(space, log.q, log.v, log.u, not k, strokes=log.strokes, sensed=log.measured, **own)
             for k, log in enumerate(logs)
         ]
         self.a = np.concatenate([log.a for log in logs])
@@ -79,8 +79,9 @@ class Equations:
         """Residuals and their Jacobian in x, from derivatives in standard parameters and coordinates of laws."""
         r, Y, in_terms = zip(*parts, strict=True)
         if len(Y) != len(self._stays) or any(a is not b for a, b in zip(Y, self._stays, strict=True)):
-            flat = np.concatenate(Y).reshape(*self.a.shape, 10 * len(self.space.carried))
-            self._stays, self._regressor = Y, Regressor(flat)
+            flat = np.concatenate(Y)
+            self._stays = Y
+            self._regressor = Regressor(flat.reshape(*flat.shape[:2], 10 * len(self.space.carried)))
         slopes = self.space.bodies.slopes(x[: self.space.bodies.size])
         return np.concatenate(r), Chained(self._regressor, slopes, np.concatenate(in_terms))
 
@@ -110,7 +111,7 @@ class Equations:
         return r, jacobian
 
     def in_acceleration(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Accelerations measured less those predicted."""
+        """Accelerations measured less those predicted, and the same of IMUs."""
         found = [part.in_acceleration(x, a) for part, a in zip(self.parts, self.each(self.a), strict=True)]
         r, jacobian = self.equations(x, found)
         return r, np.asarray(jacobian)
@@ -130,6 +131,12 @@ class Equations:
     def accelerations(self, x: np.ndarray) -> list[np.ndarray]:
         """Predicted accelerations, M and H."""
         return self.joined([part.acceleration(x) for part in self.parts])
+
+    def whitening(self, noise: NoiseLevels, H: np.ndarray) -> np.ndarray:
+        """Of the residuals of `in_acceleration`."""
+        felt = np.concatenate([part.felt for part in self.parts]) @ H
+        level = np.concatenate([noise.acceleration, self.parts[0].felt_noise])
+        return NoiseLevels(level, noise.force).whitening(np.concatenate([H, felt], axis=1))
 
     def levels(self, x: np.ndarray, near: NoiseLevels | None, least: NoiseLevels | None, rough: bool) -> NoiseLevels:
         """The noise about the estimates at x, sought `near` others and above `least`."""
@@ -223,7 +230,11 @@ class Solution:
 
 
 def fit_physical(
-    model: Model, logs: Sequence[Dataset], evidence: Torques | Accelerations, rows: int | None = None
+    model: Model,
+    logs: Sequence[Dataset],
+    evidence: Torques | Accelerations,
+    rows: int | None = None,
+    sensor_noise: Mapping[str, float | None] | None = None,
 ) -> Solution:
     """The open numbers of a model without unknown forces; of several logs payloads are in the first alone."""
     bodies = any(getattr(law, "learn", ()) or (isinstance(law, Payload) and not law.known) for law in model.laws)
@@ -238,7 +249,7 @@ def fit_physical(
     typical = typical_sizes(model, logs)
     space = ParameterSpace(model, typical)
     unseen = Unseen.of(model, logs[0], typical["force"])
-    equations = Equations(space, logs, evidence, unseen.pushed)
+    equations = Equations(space, logs, evidence, unseen.pushed, sensor_noise)
     held = equations.held if evidence.of_torque and equations.held.shape[1] and equations.windows is None else None
     if held is not None and not unseen.pushed and held.any(-1).sum(1).min() == robot.nv:
         raise InvalidInput("contacts hold every degree of freedom in every row, so no equation is left to learn from.")
@@ -264,7 +275,7 @@ def fit_physical(
         for _ in range(REWEIGHTINGS):
             predicted, M, H = equations.accelerations(fit.x)
             noise = NoiseLevels.of(equations.a - predicted, M, H)
-            W = noise.whitening(H)
+            W = equations.whitening(noise, H)
 
             def white(x: np.ndarray, W: np.ndarray = W) -> tuple[np.ndarray, np.ndarray]:
                 r, jacobian = equations.in_acceleration(x)

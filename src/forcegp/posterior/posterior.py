@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset, with_memory
+from forcegp.data.dataset import FORCE as OF_SENSOR
 from forcegp.data.dataset import require_rows
 from forcegp.errors import DataWarning, InvalidInput, NumericalError, require_type, usable_arguments
 from forcegp.evidence import Accelerations, ContactForces
@@ -174,7 +175,8 @@ class Posterior(Fitted):
         found = torch.diag_embed(torch.stack(levels).sum(0)) if levels else None
         if hidden is None or not dynamics.A.shape[-2]:
             return found
-        frames = [name for name in self.training.sensed if any(x.frame == name for x in dynamics.contacts)]
+        at_contacts = {f"{OF_SENSOR}{contact.frame}" for contact in dynamics.contacts}
+        frames = [name for name in self.training.sensed if name in at_contacts]
         left = hidden_forces(torch.tensor(hidden, dtype=torch.float64).to(dynamics.H), dynamics, frames)
         return left if found is None else left + found
 
