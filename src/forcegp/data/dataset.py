@@ -235,8 +235,7 @@ def imu_place(name: str) -> tuple[str, list[float], Float[np.ndarray, "3 3"]]:
             raise ValueError
     except ValueError:
         raise InvalidInput(
-            f"{name!r} has {numbers!r} behind the frame; give its place there as @x,y,z [m], or as "
-            "@x,y,z,roll,pitch,yaw [m, rad]."
+            f"{name!r} has no place in its frame; give FRAME@x,y,z [m] or FRAME@x,y,z,roll,pitch,yaw [m, rad]."
         ) from None
     return frame, pose[:3], rotation_from_rpy(pose[3:] or [0.0] * 3)
 
@@ -244,13 +243,9 @@ def imu_place(name: str) -> tuple[str, list[float], Float[np.ndarray, "3 3"]]:
 def _measured(given: Mapping[str, object], rows: int, robot: forcegp.robots.Robot) -> dict[str, np.ndarray]:
     for name in given:
         if not str(name).startswith((FORCE, IMU)):
-            raise DatasetError(
-                f"measured has {name!r}; allowed: {FORCE}FRAME, the force at a frame of the robot, and {IMU}FRAME, "
-                "what an accelerometer there measures."
-            )
-        imu = name.startswith(IMU)
-        body, _ = robot.frame(imu_place(name)[0] if imu else name.removeprefix(FORCE))
-        if imu and body < 0:
+            raise DatasetError(f"measured has {name!r}; allowed: {FORCE}FRAME and {IMU}FRAME, of frames of the robot.")
+        body, _ = robot.frame(imu_place(name)[0] if name.startswith(IMU) else name.removeprefix(FORCE))
+        if name.startswith(IMU) and body < 0:
             raise DatasetError(f"{name!r} is fixed in the world, so it measures no motion; name a link that moves.")
     return {name: finite_columns(f"measured[{name!r}]", given[name], ("x", "y", "z"), rows) for name in sorted(given)}
 

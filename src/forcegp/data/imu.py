@@ -18,21 +18,19 @@ from forcegp.data.dataset import IMU, Dataset, imu_place
 from forcegp.data.delay import LEAST_DELAY, lowest
 from forcegp.data.views import consecutive, tensors, whole_windows, window_means
 from forcegp.doubts import Doubt, look, ok, wrong
-from forcegp.errors import InvalidInput
 from forcegp.mechanics import AffineMap
 from forcegp.robots import Kinematics
 from forcegp.robots.inertia import rpy_from_rotation
 
 STANDARD = 9.80665  # m/s^2 in a g
-AGREES, WRONG = 0.02, 0.1
+AGREES, WRONG = 0.02, 0.05
 """Of what an IMU measures: the disagreement with the log that is none, and from which on it is wrong."""
-EXPLAINS = 0.3
-"""Of the disagreement: what another reading may leave."""
-SMALL = 0.35  # rad: a larger turn is one of the axes
+EXPLAINS, SMALL = 0.3, 0.35
+"""Of the disagreement: what another reading may leave; rad that are still no other axes."""
 SECONDS, MOST_ROWS = 0.1, 4000
 """Over which both are averaged, since a derived acceleration is noisy; rows that are looked at."""
-SHIFTS = np.linspace(-0.05, 0.05, 101)  # s
-LATE = 0.8  # of the disagreement: what a shift leaves at most
+SHIFTS, LATE = np.linspace(-0.05, 0.05, 101), 0.8
+"""Seconds by which an IMU may be late, and what a shift leaves of the disagreement at most."""
 
 
 def specific_force(kinematics: Kinematics, name: str) -> AffineMap:
@@ -45,103 +43,86 @@ def specific_force(kinematics: Kinematics, name: str) -> AffineMap:
     return AffineMap((R @ falls[..., None])[..., 0], R @ J[..., :3, :])
 
 
+def expected(dataset: Dataset, model: forcegp.model.Model, name: str) -> Float[np.ndarray, "rows 3"]:
+    """What an IMU should have measured by the accelerations of the log."""
+    q, v, _, a = tensors(dataset, model.robot.device)
+    with torch.no_grad():
+        return specific_force(model.robot.kinematics(q, v), name)(a).cpu().numpy()
+
+
+def _rms(values: Float[np.ndarray, "rows 3"]) -> float:
+    return float(np.sqrt(np.square(values).sum(1).mean()))
+
+
 @dataclass(frozen=True, eq=False)
 class BesideMotion:
-    """What an IMU measured and should have, as means over short windows, and `still`, what gravity alone makes of it.
+    """An IMU beside the accelerations of a log: its size and by how much both differ [m/s^2], also without gravity.
 
-    `Q` and `factor` are those of least squares in measured = factor Q expected (Schoenemann, Psychometrika 1966), and
-    `share` what they leave. Q may be a reflection; `whole` tells whether the rows show it.
+    `Q`, by an `angle` [rad], and `factor` are those of least squares in measured = factor Q expected, `share` what they
+    leave (Schoenemann, Psychometrika 1966). Q may be a reflection; `whole` tells whether the rows show all of it.
     """
 
     name: str
-    expected: Float[np.ndarray, "rows 3"]
-    measured: Float[np.ndarray, "rows 3"]
-    still: Float[np.ndarray, "rows 3"]
+    size: float
+    off: float
+    off_without_gravity: float
     Q: Float[np.ndarray, "3 3"]
+    angle: float
     factor: float
     share: float
     whole: bool
 
     @classmethod
     def of(cls, dataset: Dataset, model: forcegp.model.Model, name: str) -> BesideMotion:
-        """That of a log."""
+        """That of a log, of means over short windows."""
         steps = np.diff(dataset.time)[consecutive(dataset)[:-1]]
         width = int(max(1.0, SECONDS / np.median(steps))) if dataset.time_ordered and len(steps) else 1
         first = whole_windows(dataset, width)
         first = first[:: max(1, len(first) // MOST_ROWS)]
         rest = replace(dataset, v=0.0 * dataset.v, a=0.0 * dataset.a)
-        both = expected_by(dataset, model, name), dataset.measured[name], expected_by(rest, model, name)
+        both = expected(dataset, model, name), dataset.measured[name], expected(rest, model, name)
         p, f, still = (window_means(x, first, width) for x in both)
         left, s, right = np.linalg.svd(f.T @ p)
         if s[2] < AGREES**2 * s[0] and np.linalg.det(left @ right) < 0.0:  # in a plane nothing shows a reflection
             left[:, 2] *= -1.0
-        product = max(float(np.square(p).sum() * np.square(f).sum()), 1e-300)
-        share = float(np.sqrt(max(0.0, 1.0 - s.sum() ** 2 / product)))
-        factor = float(s.sum() / max(np.square(p).sum(), 1e-300))
-        return cls(name, p, f, still, left @ right, factor, share, bool(s[1] > AGREES**2 * s[0]))
+        own, size = max(float(np.square(p).sum()), 1e-300), max(float(np.square(f).sum()), 1e-300)
+        Q, share = left @ right, float(np.sqrt(max(0.0, 1.0 - s.sum() ** 2 / (own * size))))
+        angle = float(np.arccos(np.clip((np.trace(Q) - 1.0) / 2.0, -1.0, 1.0)))
+        shown = Q, angle, float(s.sum()) / own, share, bool(s[1] > AGREES**2 * s[0])
+        return cls(name, _rms(f), _rms(f - p), _rms(f - p + still), *shown)
 
     @property
-    def angle(self) -> float:
-        """Of Q [rad]; more than half a turn for a reflection."""
-        return float(np.arccos(np.clip((np.trace(self.Q) - 1.0) / 2.0, -1.0, 1.0))) + 4.0 * (np.linalg.det(self.Q) < 0)
-
-    @property
-    def as_turned(self) -> str:
-        """The name with the mounting that the motion shows."""
-        frame, point, turned = imu_place(self.name)
-        pose = [*point, *rpy_from_rotation(turned @ self.Q.T)]
-        return f"{IMU}{frame}@{','.join(f'{x:.5g}' for x in pose)}"
-
-    def mounted(self) -> str:
-        """The same where that is a small turn. Raises InvalidInput, with the misfit, for another one."""
-        if self.whole and self.share < WRONG and self.angle < SMALL and abs(self.factor - 1.0) < WRONG:
-            return self.as_turned
-        raise InvalidInput(
-            f"the mounting of {self.name!r} is not found: turned by {np.degrees(self.angle):.3g} degrees and times "
-            f"{self.factor:.3g} the log leaves {self.share:.1%} of it"
-            f"{'' if self.whole else ', and the link hardly turns'}; name its axes (forcegp check)."
-        )
+    def turned(self) -> str | None:
+        """The name with the mounting that the motion shows, where that is a small turn."""
+        if not self.whole or self.share > EXPLAINS or self.angle > SMALL or abs(self.factor - 1.0) > WRONG:
+            return None
+        frame, point, axes = imu_place(self.name)
+        return f"{IMU}{frame}@{','.join(f'{x:.5g}' for x in (*point, *rpy_from_rotation(axes @ self.Q.T)))}"
 
     def doubt(self) -> Doubt:
         """What is seen of sign, axes, unit, gravity and mounting."""
-
-        def rms(x: np.ndarray) -> float:
-            return float(np.sqrt(np.square(x).sum(1).mean()))
-
-        own, size, off = self.name.removeprefix(IMU), rms(self.measured), rms(self.measured - self.expected)
-        seen = f"the IMU at {own} and the accelerations of the log differ by {off:.2g} m/s^2, of {size:.3g}"
-        numbers, kind = {"error": off, "size": size}, wrong if off > WRONG * size else look
-        if off <= AGREES * size:
-            return ok(about="imu", what=f"{seen}.", numbers=numbers)
-        free = rms(self.measured - self.expected + self.still)
-        if free < EXPLAINS * off:
-            what, do = f"{seen}: gravity was taken off, without it {free:.2g} remain.", "Log what the sensor measures"
-            return wrong(about="imu", what=what, do=f"{do}: at rest 9.81 m/s^2 upwards.", numbers=numbers)
-        if not self.whole or self.share * size > EXPLAINS * off:
-            what = f"{seen}{'' if self.whole else ', and it hardly turns, so that its axes do not show'}."
-            do = "Compare its frame, point, axes and unit (g?) with the robot, or leave it out."
-            return kind(about="imu", what=what, do=do, numbers=numbers)
-        correction = {"unit": {"imu": ("g",)}} if abs(self.factor * STANDARD - 1.0) < WRONG else {}
-        says = [f"{self.factor:.3g} times as large"] * (abs(self.factor - 1.0) > AGREES)
-        says = ["in g"] if correction else says
-        near, do = np.round(self.Q), ""
-        if (abs(near).sum(0) == 1.0).all() and (near != np.eye(3)).any():
-            axes = [f"{'-' * bool(axis.sum() < 0.0)}{'xyz'[int(abs(axis).argmax())]}" for axis in near.T]
-            says += [f"of axes {', '.join(axes)} for those of its frame"]
-            do = f"Name the columns in this order: forcegp import --force imu:{own}={','.join(axes)}."
-        elif self.angle > AGREES:
-            says += [f"turned by {np.degrees(self.angle):.2g} degrees"]
-            do = f"State it: forcegp import --force imu:{self.as_turned.removeprefix(IMU)}=x,y,z."
-        what = f"{seen}: it is {' and '.join(says) or 'noisy'}, with which {self.share * size:.2g} remain."
-        return kind(about="imu", what=what, do=do, numbers=numbers, correction=correction)
-
-
-def expected_by(dataset: Dataset, model: forcegp.model.Model, name: str) -> Float[np.ndarray, "rows 3"]:
-    """What an IMU should have measured by the accelerations of the log."""
-    q, v, _, a = tensors(dataset, model.robot.device)
-    with torch.no_grad():
-        found = specific_force(model.robot.kinematics(q, v), name)
-        return (found.offset + (found.matrix @ a[..., None])[..., 0]).cpu().numpy()
+        own, off, kind = self.name.removeprefix(IMU), self.off, wrong if self.off > WRONG * self.size else look
+        says, do, correction = list[str](), "", dict[str, dict[str, tuple[str, ...]]]()
+        near, in_g = np.round(self.Q), abs(self.factor * STANDARD - 1.0) < WRONG
+        axes = ",".join(f"{'-' * bool(x.sum() < 0.0)}{'xyz'[int(abs(x).argmax())]}" for x in near.T)
+        if off <= AGREES * self.size:
+            kind = ok
+        elif self.off_without_gravity < EXPLAINS * min(off, self.size):
+            says, do = ["without gravity"], "Log what the sensor measures: at rest 9.81 m/s^2 upwards."
+        elif self.whole and self.share * self.size < EXPLAINS * off and (in_g or abs(self.factor - 1.0) < WRONG):
+            says, correction = (["in g"], {"unit": {"imu": ("g",)}}) if in_g else ([], {})
+            if (near != np.eye(3)).any() and np.linalg.norm(self.Q - near) < SMALL:
+                says += [f"{axes} of its frame's x,y,z"]
+                do = f"Name the columns in this order: forcegp import --force imu:{own}={axes}."
+            elif self.turned and self.angle > AGREES:
+                says += [f"turned by {np.degrees(self.angle):.2g} degrees"]
+                do = f"State it: forcegp import --force imu:{self.turned.removeprefix(IMU)}=x,y,z."
+        else:
+            do = "Compare its frame, point, axes and unit with the robot, or leave it out."
+            kind = wrong if off > EXPLAINS * self.size else look  # accelerations of single rows may be as noisy
+        what = f"the IMU at {imu_place(own)[0]} differs by {off:.2g} m/s^2 from the motion, of {self.size:.3g}"
+        what += f"{': it is ' * bool(says)}{' and '.join(says)}{'' if self.whole else '; it hardly turns'}."
+        return kind(about="imu", what=what, do=do, numbers={"error": off, "size": self.size}, correction=correction)
 
 
 def imu_doubts(dataset: Dataset, model: forcegp.model.Model) -> Iterator[Doubt]:
@@ -149,19 +130,18 @@ def imu_doubts(dataset: Dataset, model: forcegp.model.Model) -> Iterator[Doubt]:
     for name in (name for name in dataset.measured if name.startswith(IMU)):
         beside = BesideMotion.of(dataset, model, name)
         yield beside.doubt()
-        if not dataset.time_ordered or not beside.whole:
+        log = dataset.select_episodes(dataset.episodes[:1])
+        time, f, p = log.time, log.measured[name], beside.factor * expected(log, model, name) @ beside.Q.T
+        inner = np.flatnonzero((time >= time[0] + SHIFTS[-1]) & (time <= time[-1] + SHIFTS[0]))[:MOST_ROWS]
+        if not dataset.time_ordered or len(inner) < len(SHIFTS):
             continue
-        episode = dataset.select_episodes(dataset.episodes[:1])
-        expected, time = beside.factor * expected_by(episode, model, name) @ beside.Q.T, episode.time
-        inner = (time >= time[0] + SHIFTS[-1]) & (time <= time[-1] + SHIFTS[0])
-        inner = np.flatnonzero(inner)[:MOST_ROWS]
-        if len(inner) < MOST_ROWS // 100:
-            continue
-        columns = list(zip(episode.measured[name].T, expected[inner].T, strict=True))
-        left = [sum(np.square(np.interp(time[inner] + s, time, f) - p).sum() for f, p in columns) for s in SHIFTS]
-        late, zero = lowest(np.array(left), SHIFTS), len(SHIFTS) // 2
-        if abs(late) > max(LEAST_DELAY, 0.75 * float(np.median(np.diff(time)))) and min(left) < LATE * left[zero]:
-            what = f"the IMU at {name.removeprefix(IMU)} is logged {1e3 * abs(late):.1f} ms "
-            what += f"{'later' if late > 0.0 else 'earlier'} than the motion that it measures."
-            do = "Shift its columns by that before the log is imported."
+        moved = (np.stack([np.interp(time[inner] + s, time, x) for x in f.T], 1) for s in SHIFTS)
+        left = np.array([_rms(each - p[inner]) for each in moved])
+        late = lowest(left, SHIFTS)
+        if abs(late) > max(LEAST_DELAY, float(np.median(np.diff(time)))) and left.min() < LATE * left[len(SHIFTS) // 2]:
+            when = f"{1e3 * abs(late):.1f} ms {'later' if late > 0.0 else 'earlier'} than the motion that it measures"
+            what, do = (
+                f"the IMU at {imu_place(name)[0]} is logged {when}.",
+                "Shift its columns by that before an import.",
+            )
             yield look(about="imu delay", what=what, do=do, numbers={"delay": late})

@@ -98,30 +98,28 @@ class Sensor(Evidence):
     """A sensor of the log at `frame` ("": all), beside accelerations or torques; `noise` as a standard deviation."""
 
     kind: ClassVar[str]
-    unit: ClassVar[str]
-    example: ClassVar[str]
+    """Begins its names in `Dataset.measured`."""
     frame: str = ""
     noise: float | None = None
 
     @usable_arguments("Sensor")
     def __post_init__(self) -> None:
         if self.noise is not None:
-            own = type(self).__name__
-            require_number(f"{own} noise", self.noise, f"give a standard deviation in {self.unit}, or None")
+            require_number(f"noise of {self.name}", self.noise, "give a standard deviation in SI units, or None")
 
     def names(self, dataset: Dataset) -> list[str]:
-        """Of its sensors in `Dataset.measured`."""
-        own = {name: name.removeprefix(self.kind) for name in dataset.measured if name.startswith(self.kind)}
-        return [name for name, place in own.items() if self.frame in ("", place, place.partition("@")[0])]
+        """Of these sensors in `Dataset.measured`."""
+        wanted = f"{self.kind}{self.frame}"
+        own = [name for name in dataset.measured if name.startswith(self.kind)]
+        return [name for name in own if not self.frame or wanted in (name, name.partition("@")[0])]
 
     def check(self, dataset: Dataset) -> None:
         """Raise InvalidInput where the log has no such sensor."""
         if not self.names(dataset):
-            has = [name.removeprefix(self.kind) for name in dataset.measured if name.startswith(self.kind)]
-            what = "force sensor" if self.kind == FORCE else "IMU"
             raise InvalidInput(
-                f"the log has no {what}{f' at {self.frame!r}' * bool(self.frame)}; it has {', '.join(has) or 'none'}: "
-                f"name its columns, as in `forcegp import --force {self.example}`."
+                f"{self.name} need the sensor {self.kind}{self.frame or 'FRAME'}; the log has "
+                f"{', '.join(dataset.measured) or 'none'}: name its columns, as in `forcegp import --force "
+                "foot=fx,fy,fz,imu:hand=ax,ay,az`."
             )
 
 
@@ -135,8 +133,6 @@ class ContactForces(Sensor):
 
     name: ClassVar[str] = "contact-forces"
     kind: ClassVar[str] = FORCE
-    unit: ClassVar[str] = "N"
-    example: ClassVar[str] = "foot=fx,fy,fz"
 
 
 @dataclass(frozen=True)
@@ -144,20 +140,12 @@ class FrameAcceleration(Sensor):
     """What an IMU on the link of `frame` measured ("": all): R^T (J a + Jdot v - g), beside accelerations or torques.
 
     Torques are then `Torques(noisy="both")`, whose accelerations it makes better. `noise` [m/s^2]; None: 2 % of what it
-    measured, which holds offset and scale. With `mounting` "estimated" a small turn of the sensor is found first.
+    measured, which holds offset and scale. If it may be `turned` a little, that is found first.
     """
 
     name: ClassVar[str] = "frame-acceleration"
     kind: ClassVar[str] = IMU
-    unit: ClassVar[str] = "m/s^2"
-    example: ClassVar[str] = "imu:hand=ax,ay,az"
-    mounting: Literal["known", "estimated"] = "known"
-
-    @usable_arguments("FrameAcceleration")
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.mounting not in ("known", "estimated"):
-            raise InvalidInput(f"FrameAcceleration mounting is {self.mounting!r}; give 'known' or 'estimated'.")
+    turned: bool = False
 
 
 EVIDENCE: dict[str, type[Evidence]] = {

@@ -55,9 +55,7 @@ class TrainingData:
         there = {key: x for name, x in rows.measured.items() for key in (name.partition("@")[0], name)}
         own = {name: there.get(name, there.get(name.partition("@")[0])) for name in names}
         if lost := [name for name, values in own.items() if values is None]:
-            kind, _, frame = lost[0].partition(".")
-            what = "a force sensor" if f"{kind}." == OF_SENSOR else "an IMU"
-            raise InvalidInput(f"this model learns from {what} at {frame!r}, which these rows do not have.")
+            raise InvalidInput(f"this model learns from the sensor {lost[0]!r}, which these rows do not have.")
         sensed = {name: torch.tensor(values, device=device) for name, values in own.items()}
         q, v, u, a = (torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a))
         strokes = None if rows.strokes is None else torch.tensor(rows.strokes, device=device)
@@ -103,24 +101,21 @@ class Standardization:
 
 def observed(dynamics: ConstrainedDynamics, names: Iterable[str]) -> AffineMap:
     """Accelerations, then what these sensors measure, forces at contacts or of IMUs, as functions of joint forces."""
-    a, parts = dynamics.acceleration_map(), list[AffineMap]()
-    for name in names:
-        if name.startswith(OF_SENSOR):
-            parts.append(dynamics.force_at(name.removeprefix(OF_SENSOR)))
-        else:
-            imu = specific_force(dynamics.state.kinematics, name)
-            parts.append(AffineMap(imu(a.offset), imu.matrix @ a.matrix))
-    parts = [a, *parts]
+    a = dynamics.acceleration_map()
+
+    def of_imu(name: str) -> AffineMap:
+        felt = specific_force(dynamics.state.kinematics, name)
+        return AffineMap(felt(a.offset), felt.matrix @ a.matrix)
+
+    forces = {name: name.removeprefix(OF_SENSOR) for name in names}
+    parts = [a, *(of_imu(name) if name == place else dynamics.force_at(place) for name, place in forces.items())]
     offset, matrix = (torch.cat([part[k] for part in parts], dim=-1 - k) for k in (0, 1))
     return AffineMap(offset, matrix)
 
 
 def measured(dynamics: ConstrainedDynamics, training: TrainingData) -> Float[Tensor, "N D"]:
     """What `observed` predicts of these rows."""
-    sensed = (
-        dynamics.as_measured(name.removeprefix(OF_SENSOR), x) if name.startswith(OF_SENSOR) else x
-        for name, x in training.sensed.items()
-    )
+    sensed = (dynamics.as_measured(name.removeprefix(OF_SENSOR), x) for name, x in training.sensed.items())
     return torch.cat([training.a, *sensed], dim=-1)
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset, with_memory
-from forcegp.data.dataset import FORCE
+from forcegp.data.dataset import FORCE, IMU
 from forcegp.data.imu import specific_force
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence.bodies import standard_parameters
@@ -124,8 +124,8 @@ class RecordedRows:
     """States of one log of a model, the given forces there, and the terms of the equation of motion.
 
     `loaded` tells whether payloads that are estimated were there. Contacts that slide are refused unless `any_contact`.
-    `sensed` is what sensors measured, as `Dataset.measured`, with the `sensor_noise` of IMUs [m/s^2] by name. `pushed`
-    are joints on which something acts that nobody measured: their torques show nothing.
+    `sensed` is what sensors measured, as `Dataset.measured`. `pushed` are joints on which something acts that nobody
+    measured: their torques show nothing.
     """
 
     def __init__(
@@ -139,7 +139,6 @@ class RecordedRows:
         strokes: Float[np.ndarray, "rows nv strokes"] | None = None,
         sensed: Mapping[str, Float[np.ndarray, "rows 3"]] | None = None,
         pushed: Sequence[int] = (),
-        sensor_noise: Mapping[str, float | None] | None = None,
     ) -> None:
         model, robot = space.model, space.model.loaded_robot
         at_q, at_v, at_u = (torch.as_tensor(np.array(x), device=robot.device) for x in (q, v, u))
@@ -151,17 +150,17 @@ class RecordedRows:
         A, b, _ = model.constraint(self.state)
         self.held, self.right = independent_rows(A.cpu().numpy(), b.cpu().numpy())
         """Orthonormal rows (rows, m, nv) with ``held a = right``; rows of zeros where nothing holds."""
-        given = dict(sensed or {})
-        self.sensed = sensed = {n.removeprefix(FORCE): x for n, x in given.items() if n.startswith(FORCE)}
-        imus = {name: np.array(x) for name, x in given.items() if name not in map(FORCE.__add__, sensed)}
+        imus = {name: x for name, x in (sensed or {}).items() if name.startswith(IMU)}
         maps = [specific_force(self.kinematics, name) for name in imus]
-        none = self.state.v.new_zeros(len(self.v), 0, robot.nv)
-        self.felt = torch.cat([none, *(x.matrix for x in maps)], 1).cpu().numpy()
-        """What accelerations add to the specific forces of IMUs (rows, k, nv); `felt_right` is what of them they are."""
-        rests = [x - each.offset.cpu().numpy() for each, x in zip(maps, imus.values(), strict=True)]
-        self.felt_right = np.concatenate([np.zeros((len(self.v), 0)), *rests], axis=1)
-        level = [(sensor_noise or {}).get(name) or share_of(x) for name, x in imus.items()]
-        self.felt_noise = np.repeat(level, 3)
+        parts = [(x.matrix.cpu().numpy(), x.offset.cpu().numpy()) for x in maps]
+        self.felt = np.concatenate([np.zeros((*self.v.shape[:1], 0, robot.nv)), *(J for J, _ in parts)], axis=1)
+        """What IMUs measure of accelerations (rows, k, nv); of that their values are `felt_right`, with this noise."""
+        left = [np.array(x) - offset for x, (_, offset) in zip(imus.values(), parts, strict=True)]
+        self.felt_right = np.concatenate([np.zeros((len(self.v), 0)), *left], axis=1)
+        stated = None if model.noise is None else model.noise.sensor  # of force sensors, then of IMUs
+        level = np.repeat([share_of(x) for x in imus.values()], 3) if stated is None else np.atleast_1d(stated)
+        self.felt_noise = np.resize(level[-3 * len(imus) :], 3 * len(imus))
+        self.sensed = sensed = {n.removeprefix(FORCE): x for n, x in (sensed or {}).items() if n not in imus}
         arms = {frame: arm(self.kinematics, model, frame).cpu().numpy() for frame in sensed}
         forces = (each @ sensed[frame][..., None] for frame, each in arms.items())
         self.at_contacts = sum(forces, np.zeros((*self.v.shape, 1)))[..., 0]

@@ -47,13 +47,12 @@ from forcegp.fit.search import (
     widened,
     with_variance_priors,
 )
-from forcegp.fit.sensors import Stated, usual_evidence, with_sensor_noise, with_sensors
+from forcegp.fit.sensors import usual_evidence, with_sensors
 from forcegp.fit.unseen import Unseen
 from forcegp.forces import UnknownForces
 from forcegp.forces.kernels import LOG_VARIANCE_SPREAD
 from forcegp.inference import Engine, OptimizationResult, OptimizerOptions, engine_of
 from forcegp.model import Model
-from forcegp.noise import Noise
 from forcegp.parallel import checked_jobs
 from forcegp.posterior import Posterior
 from forcegp.posterior.drift import with_drift
@@ -133,10 +132,9 @@ def fit(
     require_type("model", model, Model, ", for example dataset.model")
     rest, refinement, sensors = _chosen(evidence, model, dataset, start)
     dataset = _checked(model, dataset, rest, refinement)
-    logs = [dataset] if baseline is None else [dataset, _checked(model, baseline, rest, None)]
-    (dataset, stated), *others = (with_sensors(log, model, rest, sensors) for log in logs)
+    dataset, model = with_sensors(dataset, model, rest, sensors)
     model = without_idle_offsets(model, dataset)
-    usual = Torques() if model.robot.space.is_vector_space else Torques(noisy="both")
+    usual = Torques("both" if rest.noisy_in_both or not model.robot.space.is_vector_space else "u")
     how = rest if isinstance(rest, Accelerations) and not model.unknown_forces else usual
     model, choice = (model, None) if isinstance(start, Posterior) else with_friction_chosen(model, dataset, how)
     dataset = dataset if choice is None else with_memory(dataset, model)
@@ -145,9 +143,11 @@ def fit(
     known = known | (known.mean() < 1.0 - LEFT_OUT)
     points = int(known.sum()) if points == len(dataset) else points  # all of them are all that are left
     dataset = dataset if known.all() else dataset.rows(np.flatnonzero(known))
-    touches = model.contacts and not model.carries_known_forces
+    touches = (model.contacts or dataset.measured) and not model.carries_known_forces
     unseen = Unseen.of(model, dataset, typical_sizes(model, [dataset])["force"]) if touches else None
-    logs = [dataset, *(log for log, _ in others)]
+    logs = [dataset]
+    if baseline is not None:
+        logs.append(with_sensors(_checked(model, baseline, rest, None), model, rest, sensors)[0])
     if isinstance(start, Posterior):
         posterior: Any = start
     elif (isinstance(rest, Torques) or not model.unknown_forces) and (model.is_open or model.unknown_forces):
@@ -156,14 +156,14 @@ def fit(
                 "torques are evidence for numbers of laws and bodies; functions are learned from accelerations, with "
                 "noise of the forces (Noise(None, force=..., learn=True)), which is the same likelihood."
             )
-        posterior = _of_numbers(model, logs, rest, rows, seed, stated)
+        posterior = _of_numbers(model, logs, rest, rows, seed)
     else:
         if baseline is not None:
             raise InvalidInput(
                 "a baseline is for payloads, without unknown functions; leave these out, or the baseline."
             )
         search = Search(checked_jobs(jobs), restarts, seed, options, start)
-        posterior = _Functions(model, search, engine, learning_points, stated, unseen).fitted(dataset, points)
+        posterior = _Functions(model, search, engine, learning_points, unseen).fitted(dataset, points)
     if choice is not None:
         posterior = posterior.with_settings(gear_friction=choice.to_dict())
     if not known.all():
@@ -227,14 +227,12 @@ def _checked(model: Model, dataset: Dataset, evidence: Any, refinement: Motions 
     return dataset.rows(np.flatnonzero(~again))
 
 
-def _of_numbers(
-    model: Model, logs: Sequence[Dataset], evidence: Any, rows: int | None, seed: int, stated: Stated
-) -> Posterior:
+def _of_numbers(model: Model, logs: Sequence[Dataset], evidence: Any, rows: int | None, seed: int) -> Posterior:
     """Laws and bodies alone, from all rows."""
     if rows is not None:
         whole_number("rows", rows, 1)
     refuse_what_has_no_answer(model)
-    found = fit_physical(model, logs, evidence, rows, stated)
+    found = fit_physical(model, logs, evidence, rows)
     trained = replace(found.model, noise=found.noise)
     training = TrainingData.of(found.rows, model.robot.device)
     result = OptimizationResult({}, found.history[-1], found.history, "Gauss-Newton steps", found.estimates.settled,
@@ -257,8 +255,6 @@ class _Functions:
     search: Search
     engine: Engine | str
     learning_points: int | None
-    stated: Stated
-    """Noise of sensors."""
     unseen: Unseen | None = None
     """What the log leaves open of forces at contacts."""
 
@@ -361,7 +357,7 @@ class _Functions:
 
         `beside` gives the likelihood in which numbers are free.
         """
-        noise = with_sensor_noise(resolved_noise(self.model.noise, rows), rows, self.stated, self.model)
+        noise = resolved_noise(self.model.noise, rows)
         noise = noise if self.unseen is None else self.unseen.with_pushes(noise, len(rows))
         model = replace(self.model, noise=noise)
         training = TrainingData.of(rows, model.robot.device, rows.measured)

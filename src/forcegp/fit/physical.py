@@ -1,6 +1,6 @@
 """The numbers of laws and bodies from all rows of a log: Gauss-Newton steps of weighted least squares."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -47,12 +47,12 @@ class Equations:
         logs: Sequence[Dataset],
         evidence: Torques | Accelerations,
         pushed: Sequence[int] = (),
-        sensor_noise: Mapping[str, float | None] | None = None,
     ) -> None:
         self.space, self.evidence, self.logs = space, evidence, logs
-        own: dict[str, Any] = {"pushed": pushed, "sensor_noise": sensor_noise}
         self.parts = [
-            RecordedRows(space, log.q, log.v, log.u, not k, strokes=log.strokes, sensed=log.measured, **own)
+            RecordedRows(
+                space, log.q, log.v, log.u, loaded=not k, strokes=log.strokes, sensed=log.measured, pushed=pushed
+            )
             for k, log in enumerate(logs)
         ]
         self.a = np.concatenate([log.a for log in logs])
@@ -78,12 +78,12 @@ class Equations:
     def equations(self, x: np.ndarray, parts: Sequence[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, Jacobian]:
         """Residuals and their Jacobian in x, from derivatives in standard parameters and coordinates of laws."""
         r, Y, in_terms = zip(*parts, strict=True)
+        residual = np.concatenate(r)
         if len(Y) != len(self._stays) or any(a is not b for a, b in zip(Y, self._stays, strict=True)):
-            flat = np.concatenate(Y)
-            self._stays = Y
-            self._regressor = Regressor(flat.reshape(*flat.shape[:2], 10 * len(self.space.carried)))
+            flat = np.concatenate(Y).reshape(*residual.shape, 10 * len(self.space.carried))
+            self._stays, self._regressor = Y, Regressor(flat)
         slopes = self.space.bodies.slopes(x[: self.space.bodies.size])
-        return np.concatenate(r), Chained(self._regressor, slopes, np.concatenate(in_terms))
+        return residual, Chained(self._regressor, slopes, np.concatenate(in_terms))
 
     def in_torque(self, x: np.ndarray, motions: Sequence[Motion]) -> tuple[np.ndarray, Jacobian]:
         """Torques needed less those measured; beside gains, where contacts hide nothing, as they are logged."""
@@ -230,11 +230,7 @@ class Solution:
 
 
 def fit_physical(
-    model: Model,
-    logs: Sequence[Dataset],
-    evidence: Torques | Accelerations,
-    rows: int | None = None,
-    sensor_noise: Mapping[str, float | None] | None = None,
+    model: Model, logs: Sequence[Dataset], evidence: Torques | Accelerations, rows: int | None = None
 ) -> Solution:
     """The open numbers of a model without unknown forces; of several logs payloads are in the first alone."""
     bodies = any(getattr(law, "learn", ()) or (isinstance(law, Payload) and not law.known) for law in model.laws)
@@ -249,7 +245,7 @@ def fit_physical(
     typical = typical_sizes(model, logs)
     space = ParameterSpace(model, typical)
     unseen = Unseen.of(model, logs[0], typical["force"])
-    equations = Equations(space, logs, evidence, unseen.pushed, sensor_noise)
+    equations = Equations(space, logs, evidence, unseen.pushed)
     held = equations.held if evidence.of_torque and equations.held.shape[1] and equations.windows is None else None
     if held is not None and not unseen.pushed and held.any(-1).sum(1).min() == robot.nv:
         raise InvalidInput("contacts hold every degree of freedom in every row, so no equation is left to learn from.")

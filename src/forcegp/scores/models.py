@@ -101,7 +101,7 @@ def learn(
     first = next((each for each in others if each not in sensors), usual[0])
     others, notes = [first, *sensors], []
     if sensors:
-        notes.append(f"evidence: {first.name}, and {listed([str(each) for each in sensors])}")
+        notes.append(f"evidence: {first}, and {listed([str(each) for each in sensors])}")
     if motions:
         Motions.refuse(model.unknown_forces)
     if not model.unknown_forces and (isinstance(first, Torques) or model.is_open):
