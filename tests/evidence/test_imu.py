@@ -33,8 +33,7 @@ QUICK = {"restarts": 1, "options": OptimizerOptions(iterations=8)}
 
 def with_accelerometer(spec, body):
     spec.body(body).add_site(name="at", pos=POINT, quat=Rotation.from_euler("xyz", TURN).as_quat(scalar_first=True))
-    kind = mujoco.mjtSensor.mjSENS_ACCELEROMETER
-    spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="at")
+    spec.add_sensor(type=mujoco.mjtSensor.mjSENS_ACCELEROMETER, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="at")
     return spec.compile()
 
 

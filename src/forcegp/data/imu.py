@@ -28,7 +28,7 @@ AGREES, WRONG = 0.02, 0.05
 EXPLAINS, SMALL = 0.3, 0.35
 """Of the disagreement: what another reading may leave; rad that are still no other axes."""
 SECONDS, MOST_ROWS = 0.1, 4000
-"""Over which both are averaged, since a derived acceleration is noisy; rows that are looked at."""
+"""Over which both are averaged, since a derived acceleration is noisy; rows on which a delay is sought."""
 SHIFTS, LATE = np.linspace(-0.05, 0.05, 101), 0.8
 """Seconds by which an IMU may be late, and what a shift leaves of the disagreement at most."""
 
@@ -78,7 +78,6 @@ class BesideMotion:
         steps = np.diff(dataset.time)[consecutive(dataset)[:-1]]
         width = int(max(1.0, SECONDS / np.median(steps))) if dataset.time_ordered and len(steps) else 1
         first = whole_windows(dataset, width)
-        first = first[:: max(1, len(first) // MOST_ROWS)]
         rest = replace(dataset, v=0.0 * dataset.v, a=0.0 * dataset.a)
         both = expected(dataset, model, name), dataset.measured[name], expected(rest, model, name)
         p, f, still = (window_means(x, first, width) for x in both)

@@ -95,10 +95,9 @@ class Motions(Evidence):
 
 @dataclass(frozen=True)
 class Sensor(Evidence):
-    """A sensor of the log at `frame` ("": all), beside accelerations or torques; `noise` as a standard deviation."""
+    """A sensor at `frame` ("": all), whose names in `Dataset.measured` begin with `kind`; `noise` is in their units."""
 
     kind: ClassVar[str]
-    """Begins its names in `Dataset.measured`."""
     frame: str = ""
     noise: float | None = None
 

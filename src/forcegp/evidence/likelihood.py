@@ -48,10 +48,7 @@ class TrainingData:
 
     @classmethod
     def of(cls, rows: Dataset, device: torch.device, names: Iterable[str] = ()) -> "TrainingData":
-        """Copies of all rows of a Dataset, and of what its sensors of these `names` measured. Raises InvalidInput.
-
-        The mounting of an IMU is that of its name here, which a fit may have found.
-        """
+        """Copies of all rows, and of what sensors measured, where IMUs are mounted as `names` say. InvalidInput."""
         there = {key: x for name, x in rows.measured.items() for key in (name.partition("@")[0], name)}
         own = {name: there.get(name, there.get(name.partition("@")[0])) for name in names}
         if lost := [name for name, values in own.items() if values is None]:

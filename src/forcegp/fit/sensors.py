@@ -18,9 +18,8 @@ from forcegp.noise import Noise
 def usual_evidence(model: Model, measured: Collection[str] = ()) -> tuple[Evidence, ...]:
     """That of a fit where none is named, beside sensors of these names: force sensors at contacts, and all IMUs."""
     touched = dict.fromkeys(contact.frame for contact in model.contacts)
-    felt = any(name.startswith(IMU) for name in measured)
-    sensors: list[Evidence] = [ContactForces(frame) for frame in touched if f"{FORCE}{frame}" in measured]
-    sensors += [FrameAcceleration()] * felt
+    felt = [FrameAcceleration()] if any(name.startswith(IMU) for name in measured) else []
+    sensors = [*(ContactForces(frame) for frame in touched if f"{FORCE}{frame}" in measured), *felt]
     if model.unknown_forces or not model.is_open:
         return Accelerations(), *sensors
     return Torques("both" if felt or not model.robot.space.is_vector_space else "u"), *sensors
