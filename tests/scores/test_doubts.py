@@ -81,7 +81,7 @@ def test_a_joint_that_hides_in_the_mean_is_named(friction):
     (sentence,) = about(found.warnings, "worse here than")
     assert f"at 1 of {len(names)} joints, {names[0]} " in sentence
     noisy = data.a.copy()
-    noisy[:, 2] += 2.0 * NOISE * np.random.default_rng(0).normal(size=len(noisy))
+    noisy[:, 2] += 3.0 * NOISE * np.random.default_rng(0).normal(size=len(noisy))
     found = scored(friction, dataclasses.replace(data, a=noisy))
     assert found.value("coverage_95") > 0.85
     (sentence,) = about(found.warnings, "95 % intervals")
