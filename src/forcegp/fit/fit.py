@@ -130,6 +130,7 @@ def fit(
     NumericalError: the engine failed.
     """
     require_type("model", model, Model, ", for example dataset.model")
+    require_type("dataset", dataset, Dataset, "; the model comes first, as in fit(model, dataset)")
     rest, refinement, sensors = _chosen(evidence, model, dataset, start)
     dataset = _checked(model, dataset, rest, refinement)
     dataset, model = with_sensors(dataset, model, rest, sensors)
@@ -203,8 +204,7 @@ def _chosen(
 
 def _checked(model: Model, dataset: Dataset, evidence: Any, refinement: Motions | None) -> Dataset:
     """The log, if it has what the evidence needs; of equal rows, or episodes of rows in order, the first alone."""
-    remedy = "; the model comes first, as in fit(model, dataset)"
-    require_rows("dataset", dataset, model.robot.joint_names, "the robot", remedy)
+    require_rows("dataset", dataset, model.robot.joint_names, "the robot")
     if len(dataset) < 2:
         raise InvalidInput(f"the dataset has {len(dataset)} rows; at least 2 are needed")
     for each in (evidence, refinement):

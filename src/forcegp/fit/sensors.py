@@ -40,8 +40,8 @@ def with_sensors(dataset: Dataset, model: Model, rest: Evidence, sensors: Sequen
                     raise InvalidInput(f"{'no small turn explains it: ' * each.turned}{beside.doubt()}")
                 if isinstance(rest, Torques) and not rest.noisy_in_both:
                     raise InvalidInput(
-                        "Torques() take accelerations for exact, which no IMU makes better; give Torques('both'), that "
-                        "is --evidence torques:both,frame-acceleration."
+                        "Torques() take accelerations for exact, which no IMU makes better; give torques:both, that is "
+                        "Torques('both')."
                     )
             elif isinstance(rest, Accelerations) and model.is_open and not model.unknown_forces:
                 raise InvalidInput(

@@ -96,10 +96,10 @@ def learn(
     """
     motions = [each for each in evidence if isinstance(each, Motions)]
     usual = usual_evidence(model, dataset.measured)
-    others = [each for each in evidence or usual if each not in motions]
-    sensors = [each for each in others if isinstance(each, Sensor)]
-    first = next((each for each in others if each not in sensors), usual[0])
-    others, notes = [first, *sensors], []
+    sensors = [each for each in evidence or usual if isinstance(each, Sensor)]
+    others = [each for each in evidence if each not in (*motions, *sensors)] or [usual[0]]
+    first, notes = others[0], []
+    others += sensors
     if sensors:
         notes.append(f"evidence: {first}, and {listed([str(each) for each in sensors])}")
     if motions:
