@@ -115,13 +115,8 @@ def require_replaceable(
 
 def write_text(path: str | Path, text: str) -> None:
     """Write UTF-8 text with the line ends that it has. Raises as `atomic_file`."""
-    write_bytes(path, text.encode("utf-8"))
-
-
-def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write a file. Raises as `atomic_file`."""
     with atomic_file(path) as temporary:
-        temporary.write_bytes(data)
+        temporary.write_bytes(text.encode("utf-8"))
 
 
 def write_json(path: str | Path, content: Mapping[str, Any]) -> None:

@@ -18,8 +18,6 @@ from forcegp.forces.actuation import OBSERVED, forces_of_file, forces_of_mjcf
 from forcegp.forces.force import Memory
 from forcegp.forces.registry import force_from_dict, force_to_dict
 from forcegp.forces.rigid_bodies import carrying
-from forcegp.mechanics import LoopClosure
-from forcegp.mechanics.constraints import closing, contact_from_dict, contact_to_dict, described
 from forcegp.mechanics.gauss_principle import Baumgarte, ConstrainedDynamics, Contact, State
 from forcegp.mechanics.surfaces import Held
 from forcegp.noise import Noise
@@ -151,19 +149,18 @@ class Model(Summary):
     @classmethod
     @usable_arguments("Model.from_mjcf")
     def from_mjcf(cls, path: str | Path, **options: Any) -> "Model":
-        """The robot of an MJCF file with its equalities of type connect and weld as closed loops, which are exact here.
+        """The robot of an MJCF file with the forces that the file states.
 
         `options` are those of `Robot.from_mjcf`, which this raises the errors of. Damping, dry friction and springs of
         the file are forces of the model. u are joint forces; where motors act at sites of bodies,
         such as rotors, u are the inputs of all motors, those of bodies that are not free last.
         """
         robot, found = Robot.read_mjcf(read_text(path), str(path), Path(path), for_system=True, **options)
-        contacts = tuple(contact for loop in found.loops for contact in closing(loop))
-        return cls(robot, contacts, forces_of_mjcf(robot, found))
+        return cls(robot, forces=forces_of_mjcf(robot, found))
 
     def to_mjcf(self, path: str | Path | None = None) -> str:
-        """`Robot.to_mjcf` with its closed loops as equalities, which MuJoCo holds softly; contacts are left out."""
-        return self._robot_of_files().to_mjcf(path, described(self.loops))
+        """`Robot.to_mjcf` with what files can hold of the forces, as `to_urdf`; contacts are left out."""
+        return self._robot_of_files().to_mjcf(path)
 
     def to_urdf(self, path: str | Path | None = None) -> str:
         """`Robot.to_urdf` with what files can hold of the forces: rotors, payloads, viscous and dry friction."""
@@ -187,17 +184,15 @@ class Model(Summary):
     @classmethod
     @usable_arguments("Model.from_file")
     def from_file(cls, path: str | Path, **options: Any) -> "Model":
-        """The robot of a file with its closed loops, if it is MJCF; `options` are those of `Robot.from_file`."""
+        """The robot of a file, with the forces that it states; `options` are those of `Robot.from_file`."""
         return cls.from_mjcf(path, **options) if is_mjcf(read_text(path)) else cls(Robot.from_urdf(path, **options))
 
     @override
     def facts(self) -> dict[str, object]:
-        """Robot, contacts, closed loops and forces."""
-        ends = dict.fromkeys(f"{loop.frame} and {loop.second_frame}" for loop in self.loops)
+        """Robot, contacts and forces."""
         return {
             "robot": f"{self.robot.name!r}, {self.robot.nv} joints",
-            "contacts": listed(f"{contact.frame} on {type(contact.surface).__name__}" for contact in self.touching),
-            **({"closed loops": listed(ends)} if ends else {}),
+            "contacts": listed(f"{contact.frame} on {type(contact.surface).__name__}" for contact in self.contacts),
             "forces": listed((type(force).__name__ for force in self.forces), most=8),
             "baumgarte": self.baumgarte or "none",
         }
@@ -245,24 +240,14 @@ class Model(Summary):
         return u
 
     @property
-    def loops(self) -> tuple[LoopClosure, ...]:
-        """The contacts that hold frames of the robot together."""
-        return tuple(contact for contact in self.contacts if isinstance(contact, LoopClosure))
-
-    @property
-    def touching(self) -> tuple[Contact, ...]:
-        """The other contacts: those with surfaces in the world."""
-        return tuple(contact for contact in self.contacts if not isinstance(contact, LoopClosure))
-
-    @property
     def sizes(self) -> tuple[int, int, int]:
         """Sizes of q, v and u."""
         return self.robot.nq, self.robot.nv, len(self.inputs)
 
-    def state(self, q: Tensor, v: Tensor, u: Tensor, bodies: Float[Tensor, "bodies 10"] | None = None) -> State:
+    def state(self, q: Tensor, v: Tensor, u: Tensor) -> State:
         """Checked states (q, v, u), each with its own size. Raises InvalidInput."""
         by = None if self._u_is_delivered else self._delivered
-        return State.of(self.loaded_robot, q, v, u, bodies, self.inputs, by)
+        return State.of(self.loaded_robot, q, v, u, self.inputs, by)
 
     @cached_property
     def _u_is_delivered(self) -> bool:
@@ -276,18 +261,9 @@ class Model(Summary):
         pushing = (force.delivered(state) for force in self.laws if isinstance(force, Thrusters))
         return sum(pushing, self.actuation.delivered(state))
 
-    def dynamics(
-        self,
-        q: Positions,
-        v: JointValues,
-        u: Float[Tensor, "*#batch nu"],
-        bodies: Float[Tensor, "bodies 10"] | None = None,
-    ) -> ConstrainedDynamics:
-        """A, b, H and Q_K at states (q, v, u), each (..., nv), from one kinematics pass; differentiable.
-
-        `bodies` are standard parameters in the place of the robot's; no inertial parameter moves contact points.
-        """
-        state = self.state(q, v, u, bodies)
+    def dynamics(self, q: Positions, v: JointValues, u: Float[Tensor, "*#batch nu"]) -> ConstrainedDynamics:
+        """A, b, H and Q_K at states (q, v, u), each (..., nv), from one kinematics pass; differentiable."""
+        state = self.state(q, v, u)
         Q_K = torch.zeros_like(state.v)
         for force in self.laws:
             Q_K = Q_K + force.force(state)
@@ -324,9 +300,7 @@ class Model(Summary):
         A, b, _ = self.constraint(self.state(q, v, u))
         size = torch.linalg.vector_norm(A, dim=-1) + 0.0 * b  # NaN where b is not finite
         for index, contact in enumerate(self.contacts):
-            if isinstance(contact, LoopClosure):  # in a plane some of its rows constrain nothing
-                size[..., index] = 1.0 + 0.0 * size[..., index]
-            elif isinstance(contact.surface, Held):  # neither do all directions of a held point
+            if isinstance(contact.surface, Held):  # in a plane some directions of a held point constrain nothing
                 alike = [k for k, x in enumerate(self.contacts) if (x.frame, x.point) == (contact.frame, contact.point)]
                 size[..., index] = torch.linalg.vector_norm(A[..., alike, :], dim=(-2, -1)) + 0.0 * b[..., index]
             if contact.switch is not None:  # where it does not act it needs no direction
@@ -386,7 +360,7 @@ class Model(Summary):
         return {
             "format": FORMAT_VERSION,
             **self.robot.to_stored(),
-            "contacts": [contact_to_dict(contact) for contact in self.contacts],
+            "contacts": [contact.to_dict() for contact in self.contacts],
             "forces": [force_to_dict(force) for force in self.forces],
             "noise": None if self.noise is None else self.noise.to_dict(),
             "baumgarte": None if self.baumgarte is None else asdict(self.baumgarte),
@@ -412,7 +386,7 @@ class Model(Summary):
                     raise FileFormatError(f"stored model is damaged: {key} is {stored[key]!r}")
             robot = Robot.from_stored(stored)
             if contacts is None:
-                contacts = [contact_from_dict(entry) for entry in stored["contacts"]]
+                contacts = [Contact.from_dict(entry) for entry in stored["contacts"]]
             baumgarte = None if stored["baumgarte"] is None else Baumgarte(**stored["baumgarte"])
             forces = tuple(force_from_dict(entry) for entry in stored["forces"])
             noise = None if stored["noise"] is None else Noise.from_dict(stored["noise"])

@@ -15,7 +15,6 @@ FILES = {
     "arm.c",
     "arm.h",
     "arm.hpp",
-    "arm_external.c",
     "CMakeLists.txt",
     "example.c",
     "self_test.c",

@@ -1,4 +1,4 @@
-"""Environments of gymnasium: its own checks, the motion against the predictor's, and one function per episode."""
+"""Environments of gymnasium: its own checks, the motion against the predictor's, and episodes."""
 
 import numpy as np
 import pytest
@@ -28,10 +28,9 @@ def settings(predictor):
     return {"model": predictor, "torque_limits": 5.0, "dt": 0.05, "start": near, "reward": reached}
 
 
-@pytest.mark.parametrize("draw", [0, 3])
 @pytest.mark.filterwarnings("ignore")  # advice on bounds and rendering
-def test_gymnasiums_own_checks_find_nothing(settings, draw):
-    env = gymnasium.make("forcegp/Robot-v0", **settings, draw=draw, max_episode_steps=5)
+def test_gymnasiums_own_checks_find_nothing(settings):
+    env = gymnasium.make("forcegp/Robot-v0", **settings, max_episode_steps=5)
     check_env(env.unwrapped, skip_render_check=True)
     env.reset(seed=1)
     ends = [env.step(env.action_space.sample())[3] for _ in range(5)]
@@ -53,23 +52,15 @@ def test_the_step_is_the_predictors_and_the_reward_the_callers(settings, predict
     assert np.array_equal(RobotVectorEnv(3, **settings).reset(seed=2)[0], seen)
 
 
-def test_every_episode_has_one_drawn_function(settings, predictor):
-    env = RobotVectorEnv(7, **settings, draw=3, steps=2)
-    seen, _ = env.reset(seed=4)
-    drawn = env.function
+def test_an_episode_that_ended_begins_anew_without_a_reward(settings):
+    env = RobotVectorEnv(7, **settings, steps=2)
+    env.reset(seed=4)
     u = np.linspace(-3.0, 3.0, 7)[:, None]
-    after = env.step(u)[0]
-    every = predictor.rollouts(
-        seen[:, :1], seen[:, 1:], u[:, None], 0.05, integrator="implicit-midpoint", functions=3, seed=0
-    )
-    np.testing.assert_allclose(after[:, 0], every.q[drawn, np.arange(7), 1, 0], rtol=1e-12)
-    np.testing.assert_allclose(after[:, 1], every.v[drawn, np.arange(7), 1, 0], rtol=1e-12)
-    assert np.array_equal(env.function, drawn)  # until the episode ends
+    env.step(u)
     assert env.step(u)[3].all()
     again, rewards, *_ = env.step(u)
     assert not rewards.any()
     assert not again[:, 1].any()  # at rest again
-    assert not np.array_equal(env.function, drawn)
 
 
 def test_a_motion_that_diverges_ends_its_episode_at_its_last_state(settings):
@@ -84,17 +75,11 @@ def test_a_motion_that_diverges_ends_its_episode_at_its_last_state(settings):
     assert np.isfinite(after).all()
 
 
-def test_motions_are_divided_among_as_many_functions_as_there_are(predictor):
-    with pytest.raises(InvalidInput, match="first dimension of 3 functions"):
-        predictor.rollouts(np.zeros((2, 1)), np.zeros((2, 1)), np.zeros((2, 4, 1)), 0.05, functions=3, divided=True)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"torque_limits": 0.0}, "not all zero"),
         ({"torque_limits": np.inf}, "give finite ones"),
-        ({"draw": -1}, "draw"),
         ({"num_envs": 0}, "num_envs"),
         ({"dt": -0.1}, "time step"),
         ({"dt": 10.0}, "dt is 10.0; one step lasts 1 s at most"),
@@ -135,12 +120,10 @@ def test_an_episode_ends_at_the_limits_of_a_joint(settings):
     assert over.tolist() == [True, False]
 
 
-def test_models_that_have_no_functions_or_are_none(settings, predictor):
+def test_models_without_functions_and_what_is_none(settings, predictor):
     rows = predictor.posterior.training
     data = Dataset(q=rows.q, v=rows.v, u=rows.u, a=rows.a, time=np.arange(len(rows.q)), model=predictor.posterior.model)
     bare = fit(data.model.known.with_forces(noise=Noise(0.01, learn=False)), data, restarts=1)
-    with pytest.raises(InvalidInput, match="draw=2 functions are asked for, and this model has none"):
-        RobotVectorEnv(**settings | {"model": bare, "draw": 2})
     assert RobotVectorEnv(**settings | {"model": bare}).reset(seed=0)[0].shape == (1, 2)
     with pytest.raises(InvalidInput, match="model is a int; give a Posterior"):
         RobotVectorEnv(**settings | {"model": 3})

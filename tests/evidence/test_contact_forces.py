@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tests.forces.world_forces import WorldForces
 from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import Accelerations, ContactForces, Torques, fit, load_posterior, save_posterior
@@ -20,6 +21,7 @@ from forcegp.fit.physical import typical_sizes
 from forcegp.fit.sensors import with_sensors
 from forcegp.fit.unseen import OF_TORQUE, PUSHED, Unseen
 from forcegp.forces import (
+    FORCES,
     Actuation,
     Coulomb,
     GearFriction,
@@ -28,7 +30,6 @@ from forcegp.forces import (
     LogNormal,
     Offset,
     Payload,
-    ToolForces,
     Viscous,
 )
 from forcegp.inference import OptimizerOptions
@@ -174,11 +175,13 @@ def test_predictions_given_accelerations_are_those_of_one_large_gaussian():
     gain = whole[:, 3:, :3] @ torch.linalg.inv(seen)
     expected = mean[:, 3:] + (gain @ (a - mean[:, :3])[..., None])[..., 0]
     spread = whole[:, 3:, 3:] - gain @ whole[:, :3, 3:]
-    found = posterior.predict(*states, a=a, of=[ContactForces("hand")])[0]
+    found = posterior.predict(*states, a=a).force_at("hand")
     torch.testing.assert_close(found.mean, expected, rtol=0.0, atol=1e-8)
     torch.testing.assert_close(found.covariance, spread, rtol=0.0, atol=1e-8)
-    with pytest.raises(InvalidInput, match="no contact there"):
-        posterior.predict(*states, of=[ContactForces("fore")])
+    with pytest.raises(InvalidInput, match=r"no contact at 'fore'.*; there is hand"):
+        posterior.predict(*states).force_at("fore")
+    several = posterior.with_contacts(fixed_point("hand")).predict(*states)
+    torch.testing.assert_close(several.force_at("hand").mean, several.contact_force.mean.unflatten(-1, (3, 3)).sum(-2))
     with pytest.raises(InvalidInput, match="a has shape"):
         posterior.predict(*states, a=a[:, :2])
 
@@ -201,9 +204,9 @@ def test_what_contacts_hide_is_in_the_interval_of_their_force():
     assert "hidden_force" not in sensed.settings
 
 
-def test_a_sensor_shows_forces_along_the_normal(tmp_path):
+def test_a_sensor_shows_forces_along_the_normal(tmp_path, monkeypatch):
     """Something pulls the tool onto the plane, the more the faster it moves: no acceleration shows it."""
-    seen = ToolForces("hand", point=(0.0, 0.0, 0.2), axes="world")
+    monkeypatch.setitem(FORCES, "world-forces", WorldForces)  # so that files carry it
     at = measured(on_plane(), on_plane(), rows=160)
     kinematics = on_plane().robot.kinematics(*tensors(at, "q", "v"))
     J = kinematics.frame_jacobian("hand", (0.0, 0.0, 0.2))[:, :3].numpy()
@@ -214,7 +217,7 @@ def test_a_sensor_shows_forces_along_the_normal(tmp_path):
     states, truth = tensors(test, "q", "v", "u"), test.measured[SENSOR] @ NORMAL
     error, hold = {}, {}
     for evidence in (Accelerations(),), (Accelerations(), ContactForces(noise=0.1)):
-        posterior = fit(on_plane(seen).with_forces(noise=Noise(0.05, learn=True)), train, evidence, restarts=1)
+        posterior = fit(on_plane(WorldForces()).with_forces(noise=Noise(0.05, learn=True)), train, evidence, restarts=1)
         found = posterior.predict(*states).multiplier
         error[len(evidence)] = np.sqrt(np.mean((found.mean[:, 0].numpy() - truth) ** 2))
         hold[len(evidence)] = np.mean(abs(found.mean[:, 0].numpy() - truth) < 1.96 * found.std[:, 0].numpy())
@@ -287,9 +290,9 @@ class TestLogsOfSensors:
             replace(log, measured=given)
 
     def test_evidence_that_a_log_lacks_is_refused(self, log):
-        with pytest.raises(InvalidInput, match=r"need the sensor force.fore; the log has force.hand:"):
+        with pytest.raises(InvalidInput, match=r"need the sensor force.fore; the log has ..force.hand"):
             fit(on_plane(Viscous()), log, [Torques(), ContactForces("fore")])
-        with pytest.raises(InvalidInput, match=r"need the sensor force.FRAME; the log has none"):
+        with pytest.raises(InvalidInput, match=r"need the sensor force.FRAME; the log has ..:"):
             fit(on_plane(Viscous()), replace(log, measured={}), [Torques(), ContactForces()])
         with pytest.raises(InvalidInput, match="beside torques"):
             fit(on_plane(Viscous()), log, [Accelerations(), ContactForces()])
@@ -328,7 +331,7 @@ def test_a_real_leg_tells_its_contact_force_without_the_sensor_after_a_calibrati
             points = 150 if evidence == Accelerations() else None
             posterior = fit(model.with_forces(*forces), train, evidence, points=points, restarts=1)
         rows = with_memory(test, posterior.model)
-        found = posterior.predict(rows.q, rows.v, rows.u, a=rows.a, of=[ContactForces("contact")])[0]
+        found = posterior.predict(rows.q, rows.v, rows.u, a=rows.a).force_at("contact")
         error = found.mean[:, 2].numpy() - test.measured[name][:, 2]
         return np.sqrt((error**2).mean()), (abs(error) < 1.96 * found.std[:, 2].numpy()).mean()
 

@@ -6,11 +6,13 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from tests.forces.world_forces import WorldForces
 from tests.posterior.arm import arm_data, arm_model
 
 from forcegp.errors import DataWarning, InvalidInput, UnknownName
 from forcegp.fit import fit as fit_model
 from forcegp.forces import (
+    AerodynamicForce,
     ContactFriction,
     JointForces,
     JointFriction,
@@ -47,13 +49,13 @@ def with_columns(data, **columns):
 
 @pytest.mark.parametrize("prefix", ["", "tool-friction "], ids=["alone", "in-a-sum"])
 def test_a_force_along_the_normal_is_hidden(on_a_table, prefix):
-    prior = ToolForces("hand", TIP, axes="world")
+    prior = WorldForces()
     forces = (prior, JointFriction()) if prefix else (prior,)
     with pytest.warns(DataWarning) as caught:
         posterior = fit(on_a_table, *forces)
     (message,) = [str(warning.message) for warning in caught]
     assert message.startswith(f"no data can identify '{prefix}force-z': the contacts take that force")
-    assert "use axes='surface', which leaves out the normal direction" in message
+    assert "learn a force along the surface, such as gp:tool-friction" in message
     force = posterior.components(on_a_table.q, on_a_table.v, on_a_table.u)["tool-friction"].latents
     states = [torch.tensor(x) for x in (on_a_table.q, on_a_table.v, on_a_table.u)]
     z = posterior.likelihood.standardization(posterior.model.unknown.features(on_a_table.model.dynamics(*states)))[2]
@@ -126,12 +128,8 @@ def test_a_tool_that_never_moves_has_no_friction(data, prior):
 @pytest.mark.parametrize(
     ("prior", "error", "message"),
     [
-        (
-            ToolForces("base", axes="world"),
-            InvalidInput,
-            "ToolForces acts on frame 'base', which is fixed",
-        ),
-        (ToolForces("tool", axes="tool"), UnknownName, "no frame 'tool'"),
+        (AerodynamicForce("base"), InvalidInput, "AerodynamicForce acts on frame 'base', which is fixed"),
+        (AerodynamicForce("tool"), UnknownName, "no frame 'tool'"),
         (JointFriction(("pna",)), UnknownName, "did you mean 'pan'"),
         (JointPositionForces(("elbow",)), UnknownName, "Valid joints: bend, lift, pan"),
         (ContactFriction(contact=1), InvalidInput, "contact 1, but the model has only contact 0"),
@@ -147,7 +145,6 @@ def test_a_prior_that_does_not_fit_the_system_is_refused_before_any_data(data, p
 def test_forces_of_a_contact_need_one():
     with pytest.raises(InvalidInput, match=r"no contact with a surface.*`contacts`"):
         arm_model(contacts=0).with_forces(ToolForces())
-    arm_model(contacts=0).with_forces(ToolForces("hand", axes="world"))
 
 
 def test_equal_terms_are_refused(data):

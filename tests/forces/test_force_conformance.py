@@ -57,16 +57,6 @@ class TestToolForcesOfThePlace(UnknownConformance):
     acts_at = TIP
 
 
-class TestToolForcesAlongTheWorld(UnknownConformance):
-    prior = ToolForces("fore", (0.1, 0.0, -0.1), axes="world", inputs=("position",))
-    acts_at = ("fore", (0.1, 0.0, -0.1))
-
-
-class TestToolForcesAlongTheTool(UnknownConformance):
-    prior = ToolForces(axes="tool")
-    acts_at = TIP
-
-
 class TestContactFriction(UnknownConformance):
     prior = ContactFriction()
     acts_at = TIP

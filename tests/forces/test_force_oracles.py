@@ -84,29 +84,6 @@ class TestPayload:
 
 
 class TestToolForces:
-    def test_along_the_world_and_the_tool(self, oracle, rows, dynamics):
-        pose, J = jacobians(oracle, *rows[:2])
-        world = ToolForces(FRAME, POINT, axes="world").direction(dynamics)
-        torch.testing.assert_close(world, J[:, :3].mT, rtol=1e-10, atol=1e-10)
-        tool = ToolForces(FRAME, POINT, axes="tool").direction(dynamics)
-        R = pose[:, :3, :3]
-        torch.testing.assert_close(tool, J[:, :3].mT @ R, rtol=1e-10, atol=1e-10)
-        at_contact = ToolForces(axes="tool").direction(dynamics)
-        torch.testing.assert_close(at_contact, tool, rtol=1e-13, atol=1e-13)
-
-    def test_features_are_place_and_motion_along_the_axes(self, oracle, rows, dynamics, model):
-        q, v, _ = rows
-        pose, J = jacobians(oracle, q, v)
-        velocity = (pose[:, :3, :3].mT @ (J[:, :3] @ v[..., None]))[..., 0]
-        prior = ToolForces(axes="tool", inputs=("velocity", "position"))
-        expected = torch.cat([velocity, pose[:, :3, 3]], dim=-1)
-        for z in prior.features(dynamics):
-            torch.testing.assert_close(z, expected, rtol=1e-10, atol=1e-10)
-        names = prior.feature_names(model.robot)[0]
-        assert names[0] == "tool velocity along tool-x [m/s]"
-        assert names[3] == "tool position along x [m]"
-        assert len(names) == expected.shape[-1]
-
     def test_along_a_surface_the_force_is_tangential_to_it(self, oracle, rows, dynamics):
         """For a point that stays on it; for one that drifts off, the force is tilted to resist all of its motion."""
         q, v, u = rows
@@ -130,13 +107,12 @@ class TestToolForces:
 
     def test_without_its_contact_it_is_zero(self, model, rows):
         free = model.with_contacts([]).dynamics(*rows)
-        for prior in (ToolForces(), ToolForces(FRAME, axes="surface"), ContactFriction()):
+        for prior in (ToolForces(), ToolForces(inputs=("velocity", "position")), ContactFriction()):
             count = len(prior.latent_names(model.robot))
             assert torch.equal(prior.direction(free), torch.zeros(ROWS, model.robot.nv, count).double())
             assert torch.equal(prior.point_force(free), torch.zeros(ROWS, 3, count).double())
             shapes = [z.shape for z in prior.features(model.dynamics(*rows))]
             assert [z.shape for z in prior.features(free)] == shapes
-        assert bool((ToolForces(FRAME, axes="world").direction(free) != 0.0).any())
 
 
 class TestContactFriction:

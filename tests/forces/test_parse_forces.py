@@ -68,10 +68,8 @@ EXPRESSIONS = {
     "gp:joint:v": JointForces(("v",)),
     "viscous:transmission=lift+pan/pan-0.5*lift": Viscous(transmission="lift+pan/pan-0.5*lift"),
     "gp: joint-friction : joints = lift / pan ": JointFriction(("lift", "pan")),
-    "gp:tool-forces:frame=hand:point=0/-0.1/2e-1:axes=world": ToolForces(
-        "hand", (0.0, -0.1, 0.2), axes="world", inputs=SURFACE_FORCES.inputs, kernel=SURFACE_FORCES.kernel
-    ),
-    "gp:tool-friction:axes=tool:contact=0": ToolForces(axes="tool"),
+    "gp:tool-friction:inputs=position:contact=2": ToolForces(2, ("position",)),
+    "gp:aerodynamic:hand:wind=0/-0.1/2e-1": AerodynamicForce("hand", wind=(0.0, -0.1, 0.2)),
     "gp:load-friction:load=false": ContactFriction(),
     "gp:tool-friction:kernel=(linear + matern-3/2)": ToolForces(kernel="linear + matern-3/2"),
     "viscous:0.3": Viscous(0.3),
@@ -96,9 +94,8 @@ MISTAKES = {
     "gp:load-friction:load=yes": "force 'load-friction' has load=yes; give true or false",
     "gp:contact-friction:contact=first": "force 'contact-friction' has contact=first; give a whole number",
     "gp:contact-friction:contact=-1": "a contact's number from 0",
-    "gp:tool-friction:point=0/0": "a point of three numbers",
-    "gp:tool-friction:point=0/0/x": r"force 'tool-friction' has point=0/0/x; give numbers as in 0.0/0.0/0.0",
-    "gp:tool-friction:axes=sideways": "give axes 'world' or 'tool' or 'surface'",
+    "gp:aerodynamic:wind=0/0": "give 3 finite numbers",
+    "gp:aerodynamic:wind=0/0/x": r"force 'aerodynamic' has wind=0/0/x; give numbers as in 0.0/0.0/0.0",
     "gp:joint:inputs=q/torque": "give one or more of 'q', 'v', 'u', each once",
     "gp:joint-friction:kernel=frictoin": "did you mean 'friction'",
     "gp:joint-friction:joints=pan/pan": "each once, or None for all",
@@ -120,8 +117,8 @@ def test_expressions(expression):
 
 
 def test_several_are_written_with_commas():
-    several = parse_forces("viscous, coulomb:0.1,gp:tool-friction:kernel=(linear + matern-3/2),axes=tool, payload:hand")
-    wanted = (Viscous(), Coulomb(0.1), ToolForces(axes="tool", kernel="linear + matern-3/2"), Payload("hand"))
+    several = parse_forces("viscous, coulomb:0.1,gp:tool-friction:kernel=(linear + matern-3/2),contact=1, payload:hand")
+    wanted = (Viscous(), Coulomb(0.1), ToolForces(1, kernel="linear + matern-3/2"), Payload("hand"))
     assert list(map(force_to_dict, several)) == list(map(force_to_dict, wanted))
     assert [force.title for force in parse_forces(["viscous", "gp:joint-friction"])] == ["viscous", "joint-friction"]
 
@@ -172,10 +169,10 @@ def test_people_add_their_own(monkeypatch):
         (lambda: JointFriction(()), r"joints are \(\)"),
         (lambda: JointFriction(7), "joints are 7"),
         (lambda: JointFriction((1, 2)), r"joints are \(1, 2\)"),
-        (lambda: ToolForces(point=None), "point None"),
-        (lambda: ToolForces(point="top"), "point 'top'"),
-        (lambda: ToolForces(point=(0.0, 0.0, math.inf)), r"point \(0.0, 0.0, inf\)"),
-        (lambda: ToolForces(frame=3), "frame is 3"),
+        (lambda: AerodynamicForce(wind=None), "wind is None"),
+        (lambda: AerodynamicForce(wind="top"), "wind is 'top'"),
+        (lambda: AerodynamicForce(wind=(0.0, 0.0, math.inf)), r"wind is \(0.0, 0.0, inf\)"),
+        (lambda: AerodynamicForce(frame=3), "frame is 3"),
         (lambda: ToolForces(contact="0"), "contact '0'"),
         (lambda: ContactFriction(contact=True), "contact True"),
         (lambda: Payload(mass=2.0), "no link; name the link that carries it"),
@@ -213,7 +210,7 @@ def test_units_are_those_of_the_joints():
     assert JointAccelerations().latent_units(robot) == ("rad/s^2", "rad/s^2", "m/s^2")
     assert ContactFriction().latent_units(robot) == ("N",)
     assert ContactFriction(load=True).latent_units(robot) == ("",)
-    assert ToolForces(axes="tool").latent_units(robot) == ("N",) * 3
+    assert ToolForces().latent_units(robot) == ("N", "N")
     assert JointFriction().feature_names(robot)[1:] == (("velocity of lift [rad/s]",), ("velocity of bend [m/s]",))
     assert JointPositionForces().feature_names(robot)[2] == ("position of bend [m]",)
     names = JointForces().feature_names(robot)[0]

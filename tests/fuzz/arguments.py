@@ -16,7 +16,7 @@ from tests.fuzz.made import INPUTS, QUICK
 from tests.fuzz.oracle import DefectError, Target, allowed
 from tests.fuzz.values import words
 from tests.posterior.arm import URDF, arm_model
-from tests.robots.mjcf_models import FOUR_BAR
+from tests.robots.mjcf_models import OPEN_BARS
 
 import forcegp
 import forcegp.control
@@ -280,7 +280,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         Robot.from_mjcf_text,
         _shown,
         given=lambda: {
-            "text": FOUR_BAR,
+            "text": OPEN_BARS,
             **dict.fromkeys(("gravity", "armature", "locked", "base")),
             "inertias": "strict",
         },
@@ -327,7 +327,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "parse_forces": _call(forces.parse_forces, given=lambda: {"expression": "gp:joint"}),
     "parse_evidence": _call(parse_evidence, given=lambda: {"words": "torques:mean=.4"}),
     "JointFriction": _call(forcegp.JointFriction, _prior, "joints kernel"),
-    "ToolForces": _call(forcegp.ToolForces, _prior, "point axes inputs contact kernel", lambda: {"frame": "hand"}),
+    "ToolForces": _call(forcegp.ToolForces, _prior, "inputs contact kernel"),
     "ContactFriction": _call(forcegp.ContactFriction, _prior, "contact load kernel"),
     "Preparation": _call(
         forcegp.data.Preparation,
@@ -350,7 +350,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "MPPI": _call(
         forcegp.MPPI,
         lambda kind, **k: kind(INPUTS.predictor, _cost, **k)(*STATE[:2]),
-        "noise functions seed",
+        "noise seed",
         lambda: {"dt": 0.01, "steps": 2, "torque_limits": 5.0, "samples": 3, "integrator": "rk4"},
     ),
     "excitation": _call(

@@ -160,7 +160,7 @@ def check_commands(case: Stored, folder: Path) -> None:
 
 @dataclass(frozen=True)
 class StoredSystem:
-    """A model of thrusters, loops and switches, with these edits."""
+    """A model of thrusters and switches, with these edits."""
 
     which: int
     edits: list[Any]

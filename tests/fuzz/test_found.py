@@ -175,7 +175,7 @@ WRONG = {
     "Motions": {"seconds": "x"},
     "IndependentAccelerations": {"inputs": np.zeros(3, [("a", "f8")])},
     "ContactFriction": {"load": np.ones(3)},
-    "ToolForces": {"axes": np.ones(3)},
+    "ToolForces": {"inputs": np.ones(3)},
     "Baumgarte": {"omega": 1e308},
     "Payload": {"mass": np.ones(3)},
     "parse_forces": {"expression": 5},

@@ -5,24 +5,19 @@ from functools import partial
 
 import pytest
 import torch
-from tests.posterior.arm import arm_model
 from tests.robots.random_positions import random_positions
 from tests.robots.test_moving_bases import LIMBS
 
-from forcegp.errors import InvalidInput, NumericalError, NumericalWarning
+from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.integration import (
     INTEGRATORS,
     SPEED_LIMIT,
     integrate,
     integrator_named,
-    onto_contacts,
-    violation,
 )
 from forcegp.integration.integrators import VECTORS, find_roots
-from forcegp.mechanics import Contact, ImplicitSurface, Plane, Sphere
 from forcegp.model import Model
 from forcegp.robots import Robot
-from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 POINT = """<robot name="point"><link name="base"/>
 <link name="mass"><inertial><mass value="2"/>
@@ -57,27 +52,6 @@ def test_order_on_a_damped_oscillator_with_its_closed_form(integrator, order):
         motion = integrate(of_vectors(integrator), lambda q, v, u: -q - damping * v + u, *begin, force, end / steps)
         errors.append(abs(float(motion.q[-1]) - exact))
     assert observed_order(errors) == pytest.approx(order, abs=0.15)
-
-
-@pytest.mark.parametrize("scale", [1e-3, 1e3])
-def test_a_start_is_moved_onto_its_surfaces_whatever_their_scale(scale):
-    """Along M^-1 A^T: the velocity solves the dense equations."""
-    sphere = Sphere((0.0, 0.1, 0.4), 0.45)
-    twice = [Contact("hand", (0.0, 0.0, 0.2), Plane((0.2, 0.0, 1.0), 0.4))] * 2
-    scaled = Contact("hand", (0.0, 0.0, 0.2), ImplicitSurface(lambda p: scale * sphere.value(p)))
-    model = arm_model(baumgarte=None).with_contacts([scaled, *twice])
-    q = torch.tensor([[0.3, 0.7, 0.8]], dtype=torch.float64)
-    v = torch.tensor([[0.8, -0.5, 0.9]], dtype=torch.float64)
-    at, moved = onto_contacts(model, q, v)
-    assert model.contacts[1].distance(model.robot.kinematics(at)).abs().max() <= 1e-12
-    assert (violation(model, at, moved)[0] / torch.tensor([scale, 1.0, 1.0])).abs().max() <= 1e-12
-    M, A = model.robot.mass_matrix(q)[0], model.dynamics(at, v, v).A[0, :2]  # the metric is that of the given position
-    dense = torch.cat([torch.cat([M, A.mT], dim=1), torch.cat([A, torch.zeros(2, 2).double()], dim=1)])
-    right = torch.cat([M @ v[0], torch.zeros(2, dtype=torch.float64)])
-    torch.testing.assert_close(moved[0], torch.linalg.solve(dense, right)[:3], rtol=1e-9, atol=1e-11)
-    far = model.with_contacts([Contact("hand", (0.0, 0.0, 0.2), Plane((0.0, 0.0, 1.0), 5.0))])
-    with pytest.raises(NumericalError, match=r"state 0 .*nearer"):
-        onto_contacts(far, q, v)
 
 
 def implicit_step(friction, joints: int, states: int):
@@ -215,15 +189,3 @@ def test_steps_have_their_order_on_the_manifold():
         ends = [moved(robot, name, dt, seconds, 0.5).q[-1] for dt in (coarse, coarse / 2)]
         errors = [float(robot.difference(reference.q[-1], end).norm()) for end in ends]
         assert errors[1] < errors[0] / 2 ** (order - 0.4), name
-
-
-def test_a_motion_that_is_lost_has_no_distance_from_its_contacts_and_no_error():
-    data = simulate_quadruped(QuadrupedConfig(seconds=0.1))
-    q, v = (torch.tensor(x[:3]) for x in (data.q, data.v))
-    lost = q.clone()
-    lost[1] = torch.nan
-    (c, rate), (known, known_rate) = (violation(data.model, each, v) for each in (lost, q))
-    assert torch.isnan(c[1]).all()
-    assert torch.isnan(rate[1]).all()
-    torch.testing.assert_close(c[[0, 2]], known[[0, 2]], rtol=0.0, atol=0.0)
-    torch.testing.assert_close(rate[[0, 2]], known_rate[[0, 2]], rtol=0.0, atol=0.0)

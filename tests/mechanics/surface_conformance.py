@@ -11,7 +11,7 @@ import torch
 
 from forcegp.errors import ContactError
 from forcegp.mechanics import Surface
-from forcegp.mechanics.surfaces import SURFACES, object_from_dict, surface_to_dict
+from forcegp.mechanics.surfaces import surface_from_dict, surface_to_dict
 
 BATCHES = [(), (1,), (0,), (4,), (2, 3), (3, 0, 2)]
 
@@ -73,7 +73,7 @@ class SurfaceConformance:
     def test_it_survives_a_file_exactly_or_says_that_it_cannot(self):
         if self.storable:
             stored = json.loads(json.dumps(surface_to_dict(self.surface)))
-            again = object_from_dict("surface", SURFACES, stored)
+            again = surface_from_dict(stored)
             assert again == self.surface
             assert type(again) is type(self.surface)
             assert surface_to_dict(again) == surface_to_dict(self.surface)

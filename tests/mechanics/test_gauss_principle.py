@@ -19,7 +19,6 @@ from tests.mechanics.systems import (
 from tests.robots.robot_models import FRAMES, MODELS
 
 from forcegp.errors import NumericalError
-from forcegp.evidence import standard_parameters
 from forcegp.mechanics import Baumgarte, Contact, Sphere
 from forcegp.model import Model
 
@@ -87,15 +86,10 @@ class TestAgainstDenseEquations:
 # ---------------------------------------------------------------- derivatives
 
 
-def bodies_of(built: Model) -> torch.Tensor:
-    """Standard parameters (bodies, 10) of the robot."""
-    return standard_parameters(built.robot).reshape(-1, 10)
-
-
 @pytest.mark.parametrize("kind", ALL)
 @pytest.mark.parametrize("model", ["tree", "chain"])
 def test_derivatives(model, kind):
-    """With respect to q, v, u and the parameters of all bodies, also where contacts are redundant.
+    """With respect to q, v and u, also where contacts are redundant.
 
     Rotor inertia makes the light wrists heavier, so that finite differences keep their digits.
     """
@@ -103,12 +97,12 @@ def test_derivatives(model, kind):
     built = built.with_robot(built.robot.with_armature([0.5] * built.robot.nv))
     Q_U = normal(built.robot.nv)
 
-    def function(q, v, u, bodies):
-        dynamics = built.dynamics(q, v, u, bodies)
+    def function(q, v, u):
+        dynamics = built.dynamics(q, v, u)
         parts = dynamics.acceleration(Q_U), dynamics.multiplier(Q_U), dynamics.constrained_offset, dynamics.H.sum(-1)
         return torch.cat([part.flatten() for part in parts])
 
-    assert_derivatives(function, *(x[0] for x in regular_states(built, 1)), bodies_of(built))
+    assert_derivatives(function, *(x[0] for x in regular_states(built, 1)))
 
 
 # ---------------------------------------------------------------- what it refuses

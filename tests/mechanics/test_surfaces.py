@@ -7,7 +7,7 @@ from tests.mechanics.systems import normal
 
 from forcegp.errors import ContactError, FileFormatError, InvalidInput
 from forcegp.mechanics import ImplicitSurface, Plane, Sphere, Surface, surface_axes
-from forcegp.mechanics.surfaces import SURFACES, TURNED_OVER, object_from_dict
+from forcegp.mechanics.surfaces import TURNED_OVER, surface_from_dict
 
 
 class TestPlane(SurfaceConformance):
@@ -115,7 +115,7 @@ def test_a_function_must_return_a_scalar_tensor(function, batch, what):
 )
 def test_damaged_surfaces_are_refused(stored):
     with pytest.raises(FileFormatError, match="surface"):
-        object_from_dict("surface", SURFACES, stored)
+        surface_from_dict(stored)
 
 
 STEP = 1e-6

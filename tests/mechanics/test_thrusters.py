@@ -55,20 +55,17 @@ def test_accelerations_are_those_of_external_forces_in_pinocchio(robot, power):
 
 def test_an_observed_wrench_acts_along_the_axes_of_the_world(robot):
     model = Model(robot, (), (Actuation(), RigidBodies(), ObservedWrench("pod")))
-    assert (model.inputs, model.held_inputs) == (("tilt", "wind_x", "wind_y", "wind_z"), (1, 2, 3))
+    assert model.inputs[:3] == ("tilt", "observed_force_x", "observed_force_y")
+    assert model.held_inputs == (1, 2, 3, 4, 5, 6)
     q, v, u = states(robot)
-    u = torch.cat([u[:, :1], torch.ones(5, 3, dtype=torch.float64) * torch.tensor([1.0, -2.0, 0.5])], -1)
+    u = torch.cat([u[:, :1], torch.ones(5, 6).double() * torch.tensor([1.0, -2.0, 0.5, 0.3, 0.1, -0.7])], -1)
     calm = Model(robot).dynamics(q, v, u[:, :1])
-    push = calm.state.kinematics.frame_jacobian("pod")[:, :3].mT @ u[0, 1:]
-    blown = model.dynamics(q, v, u)
-    torch.testing.assert_close(blown.Q_K - calm.Q_K, push)
-    six = Model(robot, (), (Actuation(), RigidBodies(), ObservedWrench("pod", tuple("abcdef"))))
-    turned = six.dynamics(q, v, torch.cat([u, u[:, 1:]], -1)).Q_K - blown.Q_K
-    torch.testing.assert_close(turned, calm.state.kinematics.frame_jacobian("pod")[:, 3:].mT @ u[0, 1:])
+    push = calm.state.kinematics.frame_jacobian("pod").mT @ u[0, 1:]
+    torch.testing.assert_close(model.dynamics(q, v, u).Q_K - calm.Q_K, push)
 
 
 def test_motions_keep_the_wrench_of_their_start(robot):
-    model = Model(robot, (), (Actuation(), RigidBodies(), ObservedWind(), ObservedWrench("pod", tuple("abcdef"))))
+    model = Model(robot, (), (Actuation(), RigidBodies(), ObservedWind(), ObservedWrench("pod")))
     assert model.held_inputs == tuple(range(1, 10))
     u = torch.randn(3, 5, 10, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     found = model.foreseen(u)
@@ -86,7 +83,7 @@ def test_motions_keep_the_wrench_of_their_start(robot):
         (lambda: Thrusters("pod", PLACES, power=3), "1 for thrusts or 2"),
         (lambda: Thrusters("pod", PLACES, names=("a", "a")), "2 different ones"),
         (lambda: Thrusters("pod", PLACES, names=("tilt", "b")), "its own name"),
-        (lambda: ObservedWrench("pod", ("a", "b")), "3 or 6 different ones"),
+        (lambda: ObservedWrench("pod", ("a", "b")), "6 different ones"),
     ],
 )
 def test_what_does_not_fit_is_refused(robot, make, words):

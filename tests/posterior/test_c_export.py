@@ -74,7 +74,7 @@ def test_one_joint_with_any_name_compiles_without_a_warning(tmp_path):
         options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
         model = fit(model.with_forces(JointForces()), data, **options)
     made = export_c(model, tmp_path / "one", covariance=True, jacobian=True, steps=DT, integrator="implicit-midpoint")
-    function = compiled(tmp_path / "one", f"{made.name}.c", f"{made.name}_external.c").gr_e_1_mean_covariance
+    function = compiled(tmp_path / "one", f"{made.name}.c").gr_e_1_mean_covariance
     _, (a, spread) = call(function, [1, 1], q[0], v[0], u[0])
     np.testing.assert_allclose(a, model.predict(q, v, u).mean[0], rtol=1e-10)
     assert 0.0 < spread[0] < 1e3
@@ -90,7 +90,7 @@ def complete(posterior, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def library(complete) -> ctypes.CDLL:
-    return compiled(complete, "arm.c", "arm_external.c", optimized=1)  # some warnings need it
+    return compiled(complete, "arm.c", optimized=1)  # some warnings need it
 
 
 @pytest.fixture(scope="module")
@@ -244,12 +244,11 @@ def test_the_self_test_the_example_and_the_commands_of_the_readme_work(complete,
     folder = tmp_path / "copy"
     shutil.copytree(complete, folder)
     commands = [line.partition("#")[0] for line in (folder / "README.txt").read_text().splitlines() if "cc " in line]
-    assert len(commands) == 3
+    assert len(commands) == 2
     for command in commands:
         quick = command.replace("-O2", "-O0")
         done = subprocess.run(quick, shell=True, cwd=folder, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
-    assert (folder / "libarm_external.so").exists()
     for program in ("example.c", "self_test.c"):
         subprocess.run(["cc", *STRICT, program, "arm.c", "-o", "x", "-lm"], cwd=folder, check=True)
     text = (folder / "arm.c").read_text()

@@ -9,7 +9,6 @@ from tests.posterior.arm import URDF, Weight, arm_data, arm_model, on_the_plane
 
 from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, UnknownName
-from forcegp.evidence import Accelerations
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction, UnknownForces
 from forcegp.inference import OptimizerOptions
@@ -142,19 +141,6 @@ def test_components_of_any_batch_and_their_names(posterior, states):
     assert flat["joint-friction"].latent_names == ("pan", "lift", "bend")
     with pytest.raises(InvalidInput, match="last dimension must be 3"):
         posterior.components([1.0], [1.0], [1.0])
-
-
-def test_quantities_by_what_they_are_of(posterior, states):
-    """Each is affine in the same forces: accelerations, the force at a contact, one unknown force by itself."""
-    whole, parts = posterior.predict(*states), posterior.components(*states)
-    contact, force = posterior.model.contacts[0], posterior.model.unknown_forces[0]
-    a, at_contact, alone = posterior.predict(*states, of=[Accelerations(), contact, force])
-    torch.testing.assert_close(a.mean, whole.mean)
-    torch.testing.assert_close(at_contact.mean, whole.contact_force.mean[..., :3])
-    torch.testing.assert_close(at_contact.covariance, whole.contact_force.covariance[..., :3, :3])
-    torch.testing.assert_close(alone.mean, next(iter(parts.values())).joint_force.mean)
-    with pytest.raises(InvalidInput, match=r"of holds 'lambda'; give Accelerations\(\)"):
-        posterior.predict(*states, of=["lambda"])
 
 
 def test_a_curve_is_that_of_dense_conditioning(posterior, dense, train):

@@ -10,6 +10,9 @@ from forcegp.fit import fit
 from forcegp.forces import JointForces
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Baumgarte
+from forcegp.posterior.rollout import Rollout
+from forcegp.simulation import QuadrupedConfig
+from forcegp.simulation.moving_bases import simulate_quadruped
 
 DT, STEPS = 1 / 240, 12
 QUICK = {"restarts": 1, "options": OptimizerOptions(iterations=15)}
@@ -64,6 +67,17 @@ def test_the_constraint_is_that_of_the_contacts(posterior, start):
     contact, robot = posterior.model.contacts[0], posterior.model.robot
     loose = posterior.rollout(q + 1e-3, v, u, DT, integrator="rk4")
     torch.testing.assert_close(loose.constraint[..., 0], contact.distance(robot.kinematics(loose.q)))
+
+
+def test_a_motion_that_is_lost_has_no_distance_from_its_contacts_and_no_error():
+    data = simulate_quadruped(QuadrupedConfig(seconds=0.1))
+    q, v = (torch.tensor(x[:3]) for x in (data.q, data.v))
+    lost = q.clone()
+    lost[1] = torch.nan
+    c, known = (Rollout(v[:, 0], each, v, v, v[0, :0], "rk4", data.model).constraint for each in (lost, q))
+    assert torch.isnan(c[1]).all()
+    assert known.shape == (3, 12)
+    torch.testing.assert_close(c[[0, 2]], known[[0, 2]], rtol=0.0, atol=0.0)
 
 
 def test_samples_are_functions_that_obey_the_constraint(posterior, start):

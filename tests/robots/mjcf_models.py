@@ -53,16 +53,16 @@ CHAIN = """<mujoco model="chain"><worldbody><body name="post"><geom size=".1"/>
  </body></body></body></worldbody></mujoco>"""
 
 BAR = '<inertial pos="{0} 0 {1}" mass="{2}" fullinertia=".01 .02 .013 .001 .002 -.001"/>'
-FOUR_BAR = f"""<mujoco model="four-bar"><worldbody>
+OPEN_BARS = f"""<mujoco model="four-bar"><worldbody>
 <body name="crank"><joint name="crank" axis="0 1 0"/>{BAR.format(0, 0.1, 1)}
  <body name="coupler" pos="0 0 .2"><joint name="coupler" axis="0 1 0"/>{BAR.format(0.2, 0, 1.5)}</body></body>
-<body name="rocker" pos=".4 0 0"><joint name="rocker" axis="0 1 0"/>{BAR.format(0.05, 0.1, 0.8)}</body></worldbody>
-<equality><connect name="pin" body1="coupler" body2="rocker" anchor=".4 0 .05"/></equality></mujoco>"""
+<body name="rocker" pos=".4 0 0"><joint name="rocker" axis="0 1 0"/>{BAR.format(0.05, 0.1, 0.8)}</body>
+</worldbody></mujoco>"""
 ALL = {
     "arm": ARM,
     "gripper": GRIPPER,
     "quadruped": QUADRUPED,
     "quadrotor": QUADROTOR,
     "chain": CHAIN,
-    "four-bar": FOUR_BAR,
+    "bars": OPEN_BARS,
 }

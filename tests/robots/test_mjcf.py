@@ -8,11 +8,12 @@ import mujoco as untyped
 import numpy as np
 import pytest
 import torch
-from tests.robots.mjcf_models import ALL, ARM, CHAIN, FOUR_BAR, GRIPPER, QUADRUPED
+from tests.robots.mjcf_models import ALL, ARM, CHAIN, GRIPPER, OPEN_BARS, QUADRUPED
 from tests.robots.mujoco_oracle import MujocoOracle, compiled, states
+from tests.robots.random_positions import random_positions
 from tests.robots.test_moving_bases import LIMBS
 
-from forcegp import Robot
+from forcegp import Model, Robot
 from forcegp.errors import (
     RobotFileWarning,
     RobotModelError,
@@ -72,10 +73,6 @@ def test_stored_robots_and_urdf_files_are_the_same_robot(name, tmp_path):
 
 
 def test_limits_names_and_losses():
-    with pytest.warns(RobotFileWarning) as caught:
-        chain = Robot.from_mjcf_text(FOUR_BAR)
-    assert "left out: closed loops (Model.from_mjcf has them) (pin)" in str(caught[0].message)
-    assert chain.joint_names == ("crank", "coupler", "rocker")
     arm = Robot.from_mjcf_text(ARM)
     assert arm.joint_names == ("shoulder", "roll", "elbow", "body_4_slide")
     assert [joint.effort_limit for joint in arm.joints] == [50.0, 8.0, 20.0, np.inf]
@@ -117,6 +114,30 @@ def test_what_acts_in_mujoco_alone_is_named(what):
     with pytest.warns(RobotFileWarning) as caught:
         Robot.from_mjcf_text(text)
     assert f"left out: {what}" in str(caught[0].message)
+
+
+@pytest.mark.parametrize("tag", ["connect", "weld"])
+@pytest.mark.parametrize("ends", ["body", "site"])
+def test_closed_loops_are_refused_until_their_joints_are_locked(tag, ends):
+    """As a tree such a mechanism would have motions that it has not."""
+    anchor = ' anchor=".4 0 .05"' if (tag, ends) == ("connect", "body") else ""
+    equality = f'<equality><{tag} name="pin" {ends}1="coupler" {ends}2="rocker"{anchor}{{}}/></equality></mujoco>'
+    bars = OPEN_BARS
+    for name in ("coupler", "rocker") if ends == "site" else ():
+        bars = bars.replace(f'<joint name="{name}"', f'<site name="{name}"/><joint name="{name}"')
+    text = bars.replace("</mujoco>", equality)
+    with pytest.raises(RobotModelError, match="pin closes a loop, from link 'coupler' to 'rocker'") as caught:
+        Robot.from_mjcf_text(text.format(""), locked={"rocker": 0.0})
+    assert "Lock the joints between these links (crank, coupler)" in str(caught.value)
+    beside = text.format("").replace("</worldbody>", f'<body name="free"><joint name="free"/>{BALL}</body></worldbody>')
+    still = Robot.from_mjcf_text(beside, locked={"rocker": 0.0, "crank": 0.0, "coupler": 0.0})
+    assert still.joint_names == ("free",)
+    assert Robot.from_mjcf_text(text.format(' active="false"')).nv == 3
+    if ends == "body":
+        held = text.format("").replace(f'{ends}2="rocker"', f'{ends}2="hand"')
+        held = held.replace("<worldbody>", '<worldbody><body name="hand" mocap="true"/>')
+        with pytest.warns(RobotFileWarning, match="left out: motions from outside"):
+            assert Robot.from_mjcf_text(held).nv == 3
 
 
 def test_a_joint_that_an_equality_holds_is_locked():
@@ -227,3 +248,35 @@ def test_rods_and_points_and_last_links_without_mass(tmp_path):
     with pytest.raises(RobotModelError, match="give it a mass"):
         Robot.from_urdf_text(bare, armature={"j": 1.0}).to_mjcf(tmp_path / "none.xml")
     assert not (tmp_path / "none.xml").exists()
+
+
+@pytest.mark.parametrize("gear", ["0 0 1 0 0 .02", "1 2 -3 .4 .5 .6", "0 0 0 .1 .2 -.3", "0 0 0 0 0 0"])
+@pytest.mark.parametrize("base", ["", '<freejoint name="root"/>'])
+def test_rotors_on_links_that_move_are_inputs(tmp_path, base, gear):
+    """MuJoCo's joint forces: a tilting pod with a rotor under a frame of its own, and one on the body."""
+    pod = '<body name="pod" pos=".2 0 .1" euler="10 0 20"><joint name="tilt" axis="0 1 0" pos="0 .01 .02"/>'
+    pod += '<geom size=".05" mass=".3"/><body pos=".05 .02 .1" euler="30 -20 5"><site name="r2" pos="0 .1 .02"/></body>'
+    right = '<motor name="right" site="r1" gear="0 0 1 0 0 .1"/>' if base else ""
+    text = (
+        f'<mujoco><worldbody><body name="frame">{base}<geom size=".1 .2 .1" type="box"/><site name="r1" pos=".1 .1 0"/>'
+        f'{pod}</body></body></worldbody><actuator><motor name="left" site="r2" gear="{gear}"/>'
+        f'<motor name="turn" joint="tilt" gear="3"/>{right}</actuator></mujoco>'
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (tmp_path / "rotors.xml").write_text(text)
+        model, plain = Model.from_mjcf(tmp_path / "rotors.xml"), mujoco.MjModel.from_xml_string(text)
+    names = ("turn", *(("right",) if base else ()), "left")
+    assert model.inputs == names
+    oracle, generator = MujocoOracle(plain), torch.Generator().manual_seed(0)
+    q = random_positions(model.robot, generator, 3)
+    v, u = (torch.randn(3, n, dtype=torch.float64, generator=generator) for n in (model.robot.nv, len(names)))
+    delivered = model.state(q, v, u).delivered
+    for k in range(3):
+        oracle.data.ctrl[[plain.actuator(name).id for name in names]] = u[k].numpy()
+        oracle.at(q[k].numpy(), v[k].numpy())
+        np.testing.assert_allclose(delivered[k], oracle.T.T @ oracle.data.qfrc_actuator, atol=1e-9)
+    assert Model.from_json(model.to_json()).inputs == names
+    if base:
+        held = Model.from_mjcf(tmp_path / "rotors.xml", locked={"tilt": 0.3})
+        assert held.inputs == ("right", "left")

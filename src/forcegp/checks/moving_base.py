@@ -121,7 +121,7 @@ def carried_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     weight = float(torch.linalg.vector_norm(robot.gravity)) * robot.mass
     if not groups or not weight:
         return
-    complete, feet = dataset.u.shape[1] == len(model.inputs), {contact.switch for contact in model.touching}
+    complete, feet = dataset.u.shape[1] == len(model.inputs), {contact.switch for contact in model.contacts}
     if None in feet or (feet and not complete):
         return
     flags = dataset.u[:, [column for column, name in enumerate(model.inputs) if name in feet]] > 0.5

@@ -36,9 +36,9 @@ class AlarmOptions:
 class Export(Command):
     """Write a fitted model as a program that needs no Python.
 
-    c: C99 with the weights inside and <math.h> only, a header, an example, a self-test, a CMakeLists.txt, and a form
-    for CasADi's external functions. It computes accelerations, the torques for a wanted motion,
-    every force by itself, and what friction remembers. It is compiled and compared with the model before it is there.
+    c: C99 with the weights inside and <math.h> only, headers for C and C++17, an example, a self-test, a
+    CMakeLists.txt. It computes accelerations, the torques for a wanted motion, every force by itself, and what friction
+    remembers. It is compiled and compared with the model before it is there.
     casadi: CasADi functions with all derivatives, for casadi.Function.load (pip install 'forcegp[casadi]').
 
     For example:

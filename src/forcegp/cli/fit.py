@@ -160,7 +160,7 @@ class Fit(Command):
         """The dataset's own model, with the robot and contacts that the options give."""
         contacts = parse_contacts(self.contact)
         model = self.robot.chosen_model(dataset, self.log)
-        return model.with_contacts((*contacts, *model.loops)) if self.contact else model
+        return model.with_contacts(contacts) if self.contact else model
 
     def _check(self, terminal: Terminal, dataset: forcegp.Dataset, model: forcegp.Model) -> None:
         """One line on what would spoil the model; contacts are not warned of again by the fit."""

@@ -25,29 +25,14 @@ Seconds = Annotated[float | None, unless_given("S", "all", float)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CutoffOptions:
-    """How a log is filtered."""
+class FilterOptions:
+    """How rows to learn from are made of a raw log."""
 
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "none"
     """Low-pass filter q and u without delay, and recompute v and a. auto: chosen by the spectrum and held-out
     torques."""
     differentiate: Literal["q", "v"] = "q"
     """q: v and a from filtered positions. v: a from filtered velocities."""
-
-    def preparation(self) -> forcegp.data.Preparation:
-        """The preparation that the options describe. Raises InvalidInput, naming the option, for what is no number."""
-        if self.cutoff in ("none", "auto"):
-            cutoff = None if self.cutoff == "none" else "auto"
-        else:
-            complaint = f"--cutoff is {self.cutoff!r}; give a frequency in Hz, auto or none."
-            [cutoff] = numbers_of(self.cutoff, complaint, one=True)
-        return forcegp.data.Preparation(cutoff=cutoff, differentiate=self.differentiate)
-
-
-@dataclass(frozen=True, kw_only=True)
-class FilterOptions(CutoffOptions):
-    """How rows to learn from are made of a raw log."""
-
     delay: Annotated[str, arg(metavar="S|auto")] = "0"
     """Delay of u in the log, in s. auto: estimated for all joints together where u are the torques of all joints and
     nothing is touched, else 0."""
@@ -59,12 +44,15 @@ class FilterOptions(CutoffOptions):
     """Drop S seconds at both ends of each episode, after the filter."""
 
     def preparation(self) -> forcegp.data.Preparation:
-        """As above."""
-        delay: float | Literal["auto"] = "auto"
-        if self.delay != "auto":
+        """The preparation that the options describe. Raises InvalidInput, naming the option, for what is no number."""
+        cutoff, delay = None if self.cutoff == "none" else self.cutoff, self.delay
+        if cutoff not in (None, "auto"):
+            complaint = f"--cutoff is {self.cutoff!r}; give a frequency in Hz, auto or none."
+            [cutoff] = numbers_of(self.cutoff, complaint, one=True)
+        if delay != "auto":
             [delay] = numbers_of(self.delay, f"--delay is {self.delay!r}; give seconds, or auto.", one=True)
-        every = 1 if self.every is None else self.every
-        return replace(super().preparation(), delay=delay, lag=self.lag, every=every, trim=self.trim)
+        how: dict[str, Any] = {"cutoff": cutoff, "delay": delay, "every": 1 if self.every is None else self.every}
+        return forcegp.data.Preparation(differentiate=self.differentiate, lag=self.lag, trim=self.trim, **how)
 
 
 def prepared_rows(
@@ -176,7 +164,7 @@ class ColumnOptions:
             return model
         if robot.identified is not None:
             raise InvalidInput("--identified brings its contacts along; leave --feet out.")
-        return model.with_contacts((*touching, *model.loops))
+        return model.with_contacts(touching)
 
     def mapped(self, logs: Sequence[Path], terminal: Terminal) -> forcegp.recordings.ColumnMapping:
         """What the flags state, and for those that are not given the file. Raises InvalidInput, FileFormatError."""
@@ -363,15 +351,13 @@ class Check(Command):
     strict: bool = False
     """Exit with code 2 if anything is wrong."""
     robot: RobotOptions = RobotOptions()
-    filter: CutoffOptions = CutoffOptions(cutoff="auto")
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Check, and show. Raises DatasetError with `strict` where something is wrong."""
-        preparation = self.filter.preparation()
         dataset = forcegp.Dataset.load(self.log)
         model = self.robot.chosen_model(dataset, self.log)
         with terminal.progress("checking"):
-            report = forcegp.check(dataset, model, preparation=preparation)
+            report = forcegp.check(dataset, model)
         content = {"data": str(self.log), **report.to_dict()}
         terminal.show(*_shown(terminal, self.log, report))
         wrong = report.doubts.at("wrong")

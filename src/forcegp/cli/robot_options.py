@@ -59,7 +59,7 @@ class RobotOptions(RobotFileOptions):
     robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "the dataset's or the model's", Path)] = None
     """Use this robot (URDF or MJCF)."""
     identified: Annotated[Path | None, IDENTIFIED, unless_given("FOLDER", "none", Path)] = None
-    """Begin with the robot and the known forces that `forcegp fit` estimated, instead of --robot."""
+    """In place of --robot: begin with the robot and the known forces that `forcegp fit` estimated."""
 
     def chosen(self, recorded: forcegp.Model | None = None) -> forcegp.Model | None:
         """What the options ask for, else `recorded`, whose contacts and forces stay, and what no URDF holds."""
@@ -95,7 +95,7 @@ class RobotOptions(RobotFileOptions):
             model = model.with_forces(
                 *(law for law in own.laws if not any(law.takes_the_place_of(each) for each in there))
             )
-        return model.with_contacts((*model.touching, *own.loops)) if own.loops else model
+        return model
 
     def chosen_model(self, dataset: forcegp.Dataset, path: Path) -> forcegp.Model:
         """The dataset's own system, with what is replaced. Raises InvalidInput where joints differ."""

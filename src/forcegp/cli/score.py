@@ -65,7 +65,7 @@ class Score(Command):
     observe: Annotated[float, arg(metavar="S")] = 0.0
     """Seconds at the beginning of LOG that a RUN learns from, as a robot at work could; the rest is scored."""
     out: Annotated[Path | None, unless_given("FOLDER", "no folder")] = None
-    """The folder of results: page, figures, numbers, models; of one RUN also report.html with the robot in motion. An
+    """The folder of results: page, numbers, models; of one RUN also report.html with the robot in motion. An
     unfinished run resumes."""
     models: CandidateOptions = CandidateOptions()
     search: SearchOptions = SearchOptions(points=100)
@@ -189,9 +189,9 @@ class Score(Command):
 
 
 def comparison(scores: forcegp.scores.Scores, title: str) -> list[Any]:
-    """Models side by side, which to take by every criterion, and what failed."""
+    """Models side by side, which to take, and what failed."""
     header, rows = forcegp.scores.overall(scores)
     brief = [[cell.partition(" (")[0] for cell in row] for row in rows]
-    taken = [columns("", *forcegp.scores.winner_table(scores), long_names=True)] if scores.winners else []
+    taken = [f"take {scores.winner.model}: {scores.winner.sentence}"] if scores.winner is not None else []
     return [columns(title, [name.replace(" [", "\n[") for name in header], brief, long_names=True),
             *scores.about.get("notes", ()), *scores.failures, *taken]  # fmt: skip

@@ -62,13 +62,10 @@ class Robot(Command):
             terminal.warn(text)
         content = _content(robot) | {"file": str(self.robot), "repaired": repaired}
         content["inputs"] = list(model.inputs)
-        content["loops"] = list(dict.fromkeys((loop.frame, loop.second_frame) for loop in model.loops))
         terminal.show(*_shown(robot, content))
         writers = {".xml": model.to_mjcf, ".mjcf": model.to_mjcf, ".urdf": robot.to_urdf}
         if self.out is not None:
             writers[self.out.suffix](self.out)
-            if model.loops and self.out.suffix == ".urdf":
-                terminal.warn("URDF has no closed loops: the file holds the open chain.")
             content["written"] = str(self.out)
             terminal.note(f"wrote {self.out}")
         return content
@@ -120,9 +117,8 @@ def _shown(robot: forcegp.Robot, content: Mapping[str, Any]) -> list[Any]:
     header |= {name: name for name in ("damping", "friction", "armature")}
     rows = [[each["name"], *(shown(each[key]) for key in header.values())] for each in content["joints"]]
     title = f"{robot.name}: {robot.nv} joints, {content['moving_mass']:.4g} kg that move; in rad or m, s, Nm or N"
-    loops = [f"closed loop: {first} and {second} are held together" for first, second in content["loops"]]
     inputs = [f"u: {', '.join(content['inputs']) or 'none'}"] if tuple(content["inputs"]) != robot.joint_names else []
-    return [tree, *loops, *inputs, columns(title, ["joint", *header], rows, long_names=True)]
+    return [tree, *inputs, columns(title, ["joint", *header], rows, long_names=True)]
 
 
 @dataclass(frozen=True, kw_only=True)

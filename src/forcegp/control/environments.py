@@ -29,8 +29,7 @@ class RobotVectorEnv(VectorEnv):
     episode that ended, or whose motion diverges (`terminated`, `info["diverged"]`), begins anew with the next step. It
     ends as well where a joint leaves the limits of position or velocity that the robot's file states.
 
-    * model: a predictor, a posterior, or the folder of one. draw: 0 moves under the mean, k draws k functions from the
-      posterior, of which every episode takes one: domain randomisation.
+    * model: a predictor, a posterior, or the folder of one.
     * reward(q, v, u, q_next, v_next) -> (n,), terminated(q, v) -> (n,), start(generator, n) -> q, v take and return
       arrays of n rows; without them 0, never, and at rest at q = 0. `steps` truncates an episode. torque_limits have to
       be finite. integrator: None takes `usual_integrator`; the attribute says which it is.
@@ -43,7 +42,6 @@ class RobotVectorEnv(VectorEnv):
         num_envs: int = 1,
         *,
         model: Any,
-        draw: int = 0,
         dt: float = 0.02,
         steps: int | None = None,
         torque_limits: Any = None,
@@ -57,9 +55,7 @@ class RobotVectorEnv(VectorEnv):
         if not isinstance(model, Predictor):
             model = require_type("model", model, Posterior).predictor(covariance="none")
         self.predictor = model
-        self.num_envs, self.draw = whole_number("num_envs", num_envs, 1), whole_number("draw", draw, 0)
-        if draw and not len(model.latent.features):
-            raise InvalidInput(f"draw={draw} functions are asked for, and this model has none; give draw=0.")
+        self.num_envs = whole_number("num_envs", num_envs, 1)
         self.steps = None if steps is None else whole_number("steps", steps, 1)
         check_time_step(dt)
         self.dt, self.reward, self.terminated, self.start = dt, reward, terminated, start
@@ -82,12 +78,12 @@ class RobotVectorEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
         self.q = self.v = np.zeros((num_envs, robot.nv))
-        self.function, self.age = np.zeros(num_envs, int), np.zeros(num_envs, int)
+        self.age = np.zeros(num_envs, int)
         self._ended = np.ones(num_envs, bool)
 
     @override
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
-        """First observations (num_envs, 2 nv); a seed decides the functions and what `start` draws."""
+        """First observations (num_envs, 2 nv); a seed decides what `start` draws."""
         super().reset(seed=seed)
         self._begin(np.ones(self.num_envs, bool))
         return self._observed(), {}
@@ -97,7 +93,8 @@ class RobotVectorEnv(VectorEnv):
         """One step of `dt`; robots whose episode had ended begin a new one instead, with reward 0."""
         u = np.clip(np.asarray(actions, float).reshape(self.q.shape), -self._limits, self._limits)
         anew, q, v = self._ended, self.q, self.v
-        q_next, v_next = self._moved(u)
+        motion = self.predictor.rollouts(q, v, u[:, None], self.dt, **self._how)
+        q_next, v_next = motion.q[:, 1].numpy(), motion.v[:, 1].numpy()
         lasted = anew | np.isfinite(q_next + v_next).all(axis=1)
         self.q, self.v = q_next, v_next
         if anew.any() or not lasted.all():
@@ -129,9 +126,6 @@ class RobotVectorEnv(VectorEnv):
                 )
         self.q, self.v, self.age = self.q.copy(), self.v.copy(), np.where(which, 0, self.age)
         self.q[which], self.v[which], self._ended = q, v, np.zeros(self.num_envs, bool)
-        if self.draw:
-            self.function = self.function.copy()
-            self.function[which] = self.np_random.integers(self.draw, size=count)
 
     def _observed(self) -> np.ndarray:
         return np.concatenate([self.q, self.v], axis=1).clip(self._low, self._high)
@@ -146,21 +140,6 @@ class RobotVectorEnv(VectorEnv):
         if values.shape != (self.num_envs,) or values.dtype.kind not in kinds or not np.isfinite(values).all():
             raise InvalidInput(f"{name} returned {given!r:.80}; return {what} ({self.num_envs},), one per robot.")
         return values
-
-    def _moved(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """q, v of all robots after a step, each under its own function."""
-        if not self.draw:
-            motion = self.predictor.rollouts(self.q, self.v, u[:, None], self.dt, **self._how)
-            return motion.q[:, 1].numpy(), motion.v[:, 1].numpy()
-        order, counts = np.argsort(self.function, kind="stable"), np.bincount(self.function, minlength=self.draw)
-        first = np.cumsum(counts) - counts  # of each function's robots in that order
-        rank = np.argsort(order) - first[self.function]
-        rows = np.zeros((self.draw, counts.max()), int)  # short groups are filled up with the first robot
-        rows[self.function, rank] = np.arange(self.num_envs)
-        how = {"functions": self.draw, "divided": True, **self._how}
-        motion = self.predictor.rollouts(self.q[rows], self.v[rows], u[rows][:, :, None], self.dt, **how)
-        q, v = (x[:, :, 1].numpy()[self.function, rank] for x in (motion.q, motion.v))
-        return q, v
 
 
 class RobotEnv(gymnasium.Env):

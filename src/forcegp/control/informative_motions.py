@@ -306,8 +306,6 @@ def excitation(
     rows, motions = whole_number("rows", rows, 1), whole_number("motions", motions, 1, 100_000)
     learned = model if isinstance(model, Posterior) and model.latent_names else None
     teaches = BaseParameters(known, bounds["torque"][1]) if learned is None else LearnedForces(learned, rows)
-    if known.loops:
-        raise InvalidInput("motions are planned joint by joint, which would break the closed loops of this robot.")
     surfaces = (known if surfaces is None else known.with_contacts(surfaces)).contacts
     draft = Excitation(robot, start, bounds, seconds, teaches.torques, surfaces, clearance, Motion(*[start] * 5))
     best, least, size = draft.kept(0.0 * draft.random(rng)), np.inf, 0.3  # refuses the start

@@ -246,9 +246,9 @@ class HybridForce(TrackingController):
     def __init__(self, predictor: Predictor, **settings: Any) -> None:
         self.predictor = require_type("predictor", predictor, Predictor, " : posterior.predictor()")
         self.model = predictor.posterior.model
-        if not self.model.touching or self.model.loops:
+        if not self.model.contacts:
             raise InvalidInput(
-                "HybridForce wants a force against a contact, and this model has none, or a closed loop; name it in "
+                "HybridForce wants a force against a contact, and this model has none; name it in "
                 "posterior.with_contacts([...]), or use ComputedTorque."
             )
         require_actuated(predictor.posterior)
@@ -319,8 +319,7 @@ class MPPI(Controller):
     exp(-cost / temperature) (Williams, Aldrich, Theodorou 2017); the best one takes part in the next call (Pinneri et
     al. 2020). Call it once in `dt` seconds, after some rounds of `improved`.
 
-    * predictor: `posterior.predictor()`. functions: 0 plans with the mean of the learned forces, k with the mean cost
-      under k functions drawn from the posterior.
+    * predictor: `posterior.predictor()`, with whose mean it plans.
     * cost: costs (...) of whole motions q, v (..., T+1, nv) under u (..., T, nv), the last state included.
     * torque_limits: largest absolute torques in Nm (N), a number or one per joint; None takes the efforts of the URDF.
     * noise: largest standard deviation around the plan, None for half the limits; it falls to a twentieth from sequence
@@ -340,7 +339,6 @@ class MPPI(Controller):
         torque_limits: Any = None,
         samples: int = 128,
         noise: Any = None,
-        functions: int = 0,
         integrator: str | None = None,
         seed: int = 0,
         threads: int | None = 1,
@@ -351,7 +349,7 @@ class MPPI(Controller):
         self.predictor, self.cost, nv = predictor, cost, predictor.nv
         check_time_step(dt)
         self.dt, self.steps = float(dt), whole_number("steps", steps, 1)
-        self.samples, self.functions = whole_number("samples", samples, 2), whole_number("functions", functions, 0)
+        self.samples = whole_number("samples", samples, 2)
         self._seed = whole_number("seed", seed, 0)
         super().__init__(predictor.posterior.model.robot, torque_limits)
         self.noise = per_joint("noise", 0.5 * self.torque_limits if noise is None else noise, nv)
@@ -361,12 +359,7 @@ class MPPI(Controller):
         self._colour = torch.linalg.cholesky(CORRELATION ** (apart[:, None] - apart).abs())
         self._scales = torch.logspace(math.log10(SMALLEST_SCALE), 0.0, self.samples, dtype=torch.float64)
         self.integrator = integrator or usual_integrator(predictor, self.dt)
-        self._how: dict[str, Any] = {
-            "integrator": self.integrator,
-            "functions": functions,
-            "seed": seed,
-            "threads": threads,
-        }
+        self._how: dict[str, Any] = {"integrator": self.integrator, "threads": threads}
 
     @override
     def restart(self) -> None:
@@ -399,7 +392,6 @@ class MPPI(Controller):
                 f"motion, {tuple(motions.diverged_at.shape)}."
             )
         costs = costs.double().masked_fill((motions.diverged_at >= 0) | costs.isnan(), math.inf)
-        costs = costs.mean(0) if self.functions else costs
         best = float(costs.min())
         if not math.isfinite(best):
             raise NumericalError(

@@ -145,7 +145,7 @@ def _cutoff(dataset: Dataset, source: Literal["q", "v"]) -> tuple[float | None, 
         return None, "the log is of postures, within which nothing moves; nothing is filtered"
     spectrum, model = motion_spectrum(dataset, source), dataset.model
     fastest = decisive = spectrum.cutoff
-    for group in model.robot.layout.groups[:1] if model.touching else ():
+    for group in model.robot.layout.groups[:1] if model.contacts else ():
         if np.isfinite(fastest[group.rows]).any():
             decisive = np.minimum(fastest, BEYOND_BASE * np.nanmax(fastest[group.rows]))
     if not np.isfinite(decisive).any():

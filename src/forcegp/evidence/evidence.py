@@ -108,17 +108,15 @@ class Sensor(Evidence):
 
     def names(self, dataset: Dataset) -> list[str]:
         """Of these sensors in `Dataset.measured`."""
-        wanted = f"{self.kind}{self.frame}"
-        own = [name for name in dataset.measured if name.startswith(self.kind)]
-        return [name for name in own if not self.frame or wanted in (name, name.partition("@")[0])]
+        own = {name: name.removeprefix(self.kind) for name in dataset.measured if name.startswith(self.kind)}
+        return [name for name, place in own.items() if self.frame in ("", place, place.partition("@")[0])]
 
     def check(self, dataset: Dataset) -> None:
         """Raise InvalidInput where the log has no such sensor."""
         if not self.names(dataset):
             raise InvalidInput(
-                f"{self.name} need the sensor {self.kind}{self.frame or 'FRAME'}; the log has "
-                f"{', '.join(dataset.measured) or 'none'}: name its columns, as in `forcegp import --force "
-                "foot=fx,fy,fz,imu:hand=ax,ay,az`."
+                f"{self.name} need the sensor {self.kind}{self.frame or 'FRAME'}; the log has {[*dataset.measured]}: "
+                "name its columns, as in `forcegp import --force foot=fx,fy,fz,imu:hand=ax,ay,az`."
             )
 
 

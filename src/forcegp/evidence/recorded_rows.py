@@ -26,7 +26,7 @@ from forcegp.evidence.least_squares import NoiseLevels, orthonormal_columns, wit
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.forces import Law, RigidBodies
 from forcegp.forces.actuation import OBSERVED
-from forcegp.mechanics import ConstrainedDynamics, Contact, Held, LoopClosure, State
+from forcegp.mechanics import ConstrainedDynamics, Contact, Held, State
 from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE
 from forcegp.model import Model
 from forcegp.robots import Kinematics
@@ -363,8 +363,8 @@ def kept_laws(space: ParameterSpace, any_contact: bool = False, sensed: Iterable
 
 
 def slides(contact: Contact) -> bool:
-    """Whether friction can act along the contact: on a surface, other than at held points and loops."""
-    return not isinstance(contact, LoopClosure) and not isinstance(contact.surface, Held)
+    """Whether friction can act along the contact: on a surface, other than at held points."""
+    return not isinstance(contact.surface, Held)
 
 
 def independent_rows(

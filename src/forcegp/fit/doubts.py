@@ -67,7 +67,7 @@ def _hidden(names: Sequence[str], terms: Sequence[int], free: Tensor, effect: Te
             )
     hidden = [not nothing and flat for nothing, flat in zip(absent, (shown <= INVISIBLE * size).tolist(), strict=True)]
     blind = [name for name, flat in zip(names, hidden, strict=True) if flat]
-    remedy = "use axes='surface', which leaves out the normal direction, or leave that prior out"
+    remedy = "learn a force along the surface, such as gp:tool-friction, or leave that prior out"
     if all(nothing or flat for nothing, flat in zip(absent, hidden, strict=True)):
         raise InvalidInput(
             f"no data can identify {_few(blind)}: the contacts take the whole force, and the acceleration shows none "

@@ -168,11 +168,9 @@ def run_restarts(search: Callable[..., Outcome], restarts: int, patience: int, j
     outcomes: list[Outcome] = []
     while len(outcomes) < restarts:
         last = min(restarts, len(outcomes) + AT_ONCE) if patience else restarts
-        indices, before = range(len(outcomes), last), tuple(outcomes)
-        if jobs == 1 or (restarts == 1 and isinstance(jobs, int)):
-            outcomes += [search(index, before=before) for index in indices]
-        else:
-            outcomes += mapped(partial(search, before=before), indices, jobs)
+        one = partial(search, before=tuple(outcomes))
+        at_once = 1 if restarts == 1 and isinstance(jobs, int) else jobs
+        outcomes += mapped(one, range(len(outcomes), last), at_once)
     return outcomes
 
 

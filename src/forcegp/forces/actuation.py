@@ -188,26 +188,24 @@ class Thrusters(LinkForce):
 class ObservedWrench(LinkForce):
     """A slow force on link `frame` that an observer estimates from the past, as wind makes it; columns of u hold it.
 
-    `names`: a force [N] at the origin of the link along the world's axes; of six, a torque [Nm], too
+    `names`: a force [N] and a torque [Nm] about the origin of the link, along the world's axes
     (`forcegp.posterior.observing`).
     """
 
     frame: str
-    names: tuple[str, ...] = ("wind_x", "wind_y", "wind_z")
+    names: tuple[str, ...] = tuple(f"observed_{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
 
     @override
     def bound_to(self, robot: Robot) -> "ObservedWrench":
         robot.frame(self.frame)
-        if len(self.names) not in (3, 6) or len(set(self.names)) < len(self.names):
-            raise InvalidInput(f"ObservedWrench names are {self.names}; give 3 or 6 different ones.")
+        if len(self.names) != 6 or len(set(self.names)) < 6:
+            raise InvalidInput(f"ObservedWrench names are {self.names}; give 6 different ones.")
         return ObservedWrench(self.frame, tuple(self.names))
 
     @override
     def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
         u, axes = features
-        world = u.unflatten(-1, (-1, 3))
-        own = (axes.mT[..., None, :, :] @ world[..., None]).flatten(-3)
-        return torch.cat([own, torch.zeros_like(own)], dim=-1) if len(self.names) == 3 else own
+        return (axes.mT[..., None, :, :] @ u.unflatten(-1, (2, 3))[..., None]).flatten(-3)
 
 
 @dataclass(frozen=True, eq=False)

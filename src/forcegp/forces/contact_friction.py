@@ -18,7 +18,6 @@ from forcegp.forces.link_forces import (
     SMALLEST_SPEED,
     ToolPoint,
     contact_axes,
-    finite_numbers,
     is_contact_number,
     nominal_normal_force,
     require_contact,
@@ -26,6 +25,7 @@ from forcegp.forces.link_forces import (
 from forcegp.forces.unknown import ExpressedKernels, Scaling, Unknown, UnknownForces
 from forcegp.mechanics import ConstrainedDynamics, Contact
 from forcegp.robots import Robot
+from forcegp.robots.arguments import finite_vector, is_sequence
 
 SMALLEST_SHARE = 0.1
 """Smallest 1 + mu g: where it nears 0, friction and normal force lift each other without end (jamming)."""
@@ -45,10 +45,10 @@ class TabulatedCurve:
 
     def __post_init__(self) -> None:
         for name in ("at", "values"):
-            values = finite_numbers(getattr(self, name))
-            if values is None:
-                raise InvalidInput(f"a tabulated curve has {name} {getattr(self, name)!r}; give finite numbers")
-            object.__setattr__(self, name, values)
+            given = getattr(self, name)
+            values = tuple(given) if is_sequence(given) else ()
+            found = finite_vector(f"{name} of a tabulated curve", values, len(values))
+            object.__setattr__(self, name, tuple(found.tolist()))
         if len(self.at) < 2 or len(self.at) != len(self.values) or any(b <= a for a, b in pairwise(self.at)):
             raise InvalidInput(
                 f"a tabulated curve has {len(self.at)} places and {len(self.values)} values; give two or more of each, "
@@ -171,9 +171,8 @@ class ContactFriction(ExpressedKernels):
     def check(self, robot: Robot, contacts: Sequence[Contact]) -> None:
         if contacts:  # without any, the robot is in the air and this force is zero
             require_contact("ContactFriction", self.contact, contacts)
-        expected = ExpectedFriction.of(self.expected)
-        if expected is not None:
-            joint_indices([name for name, _ in expected.joints], robot)
+        if isinstance(self.expected, ExpectedFriction):
+            joint_indices([name for name, _ in self.expected.joints], robot)
 
     @override
     def latent_names(self, robot: Robot) -> tuple[str, ...]:
@@ -195,11 +194,10 @@ class ContactFriction(ExpressedKernels):
         direction = tangents @ (sliding / speed)[..., None]
         if not self.load:
             return -direction
-        expected = ExpectedFriction.of(self.expected)
-        if expected is None:
-            normal_force = nominal_normal_force(dynamics, self.contact)
+        if isinstance(self.expected, ExpectedFriction):
+            normal_force = self.expected.normal_force(dynamics, self.contact, direction[..., 0], speed[..., 0])
         else:
-            normal_force = expected.normal_force(dynamics, self.contact, direction[..., 0], speed[..., 0])
+            normal_force = nominal_normal_force(dynamics, self.contact)
         return -(normal_force[..., None, None] * direction)
 
     @override

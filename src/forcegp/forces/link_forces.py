@@ -1,6 +1,5 @@
-"""Unknown forces on one link: at a point of it (`ToolForces`), on a base that moves, and those of air."""
+"""Unknown forces on one link: where it touches a surface (`ToolForces`), and those of air."""
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -10,12 +9,13 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, usable_arguments
+from forcegp.errors import InvalidInput, require_number, usable_arguments
 from forcegp.forces.actuation import ObservedWind
 from forcegp.forces.unknown import SharedInputs
-from forcegp.mechanics import ConstrainedDynamics, Contact, LoopClosure, State, surface_axes
+from forcegp.mechanics import ConstrainedDynamics, Contact, State, surface_axes
 from forcegp.mechanics.gauss_principle import placed
 from forcegp.robots import Robot
+from forcegp.robots.arguments import finite_vector
 from forcegp.robots.manifold import VELOCITIES
 
 
@@ -56,15 +56,6 @@ def nominal_normal_force(dynamics: ConstrainedDynamics, contact: int) -> Float[T
     return size * dynamics.multiplier_map().offset[..., contact].abs()
 
 
-def finite_numbers(given: object) -> tuple[float, ...] | None:
-    """`given` as finite floats, None where it is anything else."""
-    try:
-        numbers = tuple(float(entry) for entry in given)  # type: ignore[attr-defined]  # that is what is tried
-    except (TypeError, ValueError):
-        return None
-    return numbers if not isinstance(given, str) and all(map(math.isfinite, numbers)) else None
-
-
 def is_contact_number(value: object) -> bool:
     """Whether it can be the number of a contact, counted from 0."""
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0
@@ -72,13 +63,12 @@ def is_contact_number(value: object) -> bool:
 
 def require_contact(force: str, contact: int, contacts: Sequence[Contact]) -> None:
     """Raise InvalidInput if there is no such contact to slide on."""
-    sliding = (not isinstance(each, LoopClosure) for each in contacts)
-    numbers = [index for index, slides in enumerate(sliding) if slides]
+    numbers = range(len(contacts))
     if contact not in numbers:
         have = f"only contact {', '.join(map(str, numbers))}" if numbers else "no contact with a surface to slide on"
         raise InvalidInput(
             f"{force} acts at contact {contact}, but the model has {have}; give the contact (`contacts`), or use a "
-            "force that needs none, such as JointFriction or ToolForces(frame=..., axes='world')."
+            "force that needs none, such as JointFriction or AerodynamicForce(frame=...)."
         )
 
 
@@ -93,30 +83,25 @@ def require_moving(prior: str, frame: str, robot: Robot) -> None:
         )
 
 
-AXES = {"world": ("x", "y", "z"), "tool": ("tool-x", "tool-y", "tool-z"), "surface": ("tangent-1", "tangent-2")}
-"""Axes of a force at the tool, and what they are called."""
+TANGENTS = ("tangent-1", "tangent-2")
 SMALLEST_SPEED = 1e-6
 """m/s, below which a direction of motion means nothing: far below any velocity scale of friction."""
 
 
 @dataclass(frozen=True)
 class ToolForces(SharedInputs):
-    """Q_U = J_p^T E f(z): a force (N) with components f along the axes E at a point.
+    """Q_U = J_p^T E f(z): a force (N) where contact number `contact` touches, along the tangents E of its surface.
 
-    frame, point: the link and the point in it (m). Without a frame: where contact number `contact` touches, whatever it
-        is.
-    axes: "world", "tool" (those of the link) or "surface": the two tangents of the contact's surface. Along its normal
-        an ideal contact takes every force, so there is no such latent; without the contact the force is zero.
-    inputs: "velocity" and "position" of the point along the same axes ("tool": the position along those of the world).
-        Velocities are only scaled, so that a linear kernel is viscous friction.
+    Along its normal an ideal contact takes every force, so there is no such latent; without the contact the force is
+    zero.
+
+    inputs: "velocity" and "position" of the point along the tangents. Velocities are only scaled, so that a linear
+        kernel is viscous friction.
     kernel: an expression of `forcegp.forces.kernel_of`.
     """
 
-    frame: str | None = None
-    point: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    axes: str = "surface"
-    inputs: tuple[str, ...] = ("velocity",)
     contact: int = 0
+    inputs: tuple[str, ...] = ("velocity",)
     kernel: str = "linear + squared-exponential"
     allowed: ClassVar[tuple[str, ...]] = ("velocity", "position")
     from_zero: ClassVar[tuple[str, ...]] = ("velocity",)
@@ -124,90 +109,59 @@ class ToolForces(SharedInputs):
     @usable_arguments("ToolForces")
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not (self.frame is None or isinstance(self.frame, str)):
-            raise InvalidInput(f"ToolForces frame is {self.frame!r}; give the name of a link, or None for the contact.")
-        point = finite_numbers(self.point)
-        if self.axes not in AXES or point is None or len(point) != 3 or not is_contact_number(self.contact):
-            raise InvalidInput(
-                f"ToolForces has axes {self.axes!r}, point {self.point!r} and contact {self.contact!r}; give axes "
-                f"{' or '.join(map(repr, AXES))}, a point of three numbers in m, and a contact's number from 0."
-            )
-        object.__setattr__(self, "point", point)
+        if not is_contact_number(self.contact):
+            raise InvalidInput(f"ToolForces has contact {self.contact!r}; give a contact's number from 0.")
 
     @property
     @override
     def title(self) -> str:
         return "tool-forces" if "position" in self.inputs else "tool-friction"
 
-    @property
-    def _needs_contact(self) -> bool:
-        return self.frame is None or self.axes == "surface"
-
     @override
     def check(self, robot: Robot, contacts: Sequence[Contact]) -> None:
-        if self._needs_contact:
-            require_contact(f"ToolForces(frame={self.frame!r}, axes={self.axes!r})", self.contact, contacts)
-        if self.frame is not None:
-            require_moving("ToolForces", self.frame, robot)
+        require_contact("ToolForces", self.contact, contacts)
 
     @override
     def latent_names(self, robot: Robot) -> tuple[str, ...]:
-        return tuple(f"force-{name}" for name in AXES[self.axes])
+        return tuple(f"force-{name}" for name in TANGENTS)
 
     @override
     def direction(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
-        where = self._point(dynamics)
-        if where is None:
-            return torch.zeros_like(dynamics.H[..., :1]).expand(*dynamics.H.shape[:-1], len(AXES[self.axes]))
+        if self.contact >= len(dynamics.contacts):
+            return torch.zeros_like(dynamics.H[..., :2])
+        where = ToolPoint.of_contact(dynamics, self.contact)
         return where.jacobian[..., :3, :].mT @ self._directions(dynamics, where)
 
     @override
     def point_force(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch 3 C"]:
-        where = self._point(dynamics)
-        if where is None:
-            return dynamics.H.new_zeros(*dynamics.H.shape[:-2], 3, len(AXES[self.axes]))
-        return self._directions(dynamics, where)
+        if self.contact >= len(dynamics.contacts):
+            return dynamics.H.new_zeros(*dynamics.H.shape[:-2], 3, 2)
+        return self._directions(dynamics, ToolPoint.of_contact(dynamics, self.contact))
 
     @override
     def columns(self, dynamics: ConstrainedDynamics) -> dict[str, Callable[[], Tensor]]:
-        state, where = dynamics.state, self._point(dynamics)
-        if where is None:  # the force is zero whatever its features are
-            nothing = {name: state.q.new_zeros(*state.q.shape[:-1], len(x)) for name, x in self._sizes.items()}
-            return {name: lambda zeros=zeros: zeros for name, zeros in nothing.items()}
+        state = dynamics.state
+        if self.contact >= len(dynamics.contacts):  # the force is zero whatever its features are
+            nothing = state.q.new_zeros(*state.q.shape[:-1], 2)
+            return dict.fromkeys(self.allowed, lambda: nothing)
+        where = ToolPoint.of_contact(dynamics, self.contact)
         axes = self._directions(dynamics, where)
         return {
             "velocity": lambda: _along(axes, where.velocity(state.v)[..., :3]),
-            "position": lambda: _along(axes, where.position) if self.axes == "surface" else where.position,
+            "position": lambda: _along(axes, where.position),
         }
-
-    @property
-    def _sizes(self) -> dict[str, Sequence[str]]:
-        return {"velocity": AXES[self.axes], "position": AXES[self.axes] if self.axes == "surface" else "xyz"}
 
     @override
     def labels(self, robot: Robot) -> dict[str, Sequence[str]]:
         units = {"velocity": "m/s", "position": "m"}
-        return {what: [f"tool {what} along {x} [{units[what]}]" for x in along] for what, along in self._sizes.items()}
+        return {what: [f"tool {what} along {x} [{unit}]" for x in TANGENTS] for what, unit in units.items()}
 
     @override
     def latent_units(self, robot: Robot) -> tuple[str, ...]:
-        return ("N",) * len(AXES[self.axes])
+        return ("N", "N")
 
-    def _point(self, dynamics: ConstrainedDynamics) -> ToolPoint | None:
-        """None where the force belongs to a contact that the constraint does not have."""
-        if self._needs_contact and self.contact >= len(dynamics.contacts):
-            return None
-        if self.frame is None:
-            return ToolPoint.of_contact(dynamics, self.contact)
-        return ToolPoint.of(dynamics, self.frame, self.point)
-
-    def _directions(self, dynamics: ConstrainedDynamics, where: ToolPoint) -> Float[Tensor, "*batch 3 k"]:
-        if self.axes == "surface":
-            return _containing(contact_axes(dynamics, self.contact), where.velocity(dynamics.state.v)[..., :3])
-        if self.axes == "tool":
-            return where.orientation
-        identity = torch.eye(3, dtype=where.position.dtype, device=where.position.device)
-        return identity.expand_as(where.orientation)
+    def _directions(self, dynamics: ConstrainedDynamics, where: ToolPoint) -> Float[Tensor, "*batch 3 2"]:
+        return _containing(contact_axes(dynamics, self.contact), where.velocity(dynamics.state.v)[..., :3])
 
 
 def _containing(axes: Float[Tensor, "*batch 3 3"], velocity: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 2"]:
@@ -256,19 +210,10 @@ class AerodynamicForce(SharedInputs):
         super().__post_init__()
         if not (self.frame is None or isinstance(self.frame, str)):
             raise InvalidInput(f"AerodynamicForce frame is {self.frame!r}; give the name of a link, or None.")
-        wind = finite_numbers(self.wind)
-        if wind is None or len(wind) != 3:
-            raise InvalidInput(f"AerodynamicForce wind is {self.wind!r}; give its velocity along x, y and z in m/s.")
-        object.__setattr__(self, "wind", wind)
-        if self.observe is None:
-            return
-        try:  # files and commands hold text
-            seconds = float(self.observe)
-        except (TypeError, ValueError):
-            seconds = -1.0
-        if not 0.0 <= seconds < 1e6:
-            raise InvalidInput(f"AerodynamicForce observe is {self.observe!r}; give a time in s, 0, or None.")
-        object.__setattr__(self, "observe", seconds)
+        wind = finite_vector("AerodynamicForce wind", self.wind, 3, ", its velocity along x, y and z in m/s")
+        object.__setattr__(self, "wind", tuple(wind.tolist()))
+        if self.observe is not None:
+            require_number("AerodynamicForce observe", self.observe, "give a time in s, 0, or None", 0.0, 1e6)
 
     @override
     def check(self, robot: Robot, contacts: Sequence[Contact]) -> None:
@@ -340,7 +285,7 @@ class AerodynamicForce(SharedInputs):
             "angular-velocity": [f"angular velocity of {link} about its {axis} [rad/s]" for axis in "xyz"],
             "thrust": pushes[_thrust(robot)],
             "height": [f"height of {link} [m]"],
-            "attitude": [f"world {world} along {axis} of {link}" for world in AXES for axis in "xyz"],
+            "attitude": [f"world {world} along {axis} of {link}" for world in "xyz" for axis in "xyz"],
         }
 
     def _point(self, dynamics: ConstrainedDynamics) -> ToolPoint:

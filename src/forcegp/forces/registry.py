@@ -121,7 +121,7 @@ def parse_forces(expression: str | Sequence[str]) -> tuple[Force, ...]:
     words = split_outside(expression, ",") if isinstance(expression, str) else list(expression)
     joined: list[str] = []
     for word in (word.strip() for word in words):
-        # a comma may stand between options as well: gp:tool-forces:frame=link_7,axes=world
+        # a comma may stand between options as well: gp:tool-forces:contact=1,kernel=linear
         if joined and "=" in word.partition(":")[0]:
             joined[-1] += f":{word}"
         else:

@@ -12,65 +12,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, require_known, require_number
-from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE, factors
+from forcegp.errors import InvalidInput, NumericalWarning, require_known, require_number
 from forcegp.model import Model
 from forcegp.robots.manifold import ConfigurationSpace
-
-ON_SURFACE, MOST_CORRECTIONS = 1e-12, 25
-"""m, |c| / |s_p| of a point on its surface; steps of Newton's method until it is there."""
-
-
-def violation(
-    model: Model, q: Float[Tensor, "*batch nq"], v: Float[Tensor, "*batch nv"]
-) -> tuple[Float[Tensor, "*batch m"], Float[Tensor, "*batch m"]]:
-    """c(q) in m and A(q) v in m/s of the contacts, for surfaces that are signed distances; NaN where q is."""
-    lost = torch.isnan(q).any(-1, keepdim=True)  # no quaternion is made of NaN
-    c, A, _ = _constraint(
-        model, torch.where(lost, model.robot.space.neutral().to(q), q) if model.robot.space.groups else q
-    )
-    return c.masked_fill(lost, torch.nan), (A @ v[..., None])[..., 0].masked_fill(lost, torch.nan)
-
-
-def onto_contacts(
-    model: Model, q: Float[Tensor, "n nq"], v: Float[Tensor, "n nv"]
-) -> tuple[Float[Tensor, "n nq"], Float[Tensor, "n nv"]]:
-    """The states near (q, v) with c(q) = 0 to 1e-12 m and A v = 0: Newton's method along M^-1 A^T, M fixed.
-
-    Hairer, Lubich & Wanner (2006), sections IV.4 and VII.1.4; redundant contacts are legal. NumericalError names a
-    state for which no position on all surfaces is found.
-    """
-    lower = factors(model.mass_matrix_at(model.loaded_robot.kinematics(q)))[1]
-    iteration, (c, A, slope) = 0, _constraint(model, q)
-    while bool((missing := ~(c.abs() <= ON_SURFACE * slope).all(-1)).any()) and bool(A.isfinite().all()):
-        if iteration == MOST_CORRECTIONS:
-            break
-        inverse = lower.mT @ torch.linalg.pinv(A @ lower.mT, rtol=REDUNDANCY_TOLERANCE)
-        q = model.robot.space.integrate(q, -(inverse @ c[..., None])[..., 0])
-        iteration, (c, A, slope) = iteration + 1, _constraint(model, q)
-    if bool(missing.any()):
-        row = int(missing.nonzero()[0])
-        raise NumericalError(
-            f"state {row} cannot be moved onto the surfaces of the contacts: after {iteration} Newton steps |c| is "
-            f"still {float(c[row].abs().max()):.2e} m. Start nearer, and check that the robot can reach "
-            "them and that the contacts do not contradict each other."
-        )
-    inverse = lower.mT @ torch.linalg.pinv(A @ lower.mT, rtol=REDUNDANCY_TOLERANCE)
-    for _ in range(2):  # the second time removes what rounding of the first has left
-        v = v - (inverse @ (A @ v[..., None]))[..., 0]
-    return q, v
-
-
-def _constraint(model: Model, q: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """c (..., m), A (..., m, nv) and |s_p| (..., m)."""
-    if not model.contacts:
-        empty = q.new_zeros(*q.shape[:-1], 0)
-        return empty, empty[..., None].expand(*empty.shape, model.robot.nv), empty
-    kinematics = model.robot.kinematics(q)
-    rows = [contact.row(kinematics) for contact in model.contacts]
-    c, A = torch.stack([row.value for row in rows], dim=-1), torch.stack([row.A for row in rows], dim=-2)
-    return c, A, torch.stack([torch.linalg.vector_norm(row.gradient, dim=-1) for row in rows], dim=-1)
-
 
 MOST_STEPS, MOST_TRIALS = 200, 12
 TOLERANCE = 1e-9

@@ -7,17 +7,17 @@
 constraints included: (A M^-1 A^T)^+ = (A~^+)^T A~^+, H = L^-T (I - A~^+ A~) L^-1.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.errors import ContactError, InvalidInput, NumericalError, require_number
-from forcegp.mechanics.surfaces import Held, Surface
+from forcegp.mechanics.surfaces import Held, Surface, surface_from_dict, surface_to_dict
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import broadcast_batch, checked_tensor, finite_vector
 
@@ -33,15 +33,6 @@ class Baumgarte:
         for name in ("omega", "zeta"):
             words = "it must be a finite number >= 0 (and < 1e15)"  # its square must not overflow
             require_number(f"Baumgarte {name}", getattr(self, name), words, 0.0, 1e15)
-
-
-class Row(NamedTuple):
-    """One constraint c(q) = 0 at a batch of states: c (...), A (..., nv), s_p (..., 3) and A' v (...) or None."""
-
-    value: Tensor
-    A: Tensor
-    gradient: Tensor
-    drift: Tensor | None
 
 
 def placed(
@@ -83,6 +74,15 @@ class Contact:
         if self.radius and not isinstance(self.surface, Held):
             raise InvalidInput("Contact radius is of a ball that rolls on level ground; its surface must be a Held.")
 
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers and names. Raises ContactError for a surface that holds code."""
+        return vars(self) | {"point": list(self.point), "surface": surface_to_dict(self.surface)}
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> "Contact":
+        """What `to_dict` gave. Raises FileFormatError, InvalidInput, KeyError or TypeError for anything else."""
+        return cls(**{**stored, "surface": surface_from_dict(stored["surface"])})
+
     def check(self, robot: Robot) -> None:
         """Raise UnknownName for a frame that is not there, ContactError where the contact constrains nothing."""
         if robot.frame(self.frame)[0] < 0:
@@ -99,21 +99,6 @@ class Contact:
         """c(q) = s(p(q)): 0 where the constraint holds."""
         return self.surface.value(self.position(kinematics))
 
-    def row(self, kinematics: Kinematics, v: Float[Tensor, "*batch nv"] | None = None) -> "Row":
-        """c(q), A = s_p J_p and s_p; with velocities also A' v = s_p Jdot_p v + (J_p v)^T s_pp (J_p v)."""
-        p = self.position(kinematics)
-        J = self._touching(kinematics.frame_jacobian(self.frame, self.point))
-        gradient = self.surface.gradient(p)
-        A = (gradient[..., None, :] @ J)[..., 0, :]
-        drift = None
-        if v is not None:
-            bias = kinematics.frame_bias_acceleration(self.frame, self.point)
-            bias_acceleration = self._touching(bias[..., None])[..., 0]
-            velocity = (J @ v[..., None])[..., 0]
-            curvature = (velocity[..., None, :] @ self.surface.hessian(p) @ velocity[..., None])[..., 0, 0]
-            drift = (gradient * bias_acceleration).sum(-1) + curvature
-        return Row(self.surface.value(p), A, gradient, drift)
-
     def _touching(self, twist: Float[Tensor, "*batch 6 k"]) -> Float[Tensor, "*batch 3 k"]:
         """v + w x r of what touches the ground, r = -`radius` z (Featherstone 2008, section 3.5)."""
         linear, angular = twist[..., :3, :], twist[..., 3:, :]
@@ -127,13 +112,20 @@ class Contact:
     ) -> tuple[Float[Tensor, "*batch nv"], Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """One row of A (..., nv), one entry of b (...), and the surface gradient s_p (..., 3), with A a = b.
 
-        b = -A' v - 2 zeta omega A v - omega^2 c (Rath et al. 2021, section 2).
+        A = s_p J_p, A' v = s_p Jdot_p v + (J_p v)^T s_pp (J_p v), b = -A' v - 2 zeta omega A v - omega^2 c (Rath et al.
+        2021, section 2).
         """
-        c, A, gradient, drift = self.row(state.kinematics, state.v)
-        assert drift is not None, "velocities are given"
-        b = -drift
+        p, v = self.position(state.kinematics), state.v
+        J = self._touching(state.kinematics.frame_jacobian(self.frame, self.point))
+        gradient = self.surface.gradient(p)
+        A = (gradient[..., None, :] @ J)[..., 0, :]
+        bias = state.kinematics.frame_bias_acceleration(self.frame, self.point)
+        velocity = (J @ v[..., None])[..., 0]
+        curvature = (velocity[..., None, :] @ self.surface.hessian(p) @ velocity[..., None])[..., 0, 0]
+        b = -(gradient * self._touching(bias[..., None])[..., 0]).sum(-1) - curvature
         if baumgarte is not None:
-            b = b - 2.0 * baumgarte.zeta * baumgarte.omega * (A * state.v).sum(-1) - baumgarte.omega**2 * c
+            c = self.surface.value(p)
+            b = b - 2.0 * baumgarte.zeta * baumgarte.omega * (A * v).sum(-1) - baumgarte.omega**2 * c
         if self.switch is None:
             return A, b, gradient
         acts = (state.u[..., state.inputs.index(self.switch)] > 0.5).to(b.dtype)
@@ -164,7 +156,7 @@ def fixed_frame(frame: str, switch: str | None = None, size: float = 0.1) -> tup
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Positions, velocities and inputs of equal batch, and the standard parameters of `bodies` (None: the robot's).
+    """Positions, velocities and inputs of equal batch.
 
     `inputs` names the columns of u, `delivered` are the joint forces (..., nv) of its actuators, `strokes` the
     displacements of each joint (or motor, for laws at motors) from reversal to reversal before the state, the last one
@@ -175,7 +167,6 @@ class State:
     v: Float[Tensor, "*batch nv"]
     u: Float[Tensor, "*batch nu"]
     robot: Robot
-    bodies: Float[Tensor, "bodies 10"] | None = None
     inputs: tuple[str, ...] = ()
     delivered_by: "Callable[[State], Tensor] | None" = None
     strokes: Float[Tensor, "*batch nv strokes"] | None = None
@@ -198,18 +189,12 @@ class State:
     @cached_property
     def mass_matrix(self) -> Float[Tensor, "*batch nv nv"]:
         """M of the robot, with its armature."""
-        return self._dynamics[0]
+        return self.kinematics.mass_matrix()
 
     @cached_property
     def bias(self) -> Float[Tensor, "*batch nv"]:
         """Coriolis, centrifugal and gravity forces."""
-        return self._dynamics[1]
-
-    @cached_property
-    def _dynamics(self) -> tuple[Tensor, Tensor]:
-        if self.bodies is None:
-            return self.kinematics.mass_matrix_and_bias()
-        return self.kinematics.dynamics_of_bodies(self.bodies)
+        return self.kinematics.bias_forces()
 
     @property
     def delivered(self) -> Float[Tensor, "*batch nv"]:
@@ -223,7 +208,6 @@ class State:
         q: Tensor,
         v: Tensor,
         u: Tensor,
-        bodies: Float[Tensor, "bodies 10"] | None = None,
         inputs: tuple[str, ...] = (),
         delivered_by: "Callable[[State], Tensor] | None" = None,
     ) -> "State":
@@ -235,7 +219,7 @@ class State:
             u = checked_tensor("u", u, len(inputs), f"one value per input: {', '.join(inputs)}", robot.device)
         batch = broadcast_batch({"q": q.shape[:-1], "v": v.shape[:-1], "u": u.shape[:-1]})
         q, v, u = (value.expand(*batch, -1) for value in (q, v, u))
-        return cls(q, v, u, robot, bodies, inputs, delivered_by)
+        return cls(q, v, u, robot, inputs, delivered_by)
 
 
 REDUNDANCY_TOLERANCE = 1e-9

@@ -7,7 +7,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -16,23 +16,6 @@ from typing_extensions import override
 
 from forcegp.errors import ContactError, FileFormatError, InvalidInput
 from forcegp.robots.arguments import finite_vector
-
-Kind = TypeVar("Kind")
-
-
-def object_from_dict(what: str, registry: Mapping[str, type[Kind]], stored: object) -> Kind:
-    """The object that `stored` describes, lists as tuples; FileFormatError for anything else than a `what`."""
-    if not isinstance(stored, Mapping):
-        raise FileFormatError(f"a stored {what} is {stored!r}; expected an object with a type")
-    values = {key: tuple(value) if isinstance(value, list) else value for key, value in stored.items()}
-    name = values.pop("type", None)
-    if not isinstance(name, str) or name not in registry:
-        raise FileFormatError(f"unknown {what} {name!r}; known: {', '.join(registry)}")
-    try:
-        return registry[name](**values)
-    except TypeError as error:
-        raise FileFormatError(f"{what} {name!r} has wrong fields {sorted(map(str, values))}: {error}") from None
-
 
 Vector = tuple[float, float, float]
 
@@ -162,7 +145,7 @@ SURFACES: dict[str, type[Surface]] = {"plane": Plane, "sphere": Sphere, "held": 
 
 
 def surface_to_dict(surface: Surface) -> dict[str, Any]:
-    """Plain numbers for `object_from_dict`. Raises ContactError for a surface that holds code."""
+    """Plain numbers for `surface_from_dict`. Raises ContactError for a surface that holds code."""
     name = next((name for name, kind in SURFACES.items() if type(surface) is kind), None)
     if name is None:
         raise ContactError(
@@ -170,6 +153,20 @@ def surface_to_dict(surface: Surface) -> dict[str, Any]:
             f"{', '.join(SURFACES)}, or a Surface of your own with numbers as fields and an entry in SURFACES."
         )
     return {"type": name, **asdict(surface)}  # type: ignore[call-overload]  # every entry of SURFACES is a dataclass
+
+
+def surface_from_dict(stored: object) -> Surface:
+    """The surface that `surface_to_dict` stored; FileFormatError for anything else."""
+    if not isinstance(stored, Mapping):
+        raise FileFormatError(f"a stored surface is {stored!r}; expected an object with a type")
+    values = {key: tuple(value) if isinstance(value, list) else value for key, value in stored.items()}
+    name = values.pop("type", None)
+    if not isinstance(name, str) or name not in SURFACES:
+        raise FileFormatError(f"unknown surface {name!r}; known: {', '.join(SURFACES)}")
+    try:
+        return SURFACES[name](**values)
+    except TypeError as error:
+        raise FileFormatError(f"surface {name!r} has wrong fields {sorted(map(str, values))}: {error}") from None
 
 
 def _tensor(values: Sequence[float], like: Tensor) -> Tensor:

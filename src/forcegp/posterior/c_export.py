@@ -57,7 +57,7 @@ def export_c(
     monitor: Any = None,
     unchecked: bool = False,
 ) -> CExport:
-    """Write the model as C99 to a new folder: NAME.c, NAME.h, an example, a self-test, CMake, a form for CasADi.
+    """Write the model as C99 to a new folder: NAME.c, NAME.h, NAME.hpp, an example, a self-test, CMake.
 
     NAME_mean, NAME_forces, each force by itself, and of a base that is fixed NAME_inverse_dynamics are always there.
     `covariance` adds NAME_mean_covariance (the compressed one) and NAME_forces_deviation, `jacobian` NAME_linearize,

@@ -129,10 +129,6 @@ class CFiles:
         wrapped = sections(__name__, "exported_c/wrapped.hpp")
         words["CPP"] = filled("\n".join(wrapped[kind] for kind in kinds if kind in wrapped), words)
         files[f"{self.name}.hpp"] = filled(c_text(__name__, "exported_c/model.hpp"), words)
-        found = sections(__name__, "exported_c/external.c")
-        usable = [kind for kind in self.kinds if kind != "linearize" or nq == nv == nu]  # of one size
-        chosen = "".join(found[kind] for kind in ("head", *usable) if kind in found)
-        files[f"{self.name}_external.c"] = filled(chosen, words)
         files |= {file: filled(c_text(__name__, f"exported_c/{file}"), words) for file in ALIKE}
         for file, content in files.items():
             (folder / file).write_text(content, encoding="ascii")

@@ -18,7 +18,6 @@ from forcegp.posterior.prediction import ROWS_PER_BLOCK
 Posterior = Any
 """A `Posterior`, whose module imports this one."""
 
-NAMES = tuple(f"observed_{what}_{axis}" for what in ("force", "torque") for axis in "xyz")
 TRIED = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s
 MEMORY, LEAST = 1.0, 0.1  # s, of how much each time missed, and of the past that the first row needs
 
@@ -53,7 +52,7 @@ def observing(
     unexplained, effect = _unexplained(posterior, dataset, frame)
     wrench = np.einsum("nij,nj->ni", np.linalg.pinv(effect, rcond=1e-9), unexplained)
     observed = _observed(wrench, dataset, times)
-    model = replace(posterior.model, forces=(*posterior.model.forces, ObservedWrench(frame, NAMES)))
+    model = replace(posterior.model, forces=(*posterior.model.forces, ObservedWrench(frame)))
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
     seen = replace(dataset, u=np.concatenate([dataset.u, observed], axis=1), model=model, truth=truth)
     posterior = posterior.with_model(model)

@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +15,6 @@ from forcegp.data import Dataset, with_memory
 from forcegp.data.dataset import FORCE as OF_SENSOR
 from forcegp.data.dataset import require_rows
 from forcegp.errors import DataWarning, InvalidInput, NumericalError, require_type, usable_arguments
-from forcegp.evidence import Accelerations, ContactForces
 from forcegp.forces import Force
 from forcegp.inference.memory import blas_threads
 from forcegp.inference.prepared_kernels import CompressedCovariance
@@ -40,7 +39,6 @@ from forcegp.posterior.prediction import (
     components_of,
     curve_of,
     join_predictions,
-    quantity_of,
     state_rows,
     state_tensor,
     without_past,
@@ -75,43 +73,15 @@ class Posterior(Fitted):
         """The constrained dynamics of these states, with the model's inertial parameters."""
         return self.model.dynamics(q, v, u)
 
-    @overload
-    def predict(
-        self, q: Array, v: Array, u: Array, *, a: Array | None = ..., covariance: bool = ..., of: None = ...
-    ) -> Prediction: ...
-
-    @overload
-    def predict(
-        self,
-        q: Array,
-        v: Array,
-        u: Array,
-        *,
-        a: Array | None = ...,
-        covariance: bool = ...,
-        of: Sequence[Accelerations | ContactForces | Contact | Force],
-    ) -> tuple[Gaussian, ...]: ...
-
-    def predict(
-        self,
-        q: Array,
-        v: Array,
-        u: Array,
-        *,
-        a: Array | None = None,
-        covariance: bool = True,
-        of: Sequence[Accelerations | ContactForces | Contact | Force] | None = None,
-    ) -> Prediction | tuple[Gaussian, ...]:
+    def predict(self, q: Array, v: Array, u: Array, *, a: Array | None = None, covariance: bool = True) -> Prediction:
         """Distribution of the acceleration and, where the model predicts them, of the forces behind it.
 
-        A `Prediction`, or with `of` one `Gaussian` for each of `Accelerations()`, contacts of the model or
-        `ContactForces(frame)` (the force on the robot there, (..., 3) in N) and its unknown forces (joint forces). With
-        `a`, accelerations that were measured in these states (..., nv), all is given these: what an estimator of
-        contact forces without a force sensor needs. States (..., nv) are in rad, rad/s and Nm (m, m/s and N), arrays,
-        lists or tensors; `covariance=False` is much faster. Differentiable in q, v and u. Where laws remember, u has
-        columns for that (`forcegp.data.with_memory` makes them of a log); without these the past counts as unknown, in
-        the mean and in the covariance, and a DataWarning says so. InvalidInput for wrong shapes, values that are not
-        finite, and inside `vmap`; NumericalError where the result is not finite.
+        With `a`, accelerations that were measured in these states (..., nv), all is given these: what an estimator of
+        contact forces without a force sensor needs (`Prediction.force_at`). States (..., nv) are in rad, rad/s and Nm
+        (m, m/s and N), arrays, lists or tensors; `covariance=False` is much faster. Differentiable in q, v and u. Where
+        laws remember, u has columns for that (`forcegp.data.with_memory` makes them of a log); without these the past
+        counts as unknown, in the mean and in the covariance, and a DataWarning says so. InvalidInput for wrong shapes,
+        values that are not finite, and inside `vmap`; NumericalError where the result is not finite.
         """
         require_type("covariance", covariance, bool)
         memory, width = self.model.memory.names, np.shape(u)[-1:]
@@ -140,7 +110,7 @@ class Posterior(Fitted):
                 "float64 there, the mass matrix is singular, or a surface has no normal; check q, v and u of that "
                 "row, and the model by Model.check_states."
             )
-        return predicted if of is None else tuple(quantity_of(self, each, predicted, (q, v, u)) for each in of)
+        return predicted
 
     def predict_rows(self, q: Positions, v: Rows, u: Inputs, covariance: bool, a: Rows | None = None) -> Prediction:
         """`predict` for one block of checked states."""
@@ -166,6 +136,7 @@ class Posterior(Fitted):
             contact_force=through(dynamics.contact_force_map()),
             unknown_force=learned,
             noise_covariance=noise,
+            frames=tuple(contact.frame for contact in self.model.contacts),
         )
 
     def unlearned(self, dynamics: ConstrainedDynamics) -> Tensor | None:

@@ -1,7 +1,7 @@
 """Predictions as values: of accelerations, of every force by itself, and of the u that makes an acceleration."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +11,6 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, NumericalError, require_known
-from forcegp.evidence import Accelerations, ContactForces
 from forcegp.forces import Actuation, UnknownForces
 from forcegp.integration.integrators import find_roots, rows_jacobian
 from forcegp.mechanics import ConstrainedDynamics
@@ -89,6 +88,16 @@ class Prediction(Gaussian):
     contact_force: Gaussian | None
     unknown_force: Gaussian | None
     noise_covariance: Float[Tensor, "*batch nv nv"]
+    frames: tuple[str, ...] = ()
+    """Where each contact is."""
+
+    def force_at(self, frame: str) -> Gaussian:
+        """The world force on the robot at the contacts of a frame together (..., 3) in N."""
+        if self.contact_force is None or frame not in self.frames:
+            there = ", ".join(dict.fromkeys(self.frames)) or "none"
+            raise InvalidInput(f"there is no contact at {frame!r} whose force is predicted; there is {there}.")
+        own = torch.tensor([[float(each == frame) for each in self.frames]])
+        return self.contact_force.through(torch.kron(own, torch.eye(3)).to(self.mean))
 
     @override
     def facts(self) -> dict[str, object]:
@@ -141,7 +150,7 @@ def without_past(
     wide = {name: wider(lambda each, name=name: getattr(each, name)) for name in names}  # type: ignore[misc]  # bound
     acceleration = wider(lambda each: Gaussian(each.mean, each.covariance))
     assert acceleration is not None, "every model predicts it"
-    return Prediction(acceleration.mean, acceleration.covariance, **wide, noise_covariance=found.noise_covariance)
+    return replace(found, mean=acceleration.mean, covariance=acceleration.covariance, **wide)
 
 
 def join_predictions(blocks: Sequence[Prediction], batch: torch.Size) -> Prediction:
@@ -152,8 +161,8 @@ def join_predictions(blocks: Sequence[Prediction], batch: torch.Size) -> Predict
         if isinstance(first, Tensor):
             rows = torch.cat(list(parts))
             return rows.reshape(*batch, *rows.shape[1:])
-        if first is None:
-            return None
+        if first is None or isinstance(first, tuple):
+            return first
         return type(first)(*(joined([getattr(part, item.name) for part in parts]) for item in fields(first)))
 
     return joined(blocks)
@@ -332,29 +341,6 @@ def inverse_dynamics(
         at = posterior.dynamics(q, v, whole(u))
         response = torch.linalg.solve(rows_jacobian(surplus, u)[1], posterior.trained.unknown.direction(at))
         return Gaussian(u, posterior.latents(at, True).through(response).covariance)
-
-
-def quantity_of(posterior: Any, of: Any, predicted: Any, states: Sequence[Any]) -> Gaussian:
-    """One of the quantities that `Posterior.predict` takes as `of`, from its prediction at these states."""
-    contacts, forces = list(posterior.model.contacts), list(posterior.model.unknown_forces)
-    if isinstance(of, Accelerations):
-        return predicted.acceleration
-    if of in contacts:
-        return predicted.contact_force.entries(slice(3 * contacts.index(of), 3 * contacts.index(of) + 3))
-    if isinstance(of, ContactForces):
-        own = [k for k, contact in enumerate(contacts) if of.frame in ("", contact.frame)]
-        if not own:
-            raise InvalidInput(f"of holds {of!r}; the model has no contact there.")
-        together = torch.zeros(3, 3 * len(contacts), dtype=torch.float64, device=posterior.model.robot.device)
-        for k in own:
-            together[:, 3 * k : 3 * k + 3] = torch.eye(3)
-        return predicted.contact_force.through(together)
-    if of in forces:
-        components = posterior.components(*states, covariance=predicted.covariance is not None)
-        return list(components.values())[forces.index(of)].joint_force
-    raise InvalidInput(
-        f"of holds {of!r}; give Accelerations(), ContactForces(frame), or a contact or an unknown force of the model."
-    )
 
 
 def curve_of(posterior: Any, latent: str, features: Any, points: int) -> Curve:

@@ -184,16 +184,14 @@ class Predictor(Summary):
         *,
         integrator: str = "symplectic-euler",
         functions: int = 0,
-        divided: bool = False,
         seed: int = 0,
         threads: int | None = None,
     ) -> Trajectory:
         """Motions from q0 (..., nq), v0 (..., nv) under u (..., T, nu), with batches that broadcast, without a graph.
 
         As `posterior.rollout`, where of what laws remember the first row of u counts, under the mean, or with
-        `functions` under each of so many drawn ones, which are the first dimension; `divided` takes motions (functions,
-        ..., nv), each under its own. Compiled, many steps are done at once on `threads` threads (None: as torch has).
-        Raises InvalidInput for arguments that do not fit.
+        `functions` under each of so many drawn ones, which are the first dimension. Compiled, many steps are done at
+        once on `threads` threads (None: as torch has). Raises InvalidInput for arguments that do not fit.
         """
         threads = None if threads is None else whole_number("threads", threads, 1)
         functions, seed = whole_number("functions", functions, 0), whole_number("seed", seed, 0)
@@ -208,11 +206,8 @@ class Predictor(Summary):
             def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:  # drawn when a motion is left to torch
                 return self.posterior.accelerations(self.posterior.model.baumgarte, functions, seed)(q, v, u)
 
-            if not divided:
-                start, v, forces = start.repeat(functions, 1), v.repeat(functions, 1), forces.repeat(1, functions, 1)
-                batch = (functions, *batch)
-            elif tuple(batch[:1]) != (functions,):
-                raise InvalidInput(f"divided motions need a first dimension of {functions} functions; given: {batch}.")
+            start, v, forces = start.repeat(functions, 1), v.repeat(functions, 1), forces.repeat(1, functions, 1)
+            batch = (functions, *batch)
         with torch.no_grad():
             return moved(
                 batch, loops, method, acceleration, self.posterior.model, start, v, forces, dt, threads=threads

@@ -23,7 +23,6 @@ from forcegp.integration.integrators import (
     integrate,
     integrator_named,
     rows_jacobian,
-    violation,
     warn_of_divergence,
 )
 from forcegp.model import Model
@@ -151,9 +150,14 @@ class Rollout:
     @cached_property
     def constraint(self) -> Float[Tensor, "*batch rows m"]:
         """c(q) (..., T+1, m) in m, the distance of every contact point from its surface, where that is signed."""
-        rows = (x.flatten(0, -2).split(ROWS_PER_BLOCK) for x in (self.q, self.v))
-        found = torch.cat([violation(self.model, *block)[0] for block in zip(*rows, strict=True)])
-        return found.reshape(*self.q.shape[:-1], -1)
+        lost = torch.isnan(self.q).any(-1, keepdim=True)
+        q = torch.where(lost, self.space.neutral().to(self.q), self.q)  # no quaternion is made of NaN
+        c = q.new_zeros(*q.shape[:-1], len(self.model.contacts))
+        for own, rows in zip(*(x.flatten(0, -2).split(ROWS_PER_BLOCK) for x in (c, q)), strict=True):
+            kinematics = self.model.robot.kinematics(rows)
+            for k, contact in enumerate(self.model.contacts):
+                own[:, k] = contact.distance(kinematics)
+        return c.masked_fill(lost, torch.nan)
 
     def interval(self, quantity: Literal["q", "v"] = "q") -> tuple[Tensor, Tensor]:
         """Lower and upper ends (..., T+1, nv) of the 95 % interval: calibrated, or quantiles of the samples.

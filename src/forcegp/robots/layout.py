@@ -270,6 +270,28 @@ def lay_out(
     )
 
 
+def check_tree(layout: Layout, loops: Sequence[tuple[str, str, str]], problems: Problems) -> None:
+    """Report links that an equality of the file holds together (its name, the links) although joints move them."""
+
+    def moving(link: str) -> list[int]:
+        above = [layout.links[link].body]
+        while above[-1] != WORLD:
+            above.append(layout.parents[above[-1]])
+        return above[:-1]
+
+    for name, *links in loops:
+        between = sorted(set(moving(links[0])) ^ set(moving(links[1])))
+        if between:
+            problems.errors.append(
+                RobotModelError(
+                    f"{problems.source}: {name} closes a loop, from link {links[0]!r} to {links[1]!r}",
+                    "; a robot is a tree here, which would move in another way. Lock the joints between these links "
+                    f"({', '.join(layout.bodies[body].name for body in between)}) by `locked` or --lock, or take the "
+                    "equality out of the file where nothing holds them together.",
+                )
+            )
+
+
 def _check_locked(description: RobotDescription, locked: Mapping[str, float]) -> None:
     by_name = {joint.name: joint for joint in description.joints}
     for name, position in locked.items():
@@ -315,8 +337,8 @@ def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]
             link = above[link].parent
         loop = [*loop[loop.index(link) :], link]
         raise RobotModelError(
-            f"{source}: the links {' <- '.join(map(repr, loop))} form a loop; remove one of its joints "
-            "(a closed mechanism needs a tree plus constraints)."
+            f"{source}: the links {' <- '.join(map(repr, loop))} form a loop, and a robot is a tree here; "
+            "remove one of its joints, and lock those that it leaves without a hold."
         )
     return roots[0], children
 

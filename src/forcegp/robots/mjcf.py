@@ -17,7 +17,7 @@ from forcegp.errors import RobotModelError, required_extra
 from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import inverse, transform
 from forcegp.robots.layout import BASE, OUTSIDE, followed, joint_motion
-from forcegp.robots.mjcf_model import CompiledModel, LoopDescription, Translation
+from forcegp.robots.mjcf_model import CompiledModel, Translation
 from forcegp.robots.sandbox import read_apart
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.urdf import MOST_TAGS, Joint, free_joint, numbers, parse_xml
@@ -109,7 +109,7 @@ KINDS = {"floating": "free", "prismatic": "slide", "revolute": "hinge", "continu
 class MjcfWriter:
     """The text of one robot; `left_out` are frames that it lacks."""
 
-    def __init__(self, robot: RobotStructure, loops: Sequence[LoopDescription] = ()) -> None:
+    def __init__(self, robot: RobotStructure) -> None:
         self.robot, description = robot, robot.description
         self.held, _ = followed(description, robot.locked, Problems(robot.source))
         self.groups = {group.name: group for group in robot.layout.groups}
@@ -119,15 +119,6 @@ class MjcfWriter:
             self.children[joint.parent].append(joint)
         self.lines: list[str] = []
         self.left_out: list[str] = []
-        self.sites: dict[str, list[str]] = {}
-        self.equalities = self._couplings()
-        for loop in loops:  # sites: the anchors of bodies would be taken from the posture at q = 0
-            for end, link, point in zip("12", loop.frames, loop.points, strict=True):
-                name = quoteattr(f"{loop.name}_{end}")
-                self.sites.setdefault(link, []).append(f'<site name={name} pos="{numbers(point)}"/>')
-            ends = " ".join(f"site{end}={quoteattr(f'{loop.name}_{end}')}" for end in "12")
-            tag = "weld" if loop.turning else "connect"
-            self.equalities.append(f"    <{tag} name={quoteattr(loop.name)} {ends}/>")
 
     def text(self) -> str:
         """The whole file."""
@@ -136,7 +127,6 @@ class MjcfWriter:
         if BASE in self.groups and BASE not in named:
             self._chain(free_joint(BASE, OUTSIDE, root), np.eye(4), 2)
         elif root == "world" and not robot.link(root).mass:
-            self.lines += [f"    {site}" for site in self.sites.get(root, ())]
             self._below(root, 2)
         else:
             self._body(root, np.eye(4), [], 2)
@@ -149,7 +139,7 @@ class MjcfWriter:
                 "  <worldbody>",
                 *self.lines,
                 "  </worldbody>",
-                *_block("equality", self.equalities),
+                *_block("equality", self._couplings()),
                 *_block("actuator", motors),
                 "</mujoco>\n",
             ]
@@ -163,7 +153,6 @@ class MjcfWriter:
         inertial = self.robot.link(link)
         if inertial.mass > 0.0:
             self.lines.append(f"{space}  {_inertial(inertial.mass, inertial.center_of_mass, inertial.inertia)}")
-        self.lines += [f"{space}  {site}" for site in self.sites.get(link, ())]
         self._below(link, depth + 1)
         self.lines.append(f"{space}</body>")
 

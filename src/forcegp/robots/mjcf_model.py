@@ -1,4 +1,4 @@
-"""A model that MuJoCo compiled, as URDF elements, rotor inertias and closed loops (:mod:`forcegp.robots.mjcf`)."""
+"""A model that MuJoCo compiled, as URDF elements and rotor inertias (:mod:`forcegp.robots.mjcf`)."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -20,16 +20,6 @@ WORLD = "world"
 
 
 @dataclass(frozen=True)
-class LoopDescription:
-    """Two points, in m in the frames of two links, that are one; with ``turning`` the frames also turn together."""
-
-    name: str
-    frames: tuple[str, str]
-    points: tuple[tuple[float, float, float], tuple[float, float, float]]
-    turning: bool
-
-
-@dataclass(frozen=True)
 class Motor:
     """Joint forces by joint, or a wrench (N, Nm) about the origin of a link, of one unit of an actuator's input."""
 
@@ -46,7 +36,8 @@ class Translation:
     urdf: str
     gravity: np.ndarray
     locked: dict[str, float]
-    loops: tuple[LoopDescription, ...] = ()
+    loops: tuple[tuple[str, str, str], ...] = ()
+    """Names of equalities that hold two links together, and these."""
     motors: tuple[Motor, ...] = ()
     """All, if some act at sites of bodies."""
     springs: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -74,7 +65,7 @@ class CompiledModel:
         self.taken_joints = taken
 
     def translation(self) -> Translation:
-        """Links, joints and loops; notes of what is left out."""
+        """Links and joints; notes of what is left out."""
         self._couple()
         self._link(WORLD)
         for body in range(1, self.model.nbody):
@@ -273,39 +264,18 @@ class CompiledModel:
         linear = model.jnt_stiffness[joint] and not _any(model, "jnt_stiffnesspoly", joint)
         return bool(linear) and model.jnt_type[joint] >= 2 and joint not in self.couplings
 
-    def _loops(self) -> Iterator[LoopDescription]:
-        """Equalities of type connect and weld; what they need of frames becomes links."""
+    def _loops(self) -> Iterator[tuple[str, str, str]]:
+        """Equalities of type connect and weld between links; who moves a mocap body moves it from outside."""
         model, kinds = self.model, self.mujoco.mjtEq
         for k in range(model.neq):
-            weld = model.eq_type[k] == kinds.mjEQ_WELD
-            if not (weld or model.eq_type[k] == kinds.mjEQ_CONNECT) or not model.eq_active0[k]:
+            if model.eq_type[k] not in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)) or not model.eq_active0[k]:
                 continue
-            name, data = self._equality(k), model.eq_data[k]
-            if not self.for_system:
-                self._lose("closed loops (Model.from_mjcf has them)", name)
-                continue
-            ends = [int(model.eq_obj1id[k]), int(model.eq_obj2id[k])]
+            ends = [model.eq_obj1id[k], model.eq_obj2id[k]]
             if model.eq_objtype[k] == int(self.mujoco.mjtObj.mjOBJ_SITE):
-                bodies = [int(model.site_bodyid[end]) for end in ends]
-                poses = [self._pose(model.site_pos[end], model.site_quat[end]) for end in ends]
-            elif weld:  # a frame of the first body, which is to be that of the second one
-                bodies, held = ends, self._pose(data[3:6], data[6:10])
-                poses = [held @ transform(np.eye(3), -data[:3]), np.eye(4)]
-            else:
-                bodies, poses = ends, [transform(np.eye(3), data[:3]), transform(np.eye(3), data[3:6])]
-            first, second = (self.bodies[body] for body in bodies)
-            points: list[Any] = [tuple(pose[:3, 3].tolist()) for pose in poses]
-            if weld:
-                first, second = map(self._frame, (f"{name}_a", f"{name}_b"), bodies, poses)
-                points = [(0.0, 0.0, 0.0)] * 2
-            yield LoopDescription(name, (first, second), (points[0], points[1]), weld)
-
-    def _frame(self, name: str, body: int, pose: np.ndarray) -> str:
-        if np.array_equal(pose, np.eye(4)):
-            return self.bodies[body]
-        frame = self._named(name, self.links)
-        self._fixed(self.bodies[body], frame, pose)
-        return frame
+                ends = [model.site_bodyid[end] for end in ends]
+            if (model.body_mocapid[ends] < 0).all():
+                first, second = (self.bodies[end] for end in ends)
+                yield self._equality(k), first, second
 
     def _rotor(self, joint: int) -> float:
         """The inertia of the rotor of a joint that turns or slides, with those of its actuators, in kg m^2 or kg."""

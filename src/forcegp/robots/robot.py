@@ -27,9 +27,9 @@ from forcegp.robots.arguments import (
 from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import SINGULAR
 from forcegp.robots.kinematics import Kinematics
-from forcegp.robots.layout import BaseChoice, check_base, check_choice, lay_out
+from forcegp.robots.layout import BaseChoice, check_base, check_choice, check_tree, lay_out
 from forcegp.robots.mjcf import MjcfWriter, is_mjcf, translate
-from forcegp.robots.mjcf_model import LoopDescription, Translation
+from forcegp.robots.mjcf_model import Translation
 from forcegp.robots.structure import RigidBodyDynamics, RobotStructure, bodies_without_inertia, compile_tree
 from forcegp.robots.urdf import parse_urdf
 from forcegp.robots.urdf_file import (
@@ -102,8 +102,8 @@ class Robot(RobotStructure, RigidBodyDynamics):
         Bodies, and named sites, are links; joints follow in MuJoCo's order, with armature, damping, dry friction and
         limits; a linear equality of two is a mimic joint. q is `qpos` with quaternions x, y, z, w; the linear velocity
         of a free body is in its axes. Parameters and errors are those of :meth:`from_urdf_text`, by default as in the
-        file; RobotModelError has MuJoCo's reason. A RobotFileWarning names what acts in MuJoCo only (`Model.from_mjcf`
-        has springs and closed loops).
+        file; RobotModelError has MuJoCo's reason, or names what closes a loop (lock its joints). A RobotFileWarning
+        names what acts in MuJoCo only (`Model.from_mjcf` has springs).
         """
         return cls.read_mjcf(read_text(path), str(path), Path(path), **options)[0]
 
@@ -139,7 +139,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         found = translate(text, path, for_system, problems)
         problems.given["locked"] = found.locked | dict(locked or {})
         gravity = found.gravity if gravity is None else gravity
-        return cls._made(found.urdf, problems, gravity, armature), found
+        return cls._made(found.urdf, problems, gravity, armature, found.loops), found
 
     @classmethod
     def _made(
@@ -148,10 +148,11 @@ class Robot(RobotStructure, RigidBodyDynamics):
         problems: Problems,
         gravity: Vector,
         armature: Vector | Mapping[str, float | int] | None,
+        loops: Sequence[tuple[str, str, str]] = (),
         *,
         quiet: bool = False,
     ) -> "Robot":
-        """The robot of URDF text; `problems` has the arguments and what is wrong already."""
+        """The robot of URDF text; `problems` has the arguments and what is wrong already, `loops` are refused."""
         base, inertias = problems.given["base"], problems.given["inertias"]
         check_choice(base)
         locked = locked_positions(problems.given["locked"] or {})
@@ -177,6 +178,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
             limp = robot._limp() if without and not problems.broken else range(robot.nv)
             problems.errors += [error for coordinate, error in without if coordinate in limp]
             check_base(description, layout.standing, problems)
+            check_tree(layout, loops, problems)
         problems.raise_all()
         assert robot is not None, "a problem was collected otherwise"
         if not quiet:
@@ -263,13 +265,13 @@ class Robot(RobotStructure, RigidBodyDynamics):
         return text
 
     @usable_arguments("Robot.to_mjcf")
-    def to_mjcf(self, path: str | Path | None = None, loops: Sequence[LoopDescription] = ()) -> str:
-        """MJCF text with armature, damping, friction, motors and ``loops``; written to ``path`` if given.
+    def to_mjcf(self, path: str | Path | None = None) -> str:
+        """MJCF text with armature, damping, friction and motors; written to ``path`` if given.
 
         A RobotFileWarning names frames that move without mass, which are left out. Raises RobotModelError for what
         MuJoCo cannot hold, such as a last link without mass.
         """
-        writer = MjcfWriter(self, loops)
+        writer = MjcfWriter(self)
         text = writer.text()
         if writer.left_out:
             left_out = (

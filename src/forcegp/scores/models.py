@@ -70,7 +70,7 @@ def usual_forces(model: Model) -> str:
     jointed = bool(model.robot.single_joint_names)
     if thruster_columns(model):
         return "gp:joint-friction+gp:aerodynamic" if jointed else "gp:aerodynamic"
-    if any(slides(contact) for contact in model.touching):
+    if any(slides(contact) for contact in model.contacts):
         return "gp:tool-friction"
     return "gp:joint-friction" if jointed else "gp:joint"
 
@@ -84,7 +84,6 @@ def learn(
     recording: Dataset | None = None,
     baseline: Dataset | None = None,
     engine: Any = "auto",
-    learning_points: int | None = None,
     iterations: int | None = None,
     **search: Any,
 ) -> tuple[Posterior, list[str]]:
@@ -113,11 +112,10 @@ def learn(
         points = count if everything else min(POINTS if points is None else points, count)
         options = default_options(points)
         options = options if iterations is None else replace(options, iterations=iterations)
-        how: dict[str, Any] = {"engine": engine, "learning_points": learning_points}
+        how: dict[str, Any] = {"engine": engine}
         if everything:
             model = with_force_noise(model, dataset)
             how |= all_rows_at_once(points, model.robot.nv)
-            how |= {} if learning_points is None else {"learning_points": learning_points}
         if not model.unknown_forces:
             search = {**search, "restarts": 1}  # its starts are all the same
         how |= {"options": options, **search}

@@ -11,11 +11,9 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.text import Text
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 from PIL import Image
 
 from forcegp.atomic_files import atomic_file
@@ -88,15 +86,6 @@ def legend_below(figure: FigureBase, *axes: Axes, columns: int | None = None, si
     """The entries of these axes below all panels, by default in one row."""
     more |= {"handles": (handles := legend_entries(*axes)), "ncols": columns or max(1, len(handles))}
     figure.legend(loc="outside lower center", fontsize=size, frameon=False, **more)
-
-
-def plain_ticks(axis: Axis) -> None:
-    """Numbers such as 0.02 and 50 on a logarithmic axis with its final limits: at powers of ten alone if it is long."""
-    low, high = axis.get_view_interval()
-    of_decades = LogLocator(subs=(1.0, 2.0, 5.0) if high < 80.0 * low else (1.0,))
-    axis.set_major_locator(MaxNLocator(3) if high < 5.0 * low else of_decades)
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 @dataclass(frozen=True, eq=False)
