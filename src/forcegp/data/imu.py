@@ -91,10 +91,8 @@ class BesideMotion:
         return cls(name, _rms(f), _rms(f - p), _rms(f - p + still), *shown)
 
     @property
-    def turned(self) -> str | None:
-        """The name with the mounting that the motion shows, where that is a small turn."""
-        if not self.whole or self.share > EXPLAINS or self.angle > SMALL or abs(self.factor - 1.0) > WRONG:
-            return None
+    def turned(self) -> str:
+        """The name with the mounting that the motion shows."""
         frame, point, axes = imu_place(self.name)
         return f"{IMU}{frame}@{','.join(f'{x:.5g}' for x in (*point, *rpy_from_rotation(axes @ self.Q.T)))}"
 
@@ -103,17 +101,19 @@ class BesideMotion:
         own, off, kind = self.name.removeprefix(IMU), self.off, wrong if self.off > WRONG * self.size else look
         says, do, correction = list[str](), "", dict[str, dict[str, tuple[str, ...]]]()
         near, in_g = np.round(self.Q), abs(self.factor * STANDARD - 1.0) < WRONG
+        named = bool((near != np.eye(3)).any()) and np.linalg.norm(self.Q - near) < SMALL
+        explained = self.whole and self.share * self.size < EXPLAINS * off and (in_g or abs(self.factor - 1.0) < WRONG)
         axes = ",".join(f"{'-' * bool(x.sum() < 0.0)}{'xyz'[int(abs(x).argmax())]}" for x in near.T)
         if off <= AGREES * self.size:
             kind = ok
         elif self.off_without_gravity < EXPLAINS * min(off, self.size):
             says, do = ["without gravity"], "Log what the sensor measures: at rest 9.81 m/s^2 upwards."
-        elif self.whole and self.share * self.size < EXPLAINS * off and (in_g or abs(self.factor - 1.0) < WRONG):
+        elif explained and (named or np.linalg.det(self.Q) > 0.0):
             says, correction = (["in g"], {"unit": {"imu": ("g",)}}) if in_g else ([], {})
-            if (near != np.eye(3)).any() and np.linalg.norm(self.Q - near) < SMALL:
+            if named:
                 says += [f"{axes} of its frame's x,y,z"]
                 do = f"Name the columns in this order: forcegp import --force imu:{own}={axes}."
-            elif self.turned and self.angle > AGREES:
+            elif self.angle > AGREES:
                 says += [f"turned by {np.degrees(self.angle):.2g} degrees"]
                 do = f"State it: forcegp import --force imu:{self.turned.removeprefix(IMU)}=x,y,z."
         else:
@@ -139,8 +139,5 @@ def imu_doubts(dataset: Dataset, model: forcegp.model.Model) -> Iterator[Doubt]:
         late = lowest(left, SHIFTS)
         if abs(late) > max(LEAST_DELAY, float(np.median(np.diff(time)))) and left.min() < LATE * left[len(SHIFTS) // 2]:
             when = f"{1e3 * abs(late):.1f} ms {'later' if late > 0.0 else 'earlier'} than the motion that it measures"
-            what, do = (
-                f"the IMU at {imu_place(name)[0]} is logged {when}.",
-                "Shift its columns by that before an import.",
-            )
-            yield look(about="imu delay", what=what, do=do, numbers={"delay": late})
+            what = f"the IMU at {imu_place(name)[0]} is logged {when}."
+            yield look(about="imu delay", what=what, do="Shift its columns before an import.", numbers={"delay": late})

@@ -7,7 +7,7 @@ import numpy as np
 
 from forcegp.data import Dataset
 from forcegp.data.dataset import FORCE, IMU
-from forcegp.data.imu import BesideMotion
+from forcegp.data.imu import SMALL, BesideMotion
 from forcegp.errors import InvalidInput
 from forcegp.evidence import Accelerations, ContactForces, Evidence, FrameAcceleration, Sensor, Torques
 from forcegp.evidence.recorded_rows import share_of, slides
@@ -35,8 +35,11 @@ def with_sensors(dataset: Dataset, model: Model, rest: Evidence, sensors: Sequen
             at = [contact for contact in model.contacts if f"{FORCE}{contact.frame}" == name]
             if isinstance(each, FrameAcceleration):
                 beside = BesideMotion.of(dataset, model, name)
-                found = beside.turned if each.turned else name
-                if found is None or (not each.turned and beside.doubt().level == "wrong"):
+                little = each.turned and beside.whole and beside.angle < SMALL
+                if little:
+                    found = beside.turned
+                    beside = BesideMotion.of(replace(dataset, measured={found: dataset.measured[name]}), model, found)
+                if beside.doubt().level == "wrong" or (each.turned and not little):
                     raise InvalidInput(f"{'no small turn explains it: ' * each.turned}{beside.doubt()}")
                 if isinstance(rest, Torques) and not rest.noisy_in_both:
                     raise InvalidInput(
