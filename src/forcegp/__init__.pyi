@@ -29,7 +29,8 @@ from .simulation import KukaSurfaceConfig as KukaSurfaceConfig, simulate_kuka_su
 
 # learning from it
 from .evidence import (
-    Accelerations as Accelerations, ContactForces as ContactForces, Motions as Motions, Torques as Torques,
+    Accelerations as Accelerations, ContactForces as ContactForces, FrameAcceleration as FrameAcceleration,
+    Motions as Motions, Torques as Torques,
 )
 from .fit import fit as fit
 from .posterior import (

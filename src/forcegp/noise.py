@@ -1,4 +1,4 @@
-"""`Noise`: of measured accelerations, of forces, and of force sensors."""
+"""`Noise`: of measured accelerations, of forces, and of sensors."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -21,17 +21,18 @@ STATED = SENSOR, PUSHES
 class Noise:
     """Standard deviations: `acceleration` in rad/s^2 or m/s^2, `force` in Nm or N (None: no force-level noise).
 
-    Each is one number or one per joint; `sensor` is one number, of force sensors in N. `pushes` are those of forces on
-    joints that something pushes which nobody measured, one per joint. None for `acceleration` takes what the dataset
-    states. With `learn` they are start values of the optimisation, else they stay fixed; the hyperprior of a learned
-    one is log-normal around its start value, with a factor of e as one standard deviation. `sensor` and `pushes` stay.
+    Each is one number or one per joint; `sensor` is one number or one per column of force sensors [N] and IMUs [m/s^2].
+    `pushes` are those of forces on joints that something pushes which nobody measured, one per joint. None for
+    `acceleration` takes what the dataset states. With `learn` they are start values of the optimisation, else they stay
+    fixed; the hyperprior of a learned one is log-normal around its start value, with a factor of e as one standard
+    deviation. `sensor` and `pushes` stay.
     The covariance of one row is diag(acceleration^2) + H diag(force^2 + pushes^2) H^T.
     """
 
     acceleration: float | tuple[float, ...] | None = 0.1
     force: float | tuple[float, ...] | None = None
     learn: bool = False
-    sensor: float | None = None
+    sensor: float | tuple[float, ...] | None = None
     pushes: tuple[float, ...] | None = None
 
     @usable_arguments("Noise")
@@ -59,7 +60,7 @@ class Noise:
                 raise InvalidInput(f"Noise has {len(values)} values for {nv} joints; give one number or one per joint.")
             out[name] = values.expand(nv).log()
         if self.sensor is not None:
-            out[SENSOR] = torch.as_tensor(self.sensor, dtype=torch.float64, device=device).reshape(1).log()
+            out[SENSOR] = torch.as_tensor(self.sensor, dtype=torch.float64, device=device).reshape(-1).log()
         return out
 
     @staticmethod
@@ -68,8 +69,7 @@ class Noise:
     ) -> Float[Tensor, "1 D"] | Float[Tensor, "N D D"]:
         """Variances (1, D) of all rows, or their covariances (N, D, D) when there is force-level noise.
 
-        The D entries are nv accelerations and what force sensors measure beside them; H is what joint forces make of
-        them.
+        The D entries are nv accelerations and what sensors measure beside them; H is what joint forces make of them.
         """
         acceleration = (2.0 * parameters[ACCELERATION]).exp()[None]
         if (sensed := H.shape[-2] - acceleration.shape[-1]) > 0:

@@ -11,13 +11,14 @@ from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import Accelerations, ContactForces, Torques, fit, load_posterior, save_posterior
 from forcegp.data import Dataset, Preparation, low_pass, resample, with_memory
-from forcegp.data.dataset import FORCE
+from forcegp.data.dataset import FORCE, IMU
+from forcegp.data.imu import specific_force
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 from forcegp.evidence.likelihood import MarginalLikelihood, TrainingData
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
-from forcegp.fit.fit import with_sensor
 from forcegp.fit.physical import typical_sizes
+from forcegp.fit.sensors import with_sensors
 from forcegp.fit.unseen import OF_TORQUE, PUSHED, Unseen
 from forcegp.forces import (
     FORCES,
@@ -32,12 +33,12 @@ from forcegp.forces import (
     Viscous,
 )
 from forcegp.inference import OptimizerOptions
-from forcegp.mechanics import fixed_point
+from forcegp.mechanics import AffineMap, fixed_point
 from forcegp.model import Model
 from forcegp.noise import Noise
 from forcegp.robots import Robot
 
-SENSOR = f"{FORCE}hand"
+SENSOR, ACCELEROMETER = f"{FORCE}hand", f"{IMU}hand@0.1,0,0.2,0.3,-0.5,1"
 NORMAL = np.array([0.2, 0.0, 1.0]) / np.hypot(0.2, 1.0)
 QUICK = {"restarts": 1, "options": OptimizerOptions(iterations=8)}
 
@@ -73,20 +74,23 @@ def on_plane(*forces):
     return arm_model(1).with_forces(*forces)
 
 
-def likelihood_of(model, log):
-    return MarginalLikelihood(model, TrainingData.of(log, torch.device("cpu"), ["hand"]))
+def with_imu(log):
+    values = np.random.default_rng(4).normal(0.0, 5.0, (len(log), 3))
+    return replace(log, measured={**log.measured, ACCELEROMETER: values})
 
 
 def test_stacked_rows_have_the_density_of_one_large_gaussian():
-    model = replace(on_plane(JointForces(("q",))), noise=Noise(0.05, 0.02, learn=True, sensor=0.3))
-    log = measured(on_plane(Viscous(0.7)), model.known, rows=12, noise=0.05)
-    likelihood = likelihood_of(model, log)
+    model = replace(on_plane(JointForces(("q",))), noise=Noise(0.05, 0.02, learn=True, sensor=(0.3, 0.2, 0.2, 0.2)))
+    log = with_imu(measured(on_plane(Viscous(0.7)), model.known, rows=12, noise=0.05))
+    likelihood = MarginalLikelihood(model, TrainingData.of(log, torch.device("cpu"), log.measured))
     kernels, parameters = likelihood.kernels, likelihood.noise.parameters(3)
     parameters = {**kernels.initial_parameters(), **parameters}
     at = model.dynamics(*tensors(log, "q", "v", "u"))
-    maps = at.acceleration_map(), at.force_at("hand")
+    a, felt = at.acceleration_map(), specific_force(at.state.kinematics, ACCELEROMETER)
+    maps = a, at.force_at("hand"), AffineMap(felt(a.offset), felt.matrix @ a.matrix)
     G = torch.cat([x.matrix for x in maps], 1)
-    y = torch.cat([torch.tensor(log.a), torch.tensor(log.measured[SENSOR] @ NORMAL[:, None])], 1)
+    seen = log.a, log.measured[SENSOR] @ NORMAL[:, None], log.measured[ACCELEROMETER]
+    y = torch.cat([torch.tensor(x) for x in seen], 1)
     r = (y - torch.cat([x.offset for x in maps], 1)).flatten()
     B = model.unknown.direction(at)
     W = torch.block_diag(*(G @ B))
@@ -95,7 +99,7 @@ def test_stacked_rows_have_the_density_of_one_large_gaussian():
     features = likelihood.standardization(model.unknown.features(at))
     for c, matrix in enumerate(kernels.matrices(parameters, features)):
         K[:, c, :, c] = matrix.detach()
-    level = torch.diag(torch.tensor([0.05, 0.05, 0.05, 0.3], dtype=torch.float64).square())
+    level = torch.diag(torch.tensor([0.05, 0.05, 0.05, 0.3, 0.2, 0.2, 0.2], dtype=torch.float64).square())
     R = torch.block_diag(*(level + 0.02**2 * G @ G.mT))
     S = W @ K.reshape(n * C, n * C) @ W.T + R
     dense = torch.distributions.MultivariateNormal(torch.zeros(len(r), dtype=torch.float64), S)
@@ -104,10 +108,10 @@ def test_stacked_rows_have_the_density_of_one_large_gaussian():
 
 @pytest.mark.parametrize("contact", [held, on_plane])
 def test_slopes_of_stacked_residuals_are_those_of_finite_differences(contact):
-    model = contact(Viscous(), Offset(), Payload("hand"))
-    log = measured(contact(Viscous(0.4)), contact(), rows=6)
+    model = contact(Viscous(), Offset(), Payload("hand")).with_forces(noise=Noise(None, sensor=(9.0, 0.1, 0.2, 0.3)))
+    log = with_imu(measured(contact(Viscous(0.4)), contact(), rows=6))
     space = ParameterSpace(model, typical_sizes(model, [log]))
-    rows = RecordedRows(space, log.q, log.v, log.u, any_contact=True, sensed={"hand": log.measured[SENSOR]})
+    rows = RecordedRows(space, log.q, log.v, log.u, any_contact=True, sensed=log.measured)
     x = 0.3 + 0.1 * np.random.default_rng(1).standard_normal(space.size)
 
     def residual(x):
@@ -115,7 +119,8 @@ def test_slopes_of_stacked_residuals_are_those_of_finite_differences(contact):
 
     r, Y, in_terms = rows.in_acceleration(x, log.a)
     slopes = np.concatenate([space.bodies.chained(x[: space.bodies.size], Y), in_terms], axis=-1)
-    assert r.shape[1] == 3 + (3 if contact is held else 1)
+    assert r.shape[1] == 3 + (3 if contact is held else 1) + 3
+    assert rows.felt_noise.tolist() == [0.1, 0.2, 0.3]
     for k in range(space.size):
         step = 1e-6 * np.eye(space.size)[k]
         numeric = (residual(x + step) - residual(x - step)) / 2e-6
@@ -229,8 +234,8 @@ def test_a_sensor_shows_forces_along_the_normal(tmp_path, monkeypatch):
     again = load_posterior(tmp_path / "run")
     assert torch.equal(again.predict(*states).multiplier.mean, found.mean)
     updated = again.update(test)
-    assert len(updated.training.sensed["hand"]) == 160
-    with pytest.raises(InvalidInput, match="a force sensor at 'hand', which these rows do not have"):
+    assert len(updated.training.sensed[SENSOR]) == 160
+    with pytest.raises(InvalidInput, match=r"the sensor 'force.hand', which these rows do not have"):
         again.update(replace(test, measured={}))
 
 
@@ -255,9 +260,9 @@ def test_a_joint_that_something_pushes_teaches_nothing(force, found):
 
 def test_noise_that_nobody_states_begins_at_two_per_cent():
     log = measured(on_plane(), on_plane(), rows=20)
-    noise = with_sensor(Noise(0.1), log, None)
-    assert noise.sensor == pytest.approx(0.02 * np.sqrt((log.measured[SENSOR] ** 2).mean()))
-    assert with_sensor(Noise(0.1), log, 0.7).sensor == 0.7
+    noise = with_sensors(log, log.model, Torques(), [ContactForces()])[1].noise
+    assert noise.sensor == pytest.approx((0.02 * np.sqrt((log.measured[SENSOR] ** 2).mean()),))
+    assert with_sensors(log, held(), Torques(), [ContactForces(noise=0.7)])[1].noise.sensor == (0.7,) * 3
     typical = np.array([1.0, 2.0, 3.0])
     assert Unseen(typical, (), 0.0 * typical, None).with_pushes(noise).force == pytest.approx(0.02 * typical)
 
@@ -283,22 +288,24 @@ class TestLogsOfSensors:
             ({"torque.hand": np.zeros((80, 3))}, "allowed: force.FRAME"),
             ({SENSOR: np.zeros((80, 2))}, r"expected \(rows, 3\)"),
             ({SENSOR: np.full((80, 3), np.nan)}, "not finite"),
+            ({"imu.hand@1,2": np.zeros((80, 3))}, "no place in its frame"),
+            ({"imu.base": np.zeros((80, 3))}, "fixed in the world"),
         ],
     )
     def test_other_sensors_are_refused(self, log, given, words):
-        with pytest.raises(DatasetError, match=words):
+        with pytest.raises((DatasetError, InvalidInput), match=words):
             replace(log, measured=given)
 
     def test_evidence_that_a_log_lacks_is_refused(self, log):
-        with pytest.raises(InvalidInput, match="no force sensor at 'fore'; it has hand"):
+        with pytest.raises(InvalidInput, match=r"need the sensor force.fore; the log has ..force.hand"):
             fit(on_plane(Viscous()), log, [Torques(), ContactForces("fore")])
-        with pytest.raises(InvalidInput, match="no force sensor; it has none"):
+        with pytest.raises(InvalidInput, match=r"need the sensor force.FRAME; the log has ..:"):
             fit(on_plane(Viscous()), replace(log, measured={}), [Torques(), ContactForces()])
         with pytest.raises(InvalidInput, match="beside torques"):
             fit(on_plane(Viscous()), log, [Accelerations(), ContactForces()])
         with pytest.raises(InvalidInput, match="has no contact"):
             fit(arm_model(0).with_forces(JointForces()), log, [Accelerations(), ContactForces()])
-        with pytest.raises(InvalidInput, match="standard deviation in N"):
+        with pytest.raises(InvalidInput, match="noise of contact-forces"):
             ContactForces(noise=0.0)
 
     def test_a_sensor_without_a_contact_is_a_force_that_is_known(self, log):

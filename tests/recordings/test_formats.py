@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
+from tests.data.samples import model
 from tests.recordings.log_files import (
     EPOCH,
     JOINTS,
@@ -22,7 +23,7 @@ from tests.recordings.log_files import (
 from tests.recordings.source_conformance import SourceConformance
 
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput
-from forcegp.recordings import open_source
+from forcegp.recordings import ColumnMapping, import_recordings, open_source
 
 
 class Tables(SourceConformance):
@@ -323,6 +324,15 @@ class TestAnyMessage(TestRos2Folder):
             "/wrench:wrench.force.y": np.full(200, 0.5),
             "/wrench:wrench.torque.z": row**2,
         }
+
+
+def test_sensors_of_other_topics_are_vectors_of_their_messages(tmp_path):
+    pytest.importorskip("rosbags")
+    own = ("/wrench:wrench.force",)
+    mapping = ColumnMapping(force={"one": own, "imu:two@0,0,0.1": own}, unit={"imu": ("g",)})
+    log = import_recordings([write_bag2(tmp_path / "log", motion())], mapping, model=model("continuous"))
+    np.testing.assert_allclose(log.measured["force.one"][7], [7.0, 0.5, -1.0])
+    np.testing.assert_allclose(log.measured["imu.two@0,0,0.1"][7], 9.80665 * np.array([7.0, 0.5, -1.0]))
 
 
 def test_columns_of_several_topics_are_refused(tmp_path):

@@ -27,6 +27,7 @@ from forcegp.checks.torque_doubts import TOUCHES, elastic_doubts, held_points, t
 from forcegp.data import Dataset, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
+from forcegp.data.imu import imu_doubts
 from forcegp.doubts import LEVELS, Doubt, Doubts, listed, look
 from forcegp.errors import InvalidInput, require_type
 from forcegp.model import Model
@@ -128,6 +129,8 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
         doubts = [*sampling_doubts(inputs), *doubts, *motion_doubts(inputs)]
     moved = Doubts(doubts).of("velocity").level != "wrong"
     contacts = contact_doubts(inputs.mended, model)
+    if moved and inputs.prepared is not None:
+        doubts += imu_doubts(inputs.prepared, model)
     doubts += [*contacts, *stance_doubts(inputs.log, model)]
     comparison = None
     if inputs.compared is None or any(each.numbers.get("quantity") == "q" for each in registers):
@@ -160,6 +163,7 @@ def _of_base(dataset: Dataset, model: Model, inputs_of: Inputs) -> Doubts:
     of_base = unmeasured or list(base_doubts(dataset, model))
     if not unmeasured and Doubts(of_base).level != "wrong":  # forces in wrong axes show nothing
         of_base += carried_doubts(dataset, model)
+    of_base += imu_doubts(dataset, model) if Doubts(of_base).level != "wrong" else ()
     flags = stance_doubts(dataset, model) if Doubts(of_joints).level != "wrong" else ()  # wrong v contradict any flag
     return Doubts([*of_base, *of_joints, *flags])
 

@@ -20,6 +20,7 @@ import forcegp.robots
 from forcegp.data.hdf5 import read_fields, write_fields
 from forcegp.errors import DatasetError, FileFormatError, InvalidInput, require_type, usable_arguments
 from forcegp.robots.arguments import real_array
+from forcegp.robots.inertia import rotation_from_rpy
 from forcegp.summary import Summary, listed, rounded
 
 ROTATION = {"q": "rad", "v": "rad/s", "u": "Nm", "a": "rad/s^2"}  # units of a revolute or continuous joint
@@ -55,7 +56,9 @@ class Dataset(Summary):
     model: the robot, whose joints the columns are, and what it touches.
     noise_std: standard deviation of the noise on `a`, (nv,), if known.
     measured: what other sensors say by name: "force.FRAME" (rows, 3) is the force on the robot at that frame [N, world
-        axes], of a force sensor; where a contact is there, at its point.
+        axes], of a force sensor; where a contact is there, at its point. "imu.FRAME" (rows, 3) is what an accelerometer
+        there measures, R^T (p'' - g) [m/s^2, its axes]: at rest 9.81 upwards. It sits elsewhere in the frame where the
+        name goes on with "@x,y,z" or "@x,y,z,roll,pitch,yaw".
     truth: what a simulation provides: noise-free "a" (rows, nv), constraint multipliers "lambda" (rows, m) [N],
         the unknown joint forces "Q_U" (rows, nv), their parts "Q_U.<name>" (rows, nv), and forces on the robot
         "force.<name>" (rows, 3) [N, world axes].
@@ -219,15 +222,31 @@ def _noise_std(given: object, joint_names: tuple[str, ...]) -> np.ndarray | None
     return values
 
 
-FORCE = "force."
-"""Begins the names of measured forces; the frame follows."""
+FORCE, IMU = "force.", "imu."
+"""Begin the names of measured forces, and of what accelerometers measure; the frame follows."""
+
+
+def imu_place(name: str) -> tuple[str, list[float], Float[np.ndarray, "3 3"]]:
+    """Frame, point [m] and axes of "imu.FRAME@x,y,z,roll,pitch,yaw", of which the end may lack. Raises InvalidInput."""
+    frame, at, numbers = name.removeprefix(IMU).partition("@")
+    try:
+        pose = [float(x) for x in numbers.split(",")] if at else [0.0] * 3
+        if len(pose) not in (3, 6) or not np.isfinite(pose).all():
+            raise ValueError
+    except ValueError:
+        raise InvalidInput(
+            f"{name!r} has no place in its frame; give FRAME@x,y,z [m] or FRAME@x,y,z,roll,pitch,yaw [m, rad]."
+        ) from None
+    return frame, pose[:3], rotation_from_rpy(pose[3:] or [0.0] * 3)
 
 
 def _measured(given: Mapping[str, object], rows: int, robot: forcegp.robots.Robot) -> dict[str, np.ndarray]:
     for name in given:
-        if not str(name).startswith(FORCE):
-            raise DatasetError(f"measured has {name!r}; allowed: {FORCE}FRAME, the force at a frame of the robot.")
-        robot.frame(name.removeprefix(FORCE))
+        if not str(name).startswith((FORCE, IMU)):
+            raise DatasetError(f"measured has {name!r}; allowed: {FORCE}FRAME and {IMU}FRAME, of frames of the robot.")
+        body, _ = robot.frame(imu_place(name)[0] if name.startswith(IMU) else name.removeprefix(FORCE))
+        if name.startswith(IMU) and body < 0:
+            raise DatasetError(f"{name!r} is fixed in the world, so it measures no motion; name a link that moves.")
     return {name: finite_columns(f"measured[{name!r}]", given[name], ("x", "y", "z"), rows) for name in sorted(given)}
 
 

@@ -1,6 +1,6 @@
 from .evidence import (
-    Accelerations as Accelerations, ContactForces as ContactForces, Evidence as Evidence, Motions as Motions,
-    Torques as Torques,
+    Accelerations as Accelerations, ContactForces as ContactForces, Evidence as Evidence,
+    FrameAcceleration as FrameAcceleration, Motions as Motions, Sensor as Sensor, Torques as Torques,
 )
 from .evidence import EVIDENCE as EVIDENCE, parse_evidence as parse_evidence
 from .bodies import (

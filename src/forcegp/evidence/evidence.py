@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import ClassVar, Literal
 
-from forcegp.data.dataset import FORCE, Dataset
+from forcegp.data.dataset import FORCE, IMU, Dataset
 from forcegp.errors import InvalidInput, require_known, require_number, usable_arguments
 from forcegp.forces.registry import called
 
@@ -94,7 +94,34 @@ class Motions(Evidence):
 
 
 @dataclass(frozen=True)
-class ContactForces(Evidence):
+class Sensor(Evidence):
+    """A sensor at `frame` ("": all), whose names in `Dataset.measured` begin with `kind`; `noise` is in their units."""
+
+    kind: ClassVar[str]
+    frame: str = ""
+    noise: float | None = None
+
+    @usable_arguments("Sensor")
+    def __post_init__(self) -> None:
+        if self.noise is not None:
+            require_number(f"noise of {self.name}", self.noise, "give a standard deviation in SI units, or None")
+
+    def names(self, dataset: Dataset) -> list[str]:
+        """Of these sensors in `Dataset.measured`."""
+        own = {name: name.removeprefix(self.kind) for name in dataset.measured if name.startswith(self.kind)}
+        return [name for name, place in own.items() if self.frame in ("", place, place.partition("@")[0])]
+
+    def check(self, dataset: Dataset) -> None:
+        """Raise InvalidInput where the log has no such sensor."""
+        if not self.names(dataset):
+            raise InvalidInput(
+                f"{self.name} need the sensor {self.kind}{self.frame or 'FRAME'}; the log has {[*dataset.measured]}: "
+                "name its columns, as in `forcegp import --force foot=fx,fy,fz,imu:hand=ax,ay,az`."
+            )
+
+
+@dataclass(frozen=True)
+class ContactForces(Sensor):
     """What a force sensor measured, beside accelerations or torques: the force on the robot at `frame` ("": at all).
 
     Where the model has a contact there, its multipliers are seen; elsewhere, beside torques, it is a force that is
@@ -102,22 +129,20 @@ class ContactForces(Evidence):
     """
 
     name: ClassVar[str] = "contact-forces"
-    frame: str = ""
-    noise: float | None = None
+    kind: ClassVar[str] = FORCE
 
-    @usable_arguments("ContactForces")
-    def __post_init__(self) -> None:
-        if self.noise is not None:
-            require_number("ContactForces noise", self.noise, "give a standard deviation in N, or None")
 
-    def check(self, dataset: Dataset) -> None:
-        """Raise InvalidInput where the log has no such sensor."""
-        frames = [name.removeprefix(FORCE) for name in dataset.measured]
-        if not frames or self.frame not in ("", *frames):
-            raise InvalidInput(
-                f"the log has no force sensor{f' at {self.frame!r}' * bool(self.frame)}; it has "
-                f"{', '.join(frames) or 'none'}: name its columns, as in `forcegp import --force foot=fx,fy,fz`."
-            )
+@dataclass(frozen=True)
+class FrameAcceleration(Sensor):
+    """What an IMU on the link of `frame` measured ("": all): R^T (J a + Jdot v - g), beside accelerations or torques.
+
+    Torques are then `Torques(noisy="both")`, whose accelerations it makes better. `noise` [m/s^2]; None: 2 % of what it
+    measured, which holds offset and scale. If it may be `turned` a little, that is found first.
+    """
+
+    name: ClassVar[str] = "frame-acceleration"
+    kind: ClassVar[str] = IMU
+    turned: bool = False
 
 
 EVIDENCE: dict[str, type[Evidence]] = {
@@ -125,6 +150,7 @@ EVIDENCE: dict[str, type[Evidence]] = {
     "torques": Torques,
     "motions": Motions,
     "contact-forces": ContactForces,
+    "frame-acceleration": FrameAcceleration,
 }
 """Kinds by the name that commands and files have for them. Add yours: EVIDENCE["mine"] = Mine."""
 

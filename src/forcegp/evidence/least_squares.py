@@ -92,7 +92,7 @@ class NoiseLevels:
 
 
 def _covariance(inverse: Tensor, acceleration: Tensor, force: Tensor) -> Tensor:
-    return torch.diag_embed(acceleration.square()).expand_as(inverse) + (inverse * force.square()) @ inverse.mT
+    return torch.diag_embed(acceleration.square()) + (inverse * force.square()) @ inverse.mT
 
 
 ROUNDS = 12

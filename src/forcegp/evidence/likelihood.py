@@ -12,6 +12,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.data.dataset import FORCE as OF_SENSOR
+from forcegp.data.imu import specific_force
 from forcegp.errors import ContactError, DataWarning, InvalidInput
 from forcegp.forces import Scaling, Unknown, UnknownForces
 from forcegp.inference import Engine, Exact, LatentKernels, LatentPosterior, ProblemSize, Terms, negative_log_likelihood
@@ -27,7 +28,7 @@ RESIDUAL_FLOOR = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class TrainingData:
-    """States and measured accelerations (N, nv), float64, and by frame the forces (N, 3) that sensors measured.
+    """States and measured accelerations (N, nv), float64, and what sensors measured (N, 3), as `Dataset.measured`.
 
     `reference` holds the rows that features are standardised by, where they are others. Where errors resemble each
     other over `correlated_rows`, as many rows count as one.
@@ -46,11 +47,13 @@ class TrainingData:
         return len(self.q)
 
     @classmethod
-    def of(cls, rows: Dataset, device: torch.device, frames: Iterable[str] = ()) -> "TrainingData":
-        """Copies of all rows of a Dataset, and of what its force sensors at `frames` measured. Raises InvalidInput."""
-        if lost := [name for name in frames if f"{OF_SENSOR}{name}" not in rows.measured]:
-            raise InvalidInput(f"this model learns from a force sensor at {lost[0]!r}, which these rows do not have.")
-        sensed = {name: torch.tensor(rows.measured[f"{OF_SENSOR}{name}"], device=device) for name in frames}
+    def of(cls, rows: Dataset, device: torch.device, names: Iterable[str] = ()) -> "TrainingData":
+        """Copies of all rows, and of what sensors measured, where IMUs are mounted as `names` say. InvalidInput."""
+        there = {key: x for name, x in rows.measured.items() for key in (name.partition("@")[0], name)}
+        own = {name: there.get(name, there.get(name.partition("@")[0])) for name in names}
+        if lost := [name for name, values in own.items() if values is None]:
+            raise InvalidInput(f"this model learns from the sensor {lost[0]!r}, which these rows do not have.")
+        sensed = {name: torch.tensor(values, device=device) for name, values in own.items()}
         q, v, u, a = (torch.tensor(x, device=device) for x in (rows.q, rows.v, rows.u, rows.a))
         strokes = None if rows.strokes is None else torch.tensor(rows.strokes, device=device)
         return cls(q, v, u, a, strokes=strokes, sensed=sensed)
@@ -93,17 +96,24 @@ class Standardization:
         return [(z - m) / s for z, m, s in zip(features, self.shift, self.scale, strict=True)]
 
 
-def observed(dynamics: ConstrainedDynamics, frames: Iterable[str]) -> AffineMap:
-    """Accelerations, then the forces at contacts of these frames, as functions of the joint forces."""
-    parts = [dynamics.acceleration_map(), *(dynamics.force_at(frame) for frame in frames)]
+def observed(dynamics: ConstrainedDynamics, names: Iterable[str]) -> AffineMap:
+    """Accelerations, then what these sensors measure, forces at contacts or of IMUs, as functions of joint forces."""
+    a = dynamics.acceleration_map()
+
+    def of_imu(name: str) -> AffineMap:
+        felt = specific_force(dynamics.state.kinematics, name)
+        return AffineMap(felt(a.offset), felt.matrix @ a.matrix)
+
+    forces = {name: name.removeprefix(OF_SENSOR) for name in names}
+    parts = [a, *(of_imu(name) if name == place else dynamics.force_at(place) for name, place in forces.items())]
     offset, matrix = (torch.cat([part[k] for part in parts], dim=-1 - k) for k in (0, 1))
     return AffineMap(offset, matrix)
 
 
 def measured(dynamics: ConstrainedDynamics, training: TrainingData) -> Float[Tensor, "N D"]:
     """What `observed` predicts of these rows."""
-    forces = (dynamics.as_measured(frame, force) for frame, force in training.sensed.items())
-    return torch.cat([training.a, *forces], dim=-1)
+    sensed = (dynamics.as_measured(name.removeprefix(OF_SENSOR), x) for name, x in training.sensed.items())
+    return torch.cat([training.a, *sensed], dim=-1)
 
 
 FAR_FROM_SURFACE = 0.01
@@ -214,7 +224,7 @@ class MarginalLikelihood:
 
     @cached_property
     def observed(self) -> AffineMap:
-        """What was measured as a function of the joint forces: accelerations, then what each force sensor saw."""
+        """What was measured as a function of the joint forces: accelerations, then what each sensor saw."""
         return observed(self.dynamics, self.training.sensed)
 
     @cached_property

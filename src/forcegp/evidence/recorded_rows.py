@@ -18,7 +18,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset, with_memory
-from forcegp.data.dataset import FORCE
+from forcegp.data.dataset import FORCE, IMU
+from forcegp.data.imu import specific_force
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence.bodies import standard_parameters
 from forcegp.evidence.least_squares import NoiseLevels, orthonormal_columns, without
@@ -59,9 +60,18 @@ def motion_residuals(
     return force.cpu().numpy(), missed.cpu().numpy()
 
 
+SENSOR_SHARE = 0.02
+"""Of what a sensor measures: its standard deviation, where nobody states it."""
+
+
+def share_of(values: Float[np.ndarray, "rows k"]) -> float:
+    """The noise of a sensor that measured these values, where nobody states it."""
+    return max(SENSOR_SHARE * float(np.sqrt(np.square(values).mean())), 1e-9)
+
+
 def sensed_of(log: Dataset) -> dict[str, Float[np.ndarray, "rows 3"]]:
     """What its force sensors measured, by frame."""
-    return {name.removeprefix(FORCE): values for name, values in log.measured.items()}
+    return {name.removeprefix(FORCE): values for name, values in log.measured.items() if name.startswith(FORCE)}
 
 
 def arm(kinematics: Kinematics, model: Model, frame: str) -> Float[Tensor, "rows nv 3"]:
@@ -114,8 +124,8 @@ class RecordedRows:
     """States of one log of a model, the given forces there, and the terms of the equation of motion.
 
     `loaded` tells whether payloads that are estimated were there. Contacts that slide are refused unless `any_contact`.
-    `sensed` are forces on the robot at frames, which sensors measured. `pushed` are joints on which something acts that
-    nobody measured: their torques show nothing.
+    `sensed` is what sensors measured, as `Dataset.measured`. `pushed` are joints on which something acts that nobody
+    measured: their torques show nothing.
     """
 
     def __init__(
@@ -140,7 +150,17 @@ class RecordedRows:
         A, b, _ = model.constraint(self.state)
         self.held, self.right = independent_rows(A.cpu().numpy(), b.cpu().numpy())
         """Orthonormal rows (rows, m, nv) with ``held a = right``; rows of zeros where nothing holds."""
-        self.sensed, sensed = dict(sensed or {}), sensed or {}
+        imus = {name: x for name, x in (sensed or {}).items() if name.startswith(IMU)}
+        maps = [specific_force(self.kinematics, name) for name in imus]
+        parts = [(x.matrix.cpu().numpy(), x.offset.cpu().numpy()) for x in maps]
+        self.felt = np.concatenate([np.zeros((*self.v.shape[:1], 0, robot.nv)), *(J for J, _ in parts)], axis=1)
+        """What IMUs measure of accelerations (rows, k, nv); of that their values are `felt_right`, with this noise."""
+        left = [np.array(x) - offset for x, (_, offset) in zip(imus.values(), parts, strict=True)]
+        self.felt_right = np.concatenate([np.zeros((len(self.v), 0)), *left], axis=1)
+        stated = None if model.noise is None else model.noise.sensor  # of force sensors, then of IMUs
+        level = np.repeat([share_of(x) for x in imus.values()], 3) if stated is None else np.atleast_1d(stated)
+        self.felt_noise = np.resize(level[-3 * len(imus) :], 3 * len(imus))
+        self.sensed = sensed = {n.removeprefix(FORCE): x for n, x in (sensed or {}).items() if n not in imus}
         arms = {frame: arm(self.kinematics, model, frame).cpu().numpy() for frame in sensed}
         forces = (each @ sensed[frame][..., None] for frame, each in arms.items())
         self.at_contacts = sum(forces, np.zeros((*self.v.shape, 1)))[..., 0]
@@ -241,21 +261,22 @@ class RecordedRows:
         return dynamics.acceleration_map().offset.numpy(), M, dynamics.H.numpy()
 
     def in_acceleration(self, x: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Residual a - a^ and its derivatives, as `in_torque`; then those of what force sensors at contacts measured.
+        """Residual a - a^ and its derivatives, as `in_torque`; then those of force sensors at contacts and of IMUs.
 
         With the torque t of the motion A^T lambda = M a^ + t, of which D makes the force of a sensor, and
-        dr / dpi = -D (1 - M H) Y.
+        dr / dpi = -D (1 - M H) Y. What IMUs measure is affine in a^.
         """
         predicted, M, H = self.acceleration(x)
         Y = self.moving(predicted).regressor
         torque, in_x = self._terms(x, predicted)
-        r, shape = a - predicted, predicted.shape
-        if not self.sensed:
-            return r, (H @ Y.reshape(*shape, -1)).reshape(Y.shape), H @ in_x
-        fixed, (D, seen) = self.moving(predicted, given=False).fixed, self._sensing
-        rigid = fixed + Y.reshape(*shape, -1) @ self.space.standard_parameters(x).ravel()
-        by = np.concatenate([H, -D @ (np.eye(shape[1]) - M @ H)], axis=1)
-        r = np.concatenate([r, seen - (D @ (rigid + torque)[..., None])[..., 0]], axis=1)
+        r, by, shape = [a - predicted], [H], predicted.shape
+        if self.sensed:
+            fixed, (D, seen) = self.moving(predicted, given=False).fixed, self._sensing
+            rigid = fixed + Y.reshape(*shape, -1) @ self.space.standard_parameters(x).ravel()
+            by.append(-D @ (np.eye(shape[1]) - M @ H))
+            r.append(seen - (D @ (rigid + torque)[..., None])[..., 0])
+        r = np.concatenate([*r, self.felt_right - (self.felt @ predicted[..., None])[..., 0]], axis=1)
+        by = np.concatenate([*by, self.felt @ H], axis=1)
         return r, (by @ Y.reshape(*shape, -1)).reshape(*r.shape, *Y.shape[2:]), by @ in_x
 
     def rough_noise(self, x: np.ndarray, a: Rows) -> NoiseLevels:
@@ -269,7 +290,7 @@ class RecordedRows:
         return NoiseLevels(np.sqrt((residual**2).mean(0)).clip(1e-12), force)
 
     def likely(self, x: np.ndarray, measured: Motion, noise: NoiseLevels) -> "LikelyAccelerations":
-        """What was there where a and u are noisy, by the estimates at x and these levels of noise.
+        """What was there where a and u are noisy, by the estimates at x, these levels of noise, contacts and IMUs.
 
         Forces of joints that nothing measures, as those of a base, belong to a*, since they move the robot.
         """
@@ -278,11 +299,13 @@ class RecordedRows:
         M, a, robot = response(M), measured.a, self.space.model.robot
         of_joints = np.isin(robot.joint_names, robot.single_joint_names)
         e_a = np.diag(noise.acceleration**2) + (H * np.where(of_joints, 0.0, noise.force**2)) @ H
-        A, idle = self.held, np.logical_not(self.held.any(axis=-1))
+        A, right = np.concatenate([self.held, self.felt], 1), np.concatenate([self.right, self.felt_right], 1)
+        idle = np.logical_not(self.held.any(axis=-1))
+        least = np.concatenate([idle, np.broadcast_to(self.felt_noise**2, self.felt_right.shape)], axis=1)
         at_contacts = A @ e_a
-        among = at_contacts @ A.swapaxes(1, 2) + idle[:, :, None] * np.eye(A.shape[1])
+        among = at_contacts @ A.swapaxes(1, 2) + least[:, :, None] * np.eye(A.shape[1])
         gain = np.linalg.solve(among, at_contacts).swapaxes(1, 2)
-        moved = (gain @ (self.right[..., None] - A @ a[..., None]))[..., 0]
+        moved = (gain @ (right[..., None] - A @ a[..., None]))[..., 0]
         e_a = e_a - gain @ at_contacts
         S = M @ e_a @ M.swapaxes(1, 2) + np.diag(np.where(of_joints, noise.force**2, 0.0))
         # directions of contact forces; without them S is singular where contacts hold

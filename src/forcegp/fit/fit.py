@@ -10,14 +10,13 @@ import numpy as np
 from torch import Tensor
 
 from forcegp.data import Dataset, farthest_rows
-from forcegp.data.dataset import FORCE, require_rows
+from forcegp.data.dataset import require_rows
 from forcegp.data.views import past_known, with_memory
 from forcegp.doubts import Doubts
 from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
-from forcegp.evidence import Accelerations, ContactForces, Evidence, Motions, Torques, TrainingData
+from forcegp.evidence import Accelerations, Evidence, Motions, Sensor, Torques, TrainingData
 from forcegp.evidence.likelihood import MarginalLikelihood, check_distance, problem_size
 from forcegp.evidence.parameter_space import ParameterSpace
-from forcegp.evidence.recorded_rows import sensed_of
 from forcegp.fit.doubts import (
     check_forces,
     doubts_of_past,
@@ -48,12 +47,12 @@ from forcegp.fit.search import (
     widened,
     with_variance_priors,
 )
+from forcegp.fit.sensors import usual_evidence, with_sensors
 from forcegp.fit.unseen import Unseen
 from forcegp.forces import UnknownForces
 from forcegp.forces.kernels import LOG_VARIANCE_SPREAD
 from forcegp.inference import Engine, OptimizationResult, OptimizerOptions, engine_of
 from forcegp.model import Model
-from forcegp.noise import Noise
 from forcegp.parallel import checked_jobs
 from forcegp.posterior import Posterior
 from forcegp.posterior.drift import with_drift
@@ -61,8 +60,6 @@ from forcegp.posterior.fitted import Estimates
 from forcegp.posterior.observed_wrench import in_air, unobserved
 from forcegp.robots.arguments import whole_number
 
-SENSOR_SHARE = 0.02
-"""Of what a force sensor measures: its standard deviation, where nobody states it."""
 CONTINUE_FROM = (250, 500)
 """Rows of the searches, one after the other, at whose end one on more than `MOST_POINTS_FOR_RESTARTS` rows begins."""
 
@@ -98,7 +95,7 @@ def fit(
     dataset: rows with the joints of the robot in its order; nothing in it is changed.
     evidence: `Accelerations()` or `Torques()`, and beside it `Motions(seconds)`, which refines what it found. None
         stands for accelerations where functions are unknown, else for torques, with noisy accelerations where the base
-        moves.
+        moves or an IMU is there; and for all IMUs and force sensors at contacts, `FrameAcceleration`, `ContactForces`.
     baseline: a second log, of the same robot without the payloads that are estimated.
     points: learn functions from this many rows, those that lie farthest apart in (q, v, u); None: all.
     rows: of models without unknown functions, use so many at most, evenly spread; None: 5,000, fewer beyond 8 joints.
@@ -133,11 +130,13 @@ def fit(
     NumericalError: the engine failed.
     """
     require_type("model", model, Model, ", for example dataset.model")
-    rest, refinement, sensors = _chosen(evidence, model, start)
+    require_type("dataset", dataset, Dataset, "; the model comes first, as in fit(model, dataset)")
+    rest, refinement, sensors = _chosen(evidence, model, dataset, start)
     dataset = _checked(model, dataset, rest, refinement)
-    dataset = with_sensors(dataset, model, rest, sensors, chosen=bool(evidence))
+    dataset, model = with_sensors(dataset, model, rest, sensors)
     model = without_idle_offsets(model, dataset)
-    how = rest if isinstance(rest, Accelerations) and not model.unknown_forces else usual_torques(model)
+    usual = Torques("both" if rest.noisy_in_both or not model.robot.space.is_vector_space else "u")
+    how = rest if isinstance(rest, Accelerations) and not model.unknown_forces else usual
     model, choice = (model, None) if isinstance(start, Posterior) else with_friction_chosen(model, dataset, how)
     dataset = dataset if choice is None else with_memory(dataset, model)
     known = past_known(dataset, model)
@@ -145,9 +144,11 @@ def fit(
     known = known | (known.mean() < 1.0 - LEFT_OUT)
     points = int(known.sum()) if points == len(dataset) else points  # all of them are all that are left
     dataset = dataset if known.all() else dataset.rows(np.flatnonzero(known))
-    touches = model.contacts and not model.carries_known_forces
+    touches = (model.contacts or dataset.measured) and not model.carries_known_forces
     unseen = Unseen.of(model, dataset, typical_sizes(model, [dataset])["force"]) if touches else None
-    logs = [dataset] if baseline is None else [dataset, _checked(model, baseline, rest, None)]
+    logs = [dataset]
+    if baseline is not None:
+        logs.append(with_sensors(_checked(model, baseline, rest, None), model, rest, sensors)[0])
     if isinstance(start, Posterior):
         posterior: Any = start
     elif (isinstance(rest, Torques) or not model.unknown_forces) and (model.is_open or model.unknown_forces):
@@ -162,9 +163,8 @@ def fit(
             raise InvalidInput(
                 "a baseline is for payloads, without unknown functions; leave these out, or the baseline."
             )
-        sensor = next((each.noise for each in sensors if each.noise is not None), None)
         search = Search(checked_jobs(jobs), restarts, seed, options, start)
-        posterior = _Functions(model, search, engine, learning_points, sensor, unseen).fitted(dataset, points)
+        posterior = _Functions(model, search, engine, learning_points, unseen).fitted(dataset, points)
     if choice is not None:
         posterior = posterior.with_settings(gear_friction=choice.to_dict())
     if not known.all():
@@ -178,16 +178,15 @@ def fit(
 
 
 def _chosen(
-    evidence: Evidence | Sequence[Evidence] | None, model: Model, start: Any
-) -> tuple[Any, Motions | None, tuple[ContactForces, ...]]:
-    """The evidence to begin with, the motions that refine what it found, and force sensors beside it."""
+    evidence: Evidence | Sequence[Evidence] | None, model: Model, dataset: Dataset, start: Any
+) -> tuple[Any, Motions | None, tuple[Sensor, ...]]:
+    """The evidence to begin with, the motions that refine what it found, and sensors beside it."""
     given = () if evidence is None else (evidence,) if isinstance(evidence, Evidence) else tuple(evidence)
     if not all(isinstance(each, Evidence) for each in given):
         raise InvalidInput(f"evidence is {evidence!r}; give Accelerations(), Torques(), ContactForces() or Motions(S).")
-    sensors = tuple(each for each in given if isinstance(each, ContactForces))
-    given = tuple(each for each in given if not isinstance(each, ContactForces))
     motions = [each for each in given if isinstance(each, Motions)]
-    others = [each for each in given if not isinstance(each, Motions)]
+    sensors = tuple(each for each in given if isinstance(each, Sensor))
+    others = [each for each in given if not isinstance(each, Motions | Sensor)]
     if len(motions) > 1 or len(others) > 1:
         raise InvalidInput(
             f"evidence is {', '.join(map(str, given))}: the same rows twice; give accelerations or torques, and "
@@ -198,53 +197,14 @@ def _chosen(
         refinement.refuse(start.trained.unknown_forces if isinstance(start, Posterior) else model.unknown_forces)
     if isinstance(start, Posterior) and (refinement is None or others):
         raise InvalidInput("start is a posterior; it is refined by Motions() alone: give that as the evidence.")
-    return others[0] if others else usual_evidence(model), refinement, sensors
-
-
-def usual_evidence(model: Model) -> Evidence:
-    """That of `fit` where none is named."""
-    return Accelerations() if model.unknown_forces or not model.is_open else usual_torques(model)
-
-
-def usual_torques(model: Model) -> Torques:
-    """With noisy accelerations as well where the base moves."""
-    return Torques("u" if model.robot.space.is_vector_space else "both")
-
-
-def with_sensor(noise: Noise, rows: Dataset, stated: float | None) -> Noise:
-    """The noise with that of force sensors, where the log has them."""
-    if not rows.measured or noise.sensor is not None:
-        return noise
-    size = float(np.sqrt(np.mean([np.square(values).mean() for values in rows.measured.values()])))
-    return replace(noise, sensor=stated or max(SENSOR_SHARE * size, 1e-9))
-
-
-def with_sensors(
-    dataset: Dataset, model: Model, rest: Evidence, sensors: Sequence[ContactForces], chosen: bool
-) -> Dataset:
-    """The log with the force sensors that are evidence: of the default all that functions or laws can learn from."""
-    for each in sensors:
-        each.check(dataset)
-    at_contacts = {contact.frame for contact in model.contacts}
-    frames = list(sensed_of(dataset))
-    if sensors and all(each.frame for each in sensors):
-        frames = [each.frame for each in sensors]
-    elif not sensors:
-        frames = [] if chosen else [name for name in frames if name in at_contacts]
-    if frames and isinstance(rest, Accelerations) and model.is_open and not model.unknown_forces:
-        raise InvalidInput("force sensors teach numbers beside torques, not beside accelerations; give Torques().")
-    if model.unknown_forces and (lost := [name for name in frames if name not in at_contacts]):
-        raise InvalidInput(
-            f"a force was measured at {lost[0]!r}, where the model has no contact; give it one, or leave unknown "
-            "forces out, so that it is a force that is known."
-        )
-    return replace(dataset, measured={f"{FORCE}{name}": dataset.measured[f"{FORCE}{name}"] for name in frames})
+    usual = usual_evidence(model, dataset.measured)
+    own = tuple(each for each in usual if isinstance(each, Sensor) and not given)
+    return (others or usual)[0], refinement, sensors or own
 
 
 def _checked(model: Model, dataset: Dataset, evidence: Any, refinement: Motions | None) -> Dataset:
     """The log, if it has what the evidence needs; of equal rows, or episodes of rows in order, the first alone."""
-    remedy = "; the model comes first, as in fit(model, dataset)"
-    require_rows("dataset", dataset, model.robot.joint_names, "the robot", remedy)
+    require_rows("dataset", dataset, model.robot.joint_names, "the robot")
     if len(dataset) < 2:
         raise InvalidInput(f"the dataset has {len(dataset)} rows; at least 2 are needed")
     for each in (evidence, refinement):
@@ -295,8 +255,6 @@ class _Functions:
     search: Search
     engine: Engine | str
     learning_points: int | None
-    sensor: float | None = None
-    """Standard deviation of force sensors [N], where it is stated."""
     unseen: Unseen | None = None
     """What the log leaves open of forces at contacts."""
 
@@ -399,10 +357,10 @@ class _Functions:
 
         `beside` gives the likelihood in which numbers are free.
         """
-        noise = with_sensor(resolved_noise(self.model.noise, rows), rows, self.sensor)
+        noise = resolved_noise(self.model.noise, rows)
         noise = noise if self.unseen is None else self.unseen.with_pushes(noise, len(rows))
         model = replace(self.model, noise=noise)
-        training = TrainingData.of(rows, model.robot.device, sensed_of(rows))
+        training = TrainingData.of(rows, model.robot.device, rows.measured)
         likelihood = MarginalLikelihood(model, training)
         model.check_states(training.q, training.v, training.u)
         check_distance(model, training)

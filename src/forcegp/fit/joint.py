@@ -61,7 +61,7 @@ class Slopes:
         self.space = space
         q, v, u = (x.cpu().numpy() for x in (training.q, training.v, training.u))
         strokes = None if training.strokes is None else training.strokes.cpu().numpy()
-        sensed = {frame: x.cpu().numpy() for frame, x in training.sensed.items()}
+        sensed = {name: x.cpu().numpy() for name, x in training.sensed.items()}
         self.rows = RecordedRows(space, q, v, u, any_contact=True, strokes=strokes, sensed=sensed)
         self.a = training.a.cpu().numpy()
         self.device = training.a.device

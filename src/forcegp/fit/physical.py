@@ -27,7 +27,7 @@ from forcegp.evidence.least_squares import (
     without,
 )
 from forcegp.evidence.parameter_space import ParameterSpace
-from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, RecordedRows, sensed_of
+from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, RecordedRows
 from forcegp.fit.payloads import changes_without_rests, doubts_of_payloads, misfit, with_payloads_placed
 from forcegp.fit.unseen import Unseen
 from forcegp.forces import Actuation, Payload
@@ -51,7 +51,7 @@ class Equations:
         self.space, self.evidence, self.logs = space, evidence, logs
         self.parts = [
             RecordedRows(
-                space, log.q, log.v, log.u, loaded=not k, strokes=log.strokes, sensed=sensed_of(log), pushed=pushed
+                space, log.q, log.v, log.u, loaded=not k, strokes=log.strokes, sensed=log.measured, pushed=pushed
             )
             for k, log in enumerate(logs)
         ]
@@ -78,11 +78,12 @@ class Equations:
     def equations(self, x: np.ndarray, parts: Sequence[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, Jacobian]:
         """Residuals and their Jacobian in x, from derivatives in standard parameters and coordinates of laws."""
         r, Y, in_terms = zip(*parts, strict=True)
+        residual = np.concatenate(r)
         if len(Y) != len(self._stays) or any(a is not b for a, b in zip(Y, self._stays, strict=True)):
-            flat = np.concatenate(Y).reshape(*self.a.shape, 10 * len(self.space.carried))
+            flat = np.concatenate(Y).reshape(*residual.shape, 10 * len(self.space.carried))
             self._stays, self._regressor = Y, Regressor(flat)
         slopes = self.space.bodies.slopes(x[: self.space.bodies.size])
-        return np.concatenate(r), Chained(self._regressor, slopes, np.concatenate(in_terms))
+        return residual, Chained(self._regressor, slopes, np.concatenate(in_terms))
 
     def in_torque(self, x: np.ndarray, motions: Sequence[Motion]) -> tuple[np.ndarray, Jacobian]:
         """Torques needed less those measured; beside gains, where contacts hide nothing, as they are logged."""
@@ -110,7 +111,7 @@ class Equations:
         return r, jacobian
 
     def in_acceleration(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Accelerations measured less those predicted."""
+        """Accelerations measured less those predicted, and the same of IMUs."""
         found = [part.in_acceleration(x, a) for part, a in zip(self.parts, self.each(self.a), strict=True)]
         r, jacobian = self.equations(x, found)
         return r, np.asarray(jacobian)
@@ -130,6 +131,12 @@ class Equations:
     def accelerations(self, x: np.ndarray) -> list[np.ndarray]:
         """Predicted accelerations, M and H."""
         return self.joined([part.acceleration(x) for part in self.parts])
+
+    def whitening(self, noise: NoiseLevels, H: np.ndarray) -> np.ndarray:
+        """Of the residuals of `in_acceleration`."""
+        felt = np.concatenate([part.felt for part in self.parts]) @ H
+        level = np.concatenate([noise.acceleration, self.parts[0].felt_noise])
+        return NoiseLevels(level, noise.force).whitening(np.concatenate([H, felt], axis=1))
 
     def levels(self, x: np.ndarray, near: NoiseLevels | None, least: NoiseLevels | None, rough: bool) -> NoiseLevels:
         """The noise about the estimates at x, sought `near` others and above `least`."""
@@ -264,7 +271,7 @@ def fit_physical(
         for _ in range(REWEIGHTINGS):
             predicted, M, H = equations.accelerations(fit.x)
             noise = NoiseLevels.of(equations.a - predicted, M, H)
-            W = noise.whitening(H)
+            W = equations.whitening(noise, H)
 
             def white(x: np.ndarray, W: np.ndarray = W) -> tuple[np.ndarray, np.ndarray]:
                 r, jacobian = equations.in_acceleration(x)

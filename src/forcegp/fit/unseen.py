@@ -15,7 +15,7 @@ from forcegp.data import Dataset, evenly
 from forcegp.doubts import Doubt, look
 from forcegp.evidence.least_squares import NoiseLevels, orthonormal_columns, without
 from forcegp.evidence.parameter_space import ParameterSpace
-from forcegp.evidence.recorded_rows import RecordedRows, sensed_of
+from forcegp.evidence.recorded_rows import RecordedRows
 from forcegp.forces import Payload, RigidBodies
 from forcegp.model import Model
 from forcegp.noise import Noise
@@ -132,7 +132,7 @@ def _rows_of_known_physics(model: Model, log: Dataset) -> RecordedRows:
     plain = tuple(law for law in closed if not law.memory_names(model.robot))
     alone = replace(model, forces=plain)
     u = log.u[:, [k for k, name in enumerate(model.inputs) if name in alone.inputs]]
-    return RecordedRows(ParameterSpace(alone, {}), log.q, log.v, u, any_contact=True, sensed=sensed_of(log))
+    return RecordedRows(ParameterSpace(alone, {}), log.q, log.v, u, any_contact=True, sensed=log.measured)
 
 
 def push(

@@ -49,14 +49,14 @@ SHARP = 1e-9
 
 
 def hidden_forces(
-    hidden: Float[Tensor, " nv"], dynamics: ConstrainedDynamics, frames: Sequence[str]
+    hidden: Float[Tensor, " nv"], dynamics: ConstrainedDynamics, sensors: Sequence[str]
 ) -> Float[Tensor, "rows nv nv"]:
     """The covariance of joint forces of these standard deviations that nothing showed.
 
-    What changes accelerations, or forces at `frames` with sensors, was seen and is not among them: N(0, h^2) given that
+    What changes accelerations, or what `sensors` measure, was seen and is not among them: N(0, h^2) given that
     H e = 0 and C e = 0, which is (A h^-2 A^T)^-1 for the multipliers of independent contacts.
     """
-    prior, G = torch.diag(hidden.square()), observed(dynamics, frames).matrix
+    prior, G = torch.diag(hidden.square()), observed(dynamics, sensors).matrix
     across = prior @ G.mT
     V = G @ across
     V = V + SHARP * V.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(V.shape[-1]).to(V)

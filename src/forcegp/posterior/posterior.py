@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset, with_memory
+from forcegp.data.dataset import FORCE as OF_SENSOR
 from forcegp.data.dataset import require_rows
 from forcegp.errors import ContactWarning, DataWarning, InvalidInput, NumericalError, require_type, usable_arguments
 from forcegp.evidence.likelihood import FAR_FROM_SURFACE
@@ -162,7 +163,8 @@ class Posterior(Fitted):
         hidden = self.settings.get("hidden_force")
         if hidden is None or not dynamics.A.shape[-2]:
             return None
-        frames = [name for name in self.training.sensed if any(x.frame == name for x in dynamics.contacts)]
+        at_contacts = {f"{OF_SENSOR}{contact.frame}" for contact in dynamics.contacts}
+        frames = [name for name in self.training.sensed if name in at_contacts]
         return hidden_forces(torch.tensor(hidden, dtype=torch.float64).to(dynamics.H), dynamics, frames)
 
     def latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Gaussian:

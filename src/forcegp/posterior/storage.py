@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save
 from forcegp import __version__
 from forcegp.atomic_files import atomic_folder, require_replaceable, require_unchanged, write_digests
 from forcegp.data import units_for
-from forcegp.data.dataset import FORCE
+from forcegp.data.dataset import FORCE, IMU
 from forcegp.errors import FileFormatError, ForceGPError, require_type, usable_arguments
 from forcegp.evidence.likelihood import TrainingData
 from forcegp.inference import OptimizationResult, engine_from_dict
@@ -76,7 +76,7 @@ def save_posterior(posterior: Posterior, path: str | Path, *, overwrite: bool = 
     tensors = {f"{PARAMETERS}{name}": value for name, value in posterior.hyperparameters.items()}
     for prefix, rows in ((TRAINING, posterior.training), (REFERENCE, posterior.training.reference)):
         tensors |= {prefix + name: value for name in ROWS if (value := getattr(rows, name, None)) is not None}
-        tensors |= {f"{prefix}{FORCE}{name}": value for name, value in (rows.sensed if rows else {}).items()}
+        tensors |= {f"{prefix}{name}": value for name, value in (rows.sensed if rows else {}).items()}
     with atomic_folder(path, overwrite=overwrite) as folder:
         folder.mkdir()
         # safetensors' own `save_file` ignores the umask; rows of one tensor may share memory with another's
@@ -139,10 +139,10 @@ def _rows(prefix: str, tensors: Mapping[str, torch.Tensor], model: Model) -> Tra
     for name, value in given.items():
         if value.shape != (count, columns.get(name, model.robot.nv)):
             raise ValueError(f"{prefix}{name} has shape {tuple(value.shape)}, which is not that of {count} rows")
-    own = f"{prefix}{FORCE}"
-    sensed = {name.removeprefix(own): value for name, value in tensors.items() if name.startswith(own)}
+    own = (f"{prefix}{FORCE}", f"{prefix}{IMU}")
+    sensed = {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(own)}
     if any(value.shape != (count, 3) for value in sensed.values()):
-        raise ValueError(f"{own} has other shapes than ({count}, 3)")
+        raise ValueError(f"sensors have other shapes than ({count}, 3)")
     return TrainingData(**given, sensed=sensed)
 
 

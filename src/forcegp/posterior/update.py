@@ -25,7 +25,7 @@ def learn_more_rows(posterior: Structured, rows: Dataset) -> Structured:
         variance = terms.noise.expand(len(terms.W), *terms.noise.shape[1:])
         latent = with_rows(latent, terms._replace(noise=variance))
     both = training, more.training
-    sensed = {frame: torch.cat([x.sensed[frame] for x in both]) for frame in training.sensed}
+    sensed = {name: torch.cat([x.sensed[name] for x in both]) for name in training.sensed}
     pairs = {name: [getattr(x, name) for x in both] for name in (*"qvua", "strokes")}
     joined = {name: None if any(x is None for x in pair) else torch.cat(pair) for name, pair in pairs.items()}
     likelihood = replace(more, training=replace(training, **joined, sensed=sensed, reference=more.training.reference))

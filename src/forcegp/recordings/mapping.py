@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from forcegp.data.imu import STANDARD
 from forcegp.doubts import stated_as
 from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
 from forcegp.recordings.source import Source
@@ -54,6 +55,7 @@ UNITS: dict[str, dict[str, LogUnit]] = {
     | _units("rad/s", {"rad/s": 1, "rev/s": _TURNS, "rpm": 60 * _TURNS}),
     "a": _units("rad/s^2", {"rad/s^2": 1, "deg/s^2": _DEGREES}) | _units("m/s^2", {"m/s^2": 1, "mm/s^2": 1e3}),
     "force": _units("N", {"N": 1, "mN": 1e3, "kN": 1e-3}),
+    "imu": _units("m/s^2", {"m/s^2": 1, "mm/s^2": 1e3, "g": 1 / STANDARD}),
 }
 """By quantity and name: what `ColumnMapping.unit` accepts."""
 
@@ -84,6 +86,7 @@ class ColumnMapping:
     q, v, u, a: per signal, its columns: patterns (`pos{1..7}`), names of vectors, combinations (`theta2 - theta1`), or
         one constant. None: v and a are differentiated, the others are looked for by the names of the joints.
     force: by frame of the robot, three columns of a force sensor there: the force on the robot, x, y, z in world axes.
+        By "imu:FRAME", "imu:FRAME@x,y,z" or "imu:FRAME@x,y,z,roll,pitch,yaw" those of an accelerometer, in its axes.
     joints: their names, in the order of the columns; columns of a base that moves stand where its robot has them.
     orientation: of a base that moves: quaternions "xyzw" (default) or "wxyz", or "angles" roll, pitch and yaw.
     axes: of its v and a, of the linear and the angular part: "body" (default), "world", or "imu" for what an
@@ -203,16 +206,17 @@ class ColumnMapping:
 
 
 EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body", "force": "foot=fx,fy,fz"}
+OF_IMU = "imu:"  # before a frame of `force`
 
 
 def by_quantity(flag: str, text: str) -> dict[str, tuple[str, ...]]:
     """`q=deg,m,time=ms` as {"q": ("deg", "m"), "time": ("ms",)}: what follows a name up to the next is its list."""
     found: dict[str, tuple[str, ...]] = {}
     name = None
-    for part in text.split(","):
+    for part in re.sub(r"imu:[^=]*=", lambda own: own[0].replace(",", ";"), text).split(","):  # a place has commas
         before, equals, after = part.partition("=")
         if equals:
-            name, part = before.strip(), after
+            name, part = before.strip().replace(";", ","), after
             if name in found:
                 raise InvalidInput(f"--{flag} names {name} twice.")
         if name is None or not part.strip():

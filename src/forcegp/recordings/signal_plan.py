@@ -13,9 +13,10 @@ from jaxtyping import Float
 import forcegp
 from forcegp.data import differentiate
 from forcegp.data.configurations import in_base
-from forcegp.data.dataset import FORCE, ROTATION, TRANSLATION
+from forcegp.data.dataset import FORCE, IMU, ROTATION, TRANSLATION, imu_place
 from forcegp.errors import FileFormatError, InvalidInput, require_known
 from forcegp.recordings.mapping import (
+    OF_IMU,
     ORIENTATIONS,
     SIGNALS,
     ColumnMapping,
@@ -239,15 +240,16 @@ def _joints(mapping: ColumnMapping, robot: Robot) -> tuple[str, ...]:
 
 
 def _sensor(mapping: ColumnMapping, frame: str, source: Source, model: forcegp.Model) -> Iterator[JointSignal]:
-    """The force at a frame."""
-    model.robot.frame(frame)
+    """The force at a frame, or what an IMU there measures."""
+    kind, own = ("imu", f"{IMU}{frame.removeprefix(OF_IMU)}") if frame.startswith(OF_IMU) else ("force", FORCE + frame)
+    model.robot.frame(imu_place(own)[0] if kind == "imu" else frame)
     expressions = _expressions(mapping.force[frame], (), source, may_lack=False)
     if len(expressions) != 3:
         raise InvalidInput(
             f"force of {frame} has {len(expressions)} columns; give x, y and z, with 0 for what was not measured."
         )
-    unit = log_unit("force", mapping.unit.get("force", ("N",))[0])
-    yield from (JointSignal(f"{FORCE}{frame}", axis, x, unit, 1.0) for axis, x in zip("xyz", expressions, strict=True))
+    unit = log_unit(kind, mapping.unit.get(kind, ("N" if kind == "force" else "m/s^2",))[0])
+    yield from (JointSignal(own, axis, x, unit, 1.0) for axis, x in zip("xyz", expressions, strict=True))
 
 
 def _expressions(patterns: Sequence[str], joints: Sequence[str], source: Source, may_lack: bool) -> list[Expression]:

@@ -14,12 +14,12 @@ import torch
 
 from forcegp.data import Dataset, thruster_columns, with_memory
 from forcegp.errors import FitError, InvalidInput
-from forcegp.evidence import Accelerations, ContactForces, Evidence, Motions, Torques, parse_evidence
+from forcegp.evidence import Accelerations, Evidence, Motions, Sensor, Torques, parse_evidence
 from forcegp.evidence.least_squares import correlation_time
-from forcegp.evidence.recorded_rows import sensed_of, slides
+from forcegp.evidence.recorded_rows import slides
 from forcegp.fit import calibrated, default_options, fit, held_out_noise
-from forcegp.fit.fit import usual_evidence
 from forcegp.fit.search import MOST_POINTS_FOR_RESTARTS
+from forcegp.fit.sensors import usual_evidence
 from forcegp.forces import (
     IndependentAccelerations,
     JointAccelerations,
@@ -94,17 +94,13 @@ def learn(
     have more rows, and intervals of motions are calibrated then. `search` is restarts, seed, jobs.
     """
     motions = [each for each in evidence if isinstance(each, Motions)]
-    sensors = [each for each in evidence if isinstance(each, ContactForces)]
-    others = [each for each in evidence if each not in (*motions, *sensors)] or [usual_evidence(model)]
+    usual = usual_evidence(model, dataset.measured)
+    sensors = [each for each in evidence or usual if isinstance(each, Sensor)]
+    others = [each for each in evidence if each not in (*motions, *sensors)] or [usual[0]]
     first, notes = others[0], []
-    if not evidence:
-        touched = {contact.frame for contact in model.contacts}
-        sensors = [ContactForces(frame) for frame in sensed_of(dataset) if frame in touched]
     others += sensors
     if sensors:
-        notes.append(
-            f"evidence: {first.name}, and forces measured at {listed([x.frame or 'all frames' for x in sensors])}"
-        )
+        notes.append(f"evidence: {first}, and {listed([str(each) for each in sensors])}")
     if motions:
         Motions.refuse(model.unknown_forces)
     if not model.unknown_forces and (isinstance(first, Torques) or model.is_open):
@@ -359,7 +355,7 @@ def checked_identification(name: str, model: Model) -> tuple[Model, Acceleration
     opened = named_model(model, words)
     if opened.unknown_forces or not opened.is_open:
         raise InvalidInput(f"identification {name!r} has nothing to identify, or unknown forces; name laws and bodies.")
-    chosen = evidence[0] if evidence else usual_evidence(opened)
+    chosen = (evidence or usual_evidence(opened))[0]
     if not isinstance(chosen, Accelerations | Torques):
         raise InvalidInput(f"identification {name!r} is from {chosen.name}; give accelerations or torques.")
     return opened, chosen
