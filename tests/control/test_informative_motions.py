@@ -8,7 +8,7 @@ import pytest
 import scipy.linalg
 from tests.posterior.arm import URDF, arm_data, arm_model
 
-from forcegp import Contact, Dataset, Plane, Robot, excitation, fit
+from forcegp import Contact, Dataset, Plane, excitation, fit
 from forcegp.control.informative_motions import far_apart
 from forcegp.errors import InvalidInput
 from forcegp.forces import JointFriction
@@ -149,9 +149,6 @@ def test_the_file_has_the_motion(chosen, tmp_path):
     assert table.shape == (201, 13)
     np.testing.assert_allclose(table[:, 1:10], np.hstack(chosen.trajectory(table[:, 0])), atol=1e-7)
     assert "condition" in repr(chosen)
-
-
-ENDLESS = Robot.from_urdf_text(URDF.replace('type="revolute"', 'type="continuous"').replace('lower="-3" upper="3"', ""))
 
 
 @pytest.mark.parametrize(

@@ -193,10 +193,6 @@ def _of_posterior(name: str, then: Callable[[Any], Any] = lambda made: made, **m
     return lambda _, **k: then(getattr(INPUTS.posterior, name)(**{**k, **more}))
 
 
-def _of_robot(name: str) -> Callable[..., Any]:
-    return lambda _, **k: getattr(_robot(), name)(**k)
-
-
 def _of_drone(name: str) -> Callable[..., Any]:
     return lambda _, **k: getattr(_drone(), name)(**k)
 

@@ -24,7 +24,6 @@ from forcegp.model import Model
 
 TOLERANCE = 1e-10
 ALL = [*INDEPENDENT, *REDUNDANT]
-LINKS = {"iiwa": ("lbr_iiwa_link_7", "lbr_iiwa_link_4"), "tree": ("right_hand", "body"), "chain": ("wrist", "bracket")}
 
 
 @cache

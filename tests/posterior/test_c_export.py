@@ -4,7 +4,7 @@ import ctypes
 import shutil
 import subprocess
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -328,17 +328,6 @@ def test_without_a_compiler_it_is_written_and_says_that_nothing_was_compared(pos
         made = export_c(posterior, tmp_path / "arm")
     assert made.differences == {}
     assert (tmp_path / "arm" / "arm.c").exists()
-
-
-@dataclass(frozen=True)
-class Deciding(JointFriction):
-    """With a branch on values, in one of the ways in which Python can take one."""
-
-    how: str = "if"
-
-    def features(self, dynamics):
-        ways = {"if": lambda z: bool(z[0, 0] > 0.0), "numpy": lambda z: z.detach().numpy().min() > 0.0}
-        return tuple(z if ways[self.how](z) else -z for z in super().features(dynamics))
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from tests.posterior.arm import URDF, Weight, arm_data, arm_model, on_the_plane
+from tests.posterior.arm import URDF, Weight, arm_data, arm_model
 
-from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, UnknownName
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction, UnknownForces
@@ -183,25 +182,6 @@ def test_wrong_curves_are_refused(posterior, train):
     with pytest.raises(InvalidInput, match=r"'pan' .*\(n, 9\)"):
         joint.curve("pan")
     assert joint.curve("pan", np.zeros((2, 9))).mean.shape == (2,)
-
-
-def slid(model, friction, rows, seed, speed):
-    """Noise-free rows on the surface of `model` under a true friction of its tool, and the force itself."""
-    generator = np.random.default_rng(seed)
-    q = on_the_plane(model, generator.uniform([-0.6, 0.4, 0.4], [0.6, 1.0, 1.0], (rows, 3)))
-    v, u = generator.normal(0.0, speed, (rows, 3)), generator.normal(0.0, 3.0, (rows, 3))
-    at = [torch.tensor(x) for x in (q, v, u)]
-    A = model.dynamics(*at).A
-    at[1] = at[1] - (torch.linalg.pinv(A) @ (A @ at[1][..., None]))[..., 0]  # along the surface
-    dynamics = model.dynamics(*at)
-    prior = ContactFriction()
-    latent = friction(prior.features(dynamics)[0])[..., None]
-    force = (prior.point_force(dynamics) @ latent)[..., 0]
-    a = dynamics.acceleration((prior.direction(dynamics) @ latent)[..., 0])
-    data = Dataset(
-        q=q, v=at[1].numpy(), u=u, a=a.numpy(), time=0.01 * np.arange(rows), model=model, noise_std=np.full(3, 1e-4)
-    )
-    return data, force
 
 
 def test_what_cannot_move_is_refused(posterior, train):

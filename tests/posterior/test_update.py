@@ -152,10 +152,6 @@ def test_rows_away_from_the_surface_are_refused(posterior):
         posterior.update(away)
 
 
-def stating(data, noise_std):
-    return dataclasses.replace(data, noise_std=noise_std)
-
-
 def test_more_rows_than_memory_holds_are_refused_before_anything_is_computed(posterior, monkeypatch):
     few = arm_data(60, seed=17)
     again = {name: np.tile(getattr(few, name), (1000, 1)) for name in ("q", "v", "u", "a")}

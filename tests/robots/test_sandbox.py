@@ -17,7 +17,6 @@ def copies(*counts, inside=BODY):
     return "".join(f'<replicate count="{n}" offset="1 0 0">' for n in counts) + inside + "</replicate>" * len(counts)
 
 
-CIRCLE = {"s.xml": SCENE.format(SUB.format("s.xml"), BODY)}
 INCLUDES = "".join(f'<include file="part_{k}.xml"/>' for k in range(80))
 ATTACKS = {
     "names itself": (SCENE.format('<include file="robot.xml"/>', BODY), {}, "names this file again"),
