@@ -17,8 +17,19 @@ import time
 import numpy as np
 import torch
 
-from benchmarks.pd_gravity import PDGravity
-from benchmarks.tracking import CONFIG, FINE, GAINS, RATE, Reference, excitation, fits, followed, robot_of, rows_of
+from benchmarks.tracking import (
+    CONFIG,
+    FINE,
+    GAINS,
+    RATE,
+    PDGravity,
+    Reference,
+    excitation,
+    fits,
+    followed,
+    robot_of,
+    rows_of,
+)
 from forcegp import ContactMonitor, Model, Robot, Viscous
 from forcegp.control.monitor import ContactState
 from forcegp.forces import Stribeck

@@ -14,11 +14,11 @@ import torch
 from matplotlib.axes import Axes
 from PIL import Image
 
-from benchmarks.pd_gravity import PDGravity
 from benchmarks.tracking import (
     CONFIG,
     GAINS,
     RATE,
+    PDGravity,
     controllers,
     error,
     excitation,

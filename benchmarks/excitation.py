@@ -25,7 +25,6 @@ import numpy as np
 import torch
 from scipy.stats import spearmanr
 
-from benchmarks.pd_gravity import PDGravity
 from benchmarks.tracking import (
     CONFIG,
     GAINS,
@@ -33,6 +32,7 @@ from benchmarks.tracking import (
     NOISE,
     RATE,
     SEEDS,
+    PDGravity,
     Reference,
     followed,
     robot_of,

@@ -20,8 +20,7 @@ import mujoco as untyped
 import numpy as np
 from mujoco import rollout
 
-from benchmarks.pd_gravity import PDGravity
-from benchmarks.tracking import GAINS, excitation, followed, robot_of, rows_of
+from benchmarks.tracking import GAINS, PDGravity, excitation, followed, robot_of, rows_of
 from forcegp import JointFriction, Model, Robot, fit
 from forcegp.control.mujoco_forces import MujocoForces
 

@@ -18,16 +18,20 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
+from typing_extensions import override
 
-from benchmarks.pd_gravity import PDGravity
 from forcegp import ComputedTorque, Coulomb, Dataset, JointFriction, KukaSurfaceConfig, Model, Robot, Viscous, fit
+from forcegp.control.tracking import TrackingController
 from forcegp.data import farthest_rows
 from forcegp.evidence import Accelerations
 from forcegp.forces import GearFriction, Offset, RigidBodies, Rotor
 from forcegp.posterior import Posterior
+from forcegp.robots.compiled import CompiledRobot
 from forcegp.simulation.kuka_surface import joint_friction_of, kuka_robot
 
 SEEDS = (1, 2, 3, 4, 5)
@@ -35,6 +39,18 @@ RATE, FINE, NOISE, ROWS = 240, 4, 0.1, 100
 CONFIG = KukaSurfaceConfig(joint_friction="stribeck")
 GAINS = {"stiffness": 100.0}
 MIDDLE = np.array([0.0, 0.5, 0.0, -1.3, 0.0, 0.9, 0.0])
+
+
+class PDGravity(TrackingController):
+    """u = M(q) (Kd (v_d - v) + Kp (q_d - q)) + g(q): masses alone; `robot` may be `robot.compile()`."""
+
+    def __init__(self, robot: Robot | CompiledRobot, **settings: Any) -> None:
+        self._dynamics = robot
+        super().__init__(robot.robot if isinstance(robot, CompiledRobot) else robot, **settings)  # type: ignore[arg-type]  # it is a Robot
+
+    @override
+    def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
+        return self._dynamics.mass_matrix(q) @ self.feedback(e, e_v) + self._dynamics.gravity_forces(q)
 
 
 def robot_of(payload: float = 0.0, inertia: float = 1.0) -> Robot:
