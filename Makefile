@@ -12,7 +12,7 @@ ARGS ?=
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: demo test test-all test-processors mutants test-browser check docs format bench clean help
+.PHONY: demo test test-all test-processors mutants test-browser check docs format bench release-check clean help
 
 demo: $(VENV)/.demo  ## simulate, learn and score; prints the table and writes a report
 	$(BIN)/forcegp demo $(ARGS)
@@ -49,6 +49,22 @@ format: $(VENV)/.check  ## mend what ruff can mend by itself
 
 bench: $(VENV)/.test  ## measure; benchmarks/README.md says what
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m benchmarks $(ARGS)
+
+# The sdist is tested by the first Python that is here; the wheel makes the demo's report with each.
+release-check:  ## build what is published, check it, and try it in empty environments of every Python that is here
+	rm -rf dist build/release
+	$(PYTHON) -m venv build/release/tools
+	build/release/tools/bin/pip install --quiet build twine
+	build/release/tools/bin/python -m build --outdir dist
+	build/release/tools/bin/twine check --strict dist/*
+	for python in python3.11 python3.12 python3.13 python3.14; do \
+		$$python -c pass 2> /dev/null || { echo "$$python is not here, and was not tried."; continue; }; \
+		$$python -m venv build/release/$$python || exit 1; \
+		build/release/$$python/bin/pip install --quiet --extra-index-url $(TORCH_INDEX) --constraint constraints.txt "$$(ls dist/*.whl)[sim]" || exit 1; \
+		(cd build/release/$$python && bin/forcegp demo) || exit 1; \
+	done
+	tar -xzf dist/*.tar.gz -C build/release
+	$(MAKE) -C build/release/forcegp-* test
 
 clean:  ## remove .venv, caches and builds; keeps what runs and demos wrote
 	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis .processors

@@ -1,6 +1,6 @@
 """How many robot files does forcegp take, and are the numbers those of Pinocchio and MuJoCo?
 
-Every file below the folders whose root element is <robot> (.urdf) or <mujoco> is read once as it is, and where
+Every file below the folders whose root element is <robot> (.urdf, .xacro) or <mujoco> is read once as it is, and where
 that fails once more with exactly the arguments that the error names (`error.remedy`); equal files count once. Counted
 are robot files: those that Pinocchio (URDF) or MuJoCo (MJCF) loads, with a joint that moves, and, of a URDF, whose
 bodies all have mass in Pinocchio's model; MuJoCo itself requires that. Of every file that is loaded, mass matrix, bias
@@ -35,11 +35,11 @@ from forcegp.errors import ForceGPError, RobotFileWarning
 from forcegp.robots import Robot
 from forcegp.robots.layout import BASE
 from forcegp.robots.mjcf import is_mjcf
-from forcegp.robots.urdf_file import read_text
+from forcegp.robots.urdf_file import read_robot_file
 
 mujoco: Any = untyped
 CLOSE = 1e-9
-SUFFIXES = (".urdf", ".xml", ".mjcf")
+SUFFIXES = (".urdf", ".xacro", ".xml", ".mjcf")
 
 
 @dataclass(frozen=True)
@@ -102,8 +102,8 @@ def _difference(robot: Robot, theirs: Numbers) -> float:
 def _pinocchio(path: Path) -> tuple[str, Callable[[Robot], Numbers]]:
     """What Pinocchio makes of a file, and its numbers for a robot of it."""
     try:
-        model = pin.buildModelFromXML(read_text(path))
-    except Exception as error:  # whatever its parser raises
+        model = pin.buildModelFromXML(read_robot_file(path))
+    except Exception as error:  # whatever its parser, or xacro, raises
         return type(error).__name__, _pinocchio_numbers
     masses = [inertia.mass for inertia in list(model.inertias)[1:]]
     return "still" if not masses else "robot" if min(masses) > 0.0 else "massless", _pinocchio_numbers
@@ -259,7 +259,7 @@ def robot_files(folders: list[Path]) -> dict[str, tuple[Path, bool]]:
     for path in sorted(path for folder in folders for path in folder.rglob("*") if path.suffix in SUFFIXES):
         data = path.read_bytes() if path.is_file() else b""
         text = data.decode("utf-8", errors="replace")
-        if is_mjcf(text) or (b"<robot" in data and path.suffix == ".urdf"):
+        if is_mjcf(text) or (b"<robot" in data and path.suffix in (".urdf", ".xacro")):
             found.setdefault(hashlib.sha256(data).hexdigest(), (path, is_mjcf(text)))
     return found
 

@@ -91,7 +91,7 @@ def run() -> dict[str, float]:
 
 def draw(measured: dict[str, dict[int, dict[str, float]]]) -> None:
     """Time and memory over the number of rows."""
-    from forcegp.scores.figures.style import SERIES, new_figure, plain_ticks, quiet, save_figure
+    from forcegp.scores.figures.style import SERIES, new_figure, quiet, save_figure
 
     figure = new_figure(9.0, 4.0)
     panels = figure.subplots(1, 2)
@@ -102,8 +102,6 @@ def draw(measured: dict[str, dict[int, dict[str, float]]]) -> None:
             named = f"{LABELS[engine]}: N^{slope(counts, values):.1f}" if key == "cpu_s" else None
             axes.loglog(counts, values, "o-", color=color, markersize=4, linewidth=1.6, label=named)
         quiet(axes, title=title, x="training rows N", y=label)
-        for axis in (axes.xaxis, axes.yaxis):
-            plain_ticks(axis)
     figure.legend(fontsize=SMALL, frameon=False, loc="outside lower center", ncols=2)
     save_figure(figure, FOLDER / "scaling.png")
 

@@ -3,7 +3,6 @@
 import re
 
 FENCE = re.compile(r"^( *)(`{3,}|:{3,}).*?^\1\2 *$", re.DOTALL | re.MULTILINE)
-GENERATED = re.compile(r"^[>*\s]*\*\*(Better|Worse|No difference that the data show)\*\* by ")  # verdicts
 END = re.compile(r"(?<=[.!?])[)\"”*_]*\s+|(?<=[.!?][)\"”*_])\s+")
 ABBREVIATED = re.compile(r"\b(e\.g|i\.e|vs|cf|Fig|eq|eqs|No|al|p|pp|ca)\.\s", re.IGNORECASE)
 
@@ -25,7 +24,7 @@ def blocks(page: str) -> list[str]:
         else:
             found.append(line.strip())
             last = line
-    return [block for block in found if not GENERATED.match(block)]
+    return found
 
 
 def sentences(page: str) -> list[str]:

@@ -156,6 +156,18 @@ def test_other_files_of_the_repository_parse_and_agree(repository):
             assert all({"type", "attributes"} <= set(field) for field in content["body"])
 
 
+def test_the_conda_recipe_needs_what_the_wheel_needs(repository):
+    recipe = yaml.safe_load((repository / ".github/conda-forge/recipe.yaml").read_text())
+    project = tomllib.loads((repository / "pyproject.toml").read_text())["project"]
+    there = {"torch": "pytorch", "matplotlib": "matplotlib-base"}
+    parts = (re.fullmatch(r"([\w-]+)(.*)", each) for each in project["dependencies"])
+    needed = {
+        f"{there.get(name, name).lower()} {pin}".strip() for name, pin in (part.groups() for part in parts if part)
+    }
+    assert set(recipe["requirements"]["run"][1:]) == needed
+    assert recipe["context"]["version"] == project["version"]
+
+
 def test_no_picture_is_there_twice(repository):
     pictures = {path.relative_to(repository) for path in (repository / "docs").rglob("*.svg")}
     assert not {path for path in pictures if (repository / path).with_suffix(".png").exists()}

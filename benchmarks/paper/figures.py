@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from benchmarks.paper import published
 from benchmarks.paper.fits import MODELS
@@ -19,12 +20,21 @@ from forcegp.scores.figures.style import (
     draw_band,
     legend_below,
     new_figure,
-    plain_ticks,
     quiet,
 )
 
 COLORS = dict(zip(MODELS, (SERIES[1], SERIES[4], SERIES[2], SERIES[0], SERIES[3], QUIET), strict=True))
 """One colour per model, the same in every figure."""
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Numbers such as 0.02 and 50 on a logarithmic axis with its final limits: at powers of ten alone if it is long."""
+    low, high = axis.get_view_interval()
+    of_decades = LogLocator(subs=(1.0, 2.0, 5.0) if high < 80.0 * low else (1.0,))
+    axis.set_major_locator(MaxNLocator(3) if high < 5.0 * low else of_decades)
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
 
 PANELS = (
     ("mae", "MAE against noisy accelerations [rad/s²]"),

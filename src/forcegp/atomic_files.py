@@ -115,13 +115,8 @@ def require_replaceable(
 
 def write_text(path: str | Path, text: str) -> None:
     """Write UTF-8 text with the line ends that it has. Raises as `atomic_file`."""
-    write_bytes(path, text.encode("utf-8"))
-
-
-def write_bytes(path: str | Path, data: bytes) -> None:
-    """Write a file. Raises as `atomic_file`."""
     with atomic_file(path) as temporary:
-        temporary.write_bytes(data)
+        temporary.write_bytes(text.encode("utf-8"))
 
 
 def write_json(path: str | Path, content: Mapping[str, Any]) -> None:
@@ -241,7 +236,7 @@ SUMS = "SHA256SUMS"
 def write_digests(folder: Path) -> None:
     """Write the digests of all files that are in the folder and those below it."""
     names = (file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
-    (folder / SUMS).write_bytes(_text(folder, (name for name in names if name != SUMS)).encode("utf-8"))
+    (folder / SUMS).write_bytes(b"".join(_lines(folder, (name for name in names if name != SUMS))))
 
 
 def require_unchanged(folder: Path, remedy: str) -> None:
@@ -255,24 +250,21 @@ def require_unchanged(folder: Path, remedy: str) -> None:
     if sums.is_fifo():  # to open it would wait for a writer for ever
         raise FileFormatError(f"{folder} is damaged: {SUMS} is not a regular file; {remedy}")
     try:
-        stored = sums.read_bytes().decode("utf-8")
-        names = [line[66:] for line in stored.splitlines()]
+        stored = sums.read_bytes().splitlines(True)
+        names = [line[66:].decode("utf-8").removesuffix("\n") for line in stored]
         for name in names:
             if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or not (folder / name).is_file():
                 raise FileFormatError(f"{folder} lacks {name!r}, which {SUMS} lists; {remedy}")
-        if not names or stored != _text(folder, names):
-            changed = ", ".join(name for name in names if _line(folder, name) not in stored.splitlines(True))
+        now = _lines(folder, names)
+        if not now or stored != now:
+            changed = ", ".join(line[66:-1].decode() for line in now if line not in stored)
             raise FileFormatError(f"{folder} is damaged: {changed or SUMS} is not as it was written; {remedy}")
     except (OSError, ValueError) as error:
         raise FileFormatError(f"{folder} is damaged: {SUMS} cannot be read ({error}); {remedy}") from None
 
 
-def _text(folder: Path, names: Iterable[str]) -> str:
-    return "".join(_line(folder, name) for name in sorted(names))
-
-
-def _line(folder: Path, name: str) -> str:
-    return f"{file_digest(folder / name)}  {name}\n"
+def _lines(folder: Path, names: Iterable[str]) -> list[bytes]:
+    return [f"{file_digest(folder / name)}  {name}\n".encode() for name in sorted(names)]
 
 
 def file_digest(path: Path) -> str:

@@ -42,9 +42,8 @@ class Doubt:
         each = [("orientation", own[0]) for own in self.correction.get("orientation", {}).values()]
         stated = ((name, self.correction.get(name)) for name in ("axes", "unit", "sign"))
         flags = [f"--{name} {text}" for name, text in (*each, *((n, stated_as(x)) for n, x in stated if x))]
-        for name in ("gravity",):  # with "=", because a number may be negative
-            numbers = (",".join(f"{x:g}" for x in own) for own in self.correction.get(name, {}).values())
-            flags += [f"--{name}={text}" for text in numbers]
+        for own in self.correction.get(name := "gravity", {}).values():  # with "=": a number may be negative
+            flags.append(f"--{name}={','.join(f'{x:g}' for x in own)}")
         return " ".join(["forcegp import", *flags]) if flags else ""
 
     @property

@@ -8,7 +8,6 @@ import os
 import sys
 import threading
 import time
-import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future
 from pathlib import Path
@@ -62,11 +61,10 @@ def mapped(function: Callable[[Any], Outcome], arguments: Iterable[Any], jobs: J
     Raises what a task raised, in its place; as `checked_jobs`; BackendError where a process died or a task cannot
     travel. What is at work ends with the iterator: own processes by force, others when their tasks end.
     """
-    executor = executor_for(jobs)
+    executor, futures = executor_for(jobs), list[Future[Any]]()
     if isinstance(executor, ThisProcess):
         yield from map(function, arguments)
         return
-    futures: list[Future[Any]] = []
     try:
         futures += [submit(executor, function, argument) for argument in arguments]
         for future in futures:
@@ -81,7 +79,7 @@ def submit(executor: Executor, function: Callable[..., Any], *arguments: Any) ->
     Raises BackendError for what cannot travel, and where a process has died.
     """
     if isinstance(executor, ThisProcess):
-        return executor.submit(_recorded, (function, arguments), None)
+        return executor.submit(function, *arguments)
     import cloudpickle
 
     try:
@@ -90,16 +88,13 @@ def submit(executor: Executor, function: Callable[..., Any], *arguments: Any) ->
         told = " ".join(str(error).split())
         raise BackendError(f"this work cannot be sent to another process ({told}); use jobs=1") from error
     with _told_of_dead_processes():
-        return executor.submit(_recorded, task, os.getpid())
+        return executor.submit(_run, task)
 
 
 def outcome_of(future: Future[Any]) -> Any:
-    """What a task returned or raised. Shows its warnings. Raises BackendError if its process died (killed, memory)."""
+    """What a task returned or raised. Raises BackendError if its process died (killed, memory)."""
     with _told_of_dead_processes():
-        outcome, warned = future.result()
-    for text, category, file, line in warned:
-        warnings.warn_explicit(text, category, file, line, registry=_SHOWN)
-    return outcome
+        return future.result()
 
 
 @contextlib.contextmanager
@@ -112,24 +107,11 @@ def _told_of_dead_processes() -> Iterator[None]:
         raise BackendError(f"the processes broke off, which ends what was at work; {remedy} ({cause})") from error
 
 
-_SHOWN: dict[Any, Any] = {}
-"""What has been shown, so that each warning of a line of code is shown once, as in one process."""
-
-
-def _recorded(task: Any, caller: int | None) -> tuple[Any, list[tuple[Any, ...]]]:
-    """The outcome; text, category, file and line of every warning on the way, unless this process shows them."""
-    if caller is None:
-        function, arguments = task
-        return function(*arguments), []
+def _run(task: bytes) -> Any:
     import cloudpickle
 
     function, arguments = cloudpickle.loads(task)
-    if caller == os.getpid():  # a pool of threads
-        return function(*arguments), []
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        outcome = function(*arguments)
-    return outcome, [(str(each.message), each.category, each.filename, each.lineno) for each in caught]
+    return function(*arguments)
 
 
 _own: Executor | None = None

@@ -211,11 +211,6 @@ def moved(data: Dataset, by: tuple[float, float, float]) -> Dataset:
     return replace(data, model=data.model.with_contacts(contacts), truth={})
 
 
-def without_contacts(data: Dataset) -> Dataset:
-    assert data.model is not None
-    return replace(data, model=data.model.with_contacts(()), truth={})
-
-
 def invented(data: Dataset) -> Dataset:
     """A contact through which the middle of the motion passes."""
     assert data.model is not None

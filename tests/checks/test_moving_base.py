@@ -27,39 +27,35 @@ def test_a_clean_log_has_no_doubt(log):
     assert not quick_check(log)
 
 
-def test_a_quaternion_that_begins_with_w_is_named(log):
-    q = log.q.copy()
-    q[:, 3:7] = np.roll(q[:, 3:7], 1, axis=1)
-    (doubt,) = quick_check(replace(log, q=q))
-    assert (doubt.level, doubt.about) == ("wrong", "base")
-    assert "w, x, y, z" in doubt.what
-    assert "forcegp import --orientation wxyz" in doubt.advice
+def turned_about_z(log, turn):
+    """The same with its base turned about its own z axis, and its rotation to the world."""
+    spin = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, turn, *[0.0] * 12], dtype=torch.float64)
+    q = log.model.robot.integrate(torch.tensor(log.q), spin).numpy()
+    q[:, :3] = log.q[:, :3]
+    back, v, a = Rotation.from_euler("z", -turn), log.v.copy(), log.a.copy()
+    for x in (v, a):
+        x[:, :3], x[:, 3:6] = back.apply(x[:, :3]), back.apply(x[:, 3:6])
+    return replace(log, q=q, v=v, a=a), Rotation.from_quat(q[:, 3:7])
 
 
 def test_velocities_in_the_axes_of_the_world_are_named(log):
-    turn = 1.2  # far from upright, where body and world differ
-    spin = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, turn, *[0.0] * 12], dtype=torch.float64)
-    q, v = log.model.robot.integrate(torch.tensor(log.q), spin).numpy(), log.v.copy()
-    position = torch.tensor(log.q[:, :3])
-    rotation = log.model.robot.frame_pose(torch.tensor(log.q), "trunk")[:, :3, :3].numpy()
-    q[:, :3] = position
-    c, s = np.cos(turn), np.sin(turn)
-    yaw = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])  # the base turned about its own z axis
-    v[:, :3], v[:, 3:6] = v[:, :3] @ yaw.T, v[:, 3:6] @ yaw.T
-    assert not [each for each in quick_check(replace(log, q=q, v=v)) if each.about == "base"]
-    turned = rotation @ yaw.T
-    v[:, :3] = (turned @ v[:, :3, None])[..., 0]
-    v[:, 3:6] = (turned @ v[:, 3:6, None])[..., 0]
-    doubts = [each for each in quick_check(replace(log, q=q, v=v)) if each.about == "base"]
-    assert doubts[0].what.startswith("positions of 'base' change as if it had velocities in the axes of the world")
-    assert "--axes v=world" in doubts[0].command
-    v[:, 3:6] = (np.linalg.inv(turned) @ v[:, 3:6, None])[..., 0]
-    doubts = [each for each in quick_check(replace(log, q=q, v=v)) if each.about == "base"]
-    assert "linear velocities in the axes of the world" in doubts[0].what
-    assert "--axes v=world,body" in doubts[0].command
-    q[:, 3:7] = np.roll(q[:, 3:7], 1, axis=1)
-    doubts = [each for each in quick_check(replace(log, q=q, v=v)) if each.about == "base"]
-    assert "--orientation wxyz --axes v=world,body" in doubts[0].command
+    turned, rotation = turned_about_z(log, 1.2)  # far from upright, where body and world differ
+
+    def found(q=turned.q, **v):
+        v = np.hstack([v["linear"], v["angular"], turned.v[:, 6:]])
+        return quick_check(replace(turned, q=q, v=v)).of("base")
+
+    linear, angular = turned.v[:, :3].copy(), turned.v[:, 3:6].copy()
+    assert not found(linear=linear, angular=angular)
+    doubt = found(linear=rotation.apply(linear), angular=rotation.apply(angular))[0]
+    assert doubt.what.startswith("positions of 'base' change as if it had velocities in the axes of the world")
+    assert "--axes v=world" in doubt.command
+    doubt = found(linear=rotation.apply(linear), angular=angular)[0]
+    assert "linear velocities in the axes of the world" in doubt.what
+    assert "--axes v=world,body" in doubt.command
+    q = np.hstack([turned.q[:, :3], np.roll(turned.q[:, 3:7], 1, axis=1), turned.q[:, 7:]])
+    doubt = found(q, linear=rotation.apply(linear), angular=angular)[0]
+    assert "--orientation wxyz --axes v=world,body" in doubt.command
 
 
 def test_an_accelerometer_is_no_acceleration(log):
@@ -75,22 +71,12 @@ def test_an_accelerometer_is_no_acceleration(log):
 
 
 def test_accelerations_in_world_axes_are_named_also_where_they_are_no_larger_than_the_true_ones(log):
-    turn = 0.9
-    spin = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, turn, *[0.0] * 12], dtype=torch.float64)
-    q = log.model.robot.integrate(torch.tensor(log.q), spin).numpy()
-    q[:, :3] = log.q[:, :3]
-    rotation = log.model.robot.frame_pose(torch.tensor(q), "trunk")[:, :3, :3].numpy()
-    c, s = np.cos(turn), np.sin(turn)
-    yaw = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    v, a = log.v.copy(), log.a.copy()
-    for x in (v, a):
-        x[:, :3], x[:, 3:6] = x[:, :3] @ yaw.T, x[:, 3:6] @ yaw.T
-    turned = replace(log, q=q, v=v, a=a)
-    assert not [each for each in quick_check(turned) if each.about == "base acceleration"]
-    world = a.copy()
-    linear = a[:, :3] + np.cross(v[:, 3:6], v[:, :3])
-    world[:, :3], world[:, 3:6] = ((rotation @ x[:, :, None])[..., 0] for x in (linear, a[:, 3:6]))
-    (doubt,) = [each for each in quick_check(replace(turned, a=world)) if each.about == "base acceleration"]
+    turned, rotation = turned_about_z(log, 0.9)
+    assert not quick_check(turned).of("base acceleration")
+    v, world = turned.v, turned.a.copy()
+    world[:, :3] = rotation.apply(world[:, :3] + np.cross(v[:, 3:6], v[:, :3]))
+    world[:, 3:6] = rotation.apply(world[:, 3:6])
+    (doubt,) = quick_check(replace(turned, a=world)).of("base acceleration")
     assert doubt.level == "wrong"
     assert doubt.numbers["error"] < 2.0 * doubt.numbers["size"]
     assert "--axes a=world" in doubt.command

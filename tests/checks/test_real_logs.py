@@ -8,7 +8,7 @@ import pytest
 from tests.checks.logs import column, exchanged
 
 from forcegp.checks import check
-from forcegp.data import Dataset, Preparation
+from forcegp.data import Dataset
 from forcegp.model import Model
 from forcegp.recordings import ColumnMapping, import_recordings
 from forcegp.robots import Robot
@@ -30,8 +30,9 @@ def panda(shared) -> Dataset:
     return import_recordings([folder / "raw" / f"exciting_traj_{name}.txt.gz" for name in names], mapping, model=model)
 
 
+@pytest.mark.nightly
 def test_a_panda_is_well_but_its_velocities_are_late(panda):
-    report = check(panda, preparation=Preparation(cutoff=5.0))  # as `auto` has it, which takes eight seconds
+    report = check(panda)
     assert report.doubts.level == "look"
     assert report.comparison is not None
     assert np.nanmax(report.comparison.unexplained) < 0.06

@@ -189,7 +189,7 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
         table |= {"position after 1 s": {"rmse": [moved] * 3}}
         table |= {"torque": {"share": shares}} if shares else {}
         motions = {"horizons": [1.0], "squared": [[1e-4]]}
-        run = {"split": "s", "seed": 0, "error": None, "table": table, "motions": motions, "stretches": {}}
+        run = {"split": "s", "seed": 0, "error": None, "table": table, "motions": motions, "stretches": []}
         names = ("hip", "knee", "wrist")
         about = {"given": {"kind": "given", "summary": ""}}
         return verdict(Scores(models=about, runs={"given": [run]}, joint_names=names, units={}), dataset, still)

@@ -30,7 +30,7 @@ def test_a_clean_log_is_told_so(forcegp, folder):
     done = forcegp("check", "clean.h5", "--robot", "arm.urdf", "--strict", folder=folder)
     assert done.returncode == 0, done.stderr
     assert "clean.h5: 0 wrong, 0 to look at" in done.stdout
-    assert "Every joint; in Nm and rad/s²" in done.stdout
+    assert "Torque of every joint; in Nm" in done.stdout
     line = next(line for line in done.stdout.splitlines() if line.strip().startswith("lift"))
     assert line.split()[2] == "%"
 
@@ -77,7 +77,7 @@ REFUSALS = {
     ("import", "noisy.h5", "--cutoff", "500", "--out", "x.h5"): "it must be > 0 and below 100 Hz",
     ("import", "noisy.h5", "--delay", "0.1,x", "--out", "x.h5"): "--delay is '0.1,x'; give seconds",
     ("import", "lost.h5", "--cutoff", "9", "--out", "x.h5"): "not sampled uniformly: the step after row 599",
-    ("check", "clean.h5", "--cutoff", "-3"): "cutoff is -3.0",
+    ("import", "noisy.h5", "--cutoff", "-3", "--out", "x.h5"): "cutoff is -3.0",
     ("check", "arm.urdf"): "is not an HDF5 file",
 }
 

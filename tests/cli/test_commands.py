@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from forcegp import Dataset, load_posterior, score
-from forcegp.cli.main import main
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -76,7 +75,7 @@ def test_score_shows_a_line_per_joint_and_draws(workshop, forcegp, tmp_path):
     assert "95 % intervals contain" in (tmp_path / "out" / "report.html").read_text()
 
 
-def test_the_demo_tells_the_whole_story(forcegp, tmp_path, monkeypatch, capfd):
+def test_the_demo_tells_the_whole_story(forcegp, tmp_path, monkeypatch):
     small = ("demo", "--seconds", "1", "--points", "12", "--iterations", "3", "--overwrite")
     monkeypatch.setattr("forcegp.report.page.model_pictures", lambda *_: ([], []))  # as drawn for a score
     done = forcegp(*small, folder=tmp_path)
@@ -97,12 +96,6 @@ def test_the_demo_tells_the_whole_story(forcegp, tmp_path, monkeypatch, capfd):
         assert len(load_posterior(tmp_path / model["run"]).likelihood.training.q) == 12
     assert "95 % intervals contain" in (tmp_path / "demo" / "report.html").read_text()
     assert [entry.name for entry in tmp_path.iterdir()] == ["demo"]
-
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "demo" / "notes.txt").write_text("mine")
-    assert main(small) == 2
-    assert "demo holds files that `forcegp demo` did not write (notes.txt)" in capfd.readouterr().err
-    assert (tmp_path / "demo" / "notes.txt").read_text() == "mine"
 
 
 def interruptible():

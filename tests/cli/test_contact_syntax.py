@@ -49,16 +49,8 @@ def test_feet_read_as_written():
 @pytest.mark.parametrize(
     "text",
     [
-        "",
-        "@0,0,0",
-        "FL@1,2",
-        "FL@a,b,c",
-        "FL@0,0,nan",
-        ":flat",
-        "FL@0,0,0:flat",
-        "FL:ball=",
-        "FL:ball=-1",
-        "FL:ball=.1:flat",
+        *("", "@0,0,0", "FL@1,2", "FL@a,b,c", "FL@0,0,nan", ":flat", "FL@0,0,0:flat"),
+        *("FL:ball=", "FL:ball=-1", "FL:ball=.1:flat"),
     ],
 )
 def test_other_feet_are_refused(text):

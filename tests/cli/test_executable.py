@@ -42,14 +42,6 @@ def test_a_recording_becomes_a_page_in_the_browser(forcegp, folder, monkeypatch)
     assert opened[0].startswith("file:///")
 
 
-def test_a_mistake_is_one_line_on_stderr_and_exit_code_2(installed, folder):
-    done = installed("fit", "missing.h5", "--out", "never", folder=folder)
-    assert (done.returncode, done.stdout) == (2, "")
-    (line,) = done.stderr.splitlines()
-    assert line.startswith("forcegp: missing.h5 is not a file")
-    assert not (folder / "never").exists()
-
-
 def test_version_and_help_through_the_module(installed):
     done = installed("--version")
     assert done.returncode == 0

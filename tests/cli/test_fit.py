@@ -134,7 +134,6 @@ WRONG = [
     ("--forces viscous --evidence acceleration", "did you mean 'accelerations'?"),
     ("--evidence torques,accelerations --forces viscous", "the same rows twice"),
     ("--forces gp:independent --evidence motions:1", "motions refine numbers of laws and bodies"),
-    ("--forces gp:joint --baseline arm.h5", "a baseline is for payloads"),
     ("--jobs 0", "jobs is 0; give"),
     ("--engine fast", "engine"),
 ]

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import re
 
 import pytest
 from tests.posterior.arm import URDF, arm_model
@@ -44,14 +43,6 @@ def of(done) -> dict:
         quantity: {name: each["all"] and each["all"]["median"] for name, each in scores.items()}
         for quantity, scores in model["scores"].items()
     }
-
-
-def test_the_table_tells_errors_of_forces(arm, forcegp):
-    done = forcegp("score", "run", "test.h5", folder=arm)
-    assert done.returncode == 0, done.stderr
-    told = " ".join(done.stdout.split())
-    for name in ("unknown force", "contact force"):
-        assert re.search(rf"{name} \S+ \S+ \S+ – \S+ %", told), told
 
 
 def test_another_contact_is_named_with_the_remedy_and_the_remedy_helps(arm, forcegp):

@@ -9,8 +9,8 @@ import torch
 from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import ComputedTorque, HybridForce, Model, Robot, Viscous, fit
-from forcegp.errors import InvalidInput, NumericalError
-from forcegp.forces import Actuation, ContactFriction, JointForces, JointFriction, RigidBodies
+from forcegp.errors import ContactError, ContactWarning, InvalidInput, NumericalError
+from forcegp.forces import Actuation, ContactFriction, Coulomb, JointForces, JointFriction, RigidBodies
 from forcegp.inference import OptimizerOptions
 
 LINK = """<link name="{0}"><inertial><origin xyz="0 0.02 -0.2"/><mass value="{1}"/>
@@ -128,6 +128,50 @@ def test_normal_forces_that_mean_nothing(touching, force):
     control = HybridForce(touching.predictor(covariance="none"), **GAINS)
     with pytest.raises(InvalidInput, match=r"one per contact \(1\)"):
         control(q, v, q, v, v, force)
+
+
+def test_a_force_is_asked_for_only_at_the_surface(touching):
+    """Off it by more than the tolerance the controller refuses, or follows the reference in the air."""
+    predictor, (q, v) = touching.predictor(covariance="none"), state(touching)
+    rest = np.zeros(3), [7.0]
+    lifted = q + np.array([0.0, 0.1, 0.0])
+    with pytest.raises(ContactError, match="ComputedTorque first"):
+        HybridForce(predictor, **GAINS, torque_limits=1e6)(lifted, v, q, v, *rest)
+    control = HybridForce(predictor, off_surface="release", **GAINS, torque_limits=1e6)
+    free = ComputedTorque(touching.with_contacts([]).predictor(covariance="none"), **GAINS, torque_limits=1e6)
+    torch.testing.assert_close(control(lifted, v, q, v, *rest), free(lifted, v, q, v, rest[0]))
+    assert control.released
+    on = control(q, v, q, v, *rest)
+    assert not control.released
+    torch.testing.assert_close(on, HybridForce(predictor, **GAINS, torque_limits=1e6)(q, v, q, v, *rest))
+    contact, plane = touching.model.contacts[0], touching.model.contacts[0].surface  # a plane
+    at = touching.model.robot.kinematics(torch.tensor(lifted))
+    away = float(contact.position(at) @ torch.tensor(plane.normal).double()) - plane.offset
+    assert float(contact.off(at)) == pytest.approx(away, rel=1e-6)
+    HybridForce(predictor, tolerance=1.01 * abs(away), **GAINS, torque_limits=1e6)(lifted, v, q, v, *rest)
+    with pytest.raises(ContactError):
+        HybridForce(predictor, tolerance=0.99 * abs(away), **GAINS, torque_limits=1e6)(lifted, v, q, v, *rest)
+    with pytest.warns(ContactWarning, match="1 of 1 states are up to"):
+        touching.predict(lifted, v, on)
+
+
+def test_friction_that_remembers_is_that_of_the_positions_seen(touching):
+    model = arm_model().with_forces(Coulomb([0.4, 0.3, 0.2], memory=True, sigma=200.0))
+    posterior = fit(model, arm_data(30, 0))
+    control = HybridForce(posterior.predictor(covariance="none"), **GAINS, torque_limits=1e6)
+    q, v = state(posterior)
+    step = np.array([1e-3, -2e-3, 5e-4])
+    for back in (step, 2.0 * step, step):
+        u = control(q + back, v, q + back, v, np.zeros(3), [7.0])
+    z = np.sign(step) * (1.0 - np.exp(-200.0 * 1e-3 * np.array([1.0, 2.0, 0.5])))  # forth, from 0
+    z = -np.sign(step) + (z + np.sign(step)) * np.exp(-200.0 * abs(step))  # and back
+    a = np.zeros(3)
+    at = posterior.model.dynamics(*(torch.tensor(x) for x in (q + step, v)), torch.zeros(6).double())
+    M, A, b = (x.numpy() for x in (at.M, at.A, at.b))
+    inverse = np.linalg.inv(M)
+    a = inverse @ A.T @ np.linalg.solve(A @ inverse @ A.T, b)
+    expected = posterior.predictor(covariance="none").inverse_dynamics(q + step, v, a, [7.0], memory=z).mean
+    torch.testing.assert_close(u, expected)
 
 
 def test_models_with_and_without_contacts(touching):

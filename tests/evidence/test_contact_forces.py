@@ -192,11 +192,18 @@ def test_what_contacts_hide_is_in_the_interval_of_their_force():
     expected = torch.linalg.inv((at.A / h.square()) @ at.A.mT).diagonal(dim1=-2, dim2=-1)  # (A h^-2 A^T)^-1
     found = posterior.predict(*tensors(log, "q", "v", "u"))
     torch.testing.assert_close(found.multiplier.variance, expected, rtol=1e-5, atol=0.0)
+    assert float(found.unseen.min()) > 0.999  # of a model without functions all is the prior
     assert float(found.variance.max()) < 1e-6 * float(expected.min())
     sensed = fit(
         held(JointForces(("v",))), replace(log, noise_std=[0.05] * 3), [Accelerations(), ContactForces()], **QUICK
     )
     assert "hidden_force" not in sensed.settings
+    assert not bool(sensed.predict(*tensors(log, "q", "v", "u")).unseen.any())
+    learned = fit(held(JointForces(("v",))), replace(log, measured={}, noise_std=[0.05] * 3), **QUICK)
+    found = learned.predict(*tensors(log, "q", "v", "u"))
+    seen = learned.with_settings(hidden_force=None).predict(*tensors(log, "q", "v", "u"))
+    torch.testing.assert_close(found.unseen, 1.0 - seen.multiplier.variance / found.multiplier.variance)
+    assert "not seen by the log" in str(found)
 
 
 def test_a_sensor_shows_forces_along_the_normal(tmp_path, monkeypatch):

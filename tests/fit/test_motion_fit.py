@@ -69,11 +69,6 @@ def along_the_law() -> Dataset:
     return recording(line, 1)
 
 
-@pytest.fixture(scope="module")
-def beyond_the_law() -> tuple[Dataset, Dataset]:
-    return recording(bump, 2), recording(bump, 3)
-
-
 def analytical(data: Dataset):
     return fit_model(slide(1.0, 1.0).with_forces(noise=QUIET), data, points=50, restarts=1)
 

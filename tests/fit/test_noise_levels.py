@@ -53,12 +53,6 @@ def test_no_levels_are_likelier():
             assert cost(NoiseLevels(found.acceleration, found.force * off)) > least
 
 
-def test_whitened_residuals_are_white():
-    residual, M = drawn(4000, ACCELERATION, FORCE)
-    white = (NoiseLevels(ACCELERATION, FORCE).whitening(np.linalg.inv(M)) @ residual[..., None])[..., 0]
-    np.testing.assert_allclose(np.cov(white.T), np.eye(2), atol=0.08)
-
-
 def test_noise_of_forces_is_learned_beside_that_of_accelerations():
     data = arm_data(150, 6, arm_model(0))  # without contacts, for those hide what the forces do along their normal
     generator = np.random.default_rng(6)

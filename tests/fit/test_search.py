@@ -90,7 +90,3 @@ def test_a_fit_that_drops_starts_is_the_same_in_several_processes(train):
     assert one.settings["restart_status"] == two.settings["restart_status"]
     assert "dropped" in str(one.settings["restart_status"])
     np.testing.assert_allclose(one.settings["restart_objective"], two.settings["restart_objective"], rtol=1e-9)
-
-
-def test_nothing_was_found_before():
-    assert best_value(()) == float("inf")

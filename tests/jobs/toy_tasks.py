@@ -2,8 +2,6 @@
 
 import errno
 import os
-import time
-import warnings
 from pathlib import Path
 
 from forcegp.errors import FitError
@@ -43,14 +41,3 @@ def die_once(results, spec, folder):
     except FileExistsError:
         return {"survived": True}
     os._exit(3)
-
-
-def warn(results, spec, folder):
-    warnings.warn("look here", stacklevel=1)
-    return {}
-
-
-def sleep(results, spec, folder):
-    Path(spec["begun"]).write_text(str(os.getpid()))
-    time.sleep(spec["seconds"])
-    return {}

@@ -3,7 +3,6 @@
 import os
 import signal
 import time
-import warnings
 from pathlib import Path
 
 
@@ -64,11 +63,6 @@ def die(folder):
     """SIGKILL the worker; files count the attempts."""
     (Path(folder) / str(os.getpid())).touch()
     os.kill(os.getpid(), signal.SIGKILL)
-
-
-def warn(index):
-    warnings.warn("look here", UserWarning, stacklevel=1)
-    return index
 
 
 def threads(_):

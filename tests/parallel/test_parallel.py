@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 from multiprocessing import get_context
@@ -15,7 +14,6 @@ import psutil
 import pytest
 from tests.parallel import tasks
 
-from forcegp import parallel
 from forcegp.errors import BackendError, InvalidInput
 from forcegp.parallel import checked_jobs, executor_for, mapped, outcome_of, submit
 
@@ -61,17 +59,6 @@ def test_outcomes_come_as_soon_as_they_are_there(jobs, tmp_path):
     assert next(outcomes) == 0
     (tmp_path / "gate").touch()
     assert next(outcomes) == 1
-
-
-def test_warnings_of_tasks_reach_the_caller(jobs):
-    with pytest.warns(UserWarning, match="look here"):
-        assert list(mapped(tasks.warn, [1], jobs)) == [1]
-
-
-def test_this_process_does_nothing_before_it_is_asked_for(tmp_path):
-    outcomes = mapped(tasks.mark, [tmp_path / "a", tmp_path / "b"], 1)
-    assert next(outcomes) == tmp_path / "a"
-    assert not (tmp_path / "b").exists()
 
 
 def test_own_processes_are_two_and_kept_between_calls_and_compute_on_one_thread():
@@ -146,11 +133,3 @@ def test_what_cannot_travel_is_told():
 def test_wrong_jobs_are_told(wrong):
     with pytest.raises(InvalidInput, match=rf"jobs is {wrong!r}; give .*at least 1, or an Executor"):
         checked_jobs(wrong)
-
-
-def test_each_warning_of_a_line_is_shown_once(monkeypatch):
-    monkeypatch.setattr(parallel, "_SHOWN", {})
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("default")
-        list(mapped(tasks.warn, [1, 2, 3], 2))
-    assert [str(each.message) for each in caught] == ["look here"]

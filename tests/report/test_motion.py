@@ -1,6 +1,6 @@
 """Scenes of recordings: poses against Pinocchio, arrows against the components of the posterior."""
 
-from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pinocchio
@@ -11,7 +11,7 @@ from tests.robots.test_moving_bases import LIMBS
 
 from forcegp import Dataset, JointFriction, Model, Robot, fit
 from forcegp.report import recorded_scene, scene_notes
-from forcegp.report.motion import LONGEST_ARROW, PALE, _arrows
+from forcegp.report.motion import LONGEST_ARROW, PALE, _drawn
 
 
 def test_poses_are_pinocchios(swinging):
@@ -83,10 +83,9 @@ def test_arrows_are_drawn_to_scale(swinging, friction):
     np.testing.assert_allclose(farther / scene.arrow_length, expected, rtol=1e-9)
     assert scene.arrow_length == LONGEST_ARROW * scene.size
     assert f"{arrows.largest:.3g} Nm would be" in scene_notes(scene)[0]
-    shades = []
-    drawn_on = SimpleNamespace(add_arrows=lambda name, points, color, **_: shades.append(color.astype(float)))
-    _arrows(drawn_on, 0, scene)
-    color, pale = shades
+    server = MagicMock()
+    _drawn(server, scene)
+    color, pale = (call.args[2].astype(float) for call in server.scene.add_arrows.call_args_list)
     np.testing.assert_allclose((pale - color) / (255.0 - color), PALE, atol=0.02)
 
 

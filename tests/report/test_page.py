@@ -11,7 +11,6 @@ from forcegp import score
 from forcegp.errors import InvalidInput
 from forcegp.report import (
     Page,
-    Table,
     is_page,
     model_page,
     scores_sentence,
@@ -32,15 +31,15 @@ def test_a_page_needs_no_network_is_small_and_shows_everything(page, tmp_path):
     assert len(pictures) == len(page.pictures) == 1  # friction curves
     for picture in pictures:
         assert Image.open(io.BytesIO(base64.b64decode(picture))).width > 500
-    (table,) = page.tables
-    for cell in (cell for row in table.rows for cell in row):
+    ((_, _, rows),) = page.tables
+    for cell in (cell for row in rows for cell in row):
         assert f"<td>{cell}</td>" in text
     assert any("Arrows are forces" in note for note in page.scene_notes)
 
 
 def test_text_is_escaped(tmp_path):
     evil = "<script>alert(1)</script>"
-    page = Page(evil, evil, [(evil, evil)], tables=[Table(evil, [evil], [[evil]])], details={"x": evil})
+    page = Page(evil, evil, [(evil, evil)], tables=[(evil, [evil], [[evil]])], details={"x": evil})
     write_page(tmp_path / "report.html", page)
     text = (tmp_path / "report.html").read_text()
     assert "<script>" not in text

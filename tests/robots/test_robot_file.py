@@ -1,6 +1,7 @@
-"""What is written into a URDF."""
+"""What is written into a URDF, and what is expanded to one."""
 
 import math
+import sys
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,11 +13,14 @@ from hypothesis import strategies as st
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import CHAIN, MODELS, loaded
 from tests.robots.test_mimic import CHAIN_MIMICS, with_mimics
+from tests.robots.test_urdf_errors import SMALL
 
 from forcegp.errors import (
     LARGEST,
+    MissingExtra,
     NonPhysicalInertia,
     RobotFileWarning,
+    RobotModelError,
     UnknownName,
 )
 from forcegp.model import Model
@@ -49,6 +53,28 @@ def test_rotors_of_joints_that_follow_count_by_the_square_of_their_ratio():
 
 def test_without_rotors_nothing_is_in_the_file(tmp_path):
     assert Robot.from_urdf_text(CHAIN).to_urdf(tmp_path / "chain.urdf") == CHAIN
+
+
+MACRO = SMALL.replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ').replace(
+    '<mass value="2"/>', '<xacro:property name="m" value="${1 + 1}"/><mass value="${m}"/>'
+)
+
+
+def test_xacro_files_need_the_package(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "xacro", None)
+    (tmp_path / "arm.xacro").write_text(MACRO)
+    with pytest.raises(MissingExtra, match=r"arm\.xacro: .*pip install 'forcegp\[xacro\]'"):
+        Robot.from_urdf(tmp_path / "arm.xacro")
+
+
+@pytest.mark.parametrize("name", ["arm.xacro", "arm.urdf.xacro"])
+def test_xacro_files_are_expanded(tmp_path, name):
+    pytest.importorskip("xacro")
+    (tmp_path / name).write_text(MACRO)
+    assert Robot.from_urdf(tmp_path / name).link("arm").mass == 2.0
+    (tmp_path / name).write_text(MACRO.replace("1 + 1", "1 / 0"))
+    with pytest.raises(RobotModelError, match="xacro could not expand it"):
+        Robot.from_urdf(tmp_path / name)
 
 
 @pytest.mark.parametrize("model", MODELS)

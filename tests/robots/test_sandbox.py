@@ -102,3 +102,30 @@ def test_links_and_absolute_names_lead_nowhere_else(tmp_path):
         (folder / name).write_text(content)
         (linked / name).symlink_to(folder / name)
     assert Robot.from_file(linked / "scene.xml").nv == 1
+
+
+MACRO = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="r"><xacro:property name="m" value="${%s}"/>'
+PARTS = """<link name="base"/><joint name="j" type="revolute"><parent link="base"/><child link="arm"/></joint>
+<link name="arm"><inertial><mass value="${m['mass']}"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+EXPRESSIONS = {
+    "xacro.load_yaml('../secret.yaml')": "only read below its folder",
+    "xacro.load_yaml('/etc/hostname')": "only read below its folder",
+    "10**10**10": "or needed more than 2 s",
+    "[0] * 10**12": "could not expand it|or needed more",
+}
+
+
+@pytest.mark.parametrize("expression", EXPRESSIONS)
+def test_macros_read_below_their_folder_within_limits(expression, tmp_path, monkeypatch):
+    pytest.importorskip("xacro")
+    monkeypatch.setattr(sandbox, "SECONDS", 2)
+    (folder := tmp_path / "robot").mkdir()
+    for name in ("secret.yaml", "robot/own.yaml"):
+        (tmp_path / name).write_text("mass: 2.0")
+    (folder / "arm.xacro").write_text(MACRO % "xacro.load_yaml('own.yaml')" + PARTS)
+    assert Robot.from_file(folder / "arm.xacro").link("arm").mass == 2.0
+    (folder / "arm.xacro").write_text(MACRO % expression + PARTS)
+    with pytest.raises(RobotModelError, match=EXPRESSIONS[expression]) as caught:
+        Robot.from_file(folder / "arm.xacro")
+    assert "\n" not in str(caught.value)

@@ -8,7 +8,7 @@ from matplotlib.image import imread
 
 from forcegp.errors import InvalidInput
 from forcegp.scores import normal_force_figure, save_figure
-from forcegp.scores.figures.style import new_figure, plain_ticks, short_joint_names, window
+from forcegp.scores.figures.style import new_figure, short_joint_names, window
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -56,13 +56,3 @@ def test_a_window_holds_the_rows_of_one_episode_in_order_of_time(test_data):
 )
 def test_short_names_drop_what_all_joints_share(names, short):
     assert short_joint_names(names) == short
-
-
-@pytest.mark.parametrize(("low", "high"), [(0.45, 0.48), (1.0, 4.0), (0.9, 30.0), (1e-4, 10.0)])
-def test_ticks_of_logarithmic_axes_are_few(low, high):
-    axes = new_figure(1.6, 1.0).subplots()
-    axes.set_xscale("log")
-    axes.set_xlim(low, high)
-    plain_ticks(axes.xaxis)
-    shown = [value for value in axes.get_xticks() if low <= value <= high]
-    assert 2 <= len(shown) <= 6

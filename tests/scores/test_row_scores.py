@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio
@@ -21,6 +22,7 @@ from forcegp.model import Model
 from forcegp.progress import watched
 from forcegp.scores.accuracy import (
     LEVELS,
+    by_stretch,
     force_errors,
     mass_matrices,
     predict_rows,
@@ -103,7 +105,7 @@ def test_without_truth_only_measurements_are_scored_and_the_rest_is_named(poster
 def test_without_analytical_mean_the_processes_answer_for_the_known_forces_too(without_mean, test_data):
     predicted = predict_rows(without_mean, test_data)
     known = arm_model().dynamics(*(torch.tensor(x) for x in (test_data.q, test_data.v, test_data.u))).Q_K.numpy()
-    expected = np.abs(predicted.unknown_force - known - test_data.truth["Q_U"]).mean(axis=0)
+    expected = np.abs(predicted["unknown_force"] - known - test_data.truth["Q_U"]).mean(axis=0)
     np.testing.assert_allclose(scored(without_mean, test_data).columns("mae", "unknown force"), expected, rtol=1e-9)
 
 
@@ -116,7 +118,7 @@ def test_blocks_of_rows_join_seamlessly(posterior):
     rows = [0, BLOCK - 1, BLOCK, len(data) - 1]
     ends = predict_rows(posterior, data.rows(rows))
     for name in ("mean", "variance", "negative_log_density", "residual"):
-        np.testing.assert_allclose(getattr(whole, name)[rows], getattr(ends, name), rtol=1e-8, atol=1e-9)
+        np.testing.assert_allclose(whole[name][rows], ends[name], rtol=1e-8, atol=1e-9)
 
 
 # ---------------------------------------------------------------- known physics alone, in closed form
@@ -166,17 +168,22 @@ def test_densities_and_intervals_are_those_of_the_noise(known, swinging):
 
 
 def test_stretches_of_time_make_up_the_whole(known, swinging):
-    """Equal stretches: means of squares over them are those of all rows, and so are densities."""
+    """Equal stretches of 20 in all: means of squares over them are those of all rows."""
     table, stretches = known
     number = (swinging.time / (0.39 / 20)).astype(int)
     rows = np.bincount(number)
-    assert len(stretches["force"]) == len(rows)
-    assert np.average(stretches["force"], weights=rows) == pytest.approx(np.square(table["force"]["rmse"]).mean())
-    nrmse = np.square(table["acceleration"]["nrmse"]).mean()
-    assert np.average(stretches["acceleration"], weights=rows) == pytest.approx(nrmse)
-    assert np.average(stretches["density"], weights=rows) == pytest.approx(table["all joints"]["nlpd"][0])
-    first = (off(swinging) / swinging.a.std(0))[number == 0]
-    assert stretches["acceleration"][0] == pytest.approx((first**2).mean())
+    assert len(stretches) == len(rows)
+    assert np.average(stretches, weights=rows) == pytest.approx(np.square(table["force"]["rmse"]).mean())
+    first = force_errors(off(swinging), 0.0, mass_matrices(swinging, given_system()))[number == 0]
+    assert stretches[0] == pytest.approx((first**2).mean())
+
+
+def test_stretches_begin_anew_in_every_episode():
+    """Two of 40 s are cut into ten of 4 s each, and its last row."""
+    seconds = np.tile(np.arange(41.0), 2)
+    rows = SimpleNamespace(time=seconds + np.repeat([0.0, 99.5], 41), episode=np.repeat([7, 3], 41), episodes=(7, 3))
+    own = [*np.arange(1.5, 40.0, 4.0), 40.0]
+    assert by_stretch(seconds, rows) == own + own
 
 
 def test_the_mass_matrix_counts_rotors(swinging):

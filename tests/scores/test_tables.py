@@ -2,7 +2,7 @@
 
 import pytest
 
-from forcegp.scores import Scores, model_table, overall, winner_table
+from forcegp.scores import Scores, model_table, overall
 from forcegp.scores.page import columns_of, formatted, number, page, preparation_lines
 
 UNITS = {"q": "rad", "v": "rad/s", "u": ("Nm", "N"), "a": "rad/s^2"}
@@ -25,9 +25,7 @@ def run(seed: int, factor: float, diverged: int = 0, error: str | None = None) -
     }
     squared = [[(1e-5 * factor) ** 2, (2e-5 * factor) ** 2]]
     motions = {"horizons": [0.5], "motions": 2, "diverged": [diverged], "squared": squared}
-    stretches = {name: [factor**2, 1.1 * factor**2] for name in ("force", "acceleration")}
-    stretches["density"] = [5.0 * factor, 6.0 * factor]
-    return found | {"table": table, "motions": motions, "stretches": stretches}
+    return found | {"table": table, "motions": motions, "stretches": [factor**2, 1.1 * factor**2]}
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +40,7 @@ def scores() -> Scores:
         "ls": [run(0, 2.0), run(1, 2.2), run(2, 2.4, diverged=1)],
         "gp": [run(0, 0.5), run(1, 0.0, error="no luck"), run(2, 0.6)],
     }
-    about = {"rows": 100, "seeds": [0, 1, 2], "mass_matrix": ["M"], "machine": "here", "forcegp": "0"}
+    about = {"rows": 100, "seeds": [0, 1, 2], "machine": "here", "forcegp": "0"}
     return Scores(models=models, runs=runs, joint_names=("a", "b"), units=UNITS, about=about)
 
 
@@ -78,35 +76,13 @@ def test_models_side_by_side(scores):
     assert [row[5] for row in rows] == ["95.0 %"] * 3
 
 
-def test_the_model_to_take_stands_with_what_it_was_compared_with(scores):
-    header, rows = winner_table(scores)
-    assert header[1:3] == ["take", "compared"]
-    taken = {row[0].split()[0]: row[1:] for row in rows}
-    assert taken["force-space"][:2] == ["gp", "gp / ls"]
-    assert taken["force-space"][3] == "better"
-    assert taken["negative"][1] == "gp − ls"
-    assert taken["negative"][2].startswith("-9.")
-    few = Scores(models=scores.models, runs={**scores.runs, "ls": [], "urdf": []}, joint_names=("a", "b"), units=UNITS)
-    assert {row[2] for row in winner_table(few)[1]} == {"–"}, "nothing else was scored"
-
-
-def test_much_better_on_too_little_time_is_not_sure(scores):
-    """A third better in both stretches of one seed, by amounts that differ so much that no interval shows it."""
-    hard = {name: [{**run(0, 1.0), "stretches": {"force": values}}] for name, values in
-            (("ls", [4.0, 0.01]), ("gp", [0.04, 0.0099]))}  # fmt: skip
-    few = Scores(models=scores.models, runs={**hard, "urdf": []}, joint_names=("a", "b"), units=UNITS)
-    (row,) = [row for row in winner_table(few)[1] if row[0].startswith("force")]
-    assert row[1] == "gp"
-    assert row[-1] == "better, not sure"
-
-
 def test_the_page_holds_all_of_it(scores):
-    text = page(scores, [("motions", "Errors of motions.")])
+    text = page(scores)
     assert "| ls | 0.4400 (0.4000–0.4800) |" in text
-    assert "motions.png" in text
     assert "gp failed in 1 of 3 runs (s, seed 1): no luck" in text
     assert "| gp | 1.650 | 2.200 |" in text
     assert len(columns_of(scores)) == 7
+    assert f"**gp**: {scores.winner.sentence}" in text
 
 
 def test_what_was_done_with_a_log_is_told_the_last_step_first():

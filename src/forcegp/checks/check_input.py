@@ -92,19 +92,12 @@ class CheckInput:
         return data.rows(slice(None, None, max(1, -(-len(data) // self.most_rows))))
 
     @property
-    def price(self) -> Mapping[str, Any]:
-        """What the filter of the check did, or an earlier one where this one filters nothing; empty without rows."""
-        if self.prepared is None:
-            return {}
-        return preparation_report(self.prepared.metadata) if self.cutoff is not None else _earlier(self.log)
-
-    @property
     def cutoff(self) -> float | None:
         """Of the filter of the check [Hz]."""
         return None if self.prepared is None else preparation_report(self.prepared.metadata)["cutoff"]
 
     @classmethod
-    def of(cls, dataset: Dataset, model: Model, preparation: Preparation) -> "CheckInput":
+    def of(cls, dataset: Dataset, model: Model) -> "CheckInput":
         """Prepare a log for the checks. Raises InvalidInput for one that is too short, or whose rows lack an order."""
         if not dataset.time_ordered:
             raise InvalidInput("the rows are not in order of time (a sample of rows?); check the whole recording.")
@@ -113,7 +106,7 @@ class CheckInput:
         found["even"] = even = _even(mended, jumps)
         if not jumps.any():
             shortest = min(np.ptp(even.time[even.episode == number]) for number in even.episodes)
-            chosen = replace(preparation, every=1, delay=0.0, trim=0.0).resolved(even)
+            chosen = Preparation(cutoff="auto").resolved(even)
 
             def trimmed(cutoff: float) -> Preparation:
                 return replace(chosen, cutoff=cutoff, trim=float(min(1.0 / cutoff, LONGEST_TRIM * shortest)))
@@ -124,10 +117,8 @@ class CheckInput:
             if lower < HIGHEST * 0.5 / uniform_step(even.time[even.episode == even.episode[0]]):
                 with contextlib.suppress(DatasetError):  # too short for that
                     found["compared"] = trimmed(lower).rows(even)
-                    if (
-                        preparation.cutoff == "auto" and chosen.cutoff is not None
-                    ):  # what wrong torques ask for is too low
-                        seen = float(np.nanmax(motion_spectrum(even, chosen.differentiate).cutoff))
+                    if chosen.cutoff is not None:  # what wrong torques ask for is too low
+                        seen = float(np.nanmax(motion_spectrum(even).cutoff))
                         found["sharper"] = trimmed(seen).rows(even) if seen > 1.5 * lower else None
             # white noise as logged, or what the filter left
             left = preparation_report(prepared.metadata).get("acceleration_noise", {}).get("after")

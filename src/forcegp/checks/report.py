@@ -1,7 +1,7 @@
 """`check`: one log against itself and its robot, as a list of doubts that a person acts on."""
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -23,8 +23,8 @@ from forcegp.checks.signals import (
     target_doubts,
     without_registers,
 )
-from forcegp.checks.torque_doubts import TOUCHES, held_points, torque_doubts, without_stops
-from forcegp.data import Dataset, Preparation, contact_doubts
+from forcegp.checks.torque_doubts import TOUCHES, elastic_doubts, held_points, torque_doubts, without_stops
+from forcegp.data import Dataset, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
 from forcegp.doubts import LEVELS, Doubt, Doubts, listed, look
@@ -59,18 +59,14 @@ class CheckReport(Summary):
     def per_joint(self) -> list[dict[str, Any]]:
         """What was measured of every joint; None where it is not known.
 
-        "unexplained" share of the torque's variance, "residual" in Nm or N and "factor" of the fit to inverse dynamics;
-        "noise_before" and "noise_after" the filter of the acceleration in rad/s^2 or m/s^2.
+        "unexplained" share of the torque's variance, "residual" in Nm or N and "factor" of the fit to inverse dynamics.
         """
         nothing: list[Any] = [None] * self.inputs.log.nv
-        names = ("unexplained", "residual", "factor", "noise_before", "noise_after")
-        columns = {"joint": list(self.inputs.names), **dict.fromkeys(names, nothing)}
+        columns = {"joint": list(self.inputs.names), "unexplained": nothing, "residual": nothing, "factor": nothing}
         if self.comparison is not None:
             left, spread = self.comparison.unexplained, np.std(self.comparison.log.rows.u, axis=0)
             columns["unexplained"], columns["residual"] = plain(left), plain(np.sqrt(left) * spread)
             columns["factor"] = plain(self.comparison.factors)
-        if (noise := self.inputs.price.get("acceleration_noise")) is not None:
-            columns["noise_before"], columns["noise_after"] = noise["before"], noise["after"]
         return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
     def to_dict(self) -> dict[str, Any]:
@@ -79,33 +75,28 @@ class CheckReport(Summary):
         return {
             "level": self.doubts.level,
             "counts": counts,
-            "cutoff": self.inputs.price.get("cutoff"),
             "joints": self.per_joint(),
             "doubts": [doubt.to_dict() for doubt in self.doubts],
         }
 
 
-def check(dataset: Dataset, model: Model | None = None, *, preparation: Preparation | None = None) -> CheckReport:
+def check(dataset: Dataset, model: Model | None = None) -> CheckReport:
     """Look for what would spoil a model: wrong units, signs, joints, delays; dead channels; motion that shows nothing.
 
-    `model` is the robot that was recorded (default: that of the dataset).
-    `preparation` sets how to filter for the comparison (default: cut-off from the spectrum); its `delay`, `every` and
-    `trim` are not used. Nothing is changed.
+    `model` is the robot that was recorded (default: that of the dataset). Nothing is changed.
 
     Raises InvalidInput for rows out of order, fewer than 64 rows in a stretch, and a robot with other joints.
     """
     require_type("dataset", dataset, Dataset)
-    preparation = Preparation(cutoff="auto") if preparation is None else preparation
-    require_type("preparation", preparation, Preparation)
     model = dataset.model if model is None else model
     robot = require_type("model", model, Model).robot
     require_rows("dataset", dataset, robot.joint_names, robot.name)
     if robot.layout.groups:  # torques and filters are not looked at
         inputs = CheckInput.as_recorded(dataset, model)
-        return CheckReport(doubts=_of_base(dataset, model, preparation), inputs=inputs, comparison=None)
+        return CheckReport(doubts=_of_base(dataset, model, CheckInput.of), inputs=inputs, comparison=None)
     dataset, stops = without_stops(dataset, model)
     dataset, registers = without_registers(dataset)
-    inputs = CheckInput.of(dataset, model, preparation)
+    inputs = CheckInput.of(dataset, model)
     doubts, comparison = _doubts(inputs, model, [*stops, *registers])
     doubts += excitation_doubts(inputs)
     return CheckReport(doubts=Doubts(doubts), inputs=inputs, comparison=comparison)
@@ -120,7 +111,7 @@ def quick_check(dataset: Dataset, model: Model | None = None) -> Doubts:
     model = dataset.model if model is None else model
     require_rows("dataset", dataset, model.robot.joint_names, model.robot.name)
     if model.robot.layout.groups:
-        return Doubts(each for each in _of_base(dataset, model) if each.level != "ok")
+        return Doubts(each for each in _of_base(dataset, model, CheckInput.quick) if each.level != "ok")
     dataset, stops = without_stops(dataset, model)
     dataset, registers = without_registers(dataset)
     doubts, _ = _doubts(CheckInput.quick(dataset, model), model, [*stops, *registers])
@@ -153,14 +144,19 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
             sharp, heard = search(replace(inputs, compared=inputs.sharper))
             if not heard or heard[-1].about != UNKNOWN:
                 found, said = sharp, heard
+        if said and said[-1].about == UNKNOWN:
+            said = [*said, *elastic_doubts(inputs, found.log)]
         doubts, comparison = [*doubts, *said, *torque_doubts(inputs, found)], found
     return doubts, comparison
 
 
-def _of_base(dataset: Dataset, model: Model, preparation: Preparation | None = None) -> Doubts:
+Inputs = Callable[[Dataset, Model], CheckInput]
+
+
+def _of_base(dataset: Dataset, model: Model, inputs_of: Inputs) -> Doubts:
     """What is seen of a base that moves, of the joints and of what holds it; torques are not looked at."""
     unmeasured = list(unmeasured_base_doubts(dataset, model))
-    of_joints = list(_of_single_joints(dataset, model.robot, preparation))
+    of_joints = list(_of_single_joints(dataset, model.robot, inputs_of))
     of_base = unmeasured or list(base_doubts(dataset, model))
     if not unmeasured and Doubts(of_base).level != "wrong":  # forces in wrong axes show nothing
         of_base += carried_doubts(dataset, model)
@@ -168,17 +164,15 @@ def _of_base(dataset: Dataset, model: Model, preparation: Preparation | None = N
     return Doubts([*of_base, *of_joints, *flags])
 
 
-def _of_single_joints(dataset: Dataset, robot: Robot, preparation: Preparation | None) -> Iterator[Doubt]:
-    """Whether q, v and a of the joints of one degree of freedom belong together; quick where there is no filter."""
+def _of_single_joints(dataset: Dataset, robot: Robot, inputs_of: Inputs) -> Iterator[Doubt]:
+    """Whether q, v and a of the joints of one degree of freedom belong together."""
     if not robot.space.single_rows or not dataset.time_ordered:
         return
     own = _chain(robot.joint_names)
     alone = replace(dataset, model=own, q=as_vectors(dataset), u=np.zeros_like(dataset.v), truth={}, noise_std=None)
     with contextlib.suppress(InvalidInput):  # too short
-        inputs = CheckInput.quick(alone, own) if preparation is None else CheckInput.of(alone, own, preparation)
-        yield from motion_doubts(
-            replace(inputs, rotates=dataset.turns), robot.space.single_rows
-        )  # gaps may be rows whose feet are not known
+        inputs = replace(inputs_of(alone, own), rotates=dataset.turns)
+        yield from motion_doubts(inputs, robot.space.single_rows)  # gaps may be rows whose feet are not known
 
 
 def _chain(names: Sequence[str]) -> Model:

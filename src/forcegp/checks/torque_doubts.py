@@ -19,6 +19,8 @@ from forcegp.summary import plain
 
 LEAST_DELAY = 0.75  # time steps below which a delay is not reported
 MUCH = 0.5  # a delay that leaves less of what was unexplained is wrong to leave in
+BEYOND = 4.0  # of the frequency of the torque, from which on a resonance shows in none
+BLOCKS = 8  # of time, every other of which is held out
 HELD = 3.0  # of the dry friction and of what remains in motion, from which on no gear holds the joint
 RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
 
@@ -48,6 +50,45 @@ def _drift(found: Explanation) -> Iterator[Doubt]:
         )
         do = "Record the warm robot; updates of a posterior follow the level of friction."
         yield look(about="drift", what=what, do=do, joints=tuple(changed), numbers={"ratio": changed})
+
+
+def elastic_doubts(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
+    """Joints whose torque grows with the square of the frequency, beyond what rigid links and a delay tell.
+
+    With a gear of stiffness k between rotor J and link, u = tau + J a + (J / k) tau'' where the encoder is at the link
+    (Spong 1987, J. Dyn. Sys. Meas. Control 109).
+    """
+    if inputs.compared is None or len(inputs.compared) < FEWEST_ROWS:
+        return
+    log = replace(log, rows=log.changed(inputs.compared))
+    rows, found = log.rows, dict[str, float]()
+    slopes, bends = np.zeros_like(log.tau), np.zeros_like(log.tau)
+    for own in (rows.episode == number for number in rows.episodes):
+        slopes[own] = np.gradient(log.tau[own], rows.time[own], axis=0)
+        bends[own] = np.gradient(slopes[own], rows.time[own], axis=0)
+    fitted = np.arange(len(rows)) * BLOCKS // len(rows) % 2 == 0
+    for j, name in enumerate(inputs.names):
+        u, left, number = rows.u[:, j], np.zeros(2), np.zeros(2)
+        columns = np.c_[bends[:, j], log.tau[:, j], slopes[:, j], log.friction[:, j], np.ones(len(u))]
+        columns = columns / (np.linalg.norm(columns, axis=0) + 1e-300)
+        for part in (fitted, ~fitted):
+            for k, first in enumerate((1, 0)):
+                number = np.linalg.lstsq(columns[part, first:], u[part], rcond=1e-9)[0]
+                left[k] += np.square(u[~part] - columns[~part, first:] @ number).sum()
+        moved = float(np.sqrt(np.linalg.norm(bends[:, j]) / (np.linalg.norm(log.tau[:, j]) + 1e-300)))  # rad/s
+        beyond = np.sqrt(max(number[1], 0.0) / max(number[0], 1e-300))
+        much = left[0] > DOUBTFUL * np.square(u - u.mean()).sum() and left[1] < MUCH * left[0]
+        if much and 0.0 < beyond < BEYOND:
+            found[name] = float(beyond * moved) / (2.0 * np.pi)
+    if found:
+        yield look(
+            about="elastic joint",
+            what="the torque grows with the square of the frequency, as behind an elastic gear with a resonance near "
+            f"{', '.join(f'{hertz:.2g} Hz ({name})' for name, hertz in found.items())}.",
+            do="No rigid model predicts motions near it: filter by forcegp import --cutoff, at a third of it.",
+            joints=tuple(found),
+            numbers={"resonance": found},
+        )
 
 
 def _delays(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:

@@ -33,7 +33,7 @@ from forcegp.scores.accuracy import ACCELERATION, TORQUE
 from forcegp.scores.page import number
 
 MOST_CORRECTIONS = 8
-SCORES = ("models", "joint_names", "units", "recommended", "winners", "failures")
+SCORES = ("models", "joint_names", "units", "recommended", "winner", "failures")
 """What the answer holds of the scores."""
 
 
@@ -249,7 +249,6 @@ class Auto(Command):
             page = forcegp.report.model_page(
                 posterior,
                 recording,
-                pictures=forcegp.scores.scores_pictures(scores),
                 title=f"forcegp auto {' '.join(path.name for path in self.logs)}, {posterior.model.robot.name}",
                 best=content["best"],
                 findings=answer,

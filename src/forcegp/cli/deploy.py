@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, NUMBERS, Command, begins, listed, numbers_of, unless_given
 from forcegp.cli.robot_options import CONTACTS, RobotOptions, parse_contacts, require_same_joints
 from forcegp.cli.terminal import Terminal, columns
-from forcegp.errors import InvalidInput, spreadsheet_cell
+from forcegp.errors import InvalidInput
 from forcegp.scores.page import number
 
 
@@ -144,7 +143,7 @@ class Monitor(Command):
     log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
     """The log to search, at the rate of its sensors."""
     out: Annotated[Path, arg(metavar="FOLDER")]
-    """The folder to write: contacts.csv and contacts.json."""
+    """The folder to write, with contacts.json."""
     free: Annotated[str, arg(metavar="S|FREE.h5")]
     """Motion of 40 s or more without contacts, not used for training: the first S seconds of LOG, which are not
     searched, or another log."""
@@ -184,11 +183,6 @@ class Monitor(Command):
         title = f"{self.log.name}: {len(contacts)} contacts in {content['seconds']:.0f} s"
         with self.folder(self.out, content) as folder:
             write_json(folder / "contacts.json", {**content, "contacts": contacts})
-            with (folder / "contacts.csv").open("w", encoding="utf-8", newline="") as file:
-                table = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-                table.writeheader()
-                for each in contacts:
-                    table.writerow({k: spreadsheet_cell(x) if isinstance(x, str) else x for k, x in each.items()})
         limit = monitor.threshold
         header = ["on", "from [s]", "to [s]", "force [N]", "distance /\nthreshold"]
         rows = [

@@ -82,8 +82,6 @@ class Fit(Command):
     evidence: Annotated[tuple[str, ...], listed(), unless_given("EVIDENCE,...", LEARNED_FROM)] = ()
     """What is learned from: accelerations or torques (torques:both where accelerations are noisy, too, torques:mean=.4
     of means). Beside it motions:S refines the numbers on recorded positions, over windows of S seconds."""
-    baseline: Annotated[Path | None, DATASET, unless_given("LOG", "none", Path)] = None
-    """A second log, of the same robot without the payloads that are estimated."""
     contact: Annotated[tuple[str, ...], listed(goes_on=NUMBERS), unless_given(CONTACTS, "the dataset's")] = ()
     """Points that stay on surfaces, instead of the dataset's contacts; m, in the axes of the link FRAME. SURFACE is
     plane:nx,ny,nz,offset or sphere:cx,cy,cz,radius; FRAME@x,y,z:held is bolted down, as a foot on a force sensor. none
@@ -132,7 +130,6 @@ class Fit(Command):
                 dataset,
                 evidence,
                 recording=recording,
-                baseline=None if self.baseline is None else forcegp.Dataset.load(self.baseline),
                 **vars(self.search),
                 engine=self.engine,
             )

@@ -25,29 +25,14 @@ Seconds = Annotated[float | None, unless_given("S", "all", float)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CutoffOptions:
-    """How a log is filtered."""
+class FilterOptions:
+    """How rows to learn from are made of a raw log."""
 
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "none"
     """Low-pass filter q and u without delay, and recompute v and a. auto: chosen by the spectrum and held-out
     torques."""
     differentiate: Literal["q", "v"] = "q"
     """q: v and a from filtered positions. v: a from filtered velocities."""
-
-    def preparation(self) -> forcegp.data.Preparation:
-        """The preparation that the options describe. Raises InvalidInput, naming the option, for what is no number."""
-        if self.cutoff in ("none", "auto"):
-            cutoff = None if self.cutoff == "none" else "auto"
-        else:
-            complaint = f"--cutoff is {self.cutoff!r}; give a frequency in Hz, auto or none."
-            [cutoff] = numbers_of(self.cutoff, complaint, one=True)
-        return forcegp.data.Preparation(cutoff=cutoff, differentiate=self.differentiate)
-
-
-@dataclass(frozen=True, kw_only=True)
-class FilterOptions(CutoffOptions):
-    """How rows to learn from are made of a raw log."""
-
     delay: Annotated[str, arg(metavar="S|auto")] = "0"
     """Delay of u in the log, in s. auto: estimated for all joints together where u are the torques of all joints and
     nothing is touched, else 0."""
@@ -59,12 +44,15 @@ class FilterOptions(CutoffOptions):
     """Drop S seconds at both ends of each episode, after the filter."""
 
     def preparation(self) -> forcegp.data.Preparation:
-        """As above."""
-        delay: float | Literal["auto"] = "auto"
-        if self.delay != "auto":
+        """The preparation that the options describe. Raises InvalidInput, naming the option, for what is no number."""
+        cutoff, delay = None if self.cutoff == "none" else self.cutoff, self.delay
+        if cutoff not in (None, "auto"):
+            complaint = f"--cutoff is {self.cutoff!r}; give a frequency in Hz, auto or none."
+            [cutoff] = numbers_of(self.cutoff, complaint, one=True)
+        if delay != "auto":
             [delay] = numbers_of(self.delay, f"--delay is {self.delay!r}; give seconds, or auto.", one=True)
-        every = 1 if self.every is None else self.every
-        return replace(super().preparation(), delay=delay, lag=self.lag, every=every, trim=self.trim)
+        how: dict[str, Any] = {"cutoff": cutoff, "delay": delay, "every": 1 if self.every is None else self.every}
+        return forcegp.data.Preparation(differentiate=self.differentiate, lag=self.lag, trim=self.trim, **how)
 
 
 def prepared_rows(
@@ -362,15 +350,13 @@ class Check(Command):
     strict: bool = False
     """Exit with code 2 if anything is wrong."""
     robot: RobotOptions = RobotOptions()
-    filter: CutoffOptions = CutoffOptions(cutoff="auto")
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Check, and show. Raises DatasetError with `strict` where something is wrong."""
-        preparation = self.filter.preparation()
         dataset = forcegp.Dataset.load(self.log)
         model = self.robot.chosen_model(dataset, self.log)
         with terminal.progress("checking"):
-            report = forcegp.check(dataset, model, preparation=preparation)
+            report = forcegp.check(dataset, model)
         content = {"data": str(self.log), **report.to_dict()}
         terminal.show(*_shown(terminal, self.log, report))
         wrong = report.doubts.at("wrong")
@@ -388,23 +374,13 @@ def _shown(terminal: Terminal, data: Path, report: forcegp.checks.CheckReport) -
     content = report.to_dict()
     counts = content["counts"]
     heading = Text(f"{data}: {counts['wrong']} wrong, {counts['look']} to look at, {counts['ok']} ok", style="bold")
-    measured = any(value is not None for each in content["joints"] for name, value in each.items() if name != "joint")
-    numbers = [_numbers(report, content)] if measured else []
-    return [heading, doubts_table(report.doubts, terminal.worded), *numbers]
-
-
-def _numbers(report: forcegp.checks.CheckReport, content: Mapping[str, Any]) -> Any:
-    cutoff = content["cutoff"]
-    filtered = "not\nfiltered" if cutoff is None else f"filtered\nat {cutoff:.3g} Hz"
-    header = ["joint", "torque un-\nexplained", "rms", "factor", "noise of a\nas logged", filtered]
-    rows = [
-        [
-            each["joint"],
-            shown(each["unexplained"], "{:.2g} %", 100.0),
-            *(shown(each[name]) for name in ("residual", "factor", "noise_before", "noise_after")),
+    told = [heading, doubts_table(report.doubts, terminal.worded)]
+    if report.comparison is not None:
+        rows = [
+            [name, shown(left, "{:.2g} %", 100.0), shown(rms), shown(factor)]
+            for name, left, rms, factor in (each.values() for each in content["joints"])
         ]
-        for each in content["joints"]
-    ]
-    units = report.inputs.log.units
-    unit = f"{units['u']} and {units['a']}" if isinstance(units["u"], str) else "the units of each joint"
-    return columns(f"Every joint; in {unit}".replace("^2", "²"), header, rows)
+        unit = report.inputs.log.units["u"]
+        title = f"Torque of every joint; in {unit if isinstance(unit, str) else 'the unit of each joint'}"
+        told.append(columns(title, ["joint", "unexplained", "rms", "factor"], rows))
+    return told

@@ -59,7 +59,7 @@ class RobotOptions(RobotFileOptions):
     robot: Annotated[Path | None, URDF, unless_given("ARM.urdf", "the dataset's or the model's", Path)] = None
     """Use this robot (URDF or MJCF)."""
     identified: Annotated[Path | None, IDENTIFIED, unless_given("FOLDER", "none", Path)] = None
-    """Begin with the robot and the known forces that `forcegp fit` estimated, instead of --robot."""
+    """In place of --robot: begin with the robot and the known forces that `forcegp fit` estimated."""
 
     def chosen(self, recorded: forcegp.Model | None = None) -> forcegp.Model | None:
         """What the options ask for, else `recorded`, whose contacts and forces stay, and what no URDF holds."""

@@ -53,7 +53,7 @@ class Score(Command):
     blocks of time of every episode those of these numbers, from 1. auto: a quarter of the episodes, or with one episode
     blocks:5:3,5."""
     guard: Annotated[float, arg(metavar="S")] = 0.25
-    """Seconds of training rows left out beside held-out blocks."""
+    """Seconds of training rows left out beside held-out blocks; at least two time constants of the filter."""
     seeds: Annotated[int, arg(metavar="N")] = 5
     """Number of random choices of the rows that models learn from, among two thirds of the training rows."""
     horizon: Annotated[tuple[float, ...], listed(float), unless_given("S,...", ".1,.2,.5,1 after a fit")] = ()
@@ -65,7 +65,7 @@ class Score(Command):
     observe: Annotated[float, arg(metavar="S")] = 0.0
     """Seconds at the beginning of LOG that a RUN learns from, as a robot at work could; the rest is scored."""
     out: Annotated[Path | None, unless_given("FOLDER", "no folder")] = None
-    """The folder of results: page, figures, numbers, models; of one RUN also report.html with the robot in motion. An
+    """The folder of results: page, numbers, models; of one RUN also report.html with the robot in motion. An
     unfinished run resumes."""
     models: CandidateOptions = CandidateOptions()
     search: SearchOptions = SearchOptions(points=100)
@@ -102,8 +102,7 @@ class Score(Command):
         models |= {name: name for name in self.models.names()}
         rows, recording, model, split = raw, raw, None, None
         if fits:
-            rows, recording, model = self._prepared(terminal, raw, data)
-            split = forcegp.scores.split_named(rows, self.split or "auto", self.guard)
+            rows, recording, model, split = self._prepared(terminal, raw, data)
         elif self.filter.every is not None:
             rows = forcegp.data.Preparation(every=self.filter.every).apply(raw)
         with terminal.progress(f"scoring {len(rows)} rows"):
@@ -138,8 +137,8 @@ class Score(Command):
 
     def _prepared(
         self, terminal: Terminal, raw: forcegp.Dataset, data: Path
-    ) -> tuple[forcegp.Dataset, forcegp.Dataset, forcegp.Model]:
-        """Rows to learn from and to score, the same at the full rate, and the robot as given."""
+    ) -> tuple[forcegp.Dataset, forcegp.Dataset, forcegp.Model, tuple[forcegp.scores.Split, ...]]:
+        """Rows to learn from and to score, the same at the full rate, the robot as given, and the split."""
         model = self.robot.chosen_model(raw, data)
         for note in forces_of(model):
             terminal.note(note)
@@ -147,16 +146,10 @@ class Score(Command):
         rows, recording = prepared_rows(
             terminal, preparation, replace(raw, model=model), thin=self.filter.every is None
         )
-        cutoff = forcegp.data.preparation_report(rows.metadata).get("cutoff")
-        if cutoff is not None and not preparation.changes_nothing and (self.split or "auto")[0] in "ab":
-            # a filter mixes what lies on both sides of a border
-            memory = 2.5 * forcegp.data.LowPass(float(cutoff)).memory  # two time constants
-            if self.guard < memory:
-                terminal.warn(
-                    f"--guard {self.guard:g} s is shorter than two time constants of the filter ({memory:.2g} s), so "
-                    "rows on both sides of a border share measurements; give a longer one."
-                )
-        return rows, recording, model
+        guard, cutoff = self.guard, forcegp.data.preparation_report(rows.metadata).get("cutoff")
+        if cutoff is not None:  # a filter mixes what lies on both sides of a border, two time constants wide
+            guard = max(guard, 2.5 * forcegp.data.LowPass(float(cutoff)).memory)
+        return rows, recording, model, forcegp.scores.split_named(rows, self.split or "auto", guard)
 
     def _of_one(
         self,
@@ -189,9 +182,9 @@ class Score(Command):
 
 
 def comparison(scores: forcegp.scores.Scores, title: str) -> list[Any]:
-    """Models side by side, which to take by every criterion, and what failed."""
+    """Models side by side, which to take, and what failed."""
     header, rows = forcegp.scores.overall(scores)
     brief = [[cell.partition(" (")[0] for cell in row] for row in rows]
-    taken = [columns("", *forcegp.scores.winner_table(scores), long_names=True)] if scores.winners else []
+    taken = [f"take {scores.winner.model}: {scores.winner.sentence}"] if scores.winner is not None else []
     return [columns(title, [name.replace(" [", "\n[") for name in header], brief, long_names=True),
             *scores.about.get("notes", ()), *scores.failures, *taken]  # fmt: skip

@@ -27,8 +27,8 @@ NONE = (math.inf, -math.inf)  # limits that there are not; JSON has no number fo
 class Robot(Command):
     """Print the content of a robot file: its tree, joints, limits and masses, and what was ignored or repaired.
 
-    Every problem of the file is named at once, with the options under which it is taken. FILE is a URDF, or MJCF where
-    the package mujoco is installed; meshes are not needed where masses are given.
+    Every problem of the file is named at once, with the options under which it is taken. FILE is a URDF, MJCF where
+    the package mujoco is installed, or xacro where xacro is; meshes are not needed where masses are given.
 
     For example:
       forcegp robot arm.urdf

@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from forcegp.errors import printable
-from forcegp.progress import watched
+from forcegp.progress import Listener, watched
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -46,7 +46,6 @@ PLAIN_SECONDS = 10.0  # between two lines about progress where there is no termi
 
 
 UNLIMITED = 10_000  # columns of a terminal that cuts nothing
-Report = Callable[..., None]  # of done, total, and a note for people if wished
 
 
 def _console(**how: Any) -> Console:
@@ -147,33 +146,32 @@ class Terminal:
         return with_option_names(text, self.options)
 
     @contextmanager
-    def progress(self, what: str) -> Iterator[Report]:
-        """A bar with the remaining time on a terminal, a line now and then elsewhere. Without a report: a spinner."""
+    def progress(self, what: str) -> Iterator[None]:
+        """A bar with the remaining time on a terminal, a line now and then elsewhere. Before work tells: a spinner."""
         from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
         if not self.err.is_terminal:
-            lines = self._lines(what)
-            with watched(lines):
-                yield lines
+            with watched(self._lines(what)):
+                yield
             return
         of_a_task = TextColumn("{task.description}", markup=False), BarColumn(bar_width=30), TimeElapsedColumn()
         left = TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}", markup=False)
         with Progress(SpinnerColumn(), *of_a_task, *left, console=self.err, transient=True) as bars:
             task = bars.add_task(what, total=None, note="")
 
-            def report(done: int, total: int, note: str = "") -> None:
+            def report(done: int, total: int, note: str) -> None:
                 bars.update(task, completed=done, total=total, note=note)
 
             with watched(report):
-                yield report
+                yield
 
-    def _lines(self, what: str) -> Report:
+    def _lines(self, what: str) -> Listener:
         """Lines such as `simulating: 40 %`, at most one every few seconds."""
         reported = time.monotonic()
         if self.names_stages:
             self.note(f"{what} ...")
 
-        def report(done: int, total: int, note: str = "") -> None:
+        def report(done: int, total: int, note: str) -> None:
             nonlocal reported
             if time.monotonic() - reported >= PLAIN_SECONDS and done < total:
                 reported = time.monotonic()

@@ -4,14 +4,23 @@ import math
 import warnings
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, NumericalError, NumericalWarning, require_number, require_type
+from forcegp.errors import (
+    ContactError,
+    InvalidInput,
+    NumericalError,
+    NumericalWarning,
+    require_known,
+    require_number,
+    require_type,
+)
+from forcegp.evidence.likelihood import FAR_FROM_SURFACE
 from forcegp.integration.integrators import check_time_step
 from forcegp.model import Model
 from forcegp.posterior.prediction import JointForces, require_actuated
@@ -200,7 +209,7 @@ def joint_forces(model: Moving, q: Tensor, v: Tensor, u: Tensor, past: Past | No
     if isinstance(model, Predictor):
         return model.joint_forces(q, v, u)
     at = model.dynamics(q, v, u)
-    return JointForces(at.Q_K, torch.eye(len(q), u.shape[-1], dtype=u.dtype), at.M, at.A, at.b)
+    return JointForces(at.Q_K, torch.eye(len(q), u.shape[-1], dtype=u.dtype), at.M, at.A, at.b, at.off())
 
 
 def torques_for(
@@ -228,9 +237,20 @@ class HybridForce(TrackingController):
     lambda_d presses the robot onto the surface. No sensor is read: the force is right where the model is.
 
     * predictor: `posterior.predictor()` of a model with contacts and analytical mean; forces are those at (q, v_d).
+    * tolerance: m that a contact's point may be off its surface. Beyond it the force would push nothing: "raise" a
+      ContactError, or "release", where the robot follows the reference in the air (`released` is True then).
+    * position_noise: as `ComputedTorque` has it.
     """
 
-    def __init__(self, predictor: Predictor, **settings: Any) -> None:
+    def __init__(
+        self,
+        predictor: Predictor,
+        *,
+        tolerance: float = FAR_FROM_SURFACE,
+        off_surface: Literal["raise", "release"] = "raise",
+        position_noise: float = 0.0,
+        **settings: Any,
+    ) -> None:
         self.predictor = require_type("predictor", predictor, Predictor, " : posterior.predictor()")
         self.model = predictor.posterior.model
         if not self.model.contacts:
@@ -239,11 +259,22 @@ class HybridForce(TrackingController):
                 "posterior.with_contacts([...]), or use ComputedTorque."
             )
         require_actuated(predictor.posterior)
+        require_number("tolerance", tolerance, "give m, more than 0")
+        require_known("off_surface", off_surface, "HybridForce", ("raise", "release"))
         super().__init__(self.model.robot, **settings)
+        self.tolerance, self.released = tolerance, False
+        self.past = Past(self.model, position_noise)
+        self._free: ComputedTorque | None = None
+        if off_surface == "release":
+            free = predictor.posterior.with_contacts([]).predictor(covariance="none")
+            self._free = ComputedTorque(free, position_noise=position_noise, **settings)
 
     @override
     def __call__(self, q: Any, v: Any, q_d: Any, v_d: Any, a_d: Any, normal_force: Any = None) -> Float[Tensor, " nv"]:
-        """The torques (nv,) in Nm (N) for this reference and `normal_force` (m,) >= 0 in N on the robot."""
+        """The torques (nv,) in Nm (N) for this reference and `normal_force` (m,) >= 0 in N on the robot.
+
+        Raises ContactError for a point farther off its surface than `tolerance`.
+        """
         count = len(self.model.contacts)
         wanted = real_tensor("normal_force", 0.0 if normal_force is None else normal_force, torch.device("cpu"))
         if normal_force is None or wanted.shape not in ((), (count,)) or not bool((wanted >= 0.0).all()):
@@ -256,13 +287,26 @@ class HybridForce(TrackingController):
 
     @override
     def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
-        at = self.predictor.joint_forces(q, v_d, self.last)
+        self.past.see(q)
+        if self._free is not None:
+            self._free.past.see(q)
+        at = joint_forces(self.predictor, q, v_d, self.last, self.past)
+        far = float(at.off.abs().max())
+        self.released = far > self.tolerance
+        if self.released and self._free is None:
+            raise ContactError(
+                f"a contact's point is {far:.3g} m off its surface, and at most {self.tolerance:g} m are allowed: a "
+                'force there would push nothing; move it there by ComputedTorque first, or give off_surface="release".'
+            )
+        if self.released and self._free is not None:
+            return self._free._torques(q, v, v_d, a_d, e, e_v)
         free = a_d + self.feedback(e, e_v)
         towards = torch.linalg.solve(at.M, at.A.mT)  # M^-1 A^T
         a = free + towards @ torch.linalg.lstsq(at.A @ towards, at.b - at.A @ free, driver="gelsd").solution
-        u = torques_for(self.predictor, q, v_d, at.M @ a - at.A.mT @ self.wanted, self.last, at)
+        u = torques_for(self.predictor, q, v_d, at.M @ a - at.A.mT @ self.wanted, self.last, at, self.past)
         # where that finds none with shorter steps, or its error
-        return self.predictor.inverse_dynamics(q, v_d, a, self.wanted).mean if u is None else u
+        found = self.predictor.inverse_dynamics
+        return found(q, v_d, a, self.wanted, self.past.z).mean if u is None else u
 
 
 LOOKED_AT, SLOPE, SLOW = 50, 1e-4, 1.0

@@ -21,11 +21,6 @@ LARGEST_TURN = 0.5 * np.pi  # between two rows: beyond it the log does not show 
 Positions = Float[np.ndarray, "rows nq"]
 
 
-def space_of(dataset: Dataset) -> ConfigurationSpace:
-    """What positions the recorded robot can have."""
-    return dataset.model.robot.space
-
-
 def continuous(space: ConfigurationSpace, q: Positions) -> Positions:
     """The same positions with quaternions that change sign nowhere.
 
@@ -116,15 +111,10 @@ def in_base(
 
 def as_vectors(dataset: Dataset) -> Float[np.ndarray, "rows nv"]:
     """Positions as vectors that change from row to row as the robot moves, in body axes; q itself on a fixed base."""
-    space = space_of(dataset)
+    space = dataset.model.robot.space
     if space.is_vector_space:
         return dataset.q
     q = torch.tensor(dataset.q)
     steps = space.difference(q[:-1], q[1:]).numpy()
     steps[np.diff(dataset.episode) != 0] = 0.0
     return np.concatenate([np.zeros((1, dataset.nv)), np.cumsum(steps, axis=0)])
-
-
-def actuators(dataset: Dataset) -> int:
-    """How many columns of u are forces. Those of observers and switches follow, which no filter may touch."""
-    return len(dataset.model.actuators)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 import forcegp.mechanics
 from forcegp.data.dataset import Dataset
@@ -30,48 +28,6 @@ def rows_in_contact(dataset: Dataset) -> Dataset:
     if off or not touching.any():
         raise ContactError(str(off[0]) if off else "the points of the contacts never move along their surfaces.")
     return dataset.rows(touching)
-
-
-class PointMotion(NamedTuple):
-    """The point of a contact in every row, in m, m/s and m/s^2; `rate` and `residual` A a - b are along the normal.
-
-    `noise` is the standard deviation of A a that the noise on the acceleration makes; 0 where it is not known. Those
-    that noise on v makes of the rate and the speed are `rate_noise` and `speed_noise`.
-    """
-
-    distance: Float[np.ndarray, " rows"]
-    rate: Float[np.ndarray, " rows"]
-    speed: Float[np.ndarray, " rows"]
-    acceleration: Float[np.ndarray, " rows"]
-    residual: Float[np.ndarray, " rows"]
-    noise: Float[np.ndarray, " rows"]
-    rate_noise: Float[np.ndarray, " rows"]
-    speed_noise: Float[np.ndarray, " rows"]
-
-
-def point_motions(dataset: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, ...]) -> list[PointMotion]:
-    """`noise_seen` on v and a, where the rows show it; that on a is the Dataset's where it states one."""
-    q, v, u, a = tensors(dataset)
-    state = model.state(q, v, u)
-    wander, sigma = map(torch.tensor, noise_seen)
-    if dataset.noise_std is not None:
-        sigma = torch.tensor(dataset.noise_std)
-    motions = []
-    for contact in model.contacts:
-        A, b, gradient = contact.constraint(state, model.baumgarte)
-        size = torch.linalg.vector_norm(gradient, dim=-1)
-        J = state.kinematics.frame_jacobian(contact.frame, contact.point)[:, :3]
-        speed, acceleration = (torch.linalg.vector_norm((J @ x[..., None])[..., 0], dim=-1) for x in (v, a))
-        distance, rate = contact.distance(state.kinematics) / size, (A * v).sum(-1) / size
-        residual = ((A * a).sum(-1) - b) / size
-        noises = (A * sigma).norm(dim=-1) / size, (A * wander).norm(dim=-1) / size, (J * wander).flatten(1).norm(dim=-1)
-        motions.append(PointMotion(*(x.numpy() for x in (distance, rate, speed, acceleration, residual, *noises))))
-    return motions
-
-
-def recovery_of(model: forcegp.Model) -> float:
-    """Baumgarte's omega [1/s]."""
-    return 0.0 if model.baumgarte is None else model.baumgarte.omega
 
 
 MOST_ROWS, FEWEST_ROWS = 240, 10
@@ -110,10 +66,16 @@ def _noise(dataset: Dataset) -> tuple[np.ndarray, ...]:
 def _on_surfaces(
     rows: Dataset, model: forcegp.Model, noise_seen: tuple[np.ndarray, ...], *, flagged: bool = True
 ) -> tuple[Bool[np.ndarray, " rows"], list[Doubt]]:
-    """Rows whose points move along their surfaces, and the first contact whose point does not; none for drawn rows."""
+    """Rows whose points move along their surfaces, and the first contact whose point does not; none for drawn rows.
+
+    `noise_seen` on v and a, where the rows show it; that on a is the Dataset's where it states one.
+    """
     touching = np.ones(len(rows), dtype=bool)
-    motions = point_motions(rows, model, noise_seen)
-    for index, (contact, motion) in enumerate(zip(model.contacts, motions, strict=True)):
+    q, v, u, a = tensors(rows)
+    state, (wander, sigma) = model.state(q, v, u), map(torch.tensor, noise_seen)
+    sigma = sigma if rows.noise_std is None else torch.tensor(rows.noise_std)
+    omega = 0.0 if model.baumgarte is None else model.baumgarte.omega
+    for index, contact in enumerate(model.contacts):
         if contact.switch is not None and not flagged:
             continue
         acts = np.ones(len(rows), bool)
@@ -121,16 +83,21 @@ def _on_surfaces(
             acts = rows.u[:, model.inputs.index(contact.switch)] > 0.5
         if not acts.any():
             continue
-        motion = PointMotion(*(values[acts] for values in motion))
-        distance, rate = np.abs(motion.distance), np.abs(motion.rate)
-        residual, acceleration, noise = (
-            float(np.median(np.abs(values))) for values in (motion.residual, motion.acceleration, motion.noise)
-        )
-        recovered = recovery_of(model) * np.minimum(distance, FARTHEST)
-        slow = rate <= ALONG_NORMAL * motion.speed + CREEP + recovered + 2.0 * motion.rate_noise
-        middle = np.median(motion.distance[slow]) if slow.any() else 0.0
-        along = slow & (np.abs(motion.distance - middle) <= FARTHEST)
-        moves = motion.speed > 2.0 * (CREEP + motion.speed_noise)
+        A, b, gradient = contact.constraint(state, model.baumgarte)
+        size = torch.linalg.vector_norm(gradient, dim=-1)
+        A, b, away = A / size[:, None], b / size, contact.distance(state.kinematics) / size
+        J = state.kinematics.frame_jacobian(contact.frame, contact.point)[:, :3]
+        speed, acceleration = (torch.linalg.vector_norm((J @ x[..., None])[..., 0], dim=-1) for x in (v, a))
+        noise, rate_noise, speed_noise = (A * sigma).norm(dim=-1), (A * wander).norm(dim=-1), (J * wander).flatten(1)
+        parts = away, speed, rate_noise, speed_noise.norm(dim=-1), (A * v).sum(-1).abs()
+        away, speed, rate_noise, speed_noise, rate = (x.numpy()[acts] for x in parts)
+        medians = (A * a).sum(-1) - b, acceleration, noise
+        residual, acceleration, noise = (float(np.median(np.abs(x.numpy()[acts]))) for x in medians)
+        distance = np.abs(away)
+        slow = rate <= ALONG_NORMAL * speed + CREEP + omega * np.minimum(distance, FARTHEST) + 2.0 * rate_noise
+        middle = np.median(away[slow]) if slow.any() else 0.0
+        along = slow & (np.abs(away - middle) <= FARTHEST)
+        moves = speed > 2.0 * (CREEP + speed_noise)
         share = float(along[moves].mean()) if moves.any() else 1.0
         if share < HARDLY_ANY:
             if residual <= max(BROKEN * acceleration, NOISE * noise):  # accelerations obey it: drawn, not recorded

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
-from forcegp.data.configurations import actuators, continuous, rates, space_of, through
+from forcegp.data.configurations import continuous, rates, through
 from forcegp.data.dataset import Dataset
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.robots.manifold import ConfigurationSpace
@@ -95,9 +95,9 @@ def low_pass(dataset: Dataset, cutoff: float, *, signals: Sequence[Signal] = ("q
     def filtered(name: str, rows: Dataset, label: str) -> np.ndarray:
         if name == "q":
             require_no_turns(rows, label)
-            return through(space_of(rows), rows.q, lambda q: smooth(q, rows.time))
+            return through(rows.model.robot.space, rows.q, lambda q: smooth(q, rows.time))
         values = getattr(rows, name)
-        forces = actuators(rows) if name == "u" else rows.nv
+        forces = len(rows.model.actuators) if name == "u" else rows.nv
         return np.concatenate([smooth(values[:, :forces], rows.time), values[:, forces:]], axis=1)
 
     def all_of(rows: Dataset, label: str) -> dict[str, np.ndarray]:
@@ -113,7 +113,7 @@ def low_pass(dataset: Dataset, cutoff: float, *, signals: Sequence[Signal] = ("q
 
 def shifted(dataset: Dataset, delay: float, lag: float = 0.0, lagging: Sequence[int] | None = None) -> Dataset:
     """The dataset with the forces of actuators taken `delay` s later, after a `lag` [s] of those columns, or of all."""
-    count = actuators(dataset)
+    count = len(dataset.model.actuators)
     columns = list(range(count)) if lagging is None else list(lagging)
 
     def acting(rows: Dataset, label: str) -> dict[str, np.ndarray]:
@@ -177,7 +177,7 @@ def differentiated(dataset: Dataset, source: Literal["q", "v"] = "v") -> Dataset
         if source == "v":
             return {"a": differentiate(rows.v, rows.time)}
         require_no_turns(rows, label)
-        velocity = differentiate(rows.q, rows.time, space_of(rows))
+        velocity = differentiate(rows.q, rows.time, rows.model.robot.space)
         return {"v": velocity, "a": differentiate(velocity, rows.time)}
 
     truth = dataset.truth if source == "v" else {}
@@ -207,9 +207,10 @@ def resample(dataset: Dataset, step: float) -> Dataset:
 
         signals = {name: spline(getattr(rows, name)) for name in ("v", "u", "a")}
         signals |= {name: spline(values) for name, values in rows.measured.items()}
-        signals["q"] = through(space_of(rows), rows.q, spline)
+        signals["q"] = through(rows.model.robot.space, rows.q, spline)
         before = np.searchsorted(rows.time, time * (1 + 1e-12), side="right") - 1
-        signals["u"][:, actuators(rows) :] = rows.u[before, actuators(rows) :]
+        switches = slice(len(rows.model.actuators), None)
+        signals["u"][:, switches] = rows.u[before, switches]
         parts.append({**signals, "time": time, "episode": np.full(count, number)})
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     measured = {name: joined.pop(name) for name in dataset.measured}
@@ -252,7 +253,7 @@ def by_episode(dataset: Dataset, change: Callable[[Dataset, str], dict[str, np.n
 
 def require_no_turns(rows: Dataset, label: str) -> None:
     """A position that wraps at pi jumps by a turn; every derivative and filter would take that for motion."""
-    space = space_of(rows)
+    space = rows.model.robot.space
     continuous(space, rows.q)
     angular = rows.turns[space.single_rows]
     jumps = np.abs(np.diff(space.singles(torch.from_numpy(rows.q.copy())).numpy()[:, angular], axis=0)) > np.pi

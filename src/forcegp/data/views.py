@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from forcegp.data.dataset import Dataset
-from forcegp.errors import DatasetError, InvalidInput
+from forcegp.errors import InvalidInput
 from forcegp.model import Model
 from forcegp.robots.arguments import whole_number
 
@@ -212,11 +212,6 @@ class RecordedMotions:
     v: Float[np.ndarray, "motions rows nv"]
     u: Float[np.ndarray, "motions steps nu"]
 
-    @property
-    def time(self) -> Float[np.ndarray, " rows"]:
-        """Seconds since the beginning of each motion."""
-        return self.dt * np.arange(self.q.shape[1])
-
 
 def recorded_motions(dataset: Dataset, starts: int | Sequence[int], seconds: float) -> RecordedMotions:
     """The motions of that length that begin at the given rows, or at so many rows spread evenly over the recording.
@@ -316,49 +311,12 @@ def white_noise(log: Dataset, width: int = 1, signal: str = "a") -> Float[np.nda
         return np.where((noise[0] < MOTION * noise[1]) & (noise[1] > 0.0), noise[1], np.nan)
 
 
-def time_blocks(
-    time: Float[np.ndarray, " rows"], episode: Int[np.ndarray, " _"], seconds: float
-) -> tuple[tuple[int, ...], ...]:
-    """Row numbers in blocks: rows of one episode in one stretch of `seconds` form a block, in order of time.
-
-    `time` [s] and `episode` may come in any order. Stretches are counted from the first of these rows in every episode;
-    every row is in exactly one.
-    """
-    blocks: dict[tuple[int, int], list[int]] = {}
-    first = {int(number): float(time[episode == number].min()) for number in np.unique(episode)}
-    for row in np.lexsort((time, episode)):
-        number = int(episode[row])
-        stretch = int((time[row] - first[number]) / seconds)
-        blocks.setdefault((number, stretch), []).append(int(row))
-    return tuple(tuple(rows) for rows in blocks.values())
-
-
 def repeated_rows(trained: tuple[np.ndarray, np.ndarray, np.ndarray], test: Dataset) -> Int[np.ndarray, " repeated"]:
     """Numbers of the rows of `test` whose (q, v, u) is exactly one of those in `trained`, each (rows, k)."""
     # -0.0 becomes 0.0: equal numbers have equal bytes
     known, rows = (np.hstack(each) + 0.0 for each in (trained, (test.q, test.v, test.u)))
     found = {row.tobytes() for row in known}
     return np.array([number for number, row in enumerate(rows) if row.tobytes() in found], dtype=np.int64)
-
-
-def require_disjoint(train: Dataset, test: Dataset) -> None:
-    """Refuse a pair of Datasets in which the test repeats the training.
-
-    Raises DatasetError if a row `(q, v, u)` of `test` is also in `train`, or if both have the same `metadata` and share
-    an episode: two samples of one trajectory.
-    """
-    repeated = repeated_rows((train.q, train.v, train.u), test)
-    if repeated.size:
-        raise DatasetError(
-            f"{repeated.size} of {len(test)} test rows are also training rows (the first: test row {repeated[0]}). "
-            "Test on another trajectory: another episode, recording or seed."
-        )
-    shared = sorted(set(train.episodes) & set(test.episodes))
-    if train.metadata and train.metadata == test.metadata and shared:
-        raise DatasetError(
-            f"training and test rows come from the same trajectory: equal metadata, episodes {shared} in both. "
-            "Test on another episode, recording or seed."
-        )
 
 
 ROUNDING = 1e-13  # standard deviation, relative to the largest entry, below which a column is constant but for rounding

@@ -114,9 +114,7 @@ def check_distance(model: Model, training: TrainingData) -> None:
     """Refuse a surface that no training state touches, and warn where half of them are far from it."""
     kinematics = model.robot.kinematics(training.q)
     for index, contact in enumerate(model.contacts):
-        # divided by |s_p|, which is 1 for signed distances, the value of any surface is a distance near it
-        size = torch.linalg.vector_norm(contact.surface.gradient(contact.position(kinematics)), dim=-1)
-        distances = (contact.distance(kinematics) / size).abs()
+        distances = contact.off(kinematics).abs()
         distance = float(distances.median())
         what = f"the surface of contact {index} (frame {contact.frame!r})"
         remedy = "check its surface, point and units (m), or leave the contact out"

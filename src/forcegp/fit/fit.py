@@ -137,8 +137,7 @@ def fit(
     dataset = _checked(model, dataset, rest, refinement)
     dataset = with_sensors(dataset, model, rest, sensors, chosen=bool(evidence))
     model = without_idle_offsets(model, dataset)
-    usual = Torques() if model.robot.space.is_vector_space else Torques(noisy="both")
-    how = rest if isinstance(rest, Accelerations) and not model.unknown_forces else usual
+    how = rest if isinstance(rest, Accelerations) and not model.unknown_forces else usual_torques(model)
     model, choice = (model, None) if isinstance(start, Posterior) else with_friction_chosen(model, dataset, how)
     dataset = dataset if choice is None else with_memory(dataset, model)
     known = past_known(dataset, model)
@@ -199,12 +198,17 @@ def _chosen(
         refinement.refuse(start.trained.unknown_forces if isinstance(start, Posterior) else model.unknown_forces)
     if isinstance(start, Posterior) and (refinement is None or others):
         raise InvalidInput("start is a posterior; it is refined by Motions() alone: give that as the evidence.")
-    if others:
-        return others[0], refinement, sensors
-    if model.unknown_forces or not model.is_open:
-        return Accelerations(), refinement, sensors
-    fixed = model.robot.space.is_vector_space
-    return Torques() if fixed else Torques(noisy="both"), refinement, sensors
+    return others[0] if others else usual_evidence(model), refinement, sensors
+
+
+def usual_evidence(model: Model) -> Evidence:
+    """That of `fit` where none is named."""
+    return Accelerations() if model.unknown_forces or not model.is_open else usual_torques(model)
+
+
+def usual_torques(model: Model) -> Torques:
+    """With noisy accelerations as well where the base moves."""
+    return Torques("u" if model.robot.space.is_vector_space else "both")
 
 
 def with_sensor(noise: Noise, rows: Dataset, stated: float | None) -> Noise:

@@ -1,9 +1,8 @@
 """The search of every fit: several seeded starts, the best is kept; and how much wider intervals have to be."""
 
 import math
-import re
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -13,6 +12,7 @@ import numpy as np
 import torch
 from gpytorch.kernels import ScaleKernel
 from jaxtyping import Float
+from scipy.linalg import hadamard
 from torch import Tensor
 
 from forcegp.data import Dataset
@@ -168,11 +168,9 @@ def run_restarts(search: Callable[..., Outcome], restarts: int, patience: int, j
     outcomes: list[Outcome] = []
     while len(outcomes) < restarts:
         last = min(restarts, len(outcomes) + AT_ONCE) if patience else restarts
-        indices, before = range(len(outcomes), last), tuple(outcomes)
-        if jobs == 1 or (restarts == 1 and isinstance(jobs, int)):
-            outcomes += [search(index, before=before) for index in indices]
-        else:
-            outcomes += mapped(partial(search, before=before), indices, jobs)
+        one = partial(search, before=tuple(outcomes))
+        at_once = 1 if restarts == 1 and isinstance(jobs, int) else jobs
+        outcomes += mapped(one, range(len(outcomes), last), at_once)
     return outcomes
 
 
@@ -300,6 +298,17 @@ DRAWS = 2000
 LARGEST_STEP = 2.0
 """Most that a parameter is moved by, on its log scale: the spread of the widest prior on one."""
 
+PROBES, SMALL_STEP = 8, 1e-2
+"""Directions, and the step along each, whose change of the gradient gives the diagonal of the Hessian.
+
+Neighbours, which are the parameters of one kernel, do not mix."""
+
+PAIRS = 4
+"""Of opposite moves of all hyper-parameters."""
+
+RARE = 1.645
+"""Deviations that a draw loses more than the mean, at 95 %."""
+
 NEGLIGIBLE = 1e-6
 """Standard deviation, as a fraction of the largest, below which a constraint leaves nothing open."""
 
@@ -323,8 +332,8 @@ class _States:
     def __init__(self, posterior: Posterior) -> None:
         training = posterior.training
         count = len(training.q)
-        at = torch.linspace(0, count - 1, min(STATES, count), device=training.q.device).round().long()
-        dynamics = posterior.dynamics(training.q[at], training.v[at], training.u[at])
+        self.rows = torch.linspace(0, count - 1, min(STATES, count), device=training.q.device).round().long()
+        dynamics = posterior.dynamics(*(x[self.rows] for x in (training.q, training.v, training.u)))
         self.W: Float[Tensor, "n nv C"] = dynamics.H @ posterior.trained.unknown.direction(dynamics)
         self.features = posterior.likelihood.standardization(posterior.trained.unknown.features(dynamics))
 
@@ -347,47 +356,78 @@ class _States:
         return max(1.0, float(torch.quantile(inside, CONFIDENCE)) / DEVIATIONS)
 
     def mixture_factor(self, posterior: Posterior) -> float:
-        """Standard deviations with the hyper-parameters unknown, over those with them known; at least 1."""
+        """Standard deviations with the hyper-parameters unknown, over those with them known; at least 1.
+
+        Each hyper-parameter is a standard deviation up or down (Laplace, with the diagonal of the Hessian: Bekas,
+        Kokiopoulou & Saad 2007, Applied Numerical Mathematics 57), or less where the likelihood falls sooner than that
+        tells, as along parameters that go together. Rows are predicted from the others.
+        """
         likelihood, kernels = posterior.likelihood, posterior.kernels
         _, fixed = likelihood.split_noise
-        free = {name: value for name, value in posterior.hyperparameters.items() if name not in fixed}
+        free = {name: value.detach() for name, value in posterior.hyperparameters.items() if name not in fixed}
         objective = FitObjective(likelihood, kernels, likelihood.noise, fixed)
+        count = sum(x.numel() for x in free.values())
+        probes = np.tile(hadamard(PROBES), count // PROBES + 1)[:, :count]
+        draws = np.random.default_rng(0).choice((-1.0, 1.0), (PAIRS, count))
 
-        here = float(objective(free))
-        mean, variance = self._moments(posterior.latent)
-        more = torch.zeros_like(variance)
-        scratch = kernels.at(free)
-        for names in _kinds(free):
-            try:
-                # at an optimum the objective rises by half of the curvature
-                curvature = 2.0 * (float(objective(_moved(free, names, 1.0))) - here)
-            except (NumericalError, torch.linalg.LinAlgError):
-                continue
-            step = min(LARGEST_STEP, max(curvature, LARGEST_STEP**-2) ** -0.5)
-            for sign in (1.0, -1.0):
-                moved = _moved(free, names, sign * step) | fixed
+        def shaped(signs: np.ndarray) -> dict[str, Tensor]:
+            parts = torch.tensor(signs).to(self.W).split([x.numel() for x in free.values()])
+            return {name: part.reshape(x.shape) for (name, x), part in zip(free.items(), parts, strict=True)}
+
+        value, here = _with_gradient(objective, free)
+        curvature = {name: torch.zeros_like(x) for name, x in free.items()}
+        for sign in map(shaped, probes.astype(float)):
+            _, ahead = _with_gradient(objective, _moved(free, sign, SMALL_STEP))
+            for name, total in curvature.items():
+                total += sign[name] * (ahead[name] - here[name]) / (SMALL_STEP * PROBES)
+        spread = {name: each.clamp_min(LARGEST_STEP**-2) ** -0.5 for name, each in curvature.items()}
+        told = 0.5 * sum(float((curvature[name].clamp_min(0.0) * spread[name].square()).sum()) for name in free)
+        usual = told + RARE * math.sqrt(told)  # what draws of a normal posterior lose: Gamma(n / 2)
+        mean, variance = self._without_own(posterior.latent)
+        more, scratch = [], kernels.at(free)
+        for step in ({name: sign[name] * spread[name] for name in free} for sign in map(shaped, draws)):
+            for side in (1.0, -1.0):
+                moved = _moved(free, step, side)
                 try:
-                    other = self._moments(likelihood.condition(scratch.moved_to(moved), moved, at_parameters=True))
+                    lost = float(objective(moved)) - value
+                    at = scratch.moved_to(moved | fixed)
+                    other = self._without_own(likelihood.condition(at, moved | fixed, at_parameters=True))
                 except (NumericalError, torch.linalg.LinAlgError):
                     continue  # no posterior there: nothing that the data leave open
-                more += 0.5 * ((other[0] - mean).square() + other[1] - variance)
-        total = float(variance.mean())
-        return math.sqrt(max(1.0, 1.0 + float(more.mean()) / total)) if total > 0.0 else 1.0
+                more.append(((other[0] - mean).square() + other[1] - variance) * (usual / max(lost, usual)))
+        open_ones = variance > NEGLIGIBLE**2 * variance.max()
+        if not more or not bool(open_ones.any()):
+            return 1.0
+        rise = torch.stack(more).mean(0)[open_ones] / variance[open_ones]
+        return math.sqrt(max(1.0, 1.0 + float(rise.mean())))
 
-    def _moments(self, latent: LatentPosterior) -> tuple[Tensor, Tensor]:
-        """Mean and variance (n, nv) of the accelerations that the latents make."""
-        mean = (self.W @ latent.mean(self.features)[..., None])[..., 0]
-        covariance = self.W @ latent.covariance(self.features) @ self.W.mT
-        return mean, covariance.diagonal(dim1=-2, dim2=-1)
+    def _without_own(self, latent: LatentPosterior) -> tuple[Float[Tensor, "n nv"], Float[Tensor, "n nv"]]:
+        """Mean and variance of the accelerations that the latents make, by all rows but that of the state itself.
+
+        f + S C^T B^-1 C S and so on, with B = (T^-1)_ii (Rasmussen & Williams 2006, section 5.4.2).
+        """
+        assert isinstance(latent, ExactPosterior), "fits are exact"
+        system, n = latent.system, len(self.rows)
+        C, alpha = system.deflation.C[self.rows], system.alpha[self.rows]
+        count, rank = system.alpha.shape
+        own = (self.rows[:, None] * rank + torch.arange(rank, device=self.rows.device)).reshape(-1)
+        columns = torch.zeros(count * rank, n * rank, dtype=C.dtype, device=C.device)
+        columns[own, torch.arange(n * rank, device=own.device)] = 1.0
+        inverse = system.factor.solve(columns)[own].reshape(n, rank, n, rank)
+        B = inverse.diagonal(dim1=0, dim2=2).permute(2, 0, 1)
+        S = latent.covariance(self.features)
+        gain = torch.linalg.solve(B, C @ S).mT
+        f = latent.mean(self.features) - (gain @ alpha[..., None])[..., 0]
+        covariance = self.W @ (S + gain @ C @ S) @ self.W.mT
+        return (self.W @ f[..., None])[..., 0], covariance.diagonal(dim1=-2, dim2=-1)
 
 
-def _kinds(names: Iterable[str]) -> list[list[str]]:
-    """Parameters that differ in the latent that they belong to only, `kernels.<number>.<kind>`."""
-    kinds: dict[str, list[str]] = {}
-    for name in names:
-        kinds.setdefault(re.sub(r"^kernels\.\d+\.", "", name), []).append(name)
-    return list(kinds.values())
+def _with_gradient(objective: FitObjective, at: Mapping[str, Tensor]) -> tuple[float, dict[str, Tensor]]:
+    with torch.enable_grad():
+        free = {name: value.clone().requires_grad_() for name, value in at.items()}
+        value = objective(free)
+        return float(value.detach()), dict(zip(free, torch.autograd.grad(value, list(free.values())), strict=True))
 
 
-def _moved(parameters: Mapping[str, Tensor], names: Iterable[str], step: float) -> dict[str, Tensor]:
-    return {**parameters, **{name: parameters[name] + step for name in names}}
+def _moved(parameters: Mapping[str, Tensor], by: Mapping[str, Tensor], times: float) -> dict[str, Tensor]:
+    return {name: value + times * by[name] for name, value in parameters.items()}

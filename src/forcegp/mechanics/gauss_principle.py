@@ -99,6 +99,11 @@ class Contact:
         """c(q) = s(p(q)): 0 where the constraint holds."""
         return self.surface.value(self.position(kinematics))
 
+    def off(self, kinematics: Kinematics) -> Float[Tensor, "*batch"]:
+        """How far the point is off the surface [m], with a sign, to first order: c / |s_p|."""
+        p = self.position(kinematics)
+        return self.surface.value(p) / torch.linalg.vector_norm(self.surface.gradient(p), dim=-1)
+
     def _touching(self, twist: Float[Tensor, "*batch 6 k"]) -> Float[Tensor, "*batch 3 k"]:
         """v + w x r of what touches the ground, r = -`radius` z (Featherstone 2008, section 3.5)."""
         linear, angular = twist[..., :3, :], twist[..., 3:, :]
@@ -256,6 +261,11 @@ class ConstrainedDynamics:
         offset = (inverse_lower.mT @ (pseudo_inverse @ self.b[..., None]))[..., 0]
         made = {"H": H, "constrained_offset": offset, "inverse_lower": inverse_lower, "pseudo_inverse": pseudo_inverse}
         vars(self).update(made)  # of a frozen value
+
+    def off(self) -> Float[Tensor, "*batch m"]:
+        """How far the points of the contacts are off their surfaces, in m."""
+        found = [each.off(self.state.kinematics) for each in self.contacts]
+        return torch.stack(found, dim=-1) if found else self.b
 
     def acceleration_map(self) -> AffineMap:
         """a = offset + H Q_U with offset = M^-1 Q_b + H Q_K."""

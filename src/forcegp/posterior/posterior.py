@@ -13,7 +13,8 @@ from torch import Tensor
 
 from forcegp.data import Dataset, with_memory
 from forcegp.data.dataset import require_rows
-from forcegp.errors import DataWarning, InvalidInput, NumericalError, require_type, usable_arguments
+from forcegp.errors import ContactWarning, DataWarning, InvalidInput, NumericalError, require_type, usable_arguments
+from forcegp.evidence.likelihood import FAR_FROM_SURFACE
 from forcegp.forces import Force
 from forcegp.inference.memory import blas_threads
 from forcegp.inference.prepared_kernels import CompressedCovariance
@@ -127,26 +128,41 @@ class Posterior(Fitted):
         predicted, noise = moving, _noise_covariance(given, dynamics)
         if self.is_black_box:  # its functions hold what contacts do, so forces are not those of anything
             return Prediction(predicted.mean, predicted.covariance, None, None, None, noise)
+        multiplier = through(dynamics.multiplier_map())
+        _warn_off_surfaces(dynamics)
         return Prediction(
             predicted.mean,
             predicted.covariance,
-            multiplier=through(dynamics.multiplier_map()),
+            multiplier=multiplier,
             contact_force=through(dynamics.contact_force_map()),
             unknown_force=learned,
             noise_covariance=noise,
             frames=tuple(contact.frame for contact in self.model.contacts),
+            unseen=self._unseen(multiplier, dynamics) if covariance else None,
         )
 
     def unlearned(self, dynamics: ConstrainedDynamics) -> Tensor | None:
         """The covariance of joint forces beside what was learned: noise, what pushed, and what contacts hid."""
-        given, hidden = self.hyperparameters, self.settings.get("hidden_force")
+        given, left = self.hyperparameters, self._hidden(dynamics)
         levels = [given[name].exp().square() for name in (FORCE, PUSHES) if name in given]
         found = torch.diag_embed(torch.stack(levels).sum(0)) if levels else None
+        return found if left is None else left if found is None else left + found
+
+    def _unseen(self, multiplier: Gaussian, dynamics: ConstrainedDynamics) -> Tensor:
+        """What `Prediction.unseen` documents."""
+        left, matrix = self._hidden(dynamics), dynamics.multiplier_map().matrix
+        if left is None:
+            return torch.zeros_like(multiplier.mean)
+        own = (matrix @ left @ matrix.mT).diagonal(dim1=-2, dim2=-1)
+        return own / multiplier.variance.clamp_min(torch.finfo(own.dtype).tiny)
+
+    def _hidden(self, dynamics: ConstrainedDynamics) -> Tensor | None:
+        """The covariance of joint forces that contacts hid from the log."""
+        hidden = self.settings.get("hidden_force")
         if hidden is None or not dynamics.A.shape[-2]:
-            return found
+            return None
         frames = [name for name in self.training.sensed if any(x.frame == name for x in dynamics.contacts)]
-        left = hidden_forces(torch.tensor(hidden, dtype=torch.float64).to(dynamics.H), dynamics, frames)
-        return left if found is None else left + found
+        return hidden_forces(torch.tensor(hidden, dtype=torch.float64).to(dynamics.H), dynamics, frames)
 
     def latents(self, dynamics: ConstrainedDynamics, covariance: bool) -> Gaussian:
         """All processes at a batch of states: mean (..., C), and their joint covariance (..., C, C) where asked for."""
@@ -350,3 +366,20 @@ def _has_its_place(force: Force, model: Model) -> bool:
 def _noise_covariance(parameters: Mapping[str, Tensor], dynamics: ConstrainedDynamics) -> Tensor:
     noise = Noise.covariance(parameters, dynamics.H)
     return torch.diag_embed(noise).expand_as(dynamics.H) if noise.dim() == 2 else noise
+
+
+def _warn_off_surfaces(dynamics: ConstrainedDynamics) -> None:
+    """No warning while torch transforms or records the function, where no value may decide anything."""
+    if torch._C._are_functorch_transforms_active() or not dynamics.A.shape[-2]:
+        return
+    away = (dynamics.off() * dynamics.A.detach().any(dim=-1)).detach().abs()  # a switch that is off constrains nothing
+    if away.is_meta or not bool((away > FAR_FROM_SURFACE).any()):
+        return
+    contact = int(away.amax(0).argmax())
+    warnings.warn(
+        f"{int((away > FAR_FROM_SURFACE).any(-1).sum())} of {len(away)} states are up to {float(away.max()):.3g} m off "
+        f"the surface of contact {contact} (frame {dynamics.contacts[contact].frame!r}), and are predicted as if they "
+        "touched it; predict states in the air by posterior.with_contacts([]).",
+        ContactWarning,
+        stacklevel=5,
+    )

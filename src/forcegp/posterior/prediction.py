@@ -91,6 +91,8 @@ class Prediction(Gaussian):
     noise_covariance: Float[Tensor, "*batch nv nv"]
     frames: tuple[str, ...] = ()
     """Where each contact is."""
+    unseen: Float[Tensor, "*batch m"] | None = None
+    """Share of the variance of each multiplier that is a prior on what the log did not show, 0 to 1."""
 
     def force_at(self, frame: str) -> Gaussian:
         """The world force on the robot at the contacts of a frame together (..., 3) in N."""
@@ -104,7 +106,10 @@ class Prediction(Gaussian):
     def facts(self) -> dict[str, object]:
         """Of the acceleration, and which forces there are."""
         forces = [name for name in ("multiplier", "contact_force", "unknown_force") if getattr(self, name) is not None]
-        return {**super().facts(), "forces": listed(forces)}
+        facts = {**super().facts(), "forces": listed(forces)}
+        if self.unseen is not None and self.unseen.numel() and bool((self.unseen > 0.0).any()):
+            facts["variance of contact forces not seen by the log"] = f"{float(self.unseen.mean()):.0%}"
+        return facts
 
     @property
     def measurement(self) -> Gaussian:
@@ -174,13 +179,17 @@ class Linearization(NamedTuple):
 
 
 class JointForces(NamedTuple):
-    """Q_K + Q_U (..., nv) at states under their u, dQ/du and M (..., nv, nv), A (..., m, nv) and b (..., m)."""
+    """Q_K + Q_U (..., nv) at states under their u, dQ/du and M (..., nv, nv), A (..., m, nv), b and `off` (..., m).
+
+    `off` is how far the points of the contacts are off their surfaces, in m.
+    """
 
     Q: Tensor
     dQ_du: Tensor
     M: Tensor
     A: Tensor
     b: Tensor
+    off: Tensor
 
 
 def state_rows(model: Model, q: Array, v: Array, u: Array, past: bool = True) -> tuple[list[Tensor], torch.Size]:
@@ -271,10 +280,11 @@ def joint_force(posterior: Any, dynamics: ConstrainedDynamics) -> Float[Tensor, 
 
 
 def forces_around(posterior: Any, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-    """Q_K + Q_U (n, nv) at states (n, nv), and the entries (n, k) of dQ/du, M, A and b one after the other."""
+    """Q_K + Q_U (n, nv) at states (n, nv), and the entries (n, k) of dQ/du, M, A, b and off one after the other."""
     Q, slope = rows_jacobian(lambda u: joint_force(posterior, posterior.dynamics(q, v, u)), u)
     at = posterior.dynamics(q, v, u)
-    return Q, torch.cat([slope.flatten(1), at.M.flatten(1), at.A.flatten(1), at.b], dim=-1).detach()
+    around = slope.flatten(1), at.M.flatten(1), at.A.flatten(1), at.b, at.off()
+    return Q, torch.cat(around, dim=-1).detach()
 
 
 def require_actuated(posterior: Any) -> None:

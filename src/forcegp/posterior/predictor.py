@@ -216,8 +216,10 @@ class Predictor(Summary):
         else:
             states, single = self._states(q, v, u)
             Q, around = (_single(x, single) for x in self.run("forces", states))
-        slope, M, A, b = around.split([nv * nu, nv**2, m * nv, m], dim=-1)
-        return JointForces(Q, slope.unflatten(-1, (nv, nu)), M.unflatten(-1, (nv, nv)), A.unflatten(-1, (m, nv)), b)
+        slope, M, A, b, off = around.split([nv * nu, nv**2, m * nv, m, m], dim=-1)
+        return JointForces(
+            Q, slope.unflatten(-1, (nv, nu)), M.unflatten(-1, (nv, nv)), A.unflatten(-1, (m, nv)), b, off
+        )
 
     def inverse_dynamics(self, q: Any, v: Any, a: Any, normal_force: Any = None, memory: Any = None) -> Gaussian:
         """The actuator forces u (nv,) or (n, nv) in Nm or N that make the acceleration a (rad/s^2 or m/s^2).

@@ -91,11 +91,11 @@ class Physics:
         return [*(force.title for force in self.passive), *self.terms]
 
     def traced(self, q: Tensor, v: Tensor, u: Tensor, f: Tensor) -> list[Tensor]:
-        """[a, W, Q_K + Q_U, `parts`, B, M, A, b, features ...]: what programs are written from."""
+        """[a, W, Q_K + Q_U, `parts`, B, M, A, b, off, features ...]: what programs are written from."""
         dynamics = self.model.dynamics(q, v, u)
         B = self.forces.direction(dynamics)
         Q = (B @ f[..., None])[..., 0] + dynamics.Q_K
-        around = self.parts(dynamics, B, f), B, dynamics.M, dynamics.A, dynamics.b
+        around = self.parts(dynamics, B, f), B, dynamics.M, dynamics.A, dynamics.b, dynamics.off()
         return [dynamics.acceleration_under(Q), dynamics.H @ B, Q, *around, *self._features(dynamics)]
 
     def held(
@@ -176,7 +176,7 @@ class Programs:
             return self.given[0]
         inputs = [*self.example, torch.ones(1, len(self._latents), dtype=torch.float64)]
         graph, found = trace(self.physics.traced, inputs)
-        (a, W, Q, parts, B, *around), features = ([x[0].tolist() for x in part] for part in (found[:8], found[8:]))
+        (a, W, Q, parts, B, *around), features = ([x[0].tolist() for x in part] for part in (found[:9], found[9:]))
         held: list[Any] = []
         if not self.space.is_vector_space:
             m = found[6].shape[-2]
@@ -370,7 +370,7 @@ class Programs:
         outputs = {
             "linearize": [nv, nv * (2 * nv + nu)],
             "covariance": [nv, nv**2],
-            "forces": [nv, nv * nu + nv**2 + m * nv + m],
+            "forces": [nv, nv * nu + nv**2 + m * nv + 2 * m],
             "mean": [nv],
         }.get(kind, [0] * 4)  # a loop gives as much as it is asked for
         inputs = 3 + (kind in steps_of(self.space))

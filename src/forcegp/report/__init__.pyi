@@ -2,7 +2,7 @@ from .motion import (
     Arrows as Arrows, RecordedScene as RecordedScene, recorded_scene as recorded_scene, recording as recording,
 )
 from .page import (
-    Page as Page, Table as Table, is_page as is_page, write_page as write_page,
+    Page as Page, is_page as is_page, write_page as write_page,
 )
 from .page import (
     model_page as model_page, scene_notes as scene_notes,

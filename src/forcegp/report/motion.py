@@ -2,6 +2,7 @@
 
 import io
 import socket
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -212,10 +213,10 @@ def recording(recorded: RecordedScene) -> str:
     with redirect_stdout(io.StringIO()):  # where it prints its address, which results must not be mixed with
         server = viser.ViserServer(host="127.0.0.1", port=port)
     try:
-        nodes = SceneNodes(server, recorded)
+        show = _drawn(server, recorded)
         serializer = server.get_scene_serializer()
         for row in range(len(recorded.time)):
-            nodes.show(row)
+            show(row)
             last = row + 1 == len(recorded.time)
             serializer.insert_sleep(0.0 if last else float(recorded.time[row + 1] - recorded.time[row]))
         return serializer.as_html()
@@ -224,55 +225,42 @@ def recording(recorded: RecordedScene) -> str:
             server.stop()
 
 
-class SceneNodes:
-    """The nodes of one recorded scene. `show(row)` moves them."""
+def _drawn(server: Any, recorded: RecordedScene) -> Callable[[int], None]:
+    """The nodes of one recorded scene; what is returned moves them to a row."""
+    scene, size, length = server.scene, recorded.size, recorded.arrow_length
+    scene.set_up_direction("+z")
+    scene.add_grid("/ground", width=2.0 * size, height=2.0 * size, cell_size=size / 5.0, section_size=size)
+    center = recorded.poses[..., :3, 3].mean(axis=(0, 1)) if recorded.shapes else np.zeros(3)
+    server.initial_camera.position = tuple(center + size * np.array([0.6, -0.55, 0.28]))
+    server.initial_camera.look_at = tuple(center)
+    links = [
+        scene.add_mesh_simple(
+            f"/robot/{place}",
+            shape.vertices.astype(np.float32),
+            shape.faces.astype(np.uint32),
+            color=DARK_LINK if place % 2 else LINK,
+            opacity=OPACITY,
+            flat_shading=True,
+        )
+        for place, shape in enumerate(recorded.shapes)
+    ]
+    arrows = []
+    for place, group in enumerate(recorded.arrows):  # of the mean, and thinner pale ones to the end of the interval
+        color = np.array(COLORS[place % len(COLORS)])
+        pale = color + PALE * (255 - color)
+        looks = ("mean", color, 0.014), ("interval", pale, 0.008)
+        for points, (kind, shade, width) in zip(group.tips(0, length), looks, strict=True):
+            radii = {"shaft_radius": width * size, "head_radius": 2.0 * width * size, "head_length": 2.5 * width * size}
+            name = f"/forces/{place}/{kind}"
+            arrows.append(scene.add_arrows(name, points.astype(np.float32), shade.astype(np.uint8), **radii))
 
-    def __init__(self, server: Any, recorded: RecordedScene) -> None:
-        self.recorded = recorded
-        scene, size = server.scene, recorded.size
-        scene.set_up_direction("+z")
-        scene.add_grid("/ground", width=2.0 * size, height=2.0 * size, cell_size=size / 5.0, section_size=size)
-        center = recorded.poses[..., :3, 3].mean(axis=(0, 1)) if recorded.shapes else np.zeros(3)
-        server.initial_camera.position = tuple(center + size * np.array([0.6, -0.55, 0.28]))
-        server.initial_camera.look_at = tuple(center)
-        self.links = [
-            scene.add_mesh_simple(
-                f"/robot/{place}",
-                shape.vertices.astype(np.float32),
-                shape.faces.astype(np.uint32),
-                color=DARK_LINK if place % 2 else LINK,
-                opacity=OPACITY,
-                flat_shading=True,
-            )
-            for place, shape in enumerate(recorded.shapes)
-        ]
-        self.arrows = [_arrows(scene, place, recorded) for place in range(len(recorded.arrows))]
-        self.show(0)
+    def show(row: int) -> None:
+        for pose, node in zip(recorded.poses[row], links, strict=True):
+            node.wxyz = np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)  # w first
+            node.position = pose[:3, 3]
+        tips = [points for group in recorded.arrows for points in group.tips(row, length)]
+        for node, points in zip(arrows, tips, strict=True):
+            node.points = points.astype(np.float32)
 
-    def show(self, row: int) -> None:
-        """The robot and its forces at that row."""
-        for place, node in enumerate(self.links):
-            pose = self.recorded.poses[row, place]
-            node.wxyz, node.position = quaternion(pose[:3, :3]), pose[:3, 3]
-        for group, nodes in zip(self.recorded.arrows, self.arrows, strict=True):
-            for node, points in zip(nodes, group.tips(row, self.recorded.arrow_length), strict=True):
-                node.points = points.astype(np.float32)
-
-
-def _arrows(scene: Any, place: int, recorded: RecordedScene) -> tuple[Any, Any]:
-    """Arrows of the mean, and thinner pale ones to the end of the 95 % interval."""
-    color, size = np.array(COLORS[place % len(COLORS)]), recorded.size
-    pale = (color + PALE * (255 - color)).astype(np.uint8)
-    nodes = []
-    for points, kind, shade, width in zip(
-        recorded.arrows[place].tips(0, recorded.arrow_length),
-        ("mean", "interval"), (color.astype(np.uint8), pale), (0.014, 0.008), strict=True,
-    ):  # fmt: skip
-        radii = {"shaft_radius": width * size, "head_radius": 2.0 * width * size, "head_length": 2.5 * width * size}
-        nodes.append(scene.add_arrows(f"/forces/{place}/{kind}", points.astype(np.float32), shade, **radii))
-    return nodes[0], nodes[1]
-
-
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) of a rotation matrix (3, 3)."""
-    return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
+    show(0)
+    return show

@@ -18,14 +18,8 @@ from forcegp.posterior.posterior import Posterior
 from forcegp.report.motion import RecordedScene, recorded_scene, recording
 from forcegp.scores import Picture, Scores, model_pictures, overall, unit_of
 
-
-@dataclass(frozen=True)
-class Table:
-    """Rows of text under a header."""
-
-    title: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
+Table = tuple[str, Sequence[str], Sequence[Sequence[str]]]
+"""Title, header, and rows of text."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +74,10 @@ def model_page(
     posterior: Posterior,
     dataset: Dataset,
     *,
-    pictures: Sequence[Picture] = (),
     shapes: str | Path | None = None,
     **texts: Any,
 ) -> Page:
-    """A page of `texts`, with the robot in motion, these pictures, and those of the model (`scores.model_pictures`).
+    """A page of `texts`, with the robot in motion, and pictures of the model (`scores.model_pictures`).
 
     What cannot be drawn is named on the page with the reason. `shapes` is a URDF with visual elements.
     """
@@ -94,7 +87,7 @@ def model_page(
         scene, notes = recording(recorded), scene_notes(recorded)
     except MissingExtra as error:
         scene, notes = "", [f"The robot is not shown: {error}."]
-    return Page(**texts, scene=scene, scene_notes=[*notes, *missing], pictures=[*pictures, *drawn])
+    return Page(**texts, scene=scene, scene_notes=[*notes, *missing], pictures=drawn)
 
 
 def scene_notes(recorded: RecordedScene) -> list[str]:
@@ -122,4 +115,4 @@ def scores_table(scores: Scores, names: Mapping[str, str] | None = None) -> Tabl
     """Models side by side, by these names if given."""
     header, rows = overall(scores)
     shown = [[(names or {}).get(name, name), *(cell.partition(" (")[0] for cell in cells)] for name, *cells in rows]
-    return Table("Models on time that none of them has seen", header, shown)
+    return "Models on time that none of them has seen", header, shown

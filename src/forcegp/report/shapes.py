@@ -12,7 +12,7 @@ from forcegp.errors import InvalidInput, RobotModelError, required_extra
 from forcegp.robots import Robot
 from forcegp.robots.inertia import rotation_from_rpy, transform
 from forcegp.robots.urdf import parse_xml
-from forcegp.robots.urdf_file import read_text
+from forcegp.robots.urdf_file import read_robot_file
 
 FORMATS = (".stl", ".obj", ".ply", ".off")
 """Meshes that are read; none of them can name another file that would be read with it."""
@@ -50,7 +50,7 @@ def link_shapes(robot: Robot, urdf: str | Path | None = None) -> tuple[list[Link
     Raises MissingExtra without trimesh, and InvalidInput for a file that is no URDF.
     """
     trimesh_module()
-    text = robot.urdf_text if urdf is None else read_text(urdf)
+    text = robot.urdf_text if urdf is None else read_robot_file(urdf)
     try:
         root = parse_xml(text, str(urdf))
     except RobotModelError as error:

@@ -40,7 +40,7 @@ def translate(text: str, path: Path | None, for_system: bool, problems: Problems
     folder = None if path is None else path.parent.resolve()
     asked = {"text": text, "folder": str(folder or ""), "outside": _meshes_outside(text, path, problems.source)}
     made = required_extra("mujoco", "mujoco", f"{problems.source}: MJCF")
-    answer = read_apart(problems.source, asked)
+    answer = read_apart("mujoco", problems.source, asked)
     if "refused" in answer:
         advice = "; correct that place."
         if answer["meshes"]:

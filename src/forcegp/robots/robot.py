@@ -34,6 +34,7 @@ from forcegp.robots.structure import RigidBodyDynamics, RobotStructure, bodies_w
 from forcegp.robots.urdf import parse_urdf
 from forcegp.robots.urdf_file import (
     InertiaChoice,
+    read_robot_file,
     read_text,
     with_armature,
     with_chosen_inertias,
@@ -60,11 +61,12 @@ class Robot(RobotStructure, RigidBodyDynamics):
     @classmethod
     @usable_arguments("Robot.from_urdf")
     def from_urdf(cls, path: str | Path, **options: Any) -> "Robot":
-        """Read a URDF file; ``options`` are those of :meth:`from_urdf_text`, and so are errors.
+        """Read a URDF file, or a .xacro file where the package xacro is installed. Meshes are not looked for.
 
-        Meshes are not looked for.
+        ``options`` are those of :meth:`from_urdf_text`, and so are errors. MissingExtra for a .xacro file without the
+        package.
         """
-        return cls.from_urdf_text(read_text(path), source=str(path), **options)
+        return cls.from_urdf_text(read_robot_file(path), source=str(path), **options)
 
     @classmethod
     @usable_arguments("Robot.from_urdf_text")

@@ -1,4 +1,4 @@
-"""MuJoCo's reader of robot files that others wrote, in a process of its own with limits.
+"""Readers of robot files that others wrote, MuJoCo's and xacro's, in a process of their own with limits.
 
 What crashes, hangs or takes all memory there is an error here. `python -m forcegp.robots.sandbox` is that process: it
 takes one request as JSON and gives one answer as JSON; it imports neither torch nor the rest of forcegp.
@@ -12,6 +12,7 @@ import os
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 from typing import Any
 
 from forcegp.errors import RobotModelError
@@ -23,16 +24,19 @@ MEMORY = 1 << 30
 LARGEST = {"nbody": 2_000, "njnt": 2_000, "nsite": 2_000, "ngeom": 20_000}
 """Parts of a compiled model: robots have some hundred."""
 
+ACTS = ("subprocess", "os", "socket", "ctypes", "shutil")
+"""First words of Python's audit events that no macro needs."""
 
-def read_apart(source: str, request: dict[str, Any]) -> dict[str, Any]:
-    """The answer of MuJoCo to a request; `refused` in it is the reason of one that failed.
 
-    Raises RobotModelError where there is no answer: MuJoCo crashed, or needed more than `SECONDS` or `MEMORY`.
+def read_apart(reader: str, source: str, request: dict[str, Any]) -> dict[str, Any]:
+    """The answer of a reader ("mujoco" or "xacro") to a request; `refused` in it is the reason of one that failed.
+
+    Raises RobotModelError where there is no answer: the reader crashed, or needed more than `SECONDS` or `MEMORY`.
     """
     path = os.pathsep.join(folder for folder in sys.path if folder)
     ones = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MALLOC_ARENA_MAX", "PYTHONDONTWRITEBYTECODE")
     settings = dict.fromkeys(ones, "1") | {"PYTHONPATH": path, "PYTHONWARNINGS": "ignore", "MUJOCO_GL": "disable"}
-    asked = json.dumps({"seconds": SECONDS, "memory": MEMORY, "largest": LARGEST} | request)
+    asked = json.dumps({"reader": reader, "seconds": SECONDS, "memory": MEMORY, "largest": LARGEST} | request)
     try:
         process = subprocess.run(
             [sys.executable, "-P", "-m", __name__],
@@ -46,18 +50,45 @@ def read_apart(source: str, request: dict[str, Any]) -> dict[str, Any]:
         return json.loads(process.stdout)
     except (subprocess.TimeoutExpired, ValueError):
         raise RobotModelError(
-            f"{source}: MuJoCo crashed at it, or needed more than {SECONDS} s or {MEMORY >> 20} MiB; give the file "
+            f"{source}: {reader} crashed at it, or needed more than {SECONDS} s or {MEMORY >> 20} MiB; give the file "
             "of one robot, without copies in great number."
         ) from None
 
 
-def _compiled(request: dict[str, Any]) -> dict[str, Any]:
-    """A compiled model as MuJoCo stores it, without what changes no motion."""
+def _answer(request: dict[str, Any]) -> dict[str, Any]:
     if os.name == "posix":  # elsewhere only the wall time is limited
         import resource
 
         for limit, value in ((resource.RLIMIT_CPU, request["seconds"]), (resource.RLIMIT_AS, request["memory"])):
             resource.setrlimit(limit, (value, value))
+    return {"mujoco": _compiled, "xacro": _expanded}[request["reader"]](request)
+
+
+def _expanded(request: dict[str, Any]) -> dict[str, Any]:
+    """The text of a .xacro file, whose expressions open files below its folder and of ROS packages only."""
+    xacro = importlib.import_module("xacro")
+    importlib.import_module("yaml")  # xacro loads it when a file asks
+    packages = os.pathsep.join(os.environ.get(name, "") for name in ("AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH"))
+    shown = [Path(request["path"]).parent, *(each for each in (*packages.split(os.pathsep), *sys.path) if each)]
+    allowed = [Path(each).resolve() for each in (*shown, request["path"] + "/..")]
+
+    def watch(event: str, given: tuple[Any, ...]) -> None:
+        refused = event.split(".")[0] in ACTS and event not in ("os.listdir", "os.scandir")
+        if event == "open" and not isinstance(given[0], int):
+            real = Path(os.fsdecode(given[0])).resolve()
+            refused = given[2] & (os.O_WRONLY | os.O_RDWR) or not any(real.is_relative_to(each) for each in allowed)
+        if refused:
+            raise PermissionError(f"its expressions only read below its folder: {event} {given[:1]}")
+
+    sys.addaudithook(watch)
+    try:
+        return {"text": xacro.process_file(request["path"]).toxml()}
+    except (Exception, SystemExit) as error:  # whatever the expressions of the file raise
+        return {"refused": " ".join(str(error).split())}
+
+
+def _compiled(request: dict[str, Any]) -> dict[str, Any]:
+    """A compiled model as MuJoCo stores it, without what changes no motion."""
     mujoco: Any = importlib.import_module("mujoco")
     numpy = importlib.import_module("numpy")
     if request["folder"]:
@@ -132,6 +163,6 @@ def _has_mass(mujoco: Any, spec: Any, geom: Any) -> bool:
 if __name__ == "__main__":
     channel = os.dup(1)
     os.dup2(2, 1)  # what a library prints is no answer
-    answer = json.dumps(_compiled(json.load(sys.stdin)))
+    answer = json.dumps(_answer(json.load(sys.stdin)))
     with os.fdopen(channel, "w", encoding="utf-8") as out:
         out.write(answer)

@@ -64,7 +64,7 @@ def refuse_xacro(root: Element, source: str) -> None:
     for element in (*found, *(each for each in read if re.search(r"\$[{(]", " ".join(each.attrib.values())))):
         raise RobotModelError(
             f"{source}: is an unexpanded xacro file (see <{element.tag.rsplit('}', 1)[-1]}>); "
-            "run xacro first: pip install xacro; xacro robot.urdf.xacro > robot.urdf."
+            "name it .xacro, or run xacro first: xacro robot.urdf.xacro > robot.urdf."
         )
 
 

@@ -9,10 +9,11 @@ import numpy as np
 from defusedxml import minidom
 from jaxtyping import Float
 
-from forcegp.errors import LARGEST, InvalidInput, NonPhysicalInertia, RobotModelError, UnknownName
+from forcegp.errors import LARGEST, InvalidInput, NonPhysicalInertia, RobotModelError, UnknownName, required_extra
 from forcegp.robots.arguments import Problems, Vector, by_joint, finite_vector
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import Layout
+from forcegp.robots.sandbox import read_apart
 from forcegp.robots.urdf import RobotDescription, numbers, parse_urdf, with_prefixes
 
 HEAVIEST = 1e9
@@ -223,3 +224,18 @@ def with_chosen_inertias(
 IN_THE_FILE = (
     ". Correct its <inertial> element (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>)"
 )
+
+
+def read_robot_file(path: str | Path) -> str:
+    """URDF text of a file, .xacro expanded. Raises RobotModelError, MissingExtra."""
+    text = read_text(path)
+    if Path(path).suffix != ".xacro":
+        return text
+    required_extra("xacro", "xacro", f"{path}: a file that is not expanded elsewhere")
+    answer = read_apart("xacro", str(path), {"path": str(Path(path).absolute())})
+    if "refused" in answer:
+        raise RobotModelError(
+            f"{path}: xacro could not expand it ({answer['refused']}); correct it, or "
+            "expand it where its packages are: xacro robot.xacro > robot.urdf."
+        )
+    return answer["text"]

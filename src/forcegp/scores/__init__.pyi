@@ -2,7 +2,6 @@ from .accuracy import unfinished_search as unfinished_search
 from .figures.model import (
     curve_panels as curve_panels, friction_curves_figure as friction_curves_figure,
     model_pictures as model_pictures, normal_force_figure as normal_force_figure,
-    scores_pictures as scores_pictures,
 )
 from .figures.style import Picture as Picture, save_figure as save_figure
 from .models import (
@@ -11,8 +10,7 @@ from .models import (
 )
 from .page import (
     model_table as model_table, overall as overall, unit_of as unit_of,
-    winner_table as winner_table,
 )
 from .score import score as score
-from .scores import CRITERIA as CRITERIA, PairedDifference as PairedDifference, Scores as Scores
+from .scores import PairedDifference as PairedDifference, Scores as Scores
 from .held_out import Split as Split, split_named as split_named

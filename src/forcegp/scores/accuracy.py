@@ -1,12 +1,8 @@
-"""One model against the rows of one log: a table by quantity and score, errors by stretch of time, and doubts about it.
-
-A Dataset holds true forces by name, `Q_U.<name>` and `force.<name>`; one that two components claim is not compared.
-"""
+"""One model against the rows of one log: a table by quantity and score, errors by stretch of time, and doubts."""
 
 import statistics
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +13,7 @@ from scipy.stats import norm
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from forcegp.data import Dataset, repeated_rows, time_blocks, with_memory
+from forcegp.data import Dataset, repeated_rows, with_memory
 from forcegp.data.views import in_blocks
 from forcegp.doubts import Doubt, look
 from forcegp.errors import NumericalError
@@ -43,35 +39,16 @@ CONSTANT = 1e-6  # of the largest standard deviation: less is rounding
 ROUNDING = 1e-9  # relative to the size of the truth: widths of intervals below it are none
 
 
-@dataclass(frozen=True, eq=False)
-class PredictedRows:
-    """What a model predicts for every row, and the mechanics there.
+def predict_rows(posterior: Posterior, dataset: Dataset) -> dict[str, np.ndarray]:
+    """What a model predicts for every row, and the mechanics there; the constraint is that of the Dataset's own system.
 
     `mean` and `variance` of the acceleration without noise, `measurement_variance` with that of the model, or of the
     Dataset where that is larger; `negative_log_density` of the measured rows [nats]; `known_physics`, the acceleration
     of the known forces alone; `residual` |A a - b| of the mean; the mass matrix `mass`. Of models with forces Q_U
-    (`unknown_force`), what of it is known (`carried_force`, Q_K without an analytical mean, else 0), and lambda.
-    `sensed` are forces at frames with a force sensor, x, y and z of each, given the accelerations that were measured.
+    (`unknown_force`), what of it is known (`carried_force`, Q_K without an analytical mean, else 0), and lambda
+    (`multiplier`). `sensed` are forces at frames with a force sensor, x, y and z of each, given the accelerations that
+    were measured. Variances of forces are called `unknown_force_variance` and so on.
     """
-
-    mean: Rows
-    variance: Rows
-    measurement_variance: Rows
-    negative_log_density: Float[np.ndarray, " rows"]
-    known_physics: Rows
-    residual: Float[np.ndarray, "rows c"]
-    mass: Matrices
-    unknown_force: Rows | None = None
-    unknown_force_variance: Rows | None = None
-    multiplier: Float[np.ndarray, "rows m"] | None = None
-    multiplier_variance: Float[np.ndarray, "rows m"] | None = None
-    carried_force: Rows | None = None
-    sensed: Float[np.ndarray, "rows axes"] | None = None
-    sensed_variance: Float[np.ndarray, "rows axes"] | None = None
-
-
-def predict_rows(posterior: Posterior, dataset: Dataset) -> PredictedRows:
-    """Predict all rows, some at a time. The constraint is that of the Dataset's own system."""
     dataset = with_memory(dataset, posterior.model)
     device, held, done = posterior.model.robot.device, list(posterior.model.held_inputs), 0
     names: list[str] = []
@@ -115,7 +92,7 @@ def predict_rows(posterior: Posterior, dataset: Dataset) -> PredictedRows:
 
     with blas_threads(posterior.training.q.numel()):
         arrays: Any = in_blocks(dataset, predicted, device)
-    return PredictedRows(**dict(zip(names, arrays, strict=True)))
+    return dict(zip(names, arrays, strict=True))
 
 
 def negative_log_density(
@@ -137,8 +114,8 @@ def negative_log_density(
 
 def row_scores(
     posterior: Posterior, test: Dataset, mass: Matrices | None = None, whole: Dataset | None = None
-) -> tuple[Table, dict[str, list[float | None]]]:
-    """The table, and errors in about `STRETCHES` stretches of time, over all joints, where lower is better.
+) -> tuple[Table, list[float | None]]:
+    """The table, and mean squared errors of forces in about `STRETCHES` stretches of time, over all joints.
 
     Quantities are those of `_pairs`, each with `mae`, `rmse`, `relative_rmse` (over the size of what was there, all
     columns together) and `largest` error, and with `coverage_95` and `coverage_50` of intervals. That of a measurement
@@ -150,27 +127,28 @@ def row_scores(
     it is the same for every model that is compared, None takes the model's own.
     """
     rows = predict_rows(posterior, test)
-    mass = rows.mass if mass is None else mass
+    mass = rows["mass"] if mass is None else mass
     pairs = _pairs(rows, test, mass) | _of_sensors(rows, test, sensed_frames(posterior, test))
     table = {name: metrics(*each) for name, each in pairs.items() if each[0].shape == each[2].shape and each[2].size}
-    table[ALL_JOINTS] = {"nlpd": [float(rows.negative_log_density.mean())]}
+    table[ALL_JOINTS] = {"nlpd": [float(rows["negative_log_density"].mean())]}
     measured = table[ACCELERATION]
     whole = test if whole is None else whole
     measured["nrmse"] = plain(np.array(measured["rmse"], dtype=float) / _spread(whole.a))
     if len(test.model.actuators) == test.nv and not posterior.is_black_box:
         # of the torques that the model needs for the measured motion; a share of 1 is no better than their mean
-        rms = np.sqrt(np.square(force_errors(rows.mean, test.a, rows.mass)).mean(axis=0))
+        rms = np.sqrt(np.square(force_errors(rows["mean"], test.a, rows["mass"])).mean(axis=0))
         table[TORQUE] = {"rmse": plain(rms), "share": plain(rms / _spread(whole.u[:, : test.nv]))}
-    density = norm.logpdf(test.a, rows.mean, np.sqrt(rows.measurement_variance))
+    density = norm.logpdf(test.a, rows["mean"], np.sqrt(rows["measurement_variance"]))
     measured["nlpd"] = plain(-np.asarray(density).mean(axis=0))
     measured["noise_std"] = plain(posterior.noise_std.detach().cpu().numpy())
     if test.noise_std is not None:
         measured["noise_floor"] = plain(test.noise_std * np.sqrt(2.0 / np.pi))
     for name in {ACCELERATION, TRUE_ACCELERATION} & set(table):
-        table[name]["known_physics_mae"] = plain(np.abs(rows.known_physics - pairs[name][2]).mean(axis=0))
-    return table, _by_stretch(rows, test, force_errors(rows.mean, test.a, mass), _spread(whole.a))
+        table[name]["known_physics_mae"] = plain(np.abs(rows["known_physics"] - pairs[name][2]).mean(axis=0))
+    return table, by_stretch(np.square(force_errors(rows["mean"], test.a, mass)).mean(axis=1), test)
 
 
+Predicted = Mapping[str, np.ndarray]
 Pair = tuple[np.ndarray, np.ndarray | None, np.ndarray]
 """Mean and variance of a prediction, and what was there; all (rows, columns)."""
 
@@ -181,36 +159,37 @@ def sensed_frames(posterior: Posterior, dataset: Dataset) -> list[str]:
     return [] if posterior.is_black_box else [name for name in sensed_of(dataset) if name in own]
 
 
-def _of_sensors(rows: PredictedRows, test: Dataset, frames: Sequence[str]) -> dict[str, Pair]:
+def _of_sensors(rows: Predicted, test: Dataset, frames: Sequence[str]) -> dict[str, Pair]:
     """Forces at each frame by axis, which sensors measured."""
-    if rows.sensed is None or rows.sensed_variance is None:
+    if "sensed" not in rows:
         return {}
+    mean, variance = rows["sensed"], rows["sensed_variance"]
     names = [f"{AT_SENSOR} {frame}, {axis}" for frame in frames for axis in "xyz"]
     there = np.concatenate([sensed_of(test)[frame] for frame in frames], axis=1)
     return {
-        name: (rows.sensed[:, [k]], rows.sensed_variance[:, [k]], there[:, [k]])
+        name: (mean[:, [k]], variance[:, [k]], there[:, [k]])
         for k, name in enumerate(names)
-        if rows.sensed_variance[:, k].max()
-        > CONSTANT**2 * np.square(there[:, k]).mean()  # no motion of the robot pushes along the others
+        if variance[:, k].max() > CONSTANT**2 * np.square(there[:, k]).mean()  # no motion pushes along the others
     }
 
 
-def _pairs(rows: PredictedRows, test: Dataset, mass: Matrices) -> dict[str, Pair]:
+def _pairs(rows: Predicted, test: Dataset, mass: Matrices) -> dict[str, Pair]:
     """What is compared: measured accelerations, what their errors are as joint forces, A a with b; and known truth."""
-    truth, mean = test.truth, rows.mean
-    zero, still = np.zeros_like(mean), np.zeros_like(rows.residual)
+    truth, mean = test.truth, rows["mean"]
+    zero, still = np.zeros_like(mean), np.zeros_like(rows["residual"])
     pairs: dict[str, Pair] = {
-        ACCELERATION: (mean, rows.measurement_variance, test.a),
+        ACCELERATION: (mean, rows["measurement_variance"], test.a),
         FORCE: (force_errors(mean, test.a, mass), None, zero),
-        CONSTRAINT: (rows.residual, None, still),
+        CONSTRAINT: (rows["residual"], None, still),
     }
     if "a" in truth:
-        pairs[TRUE_ACCELERATION] = mean, rows.variance, truth["a"]
-        pairs[TRUE_FORCE] = force_errors(mean, truth["a"], rows.mass), None, zero
-    if "Q_U" in truth and rows.unknown_force is not None:
-        pairs[UNKNOWN_FORCE] = rows.unknown_force, rows.unknown_force_variance, truth["Q_U"] + rows.carried_force
-    if "lambda" in truth and rows.multiplier is not None:
-        pairs[CONTACT_FORCE] = rows.multiplier, rows.multiplier_variance, truth["lambda"]
+        pairs[TRUE_ACCELERATION] = mean, rows["variance"], truth["a"]
+        pairs[TRUE_FORCE] = force_errors(mean, truth["a"], rows["mass"]), None, zero
+    if "Q_U" in truth and "unknown_force" in rows:
+        there = truth["Q_U"] + rows["carried_force"]
+        pairs[UNKNOWN_FORCE] = rows["unknown_force"], rows["unknown_force_variance"], there
+    if "lambda" in truth and "multiplier" in rows:
+        pairs[CONTACT_FORCE] = rows["multiplier"], rows["multiplier_variance"], truth["lambda"]
     return pairs
 
 
@@ -269,19 +248,16 @@ def _spread(a: Rows) -> Float[np.ndarray, " nv"]:
     return np.where(spread > CONSTANT * spread.max(initial=0.0), spread, np.nan)
 
 
-def _by_stretch(
-    predicted: PredictedRows, test: Dataset, forces: Rows, spread: np.ndarray
-) -> dict[str, list[float | None]]:
-    """By criterion: squared errors of accelerations over their variance, of forces, and densities in nats."""
-    lasting = sum(float(np.ptp(test.time[test.episode == episode])) for episode in test.episodes)
-    seconds = lasting / STRETCHES if lasting > 0.0 else 1.0
-    relative = (((predicted.mean - test.a) / spread) ** 2)[:, np.isfinite(spread)]
-    blocks = [list(block) for block in time_blocks(test.time, test.episode, seconds)]
-    found: dict[str, Any] = {"force": forces**2, "acceleration": relative, "density": predicted.negative_log_density}
-    return {
-        name: plain(np.array([values[block].mean() if values.size else np.nan for block in blocks]))
-        for name, values in found.items()
-    }
+def by_stretch(values: Float[np.ndarray, " rows"], test: Dataset) -> list[float | None]:
+    """Means in stretches of equal time, counted from the first row of every episode."""
+    since, lasting = test.time.copy(), 0.0
+    for episode in test.episodes:
+        own = test.episode == episode
+        since[own] -= since[own].min()
+        lasting += float(since[own].max())
+    stretch = np.floor(since / (lasting / STRETCHES if lasting > 0.0 else 1.0))
+    _, label = np.unique(np.stack([test.episode, stretch]), axis=1, return_inverse=True)
+    return plain(np.bincount(label.ravel(), values) / np.bincount(label.ravel()))
 
 
 WORSE = 1.01  # error of the model over that of its known forces alone, from which it is pointed out

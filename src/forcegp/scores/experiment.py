@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from forcegp.data import Dataset, contact_doubts, farthest_rows, with_strokes
 from forcegp.data.dataset import require_rows
-from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, require_type
+from forcegp.errors import ForceGPError, InvalidInput, require_type
 from forcegp.fit import fit
 from forcegp.integration import integrator_named
 from forcegp.jobs import Job, JobStore
@@ -188,10 +188,8 @@ def job_name(split: Split, seed: int, kind: str, name: str) -> str:
 
 
 def kept(store: JobStore, name: str) -> dict[str, Any]:
-    """What a finished job found, or why it failed, with its warnings. Raises FileFormatError for a damaged file."""
+    """What a finished job found, or why it failed, with its warnings. Raises as `JobStore.load`."""
     stored = store.load(name)
-    if not {"split", "seed", "error", "warnings"} <= set(stored["result"]):
-        raise FileFormatError(f"{store.place(name)} is damaged; delete it and run the same command again.")
     warned = [*stored["result"]["warnings"], *stored["warnings"]]
     return {**stored["result"], "warnings": warned, **{key: stored[key] for key in ("machine", "wall_seconds")}}
 
@@ -231,14 +229,11 @@ def _score(
     posterior = experiment.fitted(work, train, split.apply(experiment.recording)[0], identified, spec["seed"])
     seconds = before + time.process_time() - start
     model, _ = identified_before(store, spec["mass_matrix"])
-    whose = f"the model identified from all training rows ({experiment.identifies})"
-    if isinstance(model, str):
-        whose = f"the model as given, because its identification failed ({model.rstrip('.')})"
     mass = mass_matrices(test, experiment.model if isinstance(model, str) else model)
     known = isinstance(work.given, Posterior)
     how: dict[str, Any] = {"fitted_here": not known, "whole": experiment.rows}
     found = scored(posterior, test, experiment.motions(split), experiment.integrator, mass, **how)
-    return {"cpu_seconds": seconds, "mass_matrix": whose, "training_rows": experiment.points, **found}
+    return {"cpu_seconds": seconds, "training_rows": experiment.points, **found}
 
 
 def identified_before(store: JobStore, name: str) -> tuple[Model | str, float]:

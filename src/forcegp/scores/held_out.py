@@ -6,16 +6,17 @@ Neighbouring rows are nearly equal, and filters mix them, so a split of single r
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool
 
-from forcegp.data import Dataset, require_disjoint
+from forcegp.data import Dataset, repeated_rows
 from forcegp.data.views import EVEN_STEPS, RecordedMotions, recorded_motions
-from forcegp.errors import InvalidInput, require_type, usable_arguments
+from forcegp.doubts import listed
+from forcegp.errors import DatasetError, InvalidInput, require_type, usable_arguments
 from forcegp.posterior import Posterior, observing
 from forcegp.posterior.drift import in_its_record
 from forcegp.robots.arguments import whole_number
@@ -72,11 +73,14 @@ class Split:
                     f"split {self.name!r} leaves no row to {side}; the dataset has episodes {list(dataset.episodes)} "
                     f"and the guard is {self.guard} s."
                 )
-        sides = dataset.rows(train), dataset.rows(test)
-        whole = all(math.isinf(begin) and math.isinf(end) for _, begin, end in self.held_out)
-        # Blocks of one episode have equal metadata by nature; of those only repeated rows are refused.
-        require_disjoint(sides[0] if whole else replace(sides[0], metadata={}), sides[1])
-        return sides
+        known, unseen = dataset.rows(train), dataset.rows(test)
+        again = repeated_rows((known.q, known.v, known.u), unseen)
+        if again.size:
+            raise DatasetError(
+                f"{again.size} of {len(unseen)} test rows are also training rows (the first: test row {again[0]}). "
+                "Test on another trajectory: another episode, recording or seed."
+            )
+        return known, unseen
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values; None where a stretch goes to the end of the recording."""
@@ -137,7 +141,8 @@ def _episodes_apart(known: Sequence[int], episodes: Sequence[int]) -> Split:
     """Whole episodes."""
     _require_some("episodes", episodes, known)
     rest = [number for number in known if number not in episodes]
-    words = f"trained on whole episodes ({_listed(rest)}), tested on others ({_listed(episodes)})"
+    sides = [listed([*map(str, each)]) for each in (rest, episodes)]
+    words = "trained on whole episodes ({}), tested on others ({})".format(*sides)
     held_out = tuple((number, -math.inf, math.inf) for number in episodes)
     return Split(f"episodes-{'-'.join(map(str, episodes))}", words, held_out)
 
@@ -155,14 +160,9 @@ def _blocks_apart(dataset: Dataset, blocks: int, numbers: Sequence[int], guard: 
     each = "the recording" if len(dataset.episodes) == 1 else "every episode"
     words = (
         f"{each} cut into {blocks} consecutive blocks of equal duration, block{'s' if len(numbers) > 1 else ''} "
-        f"{_listed(numbers)} held out, and training rows within {guard:g} s of them left out"
+        f"{listed([*map(str, numbers)])} held out, and training rows within {guard:g} s of them left out"
     )
     return Split(f"blocks-{blocks}-{'-'.join(map(str, numbers))}", words, tuple(stretches), guard)
-
-
-def _listed(numbers: Sequence[int]) -> str:
-    *first, last = map(str, numbers)
-    return f"{', '.join(first)} and {last}" if first else last
 
 
 HORIZONS = (0.1, 0.2, 0.5, 1.0)
@@ -172,29 +172,29 @@ GAP = 1.5  # a pause of more than this many median steps is a gap, over which no
 
 @dataclass(frozen=True, eq=False)
 class HeldOutMotions:
-    """The motions to predict, and the horizons [s] that they last for; `notes` report what is missing.
+    """The motions to predict: rows of held-out stretches without gaps, and numbers of those at which motions begin.
 
-    `stretches` are the rows that each motion is part of, for observers.
+    The longest of the `horizons` [s] is how long they are; `notes` report what is missing.
     """
 
-    motions: RecordedMotions | None
-    horizons: tuple[float, ...]
-    notes: tuple[str, ...] = field(default=())
+    horizons: tuple[float, ...] = ()
     stretches: tuple[tuple[Dataset, tuple[int, ...]], ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return sum(len(starts) for _, starts in self.stretches)
 
     def of(self, posterior: Posterior) -> tuple[Posterior, RecordedMotions]:
         """The posterior, and the motions with what its observers have seen before each of them.
 
         Its friction is known where these go on in the record that it was fitted to.
         """
-        assert self.motions is not None, "there are motions"
         posterior = in_its_record(posterior, [float(rows.time.min()) for rows, _ in self.stretches])
         pairs = [observing(posterior, rows, whole=True) for rows, _ in self.stretches]
-        if all(seen is rows for (_, seen), (rows, _) in zip(pairs, self.stretches, strict=True)):
-            return posterior, self.motions
-        seconds = self.horizons[-1]
-        u = [recorded_motions(seen, at, seconds).u for (_, seen), (_, at) in zip(pairs, self.stretches, strict=True)]
-        return pairs[0][0], replace(self.motions, u=np.concatenate(u))
+        starts = [starts for _, starts in self.stretches]
+        each = [recorded_motions(seen, at, self.horizons[-1]) for (_, seen), at in zip(pairs, starts, strict=True)]
+        joined = {name: np.concatenate([getattr(one, name) for one in each]) for name in ("q", "v", "u")}
+        return pairs[0][0], RecordedMotions(tuple(row for at in starts for row in at), each[0].dt, **joined)
 
 
 def held_out_motions(
@@ -213,9 +213,9 @@ def held_out_motions(
     wanted = tuple(sorted(set(wanted)))
     starts = whole_number("starts", starts, 1)
     if not wanted:
-        return HeldOutMotions(None, (), ())
+        return HeldOutMotions()
     if not recording.time_ordered:
-        return HeldOutMotions(None, (), ("no motion was predicted: the rows are not in the order of time.",))
+        return HeldOutMotions(notes=("no motion was predicted: the rows are not in the order of time.",))
     stretches, step = _stretches(recording, held_out), _step(recording)
     longest = max((float(np.ptp(recording.time[rows])) for rows in stretches), default=0.0)
     possible, notes = tuple(h for h in wanted if step <= h <= longest * (1.0 + EVEN_STEPS)), list[str]()
@@ -224,20 +224,15 @@ def held_out_motions(
         notes.append(f"not predicted: {left_out}; held-out stretches last {longest:.3g} s at most, steps {step:.3g} s.")
         if horizons is not None:
             raise InvalidInput(f"horizons {notes[0]} Give shorter ones.")
-    found, parts = [], []
+    found = list[tuple[Dataset, tuple[int, ...]]]()
     for rows in stretches if possible else ():
         if np.ptp(recording.time[rows]) >= possible[-1] * (1.0 - EVEN_STEPS):
+            own = recording.rows(rows)
             try:
-                found.append(recorded_motions(recording.rows(rows), starts, possible[-1]))
-                parts.append((recording.rows(rows), found[-1].rows))
+                found.append((own, recorded_motions(own, starts, possible[-1]).rows))
             except InvalidInput as error:
                 notes.append(f"motions of one stretch were left out: {error}")
-    notes = list(dict.fromkeys(notes))
-    if not found:
-        return HeldOutMotions(None, (), tuple(notes))
-    joined = {name: np.concatenate([getattr(each, name) for each in found]) for name in ("q", "v", "u")}
-    motions = RecordedMotions(tuple(row for each in found for row in each.rows), found[0].dt, **joined)
-    return HeldOutMotions(motions, possible, tuple(notes), tuple(parts))
+    return HeldOutMotions(possible if found else (), tuple(found), tuple(dict.fromkeys(notes)))
 
 
 def motion_scores(
@@ -248,7 +243,7 @@ def motion_scores(
     `rmse` over the motions of q in rad or m, of a base in its own axes, and of v; `coverage_95` of q where there are
     intervals. `diverged` motions do not count. `squared` (horizons, motions) is the mean over joints for q.
     """
-    if held_out.motions is None:
+    if not len(held_out):
         return {}, None
     posterior, motions = held_out.of(posterior)
     rollout = posterior.rollout(

@@ -18,6 +18,7 @@ from forcegp.evidence import Accelerations, ContactForces, Evidence, Motions, To
 from forcegp.evidence.least_squares import correlation_time
 from forcegp.evidence.recorded_rows import sensed_of, slides
 from forcegp.fit import calibrated, default_options, fit, held_out_noise
+from forcegp.fit.fit import usual_evidence
 from forcegp.fit.search import MOST_POINTS_FOR_RESTARTS
 from forcegp.forces import (
     IndependentAccelerations,
@@ -74,13 +75,6 @@ def usual_forces(model: Model) -> str:
     return "gp:joint-friction" if jointed else "gp:joint"
 
 
-def usual_evidence(model: Model) -> Evidence:
-    """That of `fit` where none is named."""
-    if model.unknown_forces or not model.is_open:
-        return Accelerations()
-    return Torques() if model.robot.space.is_vector_space else Torques(noisy="both")
-
-
 def learn(
     model: Model,
     dataset: Dataset,
@@ -90,7 +84,6 @@ def learn(
     recording: Dataset | None = None,
     baseline: Dataset | None = None,
     engine: Any = "auto",
-    learning_points: int | None = None,
     iterations: int | None = None,
     **search: Any,
 ) -> tuple[Posterior, list[str]]:
@@ -123,11 +116,10 @@ def learn(
         points = count if everything else min(POINTS if points is None else points, count)
         options = default_options(points)
         options = options if iterations is None else replace(options, iterations=iterations)
-        how: dict[str, Any] = {"engine": engine, "learning_points": learning_points}
+        how: dict[str, Any] = {"engine": engine}
         if everything:
             model = with_force_noise(model, dataset)
             how |= all_rows_at_once(points, model.robot.nv)
-            how |= {} if learning_points is None else {"learning_points": learning_points}
         if not model.unknown_forces:
             search = {**search, "restarts": 1}  # its starts are all the same
         how |= {"options": options, **search}

@@ -10,7 +10,7 @@ import numpy as np
 
 from forcegp.data import Preparation, preparation_report
 from forcegp.scores.accuracy import ACCELERATION, ALL_JOINTS, AT_SENSOR, FORCE
-from forcegp.scores.scores import CRITERIA, MARGIN, Scores
+from forcegp.scores.scores import MARGIN, Scores
 
 
 def formatted(value: Mapping[str, Any] | float | None, digits: int = 4) -> str:
@@ -49,8 +49,8 @@ def rendered(template: Path, **values: Any) -> str:
 Column = tuple[str, str, str, int]  # title, quantity, score and decimals; of a coverage in percent
 
 
-def page(scores: Scores, figures: Sequence[tuple[str, str]] = ()) -> str:
-    """Markdown: what was done, the model to take, tables, and what failed; `figures` have names and captions."""
+def page(scores: Scores) -> str:
+    """Markdown: what was done, the model to take, tables, and what failed."""
     finished, by_joint = [name for name in scores.models if scores.finished(name)], []
     for title, quantity, score, digits in columns_of(scores) if finished else ():
         of = ACCELERATION if quantity == ALL_JOINTS else quantity  # densities of each joint alone
@@ -63,10 +63,9 @@ def page(scores: Scores, figures: Sequence[tuple[str, str]] = ()) -> str:
         Path(__file__).with_name("report.md.jinja"),
         **{"source": {}, "preparation": [], "splits": [], "configuration": {}, **scores.about, "notes": notes},
         margin=MARGIN,
-        taken=[[CRITERIA[name], f"**{each.model}**", each.sentence] for name, each in scores.winners.items()],
+        winner=scores.winner,
         overall=markdown_table(*overall(scores)) if finished else "",
         by_joint=by_joint,
-        figures=figures,
         listed=[[name, each["kind"], each["summary"], str(len(scores.finished(name)))]
                 for name, each in scores.models.items()],
         failures=scores.failures,
@@ -145,18 +144,6 @@ def _lost(scores: Scores, model: str, quantity: str) -> str:
     moved = [run["motions"] for run in scores.finished(model)]
     at = [each["diverged"][each["horizons"].index(float(quantity.split()[2]))] for each in moved]
     return f", {sum(at)} of {sum(each['motions'] for each in moved)} diverged" if sum(at) else ""
-
-
-def winner_table(scores: Scores) -> tuple[list[str], list[list[str]]]:
-    """Header and rows: by criterion the model to take, and the difference that decides, with its interval."""
-    rows = []
-    for criterion, each in scores.winners.items():
-        pair, told = each.difference, ["–"] * 3
-        if pair is not None:
-            sure = pair.outcome == "better" or not pair.favours_challenger
-            told = [pair.pair, pair.numbers, pair.outcome if sure else "better, not sure"]
-        rows.append([CRITERIA[criterion], each.model, *told])
-    return ["by", "take", "compared", "difference (95 % interval)", "shown"], rows
 
 
 def unit_of(scores: Scores, quantity: str) -> str:

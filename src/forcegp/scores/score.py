@@ -71,7 +71,7 @@ def score(
         will do. None takes some of every kind.
     split: text of `split_named` or its result; None is "auto" where anything is fitted.
     horizons: of predicted motions in s; none with (). None takes .1, .2, .5 and 1 s where anything is fitted.
-    folder: where every finished piece is kept, with the page report.md, figures and results.json; None keeps nothing.
+    folder: where every finished piece is kept, with the page report.md and results.json; None keeps nothing.
     model, recording: the robot as given, and the log at its full rate, for motions; None takes the log's, and the log.
     points, seeds: rows that models of many inputs learn from, and how many choices of them.
     starts, integrator: of the motions of every held-out stretch.
@@ -148,15 +148,10 @@ def _on_all_rows(experiment: Experiment, chosen: Mapping[str, Candidate], name: 
 
 
 def write(scores: Scores, folder: Path) -> None:
-    """The page, its figures and all numbers into a folder."""
-    from forcegp.scores.figures.model import scores_pictures
-
+    """The page and all numbers into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    pictures = scores_pictures(scores)
-    for picture in pictures:
-        picture.save(folder)
     write_json(folder / RESULTS, scores.to_dict())
-    write_text(folder / PAGE, page(scores, [(picture.name, picture.caption) for picture in pictures]))
+    write_text(folder / PAGE, page(scores))
 
 
 def _runs_of(
@@ -167,7 +162,7 @@ def _runs_of(
     for place, (name, posterior) in enumerate(given.items()):
         require_rows("log", log, posterior.joint_names, "the model")
         integrator_named(integrator, posterior.model)
-        run = {"split": "all rows", "seed": 0, "error": None, "cpu_seconds": None, "mass_matrix": "the model itself"}
+        run = {"split": "all rows", "seed": 0, "error": None, "cpu_seconds": None}
         run |= {"training_rows": len(posterior.training)}
         with part(place, len(given), name):
             runs[name] = [run | scored(posterior, log, motions, integrator)]
@@ -176,8 +171,7 @@ def _runs_of(
 
 def _split_facts(experiment: Experiment, split: Split) -> dict[str, Any]:
     (train, test), motions = split.apply(experiment.rows), experiment.motions(split)
-    count = 0 if motions.motions is None else len(motions.motions.q)
-    sides = {"training_rows": len(train), "test_rows": len(test), "motions": count, "notes": list(motions.notes)}
+    sides = {"training_rows": len(train), "test_rows": len(test), "motions": len(motions), "notes": list(motions.notes)}
     return split.to_dict() | sides
 
 
@@ -188,13 +182,12 @@ def _scores(
     about: Mapping[str, Any],
     fit: Callable[[str], Posterior],
 ) -> Scores:
-    used = sorted({run["mass_matrix"] for each in runs.values() for run in each if run["error"] is None})
     units = {name: log.units[name] for name in ("q", "v", "u", "a")}
     return Scores(
         models={name: {"kind": each.kind, "summary": each.summary} for name, each in models.items()},
         runs=runs,
         joint_names=tuple(log.joint_names),
         units={name: unit if isinstance(unit, str) else list(unit) for name, unit in units.items()},
-        about={**about, "mass_matrix": used},
+        about=about,
         fit=fit,
     )

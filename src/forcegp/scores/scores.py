@@ -1,7 +1,7 @@
 """`Scores`: what was found of several models on the same rows, and which of them is better.
 
-Squared errors over stretches and seeds are compared by the logarithm of their ratio (densities by a difference). What
-other stretches and seeds would change are jackknife variances (Efron & Stein 1981), added as Welch & Satterthwaite do.
+Squared errors over stretches and seeds are compared by the logarithm of their ratio. What other stretches and seeds
+would change are jackknife variances (Efron & Stein 1981), added as Welch & Satterthwaite do.
 """
 
 import math
@@ -29,10 +29,8 @@ MOST_LOG = 700.0  # of a ratio that is still a finite number
 CRITERIA: Mapping[str, str] = {
     "motion": "error of predicted motions",
     "force": "force-space error",
-    "acceleration": "normalised error of the acceleration",
-    "density": "negative log predictive density",
 }
-"""What is compared: `motion` over all horizons. Ratios, but densities differences."""
+"""What decides, the first that there is, motions over all horizons: where a robot goes is what simulators need."""
 
 Errors = Float[np.ndarray, "seeds horizons stretches"]
 
@@ -41,10 +39,9 @@ Errors = Float[np.ndarray, "seeds horizons stretches"]
 class PairedDifference:
     """Challenger against baseline by one criterion.
 
-    `value` is the ratio of root mean square errors (0.8: a fifth less), or the mean difference in nats; the interval is
-    of the same kind, None for one stretch and one seed. The challenger was better in `wins` of `runs` and, over all
-    seeds, in `ahead` of `stretches` (motions, for that score). A ratio within `MARGIN` of 1 is no
-    difference.
+    `value` is the ratio of root mean square errors (0.8: a fifth less), with its interval; None for one stretch and one
+    seed. The challenger was better in `wins` of `runs` and, over all seeds, in `ahead` of `stretches` (motions, for
+    that score). A ratio within `MARGIN` of 1 is no difference.
     """
 
     criterion: str
@@ -60,58 +57,42 @@ class PairedDifference:
     @property
     def outcome(self) -> str:
         """`better`, `worse` or `no difference`."""
-        equal = 0.0 if self.criterion == "density" else 1.0  # where both are equal
-        if self.interval is None or abs(self.value - equal) < MARGIN:
+        if self.interval is None or abs(self.value - 1.0) < MARGIN:
             return "no difference"
         low, high = self.interval
-        return "better" if high < equal else "worse" if low > equal else "no difference"
+        return "better" if high < 1.0 else "worse" if low > 1.0 else "no difference"
 
     @property
     def favours_challenger(self) -> bool:
         """Whether to take the challenger: shown to be better, or a third better in most stretches."""
-        large = self.criterion != "density" and self.value <= CLEAR and self.ahead >= MOSTLY * self.stretches
+        large = self.value <= CLEAR and self.ahead >= MOSTLY * self.stretches
         return self.outcome == "better" or (self.outcome == "no difference" and large)
 
     @property
-    def pair(self) -> str:
-        """What is compared: `a / b`, of densities `a − b`."""
-        return f"{self.challenger} {'−' if self.criterion == 'density' else '/'} {self.baseline}"
-
-    @property
-    def numbers(self) -> str:
-        """The value with its interval."""
-        form = "+.3g" if self.criterion == "density" else ".3g"
-        ends = "" if self.interval is None else " ({} to {})".format(*(f"{end:{form}}" for end in self.interval))
-        return f"{self.value:{form}}{ends}"
-
-    @property
     def sentence(self) -> str:
-        """The outcome with its numbers; what it goes by is for the reader to name."""
-        answer = {"better": "**Better**", "worse": "**Worse**", "no difference": "**No difference that the data show**"}
-        unit = " nats" if self.criterion == "density" else ""
-        how = "95 % interval" if self.interval else "one stretch and one seed, so no interval"
+        """The outcome with its numbers."""
+        answer = "no difference that the data show" if self.outcome == "no difference" else self.outcome
+        how = "one stretch and one seed, so no interval"
+        if self.interval is not None:
+            how = "95 % interval {:.3g} to {:.3g}".format(*self.interval)
         what = "motions" if self.criterion == "motion" else "held-out stretches of time"
         better = f"better in {self.wins} of {self.runs} runs and in {self.ahead} of {self.stretches} {what}"
-        return f"{answer[self.outcome]}: {self.pair} = {self.numbers}{unit}, {how}; {better}."
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values."""
-        return {**asdict(self), "verdict": self.outcome, "sentence": self.sentence}
+        ratio = f"{CRITERIA[self.criterion]}, {self.challenger} / {self.baseline} = {self.value:.3g}"
+        return f"{answer}: {ratio} ({how}); {better}."
 
 
 def paired_difference(
     criterion: str, challenger: str, baseline: str, one: Errors, other: Errors
 ) -> PairedDifference | None:
-    """Compare squared errors (nats for `density`) on the stretches of both. None without any, or with a 0."""
+    """Compare squared errors on the stretches of both. None without any, or with a 0."""
     usable = (np.isfinite(one) & np.isfinite(other)).all(axis=(0, 1))
     one, other = one[..., usable], other[..., usable]
-    nats = criterion == "density"
 
     def difference(seeds: np.ndarray, stretches: np.ndarray) -> float:
         a, b = (each[seeds][..., stretches].mean(axis=(0, 2)) for each in (one, other))
-        return float((a - b if nats else 0.5 * (np.log(a) - np.log(b))).mean())
+        return float(0.5 * (np.log(a) - np.log(b)).mean())
 
-    if not one.size or (not nats and bool((np.minimum(one, other).mean(axis=(0, 2)) <= 0.0).any())):
+    if not one.size or bool((np.minimum(one, other).mean(axis=(0, 2)) <= 0.0).any()):
         return None
     every = [np.arange(one.shape[axis]) for axis in (0, 2)]
     variances, freedoms = [], []
@@ -126,7 +107,7 @@ def paired_difference(
     value, interval = difference(*every), None
 
     def shown(log: float) -> float:
-        return log if nats else math.exp(min(log, MOST_LOG))
+        return math.exp(min(log, MOST_LOG))
 
     if freedoms:
         spread = sum(variances)
@@ -147,8 +128,6 @@ Kind = Literal["given", "identified", "residual", "black box", "force prior"]
 physics, and Gaussian processes on unknown forces.
 """
 PARAMETRIC, LEARNED = ("given", "identified"), ("force prior", "residual", "black box")
-ORDER = "motion", "force", "acceleration", "density"
-"""Criteria that decide, the first one that there is: where a robot goes is what simulators and controllers need."""
 
 
 def alike(texts: Iterable[tuple[str, Any]]) -> list[list[tuple[str, Any]]]:
@@ -160,7 +139,7 @@ def alike(texts: Iterable[tuple[str, Any]]) -> list[list[tuple[str, Any]]]:
 
 
 class Winner(NamedTuple):
-    """The model to take by one criterion, the difference that decides, and what else there is to say."""
+    """The model to take, the difference that decides, and what else there is to say."""
 
     model: str
     difference: PairedDifference | None
@@ -247,14 +226,13 @@ class Scores(Summary):
     # ------------------------------------------------------------------ which model
 
     def errors(self, criterion: str, model: str) -> dict[tuple[str, int], Float[np.ndarray, "horizons stretches"]]:
-        """Squared errors (nats for `density`) by split and seed; one horizon but for motions."""
+        """Squared errors by split and seed; one horizon but for motions."""
         out = {}
         for run in self.finished(model):
+            values = [run["stretches"]]
             if criterion == "motion":
-                values = None if run["motions"] is None else run["motions"]["squared"]
-            else:
-                values = [run["stretches"][criterion]] if criterion in run["stretches"] else None
-            array = np.array([] if values is None else values, dtype=np.float64)
+                values = [] if run["motions"] is None else run["motions"]["squared"]
+            array = np.array(values, dtype=np.float64)
             if array.size:
                 out[run["split"], run["seed"]] = array
         return out
@@ -286,44 +264,39 @@ class Scores(Summary):
                 # the median over runs of the error over stretches; of motions the geometric mean over horizons
                 means = [np.ma.masked_invalid(each).mean(axis=1).filled(np.nan) for each in errors.values()]
                 floor = np.finfo(float).tiny
-                levels = means if criterion == "density" else [np.log(np.maximum(each, floor)) for each in means]
-                level = float(np.median([each.mean() for each in levels]))
+                level = float(np.median([np.log(np.maximum(each, floor)).mean() for each in means]))
                 found.append((len(self.runs[name]) - len(errors), int(np.isnan(every).sum()), level, name))
         return min(found)[-1] if found else None
 
     @cached_property
-    def winners(self) -> dict[str, Winner]:
-        """By criterion the model to take: the best parametric one, unless another is shown to be better."""
-        out = {}
+    def winner(self) -> Winner | None:
+        """The best parametric model, unless another is shown to be better; None where no model was scored."""
         for criterion in CRITERIA:
             simple, other = (self.best_of(kinds, criterion) for kinds in (PARAMETRIC, LEARNED))
-            if simple is None or other is None:
-                if (only := simple or other) is not None:
-                    second = self.best_of((*PARAMETRIC, *LEARNED), criterion, but=only)
-                    found = None if second is None else self.difference(criterion, only, second)
-                    out[criterion] = Winner(only, found, "" if found else "no other model was scored")
-                continue
-            found = self.difference(criterion, other, simple)
-            if found is not None and found.favours_challenger:
-                sure = "" if found.outcome == "better" else "a third better or more, on too little time to be sure"
-                out[criterion] = Winner(other, found, sure)
-            else:
-                out[criterion] = Winner(simple, found, "nothing is shown to be better than the best parametric")
-        return out
+            if simple is not None and other is not None:
+                found = self.difference(criterion, other, simple)
+                if found is None or not found.favours_challenger:
+                    return Winner(simple, found, "nothing is shown to be better than the best parametric")
+                sure = found.outcome == "better"
+                return Winner(other, found, "" if sure else "a third better or more, on too little time to be sure")
+            if (only := simple or other) is not None:
+                second = self.best_of((*PARAMETRIC, *LEARNED), criterion, but=only)
+                found = None if second is None else self.difference(criterion, only, second)
+                return Winner(only, found, "" if found else "no other model was scored")
+        return None
 
     @property
     def recommended(self) -> str | None:
-        """The model to take, by motions, else forces, else accelerations; None where no model was scored."""
-        return next((self.winners[name].model for name in ORDER if name in self.winners), None)
+        """The model to take, by motions, else forces; None where no model was scored."""
+        return None if self.winner is None else self.winner.model
 
-    def fitted_on_all_rows(self, model: str | None = None) -> Posterior:
-        """The recommended model (or another one by name) from all rows. Raises FitError if there is none."""
-        name = self.recommended if model is None else self._named(model)
-        if name is None:
+    def fitted_on_all_rows(self) -> Posterior:
+        """The recommended model from all rows. Raises FitError if there is none."""
+        if self.recommended is None:
             raise FitError(f"no model was fitted: {'; '.join(self.failures)}.")
         if self.fit is None:
             raise FitError("these scores came without their models.")
-        return self.fit(name)
+        return self.fit(self.recommended)
 
     # ------------------------------------------------------------------ to show
 
@@ -361,7 +334,7 @@ class Scores(Summary):
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but the models as plain JSON values."""
-        models: dict[str, Any] = {}
+        models, taken = dict[str, Any](), self.winner
         for name, model in self.models.items():
             table = {
                 quantity: {
@@ -377,10 +350,11 @@ class Scores(Summary):
             "units": dict(self.units),
             "models": models,
             "recommended": self.recommended,
-            "winners": {
-                name: {"model": each.model, "why": each.sentence, "difference": pair and pair.to_dict()}
-                for name, each in self.winners.items()
-                for pair in [each.difference]
+            "winner": taken
+            and {
+                "model": taken.model,
+                "sentence": taken.sentence,
+                "difference": taken.difference and asdict(taken.difference),
             },
             "warnings": list(self.warnings),
             "failures": self.failures,

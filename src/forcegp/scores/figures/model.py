@@ -1,4 +1,4 @@
-"""Plots of one model on a recording (curves, normal forces), and of scores."""
+"""Plots of one model on a recording: curves, and forces of contacts."""
 
 import math
 import re
@@ -20,10 +20,7 @@ from forcegp.mechanics import Contact, Held
 from forcegp.model import Model
 from forcegp.posterior.posterior import Posterior
 from forcegp.progress import part
-from forcegp.scores.accuracy import ACCELERATION
 from forcegp.scores.figures import style
-from forcegp.scores.page import unit_of
-from forcegp.scores.scores import Scores
 
 LARGEST_GRID = 12
 BEYOND = 0.18  # part of the visited range that is drawn on either side of it
@@ -238,54 +235,3 @@ PICTURES: dict[str, tuple[Callable[[Posterior, Dataset], Figure], str]] = {
     "normal_force": (normal_force_figure, "The forces of contacts, and what sensors measured of them."),
 }
 """By name, how each is drawn, and what is to be seen."""
-
-
-COLORS = {
-    "given": (style.KNOWN_PHYSICS,),
-    "identified": (style.IDENTIFIED, "#00563F"),
-    "black box": (style.BLACK_BOX, "#7B3F67"),
-    "residual": (style.SERIES[4],),
-    "force prior": (style.PREDICTION, style.SERIES[5], "#17375E"),
-}
-"""By the kind of a model, as in all other figures; what is refined on motions is its model with dashes."""
-
-
-def scores_pictures(scores: Scores) -> list[style.Picture]:
-    """The errors of motions, where there are some."""
-    models = [name for name in scores.models if ACCELERATION in scores.quantities(name)]
-    caption = "How the error of predicted positions grows, on time that no model has seen."
-    return [style.Picture("motions", caption, motions_figure(scores, models))] if scores.horizons and models else []
-
-
-def motions_figure(scores: Scores, models: list[str]) -> Figure:
-    """RMS error of q over motions and joints against the length of the prediction: median and range over runs."""
-    figure = style.new_figure(8.2, 3.8)
-    axes = figure.subplots()
-    for name, looks in _looks(scores, models).items():
-        spreads = {h: scores.spread("rmse", f"position after {h:g} s", name) for h in scores.horizons}
-        known = {h: spread for h, spread in spreads.items() if spread is not None}
-        low, middle, high = ([spread[key] for spread in known.values()] for key in ("min", "median", "max"))
-        axes.plot(list(known), middle, label=name, **looks)
-        axes.fill_between(list(known), low, high, color=looks["color"], alpha=0.12, linewidth=0)
-    title, label = "Motions predicted from recorded states under recorded forces", unit_of(scores, "q")
-    style.quiet(axes, title=title, x="length of the prediction [s]", y=f"RMS error of q [{label}]")
-    axes.set_yscale("log")
-    style.plain_ticks(axes.yaxis)
-    figure.legend(loc="outside right upper", fontsize=style.SMALL, frameon=False)
-    return figure
-
-
-def _looks(scores: Scores, models: list[str]) -> dict[str, dict[str, Any]]:
-    """How every model is drawn: colours of its kind; earlier ones wider, so that curves which coincide are seen."""
-    bases = {name: re.sub(r"[@+]motions(:[^+]*)?$", "", name) for name in models}  # without refinement on motions
-    kinds = {base: scores.models[name]["kind"] for name, base in bases.items()}
-    named = sorted(kinds, key=lambda base: "gp:joint-friction" not in base)  # which has one colour everywhere
-    looks = {}
-    for below, (name, base) in enumerate(bases.items(), start=1 - len(models)):
-        alike = [other for other in named if kinds[other] == kinds[base]]
-        turn, place = divmod(alike.index(base), len(COLORS[kinds[base]]))
-        color, refined = COLORS[kinds[base]][place], name != base
-        looks[name] = {"color": color, "linestyle": "--" if refined else ("-", "-.", ":")[turn % 3]}
-        looks[name] |= {"linewidth": 1.2 - 0.35 * below, "marker": "o", "markersize": 3.0 - 0.5 * below}
-        looks[name] |= {"markerfacecolor": "white" if refined else color}
-    return looks

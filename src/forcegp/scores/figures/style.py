@@ -11,12 +11,9 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.text import Text
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
-from PIL import Image
 
 from forcegp.atomic_files import atomic_file
 from forcegp.data import Dataset
@@ -90,15 +87,6 @@ def legend_below(figure: FigureBase, *axes: Axes, columns: int | None = None, si
     figure.legend(loc="outside lower center", fontsize=size, frameon=False, **more)
 
 
-def plain_ticks(axis: Axis) -> None:
-    """Numbers such as 0.02 and 50 on a logarithmic axis with its final limits: at powers of ten alone if it is long."""
-    low, high = axis.get_view_interval()
-    of_decades = LogLocator(subs=(1.0, 2.0, 5.0) if high < 80.0 * low else (1.0,))
-    axis.set_major_locator(MaxNLocator(3) if high < 5.0 * low else of_decades)
-    axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-
-
 @dataclass(frozen=True, eq=False)
 class Picture:
     """A figure under the name of its file without ending, with a caption that says what is to be seen."""
@@ -109,16 +97,12 @@ class Picture:
 
     @cached_property
     def png(self) -> bytes:
-        """The figure in 256 colours of its own: a third of the bytes, and no difference to the eye."""
-        canvas, stream = self.figure.canvas, io.BytesIO()
+        """The figure as a file."""
+        stream = io.BytesIO()
         for text in self.figure.findobj(Text):
             text.set_parse_math(False)  # type: ignore[attr-defined]  # a Text; "$" in the name of a joint is no formula
         with rc_context({"text.parse_math": False}):  # of ticks that are made now
-            canvas.draw()
-        pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[attr-defined]  # every figure here has an Agg canvas
-        image = Image.fromarray(pixels[..., :3].copy())
-        few = image.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-        few.save(stream, format="png", optimize=True)
+            self.figure.savefig(stream, format="png")
         return stream.getvalue()
 
     def save(self, folder: Path) -> None:
