@@ -34,6 +34,7 @@ from forcegp.evidence import TrainingData
 from forcegp.forces import parse_forces
 from forcegp.integration import integrate, integrator_named
 from forcegp.posterior import Posterior, casadi_function
+from forcegp.posterior.rollout import accelerations
 
 RECOMMENDED = "gp:joint-friction,gp:load-friction"
 PRIORS = ("gp:joint", "gp:tool-friction", "gp:joint-friction", RECOMMENDED)
@@ -92,7 +93,7 @@ def motions(posterior: Posterior, apart: Dataset) -> dict[str, float]:
         warnings.simplefilter("ignore")  # of drawn functions some motions diverge
         drawn = seconds(lambda: predictor.rollouts(q0, v0, u, DT, functions=FUNCTIONS), 10)
     two = seconds(lambda: predictor.rollouts(q0, v0, u, DT, threads=2), 20)
-    acceleration = posterior.accelerations(posterior.model.baumgarte)
+    acceleration = accelerations(posterior, posterior.model)
     euler = integrator_named("symplectic-euler", posterior.model)
 
     def loop(q: torch.Tensor, v: torch.Tensor, forces: torch.Tensor) -> None:

@@ -22,7 +22,7 @@ from forcegp.mechanics.gauss_principle import Baumgarte, ConstrainedDynamics, Co
 from forcegp.mechanics.surfaces import Held
 from forcegp.noise import Noise
 from forcegp.robots import Kinematics, Robot
-from forcegp.robots.arguments import JointValues, Positions, is_sequence
+from forcegp.robots.arguments import JointValues, Positions, broadcast_batch, checked_tensor, is_sequence
 from forcegp.robots.mjcf import is_mjcf
 from forcegp.robots.urdf_file import read_text
 from forcegp.summary import Summary, listed
@@ -245,9 +245,17 @@ class Model(Summary):
         return self.robot.nq, self.robot.nv, len(self.inputs)
 
     def state(self, q: Tensor, v: Tensor, u: Tensor) -> State:
-        """Checked states (q, v, u), each with its own size. Raises InvalidInput."""
-        by = None if self._u_is_delivered else self._delivered
-        return State.of(self.loaded_robot, q, v, u, self.inputs, by)
+        """Checked and broadcast states (q, v, u), each with its own size.
+
+        Raises InvalidInput for wrong shapes, dtypes or devices.
+        """
+        robot, by = self.loaded_robot, None if self._u_is_delivered else self._delivered
+        q, v = robot.checked_input("q", q), robot.checked_input("v", v)
+        meaning = f"one value per input: {', '.join(self.inputs)}"
+        u = checked_tensor("u", u, len(self.inputs), meaning, robot.device) if by else robot.checked_input("u", u)
+        batch = broadcast_batch({"q": q.shape[:-1], "v": v.shape[:-1], "u": u.shape[:-1]})
+        q, v, u = (x.expand(*batch, -1) for x in (q, v, u))
+        return State(q, v, u, robot, self.inputs, by)
 
     @cached_property
     def _u_is_delivered(self) -> bool:

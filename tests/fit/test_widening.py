@@ -123,9 +123,9 @@ def test_everything_with_a_spread_is_widened_and_no_mean_moves(fitted):
     factor = posterior.widening
     assert factor > 1.0
     narrow, wide = plain.predict(*states), posterior.predict(*states)
-    for name in ("acceleration", "multiplier", "contact_force", "unknown_force"):
-        mine, theirs = getattr(wide, name), getattr(narrow, name)
-        assert torch.equal(mine.mean, theirs.mean), name
+    parts = ((p, p.multiplier, p.contact_force, p.unknown_force) for p in (wide, narrow))
+    for mine, theirs in zip(*parts, strict=True):
+        assert torch.equal(mine.mean, theirs.mean)
         torch.testing.assert_close(mine.covariance, factor**2 * theirs.covariance)
     assert torch.equal(wide.noise_covariance, narrow.noise_covariance)
     latent = posterior.latent_names[0]

@@ -108,7 +108,7 @@ def test_each_against_its_formula(make_and_formula):
     q, v, u = states(4, 6)
     expected = formula(q, v, u)
     assert_close(known(make()).dynamics(q, v, u).Q_K, expected, 1e-10)
-    assert_close(make().bound_to(chain()).force(State.of(chain(), q, v, u)), expected, 1e-10)
+    assert_close(make().bound_to(chain()).force(State(q, v, u, chain())), expected, 1e-10)
 
 
 def test_the_sum_is_what_is_listed_and_nothing_else():

@@ -190,6 +190,7 @@ def test_the_engine_follows_rows_features_and_memory(free):
     ("kind", "fine", "wrong"),
     [
         (Inducing, {"points": 1}, {"points": 0}),
+        (Inducing, {"tolerance": 0.0}, {"tolerance": -1e-9}),
     ],
     ids=str,
 )

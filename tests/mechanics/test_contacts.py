@@ -20,7 +20,7 @@ def contact(model: str, surface: str) -> Contact:
 
 
 def constraint(model: str, surface: str, baumgarte, q, v, u):
-    return contact(model, surface).constraint(State.of(robot(model), q, v, u), baumgarte)
+    return contact(model, surface).constraint(State(q, v, u, robot(model)), baumgarte)
 
 
 @pytest.mark.parametrize("surface", SURFACES)

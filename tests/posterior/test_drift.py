@@ -1,6 +1,6 @@
 """Friction that drifts: what a log tells of it, what `update` follows, and what intervals of motions count."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -126,7 +126,7 @@ def test_update_is_conditioning_on_all_rows(steady):
     _, posterior = steady
     rows = recording(9, level=0.05, seconds=4.0)
     given = replace(drift_of(posterior), rate=[0.02])
-    updated = posterior.with_settings(drift=given.to_dict()).update(rows)
+    updated = posterior.with_settings(drift=asdict(given)).update(rows)
     q, v, u = (torch.tensor(x) for x in (rows.q, rows.v, rows.u))
     coulomb = next(law for law in posterior.model.laws if isinstance(law, Coulomb))
     f = coulomb.force(posterior.model.state(q, v, u))[:, 0].numpy()

@@ -28,6 +28,7 @@ from forcegp.integration.midpoint_sensitivities import Accelerations, Linear, Wi
 from forcegp.model import Model
 from forcegp.posterior import Posterior
 from forcegp.posterior.fitted import Estimates
+from forcegp.posterior.rollout import accelerations
 from forcegp.progress import tell
 
 STEP = 0.005
@@ -88,7 +89,7 @@ class Unknowns:
     def accelerations(self, x: Tensor) -> Accelerations:
         """The mean acceleration and its derivatives, in x as well."""
         posterior, numbers, bodies = self.posterior(x), x.numpy(), self.space.bodies
-        mean, nv = posterior.accelerations(None), posterior.model.robot.nv
+        mean, nv = accelerations(posterior, replace(posterior.model, baumgarte=None)), posterior.model.robot.nv
         carriers = [each.body for each in self.space.carried]
 
         def at(q: Tensor, v: Tensor, u: Tensor, parameters: bool) -> Linear:

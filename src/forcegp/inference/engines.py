@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import torch
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, require_known, usable_arguments
+from forcegp.errors import InvalidInput, require_known, require_number, usable_arguments
 from forcegp.inference.dense_kernels import LatentKernels
 from forcegp.inference.inducing import InducingPosterior
 from forcegp.inference.likelihood import Terms
@@ -104,15 +104,20 @@ class Exact(Engine):
 
 @dataclass(frozen=True)
 class Inducing(Engine):
-    """Variational inducing points: at most `points` for each latent, fewer where they leave out little (`ENOUGH`)."""
+    """Variational inducing points: at most `points` for each latent, fewer where they leave out little.
+
+    `tolerance`: what they may leave out of the prior variance of a row in units of its noise, on average.
+    """
 
     name: ClassVar[str] = "inducing"
     remedy: ClassVar[str] = "give Inducing fewer points, or fewer rows"
     points: int = 500
+    tolerance: float = ENOUGH
 
     def __post_init__(self) -> None:
         if isinstance(self.points, bool) or not isinstance(self.points, int) or self.points < 1:
             raise InvalidInput(f"Inducing points is {self.points!r}; it must be a whole number >= 1")
+        require_number("Inducing tolerance", self.tolerance, "it must be at least 0", 0.0)
 
     @override
     def required_bytes(self, size: ProblemSize) -> int:
@@ -122,7 +127,7 @@ class Inducing(Engine):
     @override
     def condition(self, kernels: LatentKernels, terms: Terms) -> LatentPosterior:
         self.require_memory(ProblemSize.of(terms), terms.W.device)
-        return InducingPosterior.condition(kernels, terms, points=self.points, tolerance=ENOUGH)
+        return InducingPosterior.condition(kernels, terms, points=self.points, tolerance=self.tolerance)
 
 
 ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Exact, Inducing)}

@@ -19,7 +19,7 @@ from torch import Tensor
 from forcegp.errors import ContactError, InvalidInput, NumericalError, require_number
 from forcegp.mechanics.surfaces import Held, Surface, surface_from_dict, surface_to_dict
 from forcegp.robots import Kinematics, Robot
-from forcegp.robots.arguments import broadcast_batch, checked_tensor, finite_vector
+from forcegp.robots.arguments import finite_vector
 
 
 @dataclass(frozen=True)
@@ -205,26 +205,6 @@ class State:
     def delivered(self) -> Float[Tensor, "*batch nv"]:
         """Joint forces of the actuators, thrusters included, in Nm or N."""
         return self.u if self.delivered_by is None else self.delivered_by(self)
-
-    @classmethod
-    def of(
-        cls,
-        robot: Robot,
-        q: Tensor,
-        v: Tensor,
-        u: Tensor,
-        inputs: tuple[str, ...] = (),
-        delivered_by: "Callable[[State], Tensor] | None" = None,
-    ) -> "State":
-        """Checked and broadcast. Raises InvalidInput for wrong shapes, dtypes or devices."""
-        q, v = (robot.checked_input(name, value) for name, value in (("q", q), ("v", v)))
-        if delivered_by is None:
-            u = robot.checked_input("u", u)
-        else:
-            u = checked_tensor("u", u, len(inputs), f"one value per input: {', '.join(inputs)}", robot.device)
-        batch = broadcast_batch({"q": q.shape[:-1], "v": v.shape[:-1], "u": u.shape[:-1]})
-        q, v, u = (value.expand(*batch, -1) for value in (q, v, u))
-        return cls(q, v, u, robot, inputs, delivered_by)
 
 
 REDUNDANCY_TOLERANCE = 1e-9

@@ -73,10 +73,6 @@ class Drift:
     here: Literal["unknown", "fit", "another"] = "unknown"
     """The record whose motions are predicted; `update` tells it."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain JSON values."""
-        return asdict(self)
-
     def goes_on(self, begins: float) -> bool:
         """Whether rows that begin at this time are of the record of the last row."""
         return self.until < begins < self.until + self.seconds
@@ -149,7 +145,7 @@ def with_drift(posterior: Posterior, log: Dataset) -> Posterior:
     arrays = {"rate": rate, "noise": noise, "between": between, "level": 0.0 * rate, "bias": bias, "std": between}
     lists: dict[str, Any] = {name: values.tolist() for name, values in arrays.items()}
     drift = Drift(**lists, records=len(log.episodes), seconds=lasting, until=until)
-    return posterior.with_settings(drift=drift.to_dict())
+    return posterior.with_settings(drift=asdict(drift))
 
 
 def restricted_likelihood(y: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]) -> tuple[float, float]:
@@ -249,7 +245,7 @@ def followed(posterior: Posterior, rows: Dataset) -> Posterior:
     drift = replace(drift, level=level.tolist(), std=std.tolist(), until=until, here=here)
     louder = scaled(posterior.model, torch.as_tensor(1.0 + moved))
     there = replace(posterior, target=louder, estimates=_moved(posterior, moved, std))
-    return there.with_settings(drift=drift.to_dict())
+    return there.with_settings(drift=asdict(drift))
 
 
 def _moved(posterior: Posterior, d: np.ndarray, std: np.ndarray) -> Any:

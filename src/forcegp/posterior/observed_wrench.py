@@ -103,7 +103,7 @@ def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
     if "air" not in posterior.settings or target.known.to_dict() != unobserved(own).known.to_dict():
         raise InvalidInput(
             "the posterior was carried to another system than the one that its rows were measured on; update it "
-            "before it is carried there: posterior.update(rows).with_system(system)."
+            "before it is carried there: posterior.update(rows).with_model(model)."
         )
     return in_own_air(posterior, rows)
 

@@ -48,7 +48,6 @@ from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.preparation import prepared_predictor, rows_for
 from forcegp.posterior.programs import Physics, Programs
 from forcegp.posterior.rollout import (
-    AccelerationFunction,
     Rollout,
     accelerations,
     checked_start,
@@ -274,10 +273,6 @@ class Posterior(Fitted):
             mean = run(0, "rollouts")
             drawn = run(samples, "sampled rollouts") if samples else None
         return replace(mean, samples=drawn, intervals=self.motion_intervals)
-
-    def accelerations(self, baumgarte: Baumgarte | None, samples: int = 0, seed: int = 0) -> AccelerationFunction:
-        """(q, v, u) -> a of n rows, as `rollout` integrates it: the mean, or drawn functions, n / samples each."""
-        return accelerations(self, replace(self.model, baumgarte=baumgarte), samples, seed)
 
     def update(self, rows: Dataset) -> "Posterior":
         """A new posterior that has learned from more rows, too; this one stays as it is.

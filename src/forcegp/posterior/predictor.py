@@ -14,7 +14,6 @@ from typing_extensions import override
 
 from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, as_plain, require_plain
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
-from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.integration.integrators import Trajectory, check_time_step, integrator_named, rows_jacobian
 from forcegp.posterior.prediction import Gaussian, JointForces, Linearization, forces_around, inverse_dynamics
@@ -22,6 +21,7 @@ from forcegp.posterior.programs import Programs, steps_of
 from forcegp.posterior.rollout import (
     AccelerationFunction,
     StepLinearization,
+    accelerations,
     checked_start,
     linearized_on_manifold,
     linearized_step,
@@ -73,18 +73,13 @@ class Predictor(Summary):
     @cached_property
     def by_torch(self) -> AccelerationFunction:
         """The mean acceleration of rows."""
-        return self.posterior.accelerations(self.posterior.model.baumgarte)
+        return accelerations(self.posterior, self.posterior.model)
 
     @override
     def facts(self) -> dict[str, object]:
         """What it predicts, and how long preparing took."""
         covariance = {"joints": self.nv, "covariance": self.kind, "device": self.device}
         return {**covariance, "prepared in": f"{self.prepare_seconds:.2g} s"}
-
-    @property
-    def latent(self) -> LatentPosterior:
-        """The posterior of the latent functions."""
-        return self.posterior.latent
 
     @property
     def nv(self) -> int:
@@ -204,7 +199,7 @@ class Predictor(Summary):
         if functions:
 
             def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:  # drawn when a motion is left to torch
-                return self.posterior.accelerations(self.posterior.model.baumgarte, functions, seed)(q, v, u)
+                return accelerations(self.posterior, self.posterior.model, functions, seed)(q, v, u)
 
             start, v, forces = start.repeat(functions, 1), v.repeat(functions, 1), forces.repeat(1, functions, 1)
             batch = (functions, *batch)
