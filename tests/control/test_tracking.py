@@ -9,7 +9,7 @@ import torch
 from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import ComputedTorque, HybridForce, Model, Robot, Viscous, fit
-from forcegp.errors import ContactError, ContactWarning, InvalidInput, NumericalError
+from forcegp.errors import ContactError, InvalidInput, NumericalError
 from forcegp.forces import Actuation, ContactFriction, Coulomb, JointForces, JointFriction, RigidBodies
 from forcegp.inference import OptimizerOptions
 
@@ -151,8 +151,9 @@ def test_a_force_is_asked_for_only_at_the_surface(touching):
     HybridForce(predictor, tolerance=1.01 * abs(away), **GAINS, torque_limits=1e6)(lifted, v, q, v, *rest)
     with pytest.raises(ContactError):
         HybridForce(predictor, tolerance=0.99 * abs(away), **GAINS, torque_limits=1e6)(lifted, v, q, v, *rest)
-    with pytest.warns(ContactWarning, match="1 of 1 states are up to"):
-        touching.predict(lifted, v, on)
+    predicted = touching.predict(lifted, v, on)
+    assert float(predicted.off) == pytest.approx(away, rel=1e-6)
+    assert f"by up to {abs(away):.3g} m" in str(predicted)
 
 
 def test_friction_that_remembers_is_that_of_the_positions_seen(touching):

@@ -363,7 +363,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         _shown,
         given=lambda: {"models": INPUTS.posterior, "log": INPUTS.data, "horizons": (0.01,), "starts": 1},
     ),
-    "check": _call(forcegp.check, None, "model preparation", lambda: {"dataset": INPUTS.free}),
+    "check": _call(forcegp.check, None, "model", lambda: {"dataset": INPUTS.free}),
     "Torques": _call(forcegp.Torques, names="noisy mean"),
     "Motions": _call(forcegp.Motions, names="seconds bodies"),
     "split_named": (forcegp.scores.split_named, lambda: {"dataset": INPUTS.free, "text": "blocks:5:3", "guard": 0.01}),

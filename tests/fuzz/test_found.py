@@ -180,7 +180,6 @@ WRONG = {
     "Payload": {"mass": np.ones(3)},
     "parse_forces": {"expression": 5},
     "Preparation": {"trim": 10**30, "delay": 10**30},
-    "check": {"preparation": np.ones(3)},
     "split_named": {"guard": {}},
     "ColumnMapping": {"unit": 5},
     "ColumnMapping ": {"q": torch.zeros(3).to_sparse()},

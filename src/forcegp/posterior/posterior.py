@@ -14,8 +14,7 @@ from torch import Tensor
 from forcegp.data import Dataset, with_memory
 from forcegp.data.dataset import FORCE as OF_SENSOR
 from forcegp.data.dataset import require_rows
-from forcegp.errors import ContactWarning, DataWarning, InvalidInput, NumericalError, require_type, usable_arguments
-from forcegp.evidence.likelihood import FAR_FROM_SURFACE
+from forcegp.errors import DataWarning, InvalidInput, NumericalError, require_type, usable_arguments
 from forcegp.forces import Force
 from forcegp.inference.memory import blas_threads
 from forcegp.inference.prepared_kernels import CompressedCovariance
@@ -130,7 +129,6 @@ class Posterior(Fitted):
         if self.is_black_box:  # its functions hold what contacts do, so forces are not those of anything
             return Prediction(predicted.mean, predicted.covariance, None, None, None, noise)
         multiplier = through(dynamics.multiplier_map())
-        _warn_off_surfaces(dynamics)
         return Prediction(
             predicted.mean,
             predicted.covariance,
@@ -139,6 +137,7 @@ class Posterior(Fitted):
             unknown_force=learned,
             noise_covariance=noise,
             frames=tuple(contact.frame for contact in self.model.contacts),
+            off=dynamics.off(),
             unseen=self._unseen(multiplier, dynamics) if covariance else None,
         )
 
@@ -368,20 +367,3 @@ def _has_its_place(force: Force, model: Model) -> bool:
 def _noise_covariance(parameters: Mapping[str, Tensor], dynamics: ConstrainedDynamics) -> Tensor:
     noise = Noise.covariance(parameters, dynamics.H)
     return torch.diag_embed(noise).expand_as(dynamics.H) if noise.dim() == 2 else noise
-
-
-def _warn_off_surfaces(dynamics: ConstrainedDynamics) -> None:
-    """No warning while torch transforms or records the function, where no value may decide anything."""
-    if torch._C._are_functorch_transforms_active() or not dynamics.A.shape[-2]:
-        return
-    away = (dynamics.off() * dynamics.A.detach().any(dim=-1)).detach().abs()  # a switch that is off constrains nothing
-    if away.is_meta or not bool((away > FAR_FROM_SURFACE).any()):
-        return
-    contact = int(away.amax(0).argmax())
-    warnings.warn(
-        f"{int((away > FAR_FROM_SURFACE).any(-1).sum())} of {len(away)} states are up to {float(away.max()):.3g} m off "
-        f"the surface of contact {contact} (frame {dynamics.contacts[contact].frame!r}), and are predicted as if they "
-        "touched it; predict states in the air by posterior.with_contacts([]).",
-        ContactWarning,
-        stacklevel=5,
-    )

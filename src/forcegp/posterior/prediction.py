@@ -11,6 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, NumericalError, require_known
+from forcegp.evidence.likelihood import FAR_FROM_SURFACE
 from forcegp.forces import Actuation, UnknownForces
 from forcegp.integration.integrators import find_roots, rows_jacobian
 from forcegp.mechanics import ConstrainedDynamics
@@ -91,6 +92,8 @@ class Prediction(Gaussian):
     noise_covariance: Float[Tensor, "*batch nv nv"]
     frames: tuple[str, ...] = ()
     """Where each contact is."""
+    off: Float[Tensor, "*batch m"] | None = None
+    """How far the point of each contact is off its surface [m]: the model holds it there all the same."""
     unseen: Float[Tensor, "*batch m"] | None = None
     """Share of the variance of each multiplier that is a prior on what the log did not show, 0 to 1."""
 
@@ -107,9 +110,16 @@ class Prediction(Gaussian):
         """Of the acceleration, and which forces there are."""
         forces = [name for name in ("multiplier", "contact_force", "unknown_force") if getattr(self, name) is not None]
         facts = {**super().facts(), "forces": listed(forces)}
-        if self.unseen is not None and self.unseen.numel() and bool((self.unseen > 0.0).any()):
+        if self.off is not None and not self.off.is_meta and bool((self.off.abs() > FAR_FROM_SURFACE).any()):
+            facts["off a surface"] = f"by up to {float(self.off.abs().max()):.3g} m"
+        if self.unseen is not None and not self.unseen.is_meta and bool(self.unseen.any()):
             facts["variance of contact forces not seen by the log"] = f"{float(self.unseen.mean()):.0%}"
         return facts
+
+    @property
+    def acceleration(self) -> Gaussian:
+        """`mean` and `covariance` under their full name."""
+        return Gaussian(self.mean, self.covariance)
 
     @property
     def measurement(self) -> Gaussian:
