@@ -81,7 +81,8 @@ class Contact:
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> "Contact":
         """What `to_dict` gave. Raises FileFormatError, InvalidInput, KeyError or TypeError for anything else."""
-        return cls(**{**stored, "surface": surface_from_dict(stored["surface"])})
+        given: dict[str, Any] = {**stored, "surface": surface_from_dict(stored["surface"])}
+        return cls(**given)
 
     def check(self, robot: Robot) -> None:
         """Raise UnknownName for a frame that is not there, ContactError where the contact constrains nothing."""
