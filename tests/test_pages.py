@@ -20,12 +20,7 @@ from forcegp.scores.models import candidates, usual_identification
 
 def test_the_page_on_ones_own_robot_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "your-robot.md").read_text(encoding="utf-8")
-    example, loop = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    acceleration, force = (
-        [float(x) for x in re.findall(r"-?\d[\d.e+-]*", line)] for line in run_example(loop, tmp_path).splitlines()
-    )
-    assert abs(force[1]) < 1e-9 < abs(force[0])
-    assert len(acceleration) == 3
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     printed = run_example(example, tmp_path)
     noise, error, *_, any_force, friction = printed.splitlines()
     assert f"{float(any_force):.2f} and {float(friction):.2f}" == "0.80 and 0.10"  # the comment on the page
