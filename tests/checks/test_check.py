@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import brentq
-from tests.checks.logs import RATE, arm, clean, column, pendulum
+from tests.checks.logs import PENDULUM, RATE, arm, clean, column, pendulum
 from tests.robots.robot_models import with_link
 
 from forcegp.checks import CheckReport, check, without_stops
@@ -190,16 +190,13 @@ def test_a_model_whose_friction_remembers_is_compared_as_if_its_joints_had_slid_
     assert reports[0].to_dict() == reports[1].to_dict()
 
 
-PENDULUM = """<robot name="e"><link name="b"/><link name="l"><inertial><origin xyz="0 0 -.2"/><mass value="3"/>
-<inertia ixx=".02" iyy=".02" izz=".004" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="j" type="revolute">
-<parent link="b"/><child link="l"/><axis xyz="0 1 0"/><limit lower="-9" upper="9" effort="99" velocity="99"/></joint>
-</robot>"""
-
-
-@pytest.mark.parametrize("stiffness", [400.0, 4e4])
+@pytest.mark.parametrize("stiffness", [300.0, 4e4])
 def test_a_chirp_across_the_resonance_of_a_gear_is_named(stiffness):
     """Two masses, an encoder at the link, friction at the motor, by small steps; the stiff one is as good as rigid."""
-    rng, dt, rotor, link, seconds = np.random.default_rng(0), 2.5e-4, 0.08, 0.14, 16.0
+    robot = Robot.from_urdf_text(PENDULUM, locked={"elbow": 0.0})
+    link = float(robot.mass_matrix(torch.zeros(1).double()))
+    weight = float(robot.gravity_forces(torch.full((1,), np.pi / 2).double()))
+    rng, dt, rotor, seconds = np.random.default_rng(0), 2.5e-4, 0.08, 16.0
     q = v = motor = speed = 0.0
     rows = []
     for k in range(int(seconds / dt)):
@@ -208,16 +205,15 @@ def test_a_chirp_across_the_resonance_of_a_gear_is_named(stiffness):
         if k % 10 == 0:
             rows.append((t, q + 2e-5 * rng.standard_normal(), u + 0.02 * rng.standard_normal()))
         spring = stiffness * (motor - q) + 0.3 * (speed - v)
-        v += dt * (spring - 3.0 * 9.81 * 0.2 * np.sin(q) - 0.05 * v) / link
+        v += dt * (spring - weight * np.sin(q) - 0.05 * v) / link
         speed += dt * (u - spring - 0.3 * np.tanh(speed / 0.01)) / rotor
         q, motor = q + dt * v, motor + dt * speed
     time, q, u = np.array(rows).T
     v = np.gradient(q, time)
-    model = Model(Robot.from_urdf_text(PENDULUM))
     columns = {"q": q, "v": v, "a": np.gradient(v, time), "u": u}
-    found = check(Dataset(**{name: x[:, None] for name, x in columns.items()}, time=time, model=model)).doubts
+    found = check(Dataset(**{name: x[:, None] for name, x in columns.items()}, time=time, model=Model(robot))).doubts
     resonance = np.sqrt(stiffness * (1.0 / rotor + 1.0 / link)) / (2.0 * np.pi)
     if stiffness > 1e4:
         assert not found.of("elastic joint")
     else:  # below it, since a rotor nobody states is taken for friction
-        assert 0.7 * resonance < found.of("elastic joint")[0].numbers["resonance"]["j"] < 1.1 * resonance
+        assert 0.7 * resonance < found.of("elastic joint")[0].numbers["resonance"]["shoulder"] < 1.1 * resonance

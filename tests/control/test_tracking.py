@@ -166,7 +166,6 @@ def test_friction_that_remembers_is_that_of_the_positions_seen(touching):
         u = control(q + back, v, q + back, v, np.zeros(3), [7.0])
     z = np.sign(step) * (1.0 - np.exp(-200.0 * 1e-3 * np.array([1.0, 2.0, 0.5])))  # forth, from 0
     z = -np.sign(step) + (z + np.sign(step)) * np.exp(-200.0 * abs(step))  # and back
-    a = np.zeros(3)
     at = posterior.model.dynamics(*(torch.tensor(x) for x in (q + step, v)), torch.zeros(6).double())
     M, A, b = (x.numpy() for x in (at.M, at.A, at.b))
     inverse = np.linalg.inv(M)
