@@ -136,6 +136,8 @@ STEP = 1e-4
 """Of a length, for its derivative."""
 WRONG = 0.03
 """Logarithm of the largest factor below which a cause is not worth a word."""
+NO_STEP = 0.8
+"""Logarithm of a factor from which on one linear step tells nothing of it."""
 
 
 def misfit(
@@ -172,7 +174,7 @@ def misfit(
         own = C.T @ C - across.T @ inverse @ across
         change = -np.linalg.solve(own + np.eye(C.shape[1]) / usual**2, C.T @ white)
         more, off, factors = -0.5 * float(white @ C @ change), abs(change) > WRONG, np.exp(change)
-        if more > best and off.any():
+        if more > best and off.any() and abs(change).max() < NO_STEP:
             told = ", ".join(f"{names[k]} {factors[k]:.3g}" for k in np.flatnonzero(off))
             doubt = look(
                 about="payload",
