@@ -58,8 +58,10 @@ def elastic_doubts(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
     With a gear of stiffness k between rotor J and link, u = tau + J a + (J / k) tau'' where the encoder is at the link
     (Spong 1987, J. Dyn. Sys. Meas. Control 109).
     """
-    if inputs.compared is None or len(inputs.compared) < FEWEST_ROWS:
+    if inputs.compared is None or not inputs.compared.time_ordered:
         return
+    if np.unique(inputs.compared.episode, return_counts=True)[1].min() < FEWEST_ROWS:
+        return  # too short to be differentiated
     log = replace(log, rows=log.changed(inputs.compared))
     rows, found = log.rows, dict[str, float]()
     slopes, bends = np.zeros_like(log.tau), np.zeros_like(log.tau)

@@ -50,6 +50,8 @@ class Controller:
 
     def restart(self) -> None:
         """Forget earlier calls."""
+        if past := vars(self).get("past"):
+            past.forget()
         self.last = torch.zeros(self.robot.nv, dtype=torch.float64)
         self.saturated: Bool[Tensor, " nv"] = torch.zeros(self.robot.nv, dtype=torch.bool)
 
@@ -182,6 +184,10 @@ class Past:
 
     def __init__(self, model: Model, least: float = 0.0) -> None:
         self.memory, self.column, self.least = model.memory, model.memory_column, least
+        self.forget()
+
+    def forget(self) -> None:
+        """Nothing was seen."""
         self.z = torch.zeros(len(self.memory.names), dtype=torch.float64)
         self._last: Tensor | None = None
 
@@ -267,7 +273,8 @@ class HybridForce(TrackingController):
         self._free: ComputedTorque | None = None
         if off_surface == "release":
             free = predictor.posterior.with_contacts([]).predictor(covariance="none")
-            self._free = ComputedTorque(free, position_noise=position_noise, **settings)
+            self._free = ComputedTorque(free, **settings)
+            self._free.past = self.past
 
     @override
     def __call__(self, q: Any, v: Any, q_d: Any, v_d: Any, a_d: Any, normal_force: Any = None) -> Float[Tensor, " nv"]:
@@ -288,8 +295,6 @@ class HybridForce(TrackingController):
     @override
     def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
         self.past.see(q)
-        if self._free is not None:
-            self._free.past.see(q)
         at = joint_forces(self.predictor, q, v_d, self.last, self.past)
         far = float(at.off.abs().max())
         self.released = far > self.tolerance
@@ -305,8 +310,7 @@ class HybridForce(TrackingController):
         a = free + towards @ torch.linalg.lstsq(at.A @ towards, at.b - at.A @ free, driver="gelsd").solution
         u = torques_for(self.predictor, q, v_d, at.M @ a - at.A.mT @ self.wanted, self.last, at, self.past)
         # where that finds none with shorter steps, or its error
-        found = self.predictor.inverse_dynamics
-        return found(q, v_d, a, self.wanted, self.past.z).mean if u is None else u
+        return self.predictor.inverse_dynamics(q, v_d, a, self.wanted, self.past.z).mean if u is None else u
 
 
 LOOKED_AT, SLOPE, SLOW = 50, 1e-4, 1.0

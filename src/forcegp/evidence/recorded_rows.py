@@ -37,7 +37,7 @@ def motion_residuals(
 ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv"]]:
     """Residuals of joint forces, Q_K - M a (Nm or N), and of accelerations, measured less predicted.
 
-    Forces of feet that stand and of loops are left out, where no sensor measured them; those of contacts that slide are
+    Forces of feet that stand are left out, where no sensor measured them; those of contacts that slide are
     not. Under friction that grows with |u| the force is what u exceeds the u by that the model needs.
     """
     dataset = with_memory(require_type("dataset", dataset, Dataset), model)

@@ -100,7 +100,7 @@ def changes_without_rests(
     x: Float[np.ndarray, " k"],
     rests: Sequence[np.ndarray],
 ) -> Float[np.ndarray, "rests k"]:
-    """What leads from x to the end of a search without each of the rests, whose numbers of equations are given.
+    """What leads from x to the end of a search without each of the rests, whose numbers of rows are given.
 
     Levels of noise are found anew in each, since those of few rests are as unsure as the numbers: with the levels of
     all rests, intervals of four postures held half of the loads.
@@ -111,7 +111,7 @@ def changes_without_rests(
         def others(x: np.ndarray, at: np.ndarray = at) -> tuple[np.ndarray, np.ndarray]:
             r, jacobian = residual(x)
             kept = np.ones(len(r), dtype=bool)
-            kept[at // r.shape[1]] = False
+            kept[at] = False
             return r[kept], np.asarray(jacobian)[kept]
 
         other, size = search(others, start=x).x, space.bodies.size

@@ -151,21 +151,21 @@ class Equations:
 
     @cached_property
     def rests(self) -> list[np.ndarray]:
-        """Numbers of equations by rest of logs of postures: friction holds the same share as long as a joint stands."""
-        nv, found = self.a.shape[1], [rests_alone(log) for log in self.logs]
+        """Numbers of rows by rest of logs of postures: friction holds the same share as long as a joint stands."""
+        found = [rests_alone(log) for log in self.logs]
         found = [postures(log) if each is None else each for each, log in zip(found, self.logs, strict=True)]
         if any(each is None or each.max() >= STRETCHES for each in found):
             return []
         label = np.concatenate([each + STRETCHES * k for k, each in enumerate(found) if each is not None])
         label = label if self.windows is None else label[self.windows.starts]
-        return [(nv * np.flatnonzero(label == each)[:, None] + np.arange(nv)).ravel() for each in np.unique(label)]
+        return [np.flatnonzero(label == each) for each in np.unique(label)]
 
     def stretches(self) -> list[np.ndarray]:
-        """Numbers of equations by stretch of time, some of each log in every one; of postures each is one."""
+        """Numbers of rows by stretch of time, some of each log in every one; of postures each is one."""
         if self.rests:
             return self.rests
         lengths = [len(log) for log in self.logs] if self.windows is None else self.windows.lengths
-        nv, starts = self.a.shape[1], np.concatenate([[0], np.cumsum(lengths)])
+        starts = np.concatenate([[0], np.cumsum(lengths)])
         numbers = []
         for log, start, length in zip(self.logs, starts, lengths, strict=False):
             order = np.arange(length)
@@ -173,7 +173,7 @@ class Equations:
                 order = np.lexsort((log.time, log.episode))
             numbers.append(np.array_split(start + order, min(STRETCHES, sum(lengths))))
         rows = [np.concatenate(each) for each in zip(*numbers, strict=True)]
-        return [(nv * each[:, None] + np.arange(nv)).ravel() for each in rows if len(each)]
+        return [each for each in rows if len(each)]
 
 
 class WindowMeans:
@@ -338,6 +338,7 @@ def _estimates(
 ) -> Estimates:
     """The numbers at the end of the search."""
     white = np.concatenate([fit.white_jacobian, fit.white[..., None]], axis=-1)
+    each = np.arange(white.shape[1])  # equations of a row: of joints, and of sensors
     prior = space.prior(fit.x)[1]
     by_body = None
     everything = len(space.carried) == len(space.own) and all(each.payload is None for each in space.carried)
@@ -348,7 +349,7 @@ def _estimates(
         space.numbers(fit.x),
         space.number_slopes(fit.x),
         white.reshape(-1, white.shape[-1]),
-        equations.stretches(),
+        [(len(each) * rows[:, None] + each).ravel() for rows in equations.stretches()],
         prior,
         changes,
         move,

@@ -108,7 +108,8 @@ def on_all_rows(fitted: Posterior, rows: Dataset, engine: Engine | None, describ
         settings = {**fitted.settings, **described, "learning_points": len(reference.q)}
         settings |= {"engine": choice.engine.to_dict(), "engine_reason": choice.reason}
         posterior = replace(fitted, likelihood=likelihood, settings=settings, latent=latent, engine=choice.engine)
-    if isinstance(latent, InducingPosterior) and latent.left_out > ENOUGH:
+    asked = max(ENOUGH, engine.tolerance if isinstance(engine, Inducing) else 0.0)
+    if isinstance(latent, InducingPosterior) and latent.left_out > asked:
         warnings.warn(
             f"{sum(map(len, latent.features))} inducing points leave out {latent.left_out:.2g} of the noise variance "
             "of a row, so that the posterior is an approximation with wider intervals than the exact one; give more "

@@ -1,5 +1,6 @@
 """The search of every fit: several seeded starts, the best is kept; and how much wider intervals have to be."""
 
+import contextlib
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -299,9 +300,8 @@ LARGEST_STEP = 2.0
 """Most that a parameter is moved by, on its log scale: the spread of the widest prior on one."""
 
 PROBES, SMALL_STEP = 8, 1e-2
-"""Directions, and the step along each, whose change of the gradient gives the diagonal of the Hessian.
-
-Neighbours, which are the parameters of one kernel, do not mix."""
+"""Directions, and the step along each, whose change of the gradient gives the diagonal of the Hessian: neighbours, as
+parameters of one kernel are, do not mix."""
 
 PAIRS = 4
 """Of opposite moves of all hyper-parameters."""
@@ -366,35 +366,37 @@ class _States:
         _, fixed = likelihood.split_noise
         free = {name: value.detach() for name, value in posterior.hyperparameters.items() if name not in fixed}
         objective = FitObjective(likelihood, kernels, likelihood.noise, fixed)
-        count = sum(x.numel() for x in free.values())
-        probes = np.tile(hadamard(PROBES), count // PROBES + 1)[:, :count]
-        draws = np.random.default_rng(0).choice((-1.0, 1.0), (PAIRS, count))
+        start = torch.cat([x.reshape(-1) for x in free.values()])
 
-        def shaped(signs: np.ndarray) -> dict[str, Tensor]:
-            parts = torch.tensor(signs).to(self.W).split([x.numel() for x in free.values()])
-            return {name: part.reshape(x.shape) for (name, x), part in zip(free.items(), parts, strict=True)}
+        def named(x: Tensor) -> dict[str, Tensor]:
+            parts = zip(free.items(), x.split([each.numel() for each in free.values()]), strict=True)
+            return {name: part.reshape(like.shape) for (name, like), part in parts}
 
-        value, here = _with_gradient(objective, free)
-        curvature = {name: torch.zeros_like(x) for name, x in free.items()}
-        for sign in map(shaped, probes.astype(float)):
-            _, ahead = _with_gradient(objective, _moved(free, sign, SMALL_STEP))
-            for name, total in curvature.items():
-                total += sign[name] * (ahead[name] - here[name]) / (SMALL_STEP * PROBES)
-        spread = {name: each.clamp_min(LARGEST_STEP**-2) ** -0.5 for name, each in curvature.items()}
-        told = 0.5 * sum(float((curvature[name].clamp_min(0.0) * spread[name].square()).sum()) for name in free)
+        def with_gradient(x: Tensor) -> tuple[float, Tensor]:
+            with torch.enable_grad():
+                value = objective(named(x := x.clone().requires_grad_()))
+                return float(value.detach()), torch.autograd.grad(value, x)[0]
+
+        value, here = with_gradient(start)
+        curvature = torch.zeros_like(start)
+        for sign in np.tile(hadamard(PROBES), len(start) // PROBES + 1)[:, : len(start)]:
+            along = torch.tensor(sign).to(start)
+            with contextlib.suppress(NumericalError):  # at the edge of what can be computed: not known to be steep
+                curvature += along * (with_gradient(start + SMALL_STEP * along)[1] - here) / (SMALL_STEP * PROBES)
+        spread = curvature.clamp_min(LARGEST_STEP**-2) ** -0.5
+        told = 0.5 * float((curvature.clamp_min(0.0) * spread.square()).sum())
         usual = told + RARE * math.sqrt(told)  # what draws of a normal posterior lose: Gamma(n / 2)
         mean, variance = self._without_own(posterior.latent)
         more, scratch = [], kernels.at(free)
-        for step in ({name: sign[name] * spread[name] for name in free} for sign in map(shaped, draws)):
-            for side in (1.0, -1.0):
-                moved = _moved(free, step, side)
-                try:
-                    lost = float(objective(moved)) - value
-                    at = scratch.moved_to(moved | fixed)
-                    other = self._without_own(likelihood.condition(at, moved | fixed, at_parameters=True))
-                except (NumericalError, torch.linalg.LinAlgError):
-                    continue  # no posterior there: nothing that the data leave open
-                more.append(((other[0] - mean).square() + other[1] - variance) * (usual / max(lost, usual)))
+        draws = np.random.default_rng(0).choice((-1.0, 1.0), (PAIRS, len(start)))
+        for sign in (side * each for each in draws for side in (1.0, -1.0)):
+            moved = named(start + torch.tensor(sign).to(start) * spread)
+            try:
+                lost, at = float(objective(moved)) - value, scratch.moved_to(moved | fixed)
+                other = self._without_own(likelihood.condition(at, moved | fixed, at_parameters=True))
+            except (NumericalError, torch.linalg.LinAlgError):
+                continue  # no posterior there: nothing that the data leave open
+            more.append(((other[0] - mean).square() + other[1] - variance) * (usual / max(lost, usual, 1e-300)))
         open_ones = variance > NEGLIGIBLE**2 * variance.max()
         if not more or not bool(open_ones.any()):
             return 1.0
@@ -420,14 +422,3 @@ class _States:
         f = latent.mean(self.features) - (gain @ alpha[..., None])[..., 0]
         covariance = self.W @ (S + gain @ C @ S) @ self.W.mT
         return (self.W @ f[..., None])[..., 0], covariance.diagonal(dim1=-2, dim2=-1)
-
-
-def _with_gradient(objective: FitObjective, at: Mapping[str, Tensor]) -> tuple[float, dict[str, Tensor]]:
-    with torch.enable_grad():
-        free = {name: value.clone().requires_grad_() for name, value in at.items()}
-        value = objective(free)
-        return float(value.detach()), dict(zip(free, torch.autograd.grad(value, list(free.values())), strict=True))
-
-
-def _moved(parameters: Mapping[str, Tensor], by: Mapping[str, Tensor], times: float) -> dict[str, Tensor]:
-    return {name: value + times * by[name] for name, value in parameters.items()}

@@ -265,7 +265,10 @@ class ConstrainedDynamics:
 
     def off(self) -> Float[Tensor, "*batch m"]:
         """How far the points of the contacts are off their surfaces, in m."""
-        found = [each.off(self.state.kinematics) for each in self.contacts]
+        state, found = self.state, list[Tensor]()
+        for each in self.contacts:  # 0 where a switch lets it go
+            acts = 1.0 if each.switch is None else (state.u[..., state.inputs.index(each.switch)] > 0.5).to(self.b)
+            found.append(acts * each.off(state.kinematics))
         return torch.stack(found, dim=-1) if found else self.b
 
     def acceleration_map(self) -> AffineMap:

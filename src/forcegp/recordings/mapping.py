@@ -213,7 +213,8 @@ def by_quantity(flag: str, text: str) -> dict[str, tuple[str, ...]]:
     """`q=deg,m,time=ms` as {"q": ("deg", "m"), "time": ("ms",)}: what follows a name up to the next is its list."""
     found: dict[str, tuple[str, ...]] = {}
     name = None
-    for part in re.sub(r"imu:[^=]*=", lambda own: own[0].replace(",", ";"), text).split(","):  # a place has commas
+    placed = re.sub(r"(?<![^,])imu:[^=]*=", lambda own: own[0].replace(",", ";"), text)  # a place has commas
+    for part in placed.split(","):
         before, equals, after = part.partition("=")
         if equals:
             name, part = before.strip().replace(";", ","), after

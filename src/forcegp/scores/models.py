@@ -365,4 +365,4 @@ def identified_model(name: str, model: Model, rows: Dataset) -> Model:
     """The model that laws and bodies of this name make of these rows, with the noise of rows that are held out."""
     opened, evidence = checked_identification(name, model)
     found: Any = fit(opened, rows, evidence)
-    return replace(found.model, noise=held_out_noise(opened, rows, evidence))
+    return replace(found.model, noise=held_out_noise(opened, replace(rows, measured={}), evidence))

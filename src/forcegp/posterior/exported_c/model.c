@@ -67,7 +67,7 @@ int @NAME@_mean_covariance(const double q[@NQ@], const double v[@NV@], const dou
 int @NAME@_inverse_dynamics(const double q[@NQ@], const double v[@NV@], const double a[@NV@],
                           const double *normal_force, const double *memory, double u[@NV@]) {
   enum {N = @NV@, NU = @NU@, K = @MEMORY@, AT = @COLUMN@, M = @CONTACTS@, ROUNDS = 60};
-  double x[@ALL@], y[N + N * NU + N * N + M * N + M], wanted[N], J[N][N + 1], most = 0.0, before = HUGE_VAL, w = 1.0;
+  double x[@ALL@], y[N + N * NU + N * N + M * N + 2 * M], wanted[N], J[N][N + 1], most = 0.0, before = HUGE_VAL, w = 1.0;
   const double *Q = y, *slope = y + N, *mass = slope + N * NU, *A = mass + N * N;
   int found = stored(q, x, @NQ@) | stored(v, x + @NQ@, N) | stored(a, wanted, N);
   (void)A; (void)normal_force; (void)memory;
@@ -123,7 +123,7 @@ int @NAME@_monitor_step(@NAME@_monitor_state *state, const double q[@NQ@], const
   static const double accelerations[] = {@ACCELERATIONS@}, forces[] = {@FORCES@};
   static const double at_rest[] = {@AT_REST@}, fades[] = {@FADES@}; /* errors of friction near rest */
   static const double largest[] = {@LARGEST@}; /* |M a| of free motion, beyond which errors grow in proportion */
-  double x[@ALL@], y[N + N * NU + N * N + M * N + M], S[N][N + 1], C[N * N], MC[N * N], d = 0.0;
+  double x[@ALL@], y[N + N * NU + N * N + M * N + 2 * M], S[N][N + 1], C[N * N], MC[N * N], d = 0.0;
   const double *mass = y + N + N * NU;
   int found = stored(q, x, N) | stored(v, x + N, N) | stored(u, x + 2 * N, N), begun = state->begun;
   (void)MC;
