@@ -161,9 +161,10 @@ def without_past(
     wide = {name: wider(lambda each, name=name: getattr(each, name)) for name in names}  # type: ignore[misc]  # bound
     acceleration = wider(lambda each: Gaussian(each.mean, each.covariance))
     assert acceleration is not None, "every model predicts it"
-    if found.unseen is not None and found.multiplier is not None:
-        wide["unseen"] = found.unseen * (found.multiplier.variance / wide["multiplier"].variance.clamp_min(1e-300))
-    return replace(found, mean=acceleration.mean, covariance=acceleration.covariance, **wide)
+    made = replace(found, mean=acceleration.mean, covariance=acceleration.covariance, **wide)
+    if made.unseen is None or found.multiplier is None or made.multiplier is None:
+        return made
+    return replace(made, unseen=made.unseen * found.multiplier.variance / made.multiplier.variance.clamp_min(1e-300))
 
 
 def join_predictions(blocks: Sequence[Prediction], batch: torch.Size) -> Prediction:
