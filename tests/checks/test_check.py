@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 from tests.checks.logs import PENDULUM, RATE, arm, clean, column, pendulum
 from tests.robots.robot_models import with_link
 
-from forcegp.checks import CheckReport, check, without_stops
+from forcegp.checks import CheckReport, check, quick_check, without_stops
 from forcegp.data import Dataset, Preparation
 from forcegp.errors import InvalidInput
 from forcegp.forces import Coulomb
@@ -217,3 +217,9 @@ def test_a_chirp_across_the_resonance_of_a_gear_is_named(stiffness):
         assert not found.of("elastic joint")
     else:  # below it, since a rotor nobody states is taken for friction
         assert 0.7 * resonance < found.of("elastic joint")[0].numbers["resonance"]["shoulder"] < 1.1 * resonance
+
+
+def test_nothing_is_differentiated_across_postures():
+    data = clean(0)
+    apart = replace(data, u=data.u + np.sin(9.0 * data.q), episode=np.arange(len(data)))
+    assert not quick_check(apart.rows(slice(None, None, 7))).of("elastic joint")

@@ -162,6 +162,7 @@ def test_flags_that_mean_nothing_are_refused(flags):
 
 def test_short_forms_of_the_command_line():
     assert by_quantity("unit", "q=deg,m,time=ms") == {"q": ("deg", "m"), "time": ("ms",)}
+    assert [*by_quantity("force", "imu:l@0,0,1=/imu:acceleration,foot=/w:force")] == ["imu:l@0,0,1", "foot"]
     for flag, signs in (("u=1,-1", {"u": (1.0, -1.0)}), ("1,-1", dict.fromkeys("qvua", (1.0, -1.0)))):
         assert (
             parse_arguments(["import", "x.csv", f"--sign={flag}", "--out", "o.h5"])

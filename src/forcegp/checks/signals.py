@@ -183,7 +183,7 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
     log = inputs.log
     values, follows = getattr(log, name)[:, joint], consecutive(log)[:-1]
     held = np.diff(values) == 0
-    if np.ptp(values) == 0.0 or (name == "u" and held.mean() > HELD_STEPS):
+    if np.ptp(values) == 0.0 or not follows.any() or (name == "u" and held.mean() > HELD_STEPS):
         return
     others = np.any([np.diff(getattr(log, other)[:, joint]) != 0 for other in QUANTITY if other != name], axis=0)
     step = float(np.median(np.diff(log.time)[follows]))

@@ -264,7 +264,7 @@ def fit_physical(
     elif evidence.of_torque:
         torque = partial(equations.in_torque, motions=equations.measured)
         fit = search(torque, start=x, held=held, progress=note)
-        if options["sizes"] is not None and held is None:
+        if options["sizes"] is not None and held is None and equations.rests:
             changes = changes_without_rests(search, torque, space, fit.x, equations.rests)
     else:
         fit = search(equations.in_acceleration, start=x, progress=note)
