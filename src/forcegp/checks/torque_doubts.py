@@ -58,11 +58,10 @@ def elastic_doubts(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
     With a gear of stiffness k between rotor J and link, u = tau + J a + (J / k) tau'' where the encoder is at the link
     (Spong 1987, J. Dyn. Sys. Meas. Control 109).
     """
-    if inputs.compared is None or not inputs.compared.time_ordered:
-        return
-    if np.unique(inputs.compared.episode, return_counts=True)[1].min() < FEWEST_ROWS:
-        return  # too short to be differentiated
-    log = replace(log, rows=log.changed(inputs.compared))
+    rows = inputs.compared
+    if rows is None or not rows.time_ordered or np.unique(rows.episode, return_counts=True)[1].min() < FEWEST_ROWS:
+        return  # without an order, or too short to be differentiated
+    log = replace(log, rows=log.changed(rows))
     rows, found = log.rows, dict[str, float]()
     slopes, bends = np.zeros_like(log.tau), np.zeros_like(log.tau)
     for own in (rows.episode == number for number in rows.episodes):
@@ -181,6 +180,8 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
     if not stops:
         return log, []
     out = np.unique(np.concatenate(stops))
+    pieces = np.split(kept := np.setdiff1d(np.arange(len(log)), out), np.flatnonzero(np.diff(kept) > 1) + 1)
+    out = np.unique(np.concatenate([out, *(each for each in pieces if len(each) < FEWEST_ROWS)]))  # none to learn from
     spans = [log.time[each[[0, -1]]].tolist() for each in np.split(out, np.flatnonzero(np.diff(out) > 1) + 1)]
     doubt = look(
         about="stop",

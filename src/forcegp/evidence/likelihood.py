@@ -50,8 +50,8 @@ class TrainingData:
     def of(cls, rows: Dataset, device: torch.device, names: Iterable[str] = ()) -> "TrainingData":
         """Copies of all rows, and of what sensors measured, where IMUs are mounted as `names` say. InvalidInput."""
         frames = [name.partition("@")[0] for name in rows.measured]
-        only = {frame: x for frame, x in zip(frames, rows.measured.values(), strict=True) if frames.count(frame) == 1}
-        there = {**only, **rows.measured}
+        alone = ((frame, x) for frame, x in zip(frames, rows.measured.values(), strict=True) if frames.count(frame) < 2)
+        there = {**dict(alone), **rows.measured}
         own = {name: there.get(name, there.get(name.partition("@")[0])) for name in names}
         if lost := [name for name, values in own.items() if values is None]:
             raise InvalidInput(f"this model learns from the sensor {lost[0]!r}, which these rows do not have.")
