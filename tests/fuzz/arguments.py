@@ -268,7 +268,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         "inputs",
     ),
     "OptimizerOptions": _call(forcegp.inference.OptimizerOptions, _options, "tolerance", lambda: {"iterations": 2}),
-    "Inducing": _call(forcegp.inference.Inducing, _engine, "tolerance refine", lambda: {"points": 5}),
+    "Inducing": _call(forcegp.inference.Inducing, _engine, "tolerance", lambda: {"points": 5}),
     "Robot.from_urdf_text": _call(
         Robot.from_urdf_text, _robot_from, "gravity armature locked inertias base", lambda: {"text": URDF}
     ),
