@@ -43,7 +43,7 @@ NOISE_V, NOISE_U = 0.002, 0.05
 def moved(robot: Robot, seed: int, seconds: float, newton: float = 0.0) -> dict[str, np.ndarray]:
     """q, v, u (T, 7) as measured, and the joint torques of the pushes."""
     plant, law, reference = robot.compile(), joint_friction_of(CONFIG, robot), Reference.random(seed, 0.4, 3.5)
-    control, rng, force = PDGravity(plant, **GAINS), np.random.default_rng(seed), np.zeros(3)
+    control, rng, force = PDGravity(robot, **GAINS), np.random.default_rng(seed), np.zeros(3)
     (q, v, _), rows, push = reference(0.0), [], np.zeros(7)
     for k in range(round(seconds * RATE)):
         since = (k / RATE) % EVERY
@@ -105,7 +105,7 @@ def monitors(seed: int, calibration: dict[str, np.ndarray]) -> dict[str, Contact
     """Name -> monitor, calibrated."""
     robot = robot_of()
     given = Model(robot)
-    motion = followed(robot, excitation(seed), PDGravity(robot.compile(), **GAINS), 20.0)
+    motion = followed(robot, excitation(seed), PDGravity(robot, **GAINS), 20.0)
     models = {name: fit.predictor() for name, fit in fits(rows_of(motion, given, seed), given, seed).items()}
     made = {**models, "true model": true_system(robot)}
     made["learned, noise alone"] = models["learned"].posterior.predictor(covariance="none")

@@ -61,7 +61,7 @@ def motions() -> tuple[Robot, Posterior, dict[str, dict[str, np.ndarray]]]:
     """The arm, the model that learned, and controller -> what the arm did."""
     robot = robot_of()
     given, task = Model(robot), task_of(SEED)
-    rows = rows_of(followed(robot, excitation(SEED), PDGravity(robot.compile(), **GAINS), 20.0), given, SEED)
+    rows = rows_of(followed(robot, excitation(SEED), PDGravity(robot, **GAINS), 20.0), given, SEED)
     found = controllers(rows, given, robot, SEED)
     done = {name: followed(robot, task, control, SECONDS) for name, control in found.items()}
     return robot, fits(rows, given, SEED)["learned"], done

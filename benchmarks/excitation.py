@@ -94,7 +94,7 @@ class Learner:
     def __init__(self, seed: int) -> None:
         self.seed, self.robot = seed, robot_of()
         self.given, self.law = Model(self.robot), joint_friction_of(CONFIG, self.robot)
-        pd = PDGravity(self.robot.compile(), **GAINS)
+        pd = PDGravity(self.robot, **GAINS)
         slow = followed(self.robot, Reference.random(seed + 300, 0.1, 1.5), pd, SECONDS)
         self.rows = rows_of(slow, self.given, seed, FEW)
         self.before = fitted(self.rows)

@@ -55,7 +55,7 @@ def ends(model: Any, begin: np.ndarray, threads: int) -> np.ndarray:
 def run() -> dict[str, float]:
     robot = robot_of()
     given, rng = Model(robot), np.random.default_rng(SEED)
-    motion = followed(robot, excitation(SEED), PDGravity(robot.compile(), **GAINS), 20.0)
+    motion = followed(robot, excitation(SEED), PDGravity(robot, **GAINS), 20.0)
     rows = rows_of(motion, given, SEED, STATES)
     posterior = fit(given.with_forces(JointFriction()), rows.rows(slice(100)), restarts=1)
     model = model_of(robot)

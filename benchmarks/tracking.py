@@ -31,7 +31,6 @@ from forcegp.data import farthest_rows
 from forcegp.evidence import Accelerations
 from forcegp.forces import GearFriction, Offset, RigidBodies, Rotor
 from forcegp.posterior import Posterior
-from forcegp.robots.compiled import CompiledRobot
 from forcegp.simulation.kuka_surface import joint_friction_of, kuka_robot
 
 SEEDS = (1, 2, 3, 4, 5)
@@ -42,11 +41,11 @@ MIDDLE = np.array([0.0, 0.5, 0.0, -1.3, 0.0, 0.9, 0.0])
 
 
 class PDGravity(TrackingController):
-    """u = M(q) (Kd (v_d - v) + Kp (q_d - q)) + g(q): masses alone; `robot` may be `robot.compile()`."""
+    """u = M(q) (Kd (v_d - v) + Kp (q_d - q)) + g(q): masses alone."""
 
-    def __init__(self, robot: Robot | CompiledRobot, **settings: Any) -> None:
-        self._dynamics = robot
-        super().__init__(robot.robot if isinstance(robot, CompiledRobot) else robot, **settings)  # type: ignore[arg-type]  # it is a Robot
+    def __init__(self, robot: Robot, **settings: Any) -> None:
+        self._dynamics = robot.compile()
+        super().__init__(robot, **settings)
 
     @override
     def _torques(self, q: Tensor, v: Tensor, v_d: Tensor, a_d: Tensor, e: Tensor, e_v: Tensor) -> Tensor:
@@ -139,7 +138,7 @@ def controllers(data: Dataset, given: Model, true: Robot, seed: int) -> dict[str
     made = {
         name: ComputedTorque(fit.predictor(covariance="none"), **GAINS) for name, fit in fits(data, given, seed).items()
     }
-    return {"PD + gravity": PDGravity(given.robot.compile(), **GAINS), **made, "true model": TrueModel(true)}
+    return {"PD + gravity": PDGravity(given.robot, **GAINS), **made, "true model": TrueModel(true)}
 
 
 class TrueModel(ComputedTorque):
@@ -174,7 +173,7 @@ def by_rows(seed: int) -> dict[str, dict[str, float]]:
     robot, task = robot_of(), task_of(seed)
     given, found = Model(robot), {}
     for name, reference in {"excitation": excitation(seed), "task": task}.items():
-        motion = followed(robot, reference, PDGravity(robot.compile(), **GAINS), 20.0)
+        motion = followed(robot, reference, PDGravity(robot, **GAINS), 20.0)
         rivals = controllers(rows_of(motion, given, seed), given, robot, seed)
         found[name] = {rival: error(followed(robot, task, control, 10.0)) for rival, control in rivals.items()}
     return found
@@ -183,7 +182,7 @@ def by_rows(seed: int) -> dict[str, dict[str, float]]:
 def with_payload(seed: int) -> dict[str, dict[str, float]]:
     """All inertias of the URDF 10 % too large, 0.5 kg at the tool that it lacks, 30 s under PD of the URDF."""
     true, given, task = robot_of(payload=0.5), Model(robot_of(inertia=1.1)), task_of(seed)
-    motion = followed(true, excitation(seed), PDGravity(given.robot.compile(), **GAINS), 30.0)
+    motion = followed(true, excitation(seed), PDGravity(given.robot, **GAINS), 30.0)
     rows = rows_of(motion, given, seed, len(motion["q"]) - 1)
     bodies = given.with_forces(RigidBodies("all"), Viscous(), GearFriction(), Offset(), Rotor())
     identified = fit(bodies, rows, Accelerations()).model

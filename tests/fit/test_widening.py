@@ -81,7 +81,7 @@ def test_an_unknown_variance_widens_as_the_closed_form_does():
     mean, variance = without(theta)
     sides = [without(theta + sign * step) for sign in (1.0, -1.0)]
     told = 0.5 * curvature * step**2  # what a parabola rises by
-    told += 1.645 * math.sqrt(told)
+    told += 0.6 * math.sqrt(told)
     shares = [told / max(told, objective(theta + sign * step) - objective(theta)) for sign in (1.0, -1.0)]
     more = 0.5 * sum(k * ((m - mean) ** 2 + v - variance) for k, (m, v) in zip(shares, sides, strict=True))
     expected = math.sqrt(max(1.0, 1.0 + (more / variance).mean()))

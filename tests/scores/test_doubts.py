@@ -68,7 +68,7 @@ def test_a_model_that_is_worse_than_its_known_forces_is_named(friction):
 
 
 def test_a_joint_that_hides_in_the_mean_is_named(friction):
-    """One joint lacks the friction that was learned, and another is as noisy as five times what is stated."""
+    """One joint lacks the friction that was learned, and another has ten times the variance of noise that is stated."""
     data = arm_data(200, 1)
     states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
     known = data.model.dynamics(*states).acceleration_map().offset.numpy()

@@ -1,4 +1,4 @@
-"""Doubts of torques beside those of the search: drift, delay, stops."""
+"""Doubts of torques beside those of the search: drift, elastic joints, delay, stops."""
 
 from collections.abc import Iterator
 from dataclasses import replace

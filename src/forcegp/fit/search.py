@@ -303,8 +303,8 @@ PROBES, SMALL_STEP = 8, 1e-2
 """Directions, and the step along each, whose change of the gradient gives the diagonal of the Hessian: neighbours, as
 parameters of one kernel are, do not mix."""
 
-PAIRS, RARE = 4, 1.645
-"""Of opposite moves of all hyper-parameters; deviations that one loses more than the mean, at 95 %."""
+PAIRS, RARE = 4, 0.6
+"""Of opposite moves of all hyper-parameters; deviations beyond the mean that 73 % of normal draws do not lose."""
 
 NEGLIGIBLE = 1e-6
 """Standard deviation, as a fraction of the largest, below which a constraint leaves nothing open."""

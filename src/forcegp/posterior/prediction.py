@@ -93,7 +93,7 @@ class Prediction(Gaussian):
     frames: tuple[str, ...] = ()
     """Where each contact is."""
     off: Float[Tensor, "*batch m"] | None = None
-    """How far the point of each contact is off its surface [m]: the model holds it there all the same."""
+    """How far the point of each contact is off its surface [m], where the model holds it; 0 where a switch lets go."""
     unseen: Float[Tensor, "*batch m"] | None = None
     """Share of the variance of each multiplier that is a prior on what the log did not show, 0 to 1."""
 
