@@ -99,7 +99,7 @@ def test_models_are_compared_over_the_runs_that_both_finished():
     )
     assert found.best_of(("identified",), "force") == "ls"
     assert found.best_of(("black box",), "force") is None
-    assert found.difference("motion", "gp", "ls").outcome == "no difference"
+    assert found.difference("motion", "gp", "ls").outcome == "worse", "it diverged in three motions more"
     gp, urdf, seldom = (found.difference("force", name, "ls") for name in ("gp", "urdf", "ls2"))
     assert seldom.runs == 2
     assert (gp.outcome, urdf.outcome, gp.wins, gp.ahead, urdf.ahead, gp.stretches) == ("better", "worse", 3, 2, 0, 2)
@@ -107,6 +107,12 @@ def test_models_are_compared_over_the_runs_that_both_finished():
         "ls2 failed in 1 of 3 runs",
         "net failed in 3 of 3 runs",
     ]
+
+
+def test_a_model_whose_motions_diverge_more_often_is_worse_however_small_the_others_are():
+    found = paired_difference("motion", "a", "b", np.array([[[np.nan, 0.1, 0.1]]]), np.array([[[1.0, 1.0, 1.0]]]))
+    assert (found.outcome, found.favours_challenger, found.lost) == ("worse", False, 1)
+    assert "diverged in 1 more" in found.sentence
 
 
 def test_the_model_to_take_is_parametric_unless_another_is_shown_to_be_better():

@@ -178,6 +178,12 @@ def test_stretches_of_time_make_up_the_whole(known, swinging):
     assert stretches[0] == pytest.approx((first**2).mean())
 
 
+def test_torques_are_compared_with_those_of_the_log_whatever_the_common_mass(known, swinging):
+    model = given_system()
+    posterior = fit(model.with_forces(noise=tuple(SIGMA)), swinging, points=5)
+    assert row_scores(posterior, swinging, 2.0 * mass_matrices(swinging, model))[1] == pytest.approx(known[1])
+
+
 def test_stretches_begin_anew_in_every_episode():
     """Two of 40 s are cut into ten of 4 s each, and its last row."""
     seconds = np.tile(np.arange(41.0), 2)

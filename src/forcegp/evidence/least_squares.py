@@ -95,20 +95,20 @@ def _covariance(inverse: Tensor, acceleration: Tensor, force: Tensor) -> Tensor:
     return torch.diag_embed(acceleration.square()) + (inverse * force.square()) @ inverse.mT
 
 
-ROUNDS = 12
+ROUNDS = 16
 """Most rounds of reweighting."""
 MOST_EVALUATIONS = 300
 """Of the residuals in one round."""
-CONTENT = 0.01
-"""Two steps in a row that lower the objective by less than so many nats end a round."""
+CONTENT, ROUGHLY = 0.01, 1.0
+"""Two steps in a row that lower the objective by less than so many nats end a round; a first one sooner."""
 PASSES = 20
 """Over the noise of residuals, in each round, where unknown forces are left out."""
 LEAST_NOISE = 1e-6
 """Noise that is this fraction of the residual at the start counts as none: the data are exact."""
 SHARED = 2.0
 """Rows that the level of noise that all joints share, relative to their sizes, counts as where rows are few."""
-SETTLED = 1e-3
-"""Relative change of the noise level that ends them."""
+SETTLED, NEARLY = 1e-3, 0.03
+"""Relative change of the noise level that ends them, and one from which on they are no longer rough."""
 
 
 class Regressor:
@@ -209,6 +209,7 @@ def weighted_least_squares(
     evaluations: int = MOST_EVALUATIONS,
     moved: Moved = np.add,
     sizes: Float[np.ndarray, " nv"] | None = None,
+    roughly: bool = False,
 ) -> Fit:
     """Minimise sum_nj (r_nj / sigma_j)^2 + |prior|^2 over x and sigma; `progress(round, rms)` after each round.
 
@@ -216,6 +217,7 @@ def weighted_least_squares(
     which do not count. `known` is sigma where it is not to be found. A round takes so many `evaluations` at most. Steps
     follow `moved`: residuals that are as good as linear along it have no curved valleys. With `sizes` of r, sigma is
     drawn towards one share of these, as if by `SHARED` rows more: of a few rows a joint may be fitted exactly.
+    `roughly` ends sooner, within some hundredths of the noise and a nat.
     """
     last: list[tuple[np.ndarray, tuple[np.ndarray, Any]]] = []
 
@@ -231,12 +233,12 @@ def weighted_least_squares(
     seen = None if held is None else held[some]
     span = _span(held, np.ones(r.shape[1]))
     noise, total, settled = _noise(r, span) if known is None else known, 0, False
-    converged, expected = False, 0.0
+    converged, expected, content = False, 0.0, CONTENT if known is not None else ROUGHLY
     floor = np.maximum((LEAST_NOISE if held is None else LEAST) * noise, np.finfo(np.float64).tiny)
     for round_number in range(1, ROUNDS + 1):
         span = _span(held, noise)
         point = partial(_point, at, prior, noise, span)
-        x, nfev, converged, expected = _minimized(point, x, bounds, longest, evaluations, moved)
+        x, nfev, converged, expected = _minimized(point, x, bounds, longest, evaluations, moved, content)
         total += nfev
         r, jacobian = at(x)
         before = noise
@@ -248,7 +250,10 @@ def weighted_least_squares(
             noise = np.sqrt((len(r) * noise**2 + SHARED * common) / (len(r) + SHARED))
         if progress is not None:
             progress(round_number, float(np.sqrt((without(r, _span(held, np.ones_like(noise))) ** 2).mean())))
-        settled = bool((abs(noise - before) <= SETTLED * before).all())
+        change = float((abs(noise - before) / before).max())
+        near = change <= NEARLY
+        settled = near if roughly else change <= SETTLED and content < ROUGHLY
+        content = CONTENT if near else ROUGHLY
         if settled:
             break
     span = _span(held, noise)
@@ -294,6 +299,7 @@ def _minimized(
     longest: np.ndarray | float,
     most: int,
     moved: Moved = np.add,
+    content: float = CONTENT,
 ) -> tuple[np.ndarray, int, bool, float]:
     """Levenberg-Marquardt within bounds, on normal equations: x, evaluations, whether it converged, what it expected.
 
@@ -302,28 +308,37 @@ def _minimized(
     low, high = bounds
     here, damping, idle, first = point(x), 1e-4, 0, None
     for evaluation in range(1, most + 1):
-        held = ((here.x <= low) & (here.gradient > 0.0)) | ((here.x >= high) & (here.gradient < 0.0))
-        free = ~held
-        curvature = here.curvature[np.ix_(free, free)]
-        step = np.zeros_like(here.x)
-        diagonal = np.diag(curvature.diagonal() + 1e-12)
-        step[free] = -np.linalg.solve(curvature + damping * diagonal, here.gradient[free])
+        damped = here.curvature + damping * np.diag(here.curvature.diagonal() + 1e-12)
+        step = _step(here.gradient, damped, low - here.x, high - here.x)
         step /= float((abs(step) / longest).max(initial=1.0))
-        step = np.clip(here.x + step, low, high) - here.x
         expected = -float(here.gradient @ step + 0.5 * step @ here.curvature @ step)
         first = expected if first is None else first
-        if abs(expected) <= 1e-3 * CONTENT or idle == 2:
+        if abs(expected) <= 1e-3 * content or idle == 2:
             return here.x, evaluation, True, first
         trial = point(moved(here.x, step))
         gain = (here.cost - trial.cost) / abs(expected)
         if trial.cost < here.cost:
-            idle = idle + 1 if here.cost - trial.cost < CONTENT else 0
+            idle = idle + 1 if here.cost - trial.cost < content else 0
             here = trial
         elif damping > 1e12:  # rounding hides any descent
             return here.x, evaluation, True, first
         # Marquardt's rule: trust the quadratic model more where it was right, less where it was wrong
         damping = max(0.2 * damping, 1e-12) if gain > 0.75 else damping if gain > 0.25 else 5.0 * damping
     return here.x, most, False, first or 0.0
+
+
+def _step(gradient: np.ndarray, curvature: np.ndarray, least: np.ndarray, most: np.ndarray) -> np.ndarray:
+    """The step to the minimum: what goes too far ends at its bound, and the others go on beside that."""
+    step, free = np.zeros_like(gradient), ((least < 0.0) | (gradient < 0.0)) & ((most > 0.0) | (gradient > 0.0))
+    while free.any():
+        beside = gradient[free] + curvature[np.ix_(free, ~free)] @ step[~free]
+        step[free] = -np.linalg.solve(curvature[np.ix_(free, free)], beside)
+        within = np.clip(step, least, most)
+        if (within == step).all():
+            break
+        free &= within == step
+        step = within
+    return step
 
 
 def _point(at: Residual, prior: Residual, noise: np.ndarray, span: np.ndarray | None, x: np.ndarray) -> _Point:

@@ -14,7 +14,7 @@ from forcegp.data.dataset import require_rows
 from forcegp.data.views import past_known, with_memory
 from forcegp.doubts import Doubts
 from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
-from forcegp.evidence import Accelerations, Evidence, Motions, Sensor, Torques, TrainingData
+from forcegp.evidence import Evidence, Motions, Sensor, Torques, TrainingData
 from forcegp.evidence.likelihood import MarginalLikelihood, check_distance, problem_size
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.fit.doubts import (
@@ -135,9 +135,7 @@ def fit(
     dataset = _checked(model, dataset, rest, refinement)
     dataset, model = with_sensors(dataset, model, rest, sensors)
     model = without_idle_offsets(model, dataset)
-    usual = Torques("both" if rest.noisy_in_both or not model.robot.space.is_vector_space else "u")
-    how = rest if isinstance(rest, Accelerations) and not model.unknown_forces else usual
-    model, choice = (model, None) if isinstance(start, Posterior) else with_friction_chosen(model, dataset, how)
+    model, choice = (model, None) if isinstance(start, Posterior) else with_friction_chosen(model, dataset, rest)
     dataset = dataset if choice is None else with_memory(dataset, model)
     known = past_known(dataset, model)
     doubts = list(doubts_of_past(model, dataset, known))

@@ -337,12 +337,14 @@ def with_friction_chosen(
     if not any(force.memory is None and force.level is None for force in gears):
         return model, None
     [gear] = gears
+    usual = Torques("both" if evidence.noisy_in_both or not model.robot.space.is_vector_space else "u")
+    how = evidence if isinstance(evidence, Accelerations) and not model.unknown_forces else usual
 
     def first(transmission: Any) -> Solution:
         """The model with dry friction alone."""
         plain = tuple(Coulomb().bound_to(model.robot) if force is gear else force for force in model.laws)
         at_motors = _with_transmission(replace(model, forces=plain), transmission)
-        return fit_physical(at_motors, [log], evidence, rows=FIRST_ROWS)
+        return fit_physical(at_motors, [log], how, rows=FIRST_ROWS, roughly=True)
 
     found = first(gear.transmission)
     if gear.transmission is None:
@@ -352,7 +354,7 @@ def with_friction_chosen(
         found = found if transmission is None else first(transmission)
     beside = any(isinstance(law, DirectionalFriction) and law.learned for law in model.laws)
     parts = [part for part in PARTS if beside or part != "direction"]
-    noise = found.noise if isinstance(evidence, Accelerations) else None
+    noise = found.noise if isinstance(how, Accelerations) else None
     choice = choose_friction(found.model, log, parts, noise)
     return with_choice(model, choice), choice
 

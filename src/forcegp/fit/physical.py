@@ -205,7 +205,7 @@ ROWS = 5_000
 EQUATIONS = 40_000
 """As many rows hold these equations, one per degree of freedom, at most."""
 REWEIGHTINGS = 2
-"""Searches in which accelerations are weighted by noise of both kinds, after one in which each joint has its own."""
+"""Searches in which accelerations are weighted by noise of both kinds."""
 SEARCHES = 20
 """Most searches where forces and accelerations are both noisy, each about the accelerations of the last one."""
 STEPS = 6
@@ -224,15 +224,24 @@ class Solution:
     rows: Dataset
     history: tuple[float, ...]
     x: Float[np.ndarray, " k"]
-    """Its coordinates."""
+    """Its coordinates, and the sizes that they relate to."""
+    typical: dict[str, Float[np.ndarray, " nv"]]
     doubts: tuple[dict[str, Any], ...] = ()
     """What speaks against it, as JSON."""
 
 
 def fit_physical(
-    model: Model, logs: Sequence[Dataset], evidence: Torques | Accelerations, rows: int | None = None
+    model: Model,
+    logs: Sequence[Dataset],
+    evidence: Torques | Accelerations,
+    rows: int | None = None,
+    near: Solution | None = None,
+    roughly: bool = False,
 ) -> Solution:
-    """The open numbers of a model without unknown forces; of several logs payloads are in the first alone."""
+    """The open numbers of a model without unknown forces; of several logs payloads are in the first alone.
+
+    The search begins `near` a solution of the same model on other rows, if given; `roughly` ends it sooner.
+    """
     bodies = any(getattr(law, "learn", ()) or (isinstance(law, Payload) and not law.known) for law in model.laws)
     robot, thick = thickened(model.robot) if bodies else (model.robot, ())
     model = replace(model, robot=robot)
@@ -242,7 +251,7 @@ def fit_physical(
     if robot.space.is_vector_space and evidence.of_torque and not evidence.noisy_in_both:
         logs = [one_row_per_rest(log) for log in logs]
     logs = [log.rows(evenly(log, most)) for log in logs]
-    typical = typical_sizes(model, logs)
+    typical = typical_sizes(model, logs) if near is None else near.typical
     space = ParameterSpace(model, typical)
     unseen = Unseen.of(model, logs[0], typical["force"])
     equations = Equations(space, logs, evidence, unseen.pushed)
@@ -257,27 +266,23 @@ def fit_physical(
 
     options: dict[str, Any] = {"longest": space.longest_steps, "moved": space.moved}
     options["sizes"] = typical["force"] if all(len(log) == len(log.episodes) > 2 for log in logs) else None
+    options["roughly"] = roughly
     search = partial(weighted_least_squares, prior=space.prior, bounds=space.bounds, **options)
-    noise, x, changes = None, space.start, None
+    noise, x, changes = None, space.start if near is None else near.x, None
+    torque = partial(equations.in_torque, motions=equations.measured)
     if evidence.noisy_in_both:
         fit, noise = _with_noise_in_both(equations, search, x, note)
     elif evidence.of_torque:
-        torque = partial(equations.in_torque, motions=equations.measured)
         fit = search(torque, start=x, held=held, progress=note)
         if options["sizes"] is not None and held is None and equations.rests:
             changes = changes_without_rests(search, torque, space, fit.x, equations.rests)
     else:
-        fit = search(equations.in_acceleration, start=x, progress=note)
-        for _ in range(REWEIGHTINGS):
-            predicted, M, H = equations.accelerations(fit.x)
-            noise = NoiseLevels.of(equations.a - predicted, M, H)
-            W = equations.whitening(noise, H)
-
-            def white(x: np.ndarray, W: np.ndarray = W) -> tuple[np.ndarray, np.ndarray]:
-                r, jacobian = equations.in_acceleration(x)
-                return (W @ r[..., None])[..., 0], W @ jacobian
-
-            fit = search(white, start=fit.x, progress=note)
+        if near is None:  # torques lead into the neighbourhood with a tenth of the work
+            first = equations.in_acceleration if equations.held.shape[1] else torque
+            x = search(first, start=x, roughly=True, progress=note).x
+        fit, noise = _with_accelerations_weighted(equations, search, x, note)
+        for _ in range(1, REWEIGHTINGS):
+            fit, noise = _with_accelerations_weighted(equations, search, fit.x, note)
     found = space.model_at(fit.x)
     residual = equations.a - equations.accelerations(fit.x)[0]
     doubts = list(_doubts_of_memory(space, fit.x))
@@ -299,7 +304,23 @@ def fit_physical(
         found_levels = Noise(tuple(np.sqrt((residual**2).mean(0)).clip(1e-12)))
         level = found_levels if noise is None else Noise(tuple(noise.acceleration), tuple(noise.force))
         level = unseen.with_pushes(level)
-    return Solution(found, estimates, level, with_memory(logs[0], found), tuple(history) or (0.0,), fit.x, told)
+    found_rows = with_memory(logs[0], found)
+    return Solution(found, estimates, level, found_rows, tuple(history) or (0.0,), fit.x, typical, told)
+
+
+def _with_accelerations_weighted(
+    equations: Equations, search: Callable[..., Fit], x: np.ndarray, note: Callable[[int, float], None]
+) -> tuple[Fit, NoiseLevels]:
+    """A search among accelerations that the noise of both kinds about x weights."""
+    predicted, M, H = equations.accelerations(x)
+    noise = NoiseLevels.of(equations.a - predicted, M, H)
+    W = equations.whitening(noise, H)
+
+    def white(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        r, jacobian = equations.in_acceleration(x)
+        return (W @ r[..., None])[..., 0], W @ jacobian
+
+    return search(white, start=x, progress=note), noise
 
 
 def _with_noise_in_both(
@@ -414,12 +435,13 @@ def held_out_noise(model: Model, dataset: Dataset, evidence: Torques | Accelerat
     model identified from the rest (block cross-validation; Burman, Chow & Nolan 1994): episodes, where there are three
     or more, else `STRETCHES_LEFT_OUT` stretches of time. Raises InvalidInput for too few rows.
     """
-    require_type("model", model, Model)
-    residuals, masses, mobilities = [], [], []
-    for left_out in _left_out(require_type("dataset", dataset, Dataset)):
+    dataset = with_memory(require_type("dataset", dataset, Dataset), require_type("model", model, Model))
+    residuals, masses, mobilities, near = [], [], [], None
+    for left_out in _left_out(dataset):
         kept = np.ones(len(dataset), dtype=bool)
         kept[left_out] = False
-        found = fit_physical(model, [dataset.rows(kept)], evidence).model
+        near = fit_physical(model, [dataset.rows(kept)], evidence, near=near, roughly=True)
+        found = near.model
         rows = with_memory(dataset.rows(left_out), found)
         q, v, u = (torch.tensor(x, device=found.robot.device) for x in (rows.q, rows.v, rows.u))
         dynamics = found.dynamics(q, v, u)

@@ -115,7 +115,7 @@ def negative_log_density(
 def row_scores(
     posterior: Posterior, test: Dataset, mass: Matrices | None = None, whole: Dataset | None = None
 ) -> tuple[Table, list[float | None]]:
-    """The table, and mean squared errors of forces in about `STRETCHES` stretches of time, over all joints.
+    """The table, and mean squared errors of torques, else forces, in about `STRETCHES` stretches, over all joints.
 
     Quantities are those of `_pairs`, each with `mae`, `rmse`, `relative_rmse` (over the size of what was there, all
     columns together) and `largest` error, and with `coverage_95` and `coverage_50` of intervals. That of a measurement
@@ -136,7 +136,8 @@ def row_scores(
     measured["nrmse"] = plain(np.array(measured["rmse"], dtype=float) / _spread(whole.a))
     if len(test.model.actuators) == test.nv and not posterior.is_black_box:
         # of the torques that the model needs for the measured motion; a share of 1 is no better than their mean
-        rms = np.sqrt(np.square(force_errors(rows["mean"], test.a, rows["mass"])).mean(axis=0))
+        mass = rows["mass"]  # its own: u is there to compare with
+        rms = np.sqrt(np.square(force_errors(rows["mean"], test.a, mass)).mean(axis=0))
         table[TORQUE] = {"rmse": plain(rms), "share": plain(rms / _spread(whole.u[:, : test.nv]))}
     density = norm.logpdf(test.a, rows["mean"], np.sqrt(rows["measurement_variance"]))
     measured["nlpd"] = plain(-np.asarray(density).mean(axis=0))

@@ -18,6 +18,7 @@ from forcegp.evidence import Accelerations, Evidence, Motions, Sensor, Torques, 
 from forcegp.evidence.least_squares import correlation_time
 from forcegp.evidence.recorded_rows import slides
 from forcegp.fit import calibrated, default_options, fit, held_out_noise
+from forcegp.fit.friction_choice import with_friction_chosen
 from forcegp.fit.search import MOST_POINTS_FOR_RESTARTS
 from forcegp.fit.sensors import usual_evidence
 from forcegp.forces import (
@@ -364,5 +365,6 @@ def checked_identification(name: str, model: Model) -> tuple[Model, Acceleration
 def identified_model(name: str, model: Model, rows: Dataset) -> Model:
     """The model that laws and bodies of this name make of these rows, with the noise of rows that are held out."""
     opened, evidence = checked_identification(name, model)
+    opened, _ = with_friction_chosen(opened, rows, evidence)  # once, for all parts of the rows
     found: Any = fit(opened, rows, evidence)
     return replace(found.model, noise=held_out_noise(opened, replace(rows, measured={}), evidence))

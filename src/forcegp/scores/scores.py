@@ -41,7 +41,8 @@ class PairedDifference:
 
     `value` is the ratio of root mean square errors (0.8: a fifth less), with its interval; None for one stretch and one
     seed. The challenger was better in `wins` of `runs` and, over all seeds, in `ahead` of `stretches` (motions, for
-    that score). A ratio within `MARGIN` of 1 is no difference.
+    that score). A ratio within `MARGIN` of 1 is no difference. The challenger diverged in `lost` of them more often,
+    which the ratio does not see; that alone makes it worse.
     """
 
     criterion: str
@@ -53,10 +54,13 @@ class PairedDifference:
     interval: tuple[float, float] | None
     ahead: int = 0
     stretches: int = 0
+    lost: int = 0
 
     @property
     def outcome(self) -> str:
         """`better`, `worse` or `no difference`."""
+        if self.lost > 0:
+            return "worse"
         if self.interval is None or abs(self.value - 1.0) < MARGIN:
             return "no difference"
         low, high = self.interval
@@ -78,14 +82,16 @@ class PairedDifference:
         what = "motions" if self.criterion == "motion" else "held-out stretches of time"
         better = f"better in {self.wins} of {self.runs} runs and in {self.ahead} of {self.stretches} {what}"
         ratio = f"{CRITERIA[self.criterion]}, {self.challenger} / {self.baseline} = {self.value:.3g}"
-        return f"{answer}: {ratio} ({how}); {better}."
+        lost = f"; it diverged in {self.lost} more" if self.lost > 0 else ""
+        return f"{answer}: {ratio} ({how}); {better}{lost}."
 
 
 def paired_difference(
     criterion: str, challenger: str, baseline: str, one: Errors, other: Errors
 ) -> PairedDifference | None:
     """Compare squared errors on the stretches of both. None without any, or with a 0."""
-    usable = (np.isfinite(one) & np.isfinite(other)).all(axis=(0, 1))
+    going, others = (np.isfinite(each).all(axis=(0, 1)) for each in (one, other))
+    usable, lost = going & others, int(others.sum() - going.sum())
     one, other = one[..., usable], other[..., usable]
 
     def difference(seeds: np.ndarray, stretches: np.ndarray) -> float:
@@ -119,7 +125,7 @@ def paired_difference(
     wins = int((one.mean(axis=(1, 2)) < other.mean(axis=(1, 2))).sum())
     ahead = int((one.mean(axis=(0, 1)) < other.mean(axis=(0, 1))).sum())
     return PairedDifference(
-        criterion, challenger, baseline, len(one), wins, shown(value), interval, ahead, one.shape[2]
+        criterion, challenger, baseline, len(one), wins, shown(value), interval, ahead, one.shape[2], lost
     )
 
 
