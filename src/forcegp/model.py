@@ -260,9 +260,8 @@ class Model(Summary):
     @cached_property
     def _u_is_delivered(self) -> bool:
         """Whether u is the force of every joint, and nothing else."""
-        return (
-            self.actuation.is_exact and self.actuation.matrix is None and len(self.inputs) == len(self.actuation.names)
-        )
+        own = self.actuation
+        return own.is_exact and own.matrix is None and len(self.inputs) == len(own.names)
 
     def _delivered(self, state: State) -> Tensor:
         """Joint forces of all actuators."""

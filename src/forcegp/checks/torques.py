@@ -1,7 +1,6 @@
 """Measured torques beside those that the robot needs.
 
-`u = s tau(q, v, a) + I a + d v + sum c tanh(v / w) + o` with s, I, d, c >= 0 (Lawson & Hanson 1974): friction always
-brakes.
+`u = s tau(q, v, a) + I a + d v + sum c tanh(v / w) + o` with s, I, d, c >= 0 (Lawson & Hanson 1974): friction brakes.
 """
 
 from collections.abc import Callable

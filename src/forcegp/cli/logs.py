@@ -29,8 +29,7 @@ class FilterOptions:
     """How rows to learn from are made of a raw log."""
 
     cutoff: Annotated[str, arg(metavar="HZ|auto|none")] = "none"
-    """Low-pass filter q and u without delay, and recompute v and a. auto: chosen by the spectrum and held-out
-    torques."""
+    """Low-pass filter q and u without delay, and recompute v and a. auto: by the spectrum and held-out torques."""
     differentiate: Literal["q", "v"] = "q"
     """q: v and a from filtered positions. v: a from filtered velocities."""
     delay: Annotated[str, arg(metavar="S|auto")] = "0"
@@ -109,8 +108,7 @@ class ColumnOptions:
     joints: Annotated[str | None, unless_given("NAMES", "those of --robot", str)] = None
     """Names of the joints in the order of the columns."""
     orientation: Annotated[Literal["xyzw", "wxyz", "angles"] | None, unless_given("xyzw|wxyz|angles", "xyzw")] = None
-    """Orientation of a base that moves: a quaternion with w last or first, or angles roll, pitch, yaw (in a plane yaw
-    alone)."""
+    """Of a moving base: a quaternion, w last or first, or angles roll, pitch, yaw (in a plane yaw alone)."""
     axes: Text = None
     """Axes of a moving base's v and a, of the linear and the angular part: body, world, or imu, which is what an
     accelerometer at its origin measures. For instance v=world,body,a=imu; body unless stated."""
@@ -132,8 +130,7 @@ class ColumnOptions:
     gap: Annotated[float | None, unless_given("S", "10 median steps", float)] = None
     """A longer pause starts a new episode."""
     rate: Annotated[str, arg(metavar="HZ|auto|log")] = "auto"
-    """Rows per second. auto: rows at uneven times are given even ones at the median rate, by a cubic spline. log: every
-    stamp is kept."""
+    """Rows per second. auto: rows at uneven times get even ones at the median rate, by a spline. log: as they are."""
     start: Seconds = None
     """Leave out what comes earlier, in seconds from the first row of each episode."""
     end: Seconds = None
@@ -141,8 +138,7 @@ class ColumnOptions:
     unwrap: bool = False
     """Continue angles of joints that jump by a turn."""
     bad_rows: Literal["refuse", "skip"] = "refuse"
-    """skip: leave out rows that lack a value, up to 5 % of a log; their number is printed. Rows that lack all are never
-    refused."""
+    """skip: leave out rows that lack a value, up to 5 % of a log; their number is printed. Empty ones do not count."""
     beyond_limits: bool = False
     """Accept positions beyond the limits of the URDF."""
 

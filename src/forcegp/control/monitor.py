@@ -68,8 +68,7 @@ class ContactMonitor:
     rest, of the size s exp(-|v| / v_s), filtered as tau is: reversals show how large they are, and a joint that creeps
     has them for long. Where M a of a joint goes beyond what free motion has shown, its errors grow in proportion. An
     alarm is raised where tau^T S^-1 tau exceeds a threshold that free motion reaches as often as stated. Raises
-    InvalidInput for arguments that do not fit and a monitor that was not calibrated, DatasetError for free motion that
-    is too short.
+    InvalidInput for arguments that do not fit and a monitor not calibrated, DatasetError for too short a free motion.
     """
 
     def __init__(self, model: Moving, *, dt: float, bandwidth: float = 2.0) -> None:
@@ -168,8 +167,7 @@ class ContactMonitor:
     def place(self, q: Any, torque: Any) -> ContactPlace:
         """The contact at q (nv,) that explains an external torque (nv,) by a force without a moment.
 
-        Least squares in the metric of the noise, at points along every link; of those alike the one with the least
-        force.
+        Least squares in the metric of the noise, at points along every link; of those alike the least force.
         """
         q, tau = (torch.as_tensor(finite_vector(n, x, self.robot.nv)) for n, x in (("q", q), ("torque", torque)))
         white = torch.linalg.inv(

@@ -93,8 +93,7 @@ class TrackingController(Controller):
     * stiffness Kp in 1/s^2 and damping Kd in 1/s, numbers or one per joint; None damps critically.
     * torque_limits: largest absolute torques in Nm (N); None takes the efforts of the URDF.
 
-    Raises InvalidInput for arguments that do not fit and references out of range, NumericalError where no torque is
-    found.
+    Raises InvalidInput for arguments that do not fit and references out of range, NumericalError without a torque.
     """
 
     def __init__(

@@ -1,7 +1,6 @@
 """Positions of robots whose base moves, as signals: filtered, differentiated and written as vectors.
 
-Quaternions whose signs are continuous are filtered entry by entry and divided by their length: turns of the world
-commute.
+Quaternions whose signs are continuous are filtered by entry and divided by their length: turns of the world commute.
 """
 
 from collections.abc import Callable

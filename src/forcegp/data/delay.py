@@ -28,8 +28,7 @@ REMEMBERS = 0.3
 """Square sum with friction that remembers, over that without, below which the delay is that beside memory.
 
 Hysteresis of gears reads as a delay: 43 ms on arms with a presliding of 1 mrad and none, where it is below .2. Beside
-memory a delay is less sharp, though: where a low-pass filter of dry friction alone makes it .5, friction of velocity is
-asked, too.
+memory a delay is less sharp, though: where a low-pass filter of dry friction alone makes it .5, velocity is asked, too.
 """
 ROWS_PER_PARAMETER = 3
 

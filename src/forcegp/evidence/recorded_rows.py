@@ -111,8 +111,7 @@ Inputs = Float[np.ndarray, "rows nu"]
 class Motion:
     """Accelerations of the rows, and the torque that they need, but for what is estimated.
 
-    `regressor`: derivatives in the standard parameters of estimated bodies; `fixed`: torque of all others less given
-        forces.
+    `regressor`: derivatives in standard parameters of estimated bodies; `fixed`: torque of others less given forces.
     """
 
     a: Rows

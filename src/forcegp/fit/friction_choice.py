@@ -354,8 +354,7 @@ def with_friction_chosen(
         found = found if transmission is None else first(transmission)
     beside = any(isinstance(law, DirectionalFriction) and law.learned for law in model.laws)
     parts = [part for part in PARTS if beside or part != "direction"]
-    noise = found.noise if isinstance(how, Accelerations) else None
-    choice = choose_friction(found.model, log, parts, noise)
+    choice = choose_friction(found.model, log, parts, found.noise if isinstance(how, Accelerations) else None)
     return with_choice(model, choice), choice
 
 

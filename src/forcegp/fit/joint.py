@@ -77,8 +77,7 @@ class Slopes:
 class FreeNumbers:
     """The marginal likelihood at the best numbers, in nats: a function of kernels and noise alone.
 
-    `slopes` (rows, nv, k) of the residual about the numbers of the model; `prior`: the distance there, and its
-    Jacobian.
+    `slopes` (rows, nv, k) of the residual about the numbers of the model; `prior`: the distance and its Jacobian.
     """
 
     likelihood: MarginalLikelihood

@@ -26,8 +26,7 @@ FEWEST = 10 * STRETCHES
 def _usual_link(robot: Robot) -> str:
     """A base that moves, else of the last joint the last link of the file.
 
-    Joints that move several bodies, as those of fingers, count as none, if there are others: what fingers hold moves
-    with the hand.
+    Joints of several bodies, as of fingers, count as none, if there are others: what fingers hold moves with the hand.
     """
     if robot.base != "fixed":
         return robot.layout.moving[0]

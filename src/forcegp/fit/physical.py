@@ -71,10 +71,6 @@ class Equations:
         """Rows by log."""
         return np.split(values, self.ends)
 
-    def joined(self, parts: Sequence[tuple[np.ndarray, ...]]) -> list[np.ndarray]:
-        """Arrays of all logs."""
-        return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
-
     def equations(self, x: np.ndarray, parts: Sequence[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, Jacobian]:
         """Residuals and their Jacobian in x, from derivatives in standard parameters and coordinates of laws."""
         r, Y, in_terms = zip(*parts, strict=True)
@@ -130,7 +126,8 @@ class Equations:
 
     def accelerations(self, x: np.ndarray) -> list[np.ndarray]:
         """Predicted accelerations, M and H."""
-        return self.joined([part.acceleration(x) for part in self.parts])
+        found = [part.acceleration(x) for part in self.parts]
+        return [np.concatenate(each) for each in zip(*found, strict=True)]
 
     def whitening(self, noise: NoiseLevels, H: np.ndarray) -> np.ndarray:
         """Of the residuals of `in_acceleration`."""
@@ -264,9 +261,8 @@ def fit_physical(
         history.append(rms)
         tell(min(done, ROUNDS), ROUNDS, f"all rows, step {done}: {rms:.3g}")
 
-    options: dict[str, Any] = {"longest": space.longest_steps, "moved": space.moved}
+    options: dict[str, Any] = {"longest": space.longest_steps, "moved": space.moved, "roughly": roughly}
     options["sizes"] = typical["force"] if all(len(log) == len(log.episodes) > 2 for log in logs) else None
-    options["roughly"] = roughly
     search = partial(weighted_least_squares, prior=space.prior, bounds=space.bounds, **options)
     noise, x, changes = None, space.start if near is None else near.x, None
     torque = partial(equations.in_torque, motions=equations.measured)

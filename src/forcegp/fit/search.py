@@ -205,8 +205,7 @@ class FitObjective:
 def with_variance_priors(kernels: LatentKernels) -> LatentKernels:
     """A copy of which every output scale carries the prior log variance ~ N(log of its present value, 2^2).
 
-    The likelihood is flat below the noise: a variance could run off to zero, and standard errors beside it be too
-    small.
+    The likelihood is flat below the noise: a variance could run off to zero, with too small standard errors.
     """
     out = deepcopy(kernels)
     for module in out.modules():

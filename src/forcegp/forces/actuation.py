@@ -125,8 +125,7 @@ class Thrusters(LinkForce):
     s = u for `power` 1 (a thrust, or a share of it) and u |u| for `power` 2 (a rotor's speed). `thrust` in N and
     `torque` in Nm per unit of s, positive for a torque on the link along the axis; one number, or one each. Columns of
     u are called `names`. With `known` False what they do is left to the unknown forces.
-    Source: Mahony, Kumar & Corke, "Multirotor aerial vehicles", IEEE RAM 2012. Raises InvalidInput for what does not
-    fit.
+    Source: Mahony, Kumar & Corke, "Multirotor aerial vehicles", IEEE RAM 2012. InvalidInput for what does not fit.
     """
 
     frame: str

@@ -178,8 +178,7 @@ class JointFriction(PerJoint):
     """Q_U,j = -f_j(v_j): what resists joint j, positive for positive velocity, an independent function per joint.
 
     The kernel "friction" gives f_j(v) = tanh(v / w) g(v) + d v: dry friction that varies with velocity and direction,
-    and viscous friction. Velocities are only scaled, so that zero stays zero. `joints` restricts it to some joints, by
-    name.
+    and viscous friction. Velocities are only scaled, so that zero stays zero. `joints` restricts it to some, by name.
     """
 
     joints: tuple[str, ...] | None = None

@@ -182,8 +182,7 @@ class SmoothSignKernel(_WeightKernel, _WidthKernel):
 class BeyondVisitedKernel(_WeightKernel):
     """k = e(s) e(s'), e(s) = g (|s| - s_max)+ sign(s): beyond the visited velocities, friction may go on otherwise.
 
-    Means stay as they are, and intervals widen. g is half of the slope of the rest of the kernel over the visited
-    range.
+    Means stay as they are, and intervals widen. g is half of the slope of the rest over the visited range.
     """
 
     def __init__(self, level: AdditiveKernel, viscous: LinearKernel) -> None:

@@ -92,8 +92,7 @@ SMALLEST_SPEED = 1e-6
 class ToolForces(SharedInputs):
     """Q_U = J_p^T E f(z): a force (N) where contact number `contact` touches, along the tangents E of its surface.
 
-    Along its normal an ideal contact takes every force, so there is no such latent; without the contact the force is
-    zero.
+    Along its normal an ideal contact takes every force, so there is no such latent; without it the force is zero.
 
     inputs: "velocity" and "position" of the point along the tangents. Velocities are only scaled, so that a linear
         kernel is viscous friction.

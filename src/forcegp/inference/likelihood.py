@@ -72,8 +72,7 @@ def factorize(build: Callable[[], Float[Tensor, "n n"]]) -> CholeskyFactor:
     """Cholesky factor of the matrix that `build` returns, whose lower triangle is read and overwritten.
 
     A matrix that is not positive definite in floating point is built again with more of its mean diagonal added
-    (`JITTER_LADDER`), and a NumericalWarning. Raises NumericalError where entries are not finite, or that does not
-    help.
+    (`JITTER_LADDER`), and a NumericalWarning. NumericalError where entries are not finite, or that does not help.
     """
     jitter = 0.0
     for relative in JITTER_LADDER:

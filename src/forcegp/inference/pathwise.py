@@ -98,8 +98,7 @@ GRID = 4096
 class DrawnTerm:
     """S functions of one term; `weights` are those of its columns, or of cosines and of sines for each column.
 
-    A Matern 1/2 of one input is drawn on an even `grid` 3 length scales beyond the centres; elsewhere it is its
-    expectation.
+    A Matern 1/2 of one input is drawn on an even `grid` 3 length scales beyond the centres, elsewhere expected.
     """
 
     term: KernelTerm
@@ -193,8 +192,7 @@ def draw_functions(
 ) -> FunctionSamples:
     """Functions drawn from the posterior of the latents, `widening` times as far from its mean; the same for a seed.
 
-    `frequencies` per function and term. Raises InvalidInput for a kernel of which neither features nor a spectrum are
-    known.
+    `frequencies` per function and term. InvalidInput for a kernel without features or a spectrum.
     """
     with torch.no_grad():
         device = latent.features[0].device if latent.features else torch.device("cpu")

@@ -62,8 +62,7 @@ from forcegp.robots.arguments import whole_number
 class Posterior(Fitted):
     """a = M^-1 Q_b + H (Q_K + B f) + noise, f ~ GP (Rath et al. 2021, eqs. 6-7), conditioned on a log by `forcegp.fit`.
 
-    It predicts, rolls motions out, becomes programs, learns more rows, moves to other models. Its fields are
-    `Fitted`'s.
+    It predicts, rolls out, becomes programs, learns more rows, moves to other models. Its fields are `Fitted`'s.
     """
 
     def dynamics(
@@ -195,8 +194,7 @@ class Posterior(Fitted):
         """One process of the prior, one of `latent_names`, over its features: a friction curve, for example.
 
         `features` are (n, d) in the units of `prior.feature_names`, (n,) for one feature, or None for `points` values
-        over the range of the training data. Raises InvalidInput for another name, wrong shapes, and None for several
-        features.
+        over the range of the training data. InvalidInput for another name, wrong shapes, and None for several features.
         """
         return curve_of(self, latent, features, points)
 
@@ -214,8 +212,7 @@ class Posterior(Fitted):
     def programs(self, model: Model | None = None, compressed: CompressedCovariance | None = None) -> Programs:
         """What is compiled and exported, in another model if one is given.
 
-        Raises InvalidInput for other devices and noisy torques and, when something is made of them, what no graph
-        holds.
+        Raises InvalidInput for other devices and noisy torques and, when made of them, what no graph holds.
         """
         model = self.model if model is None else model
         rows = rows_for(self.training, self.trained, model)
@@ -279,8 +276,7 @@ class Posterior(Fitted):
         Parameters, noise level and standardization stay, so it is that of conditioning on all rows at once, in O(N^2).
         Without unknown forces the level of dry friction follows rows in order of time, as far as `settings["drift"]`
         lets it: give the last seconds of a record, whose coming motions are to be predicted. Raises InvalidInput for
-        rows that do not fit and models that would have to be trained again, ContactError for rows at which the contacts
-        cannot hold.
+        rows that do not fit and models to be trained again, ContactError for rows at which the contacts cannot hold.
         """
         example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, model=posterior.model)"
         require_rows("rows", rows, self.model.robot.joint_names, "the model", example)

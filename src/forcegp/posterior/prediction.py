@@ -269,8 +269,7 @@ def components_of(prior: UnknownForces, dynamics: ConstrainedDynamics, latents: 
 class Curve:
     """One process over some of its features, for example a friction curve: force over velocity.
 
-    `features` (n, d) and names with units; `mean`, `std` (n,) in `unit`; `visited` (2, d) is the range of the training
-    data.
+    `features` (n, d) and names with units; `mean`, `std` (n,) in `unit`; `visited` (2, d) is that of training data.
     """
 
     name: str

@@ -160,8 +160,7 @@ class Rollout:
     def interval(self, quantity: Literal["q", "v"] = "q") -> tuple[Tensor, Tensor]:
         """Lower and upper ends (..., T+1, nv) of the 95 % interval: calibrated, or quantiles of the samples.
 
-        Of q where a base moves, as steps: `low <= robot.difference(rollout.q, other) <= high`. InvalidInput where there
-        is neither.
+        Of q where a base moves, as steps: `low <= robot.difference(rollout.q, other) <= high`. InvalidInput without.
         """
         if self.intervals is None:
             low, high = self._sampled(quantity, least=1).quantile(self.time.new_tensor([0.025, 0.975]), dim=0)

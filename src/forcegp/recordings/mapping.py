@@ -1,7 +1,6 @@
 """`ColumnMapping`: which columns are what, in which units; names in short and guessed, and combinations of columns.
 
-Known columns are recognised letter by letter, the longest first, so most names need no quotes; backticks settle the
-rest.
+Known columns are recognised letter by letter, the longest first, so most names need no quotes; backticks settle others.
 """
 
 import ast

@@ -291,8 +291,7 @@ REPEATED = 0.05
 
 GAP = 10.0
 """Median steps. A cubic spline through samples g apart misses at most 5/384 (2 pi f g)^4 of the amplitude of a sine of
-frequency f (Hall & Meyer 1976): across 10 steps at 1 kHz 0.013 % at 5 Hz and 3 % at 20 Hz. Longer pauses end an
-episode."""
+frequency f (Hall & Meyer 1976): over 10 steps at 1 kHz 0.013 % at 5 Hz, 3 % at 20 Hz. Longer pauses end episodes."""
 
 FEWEST_ROWS = 5  # of an episode: two derivatives by central differences need so many
 SLOWEST, FASTEST = 2.0, 2e5
@@ -304,8 +303,7 @@ def _stretches(
 ) -> tuple[tuple[tuple[int, np.ndarray], ...], float, float, dict[str, Any]]:
     """Rows between gaps, their median step, the worst relative deviation from it, and what was left out.
 
-    Of rows with the same stamp the first is kept. Raises DatasetError for time that runs backwards and impossible
-    rates.
+    Of rows with the same stamp the first is kept. DatasetError for time that runs backwards and impossible rates.
     """
     begins = episodes[:, 1]
     steps = np.diff(time)

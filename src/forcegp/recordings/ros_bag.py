@@ -241,8 +241,7 @@ def read_on_one_clock(source: Source, plan: SignalPlan) -> Read:
     """The columns of a plan, all at the messages of the topic of its time; of a sparse table, of its positions.
 
     Angles that move by half a turn or more between two messages are held, as they wrap, and of quaternions the sign
-    means nothing. Raises InvalidInput where joining has no meaning, DatasetError for stamps that run backwards or do
-    not overlap.
+    means nothing. Raises InvalidInput where joining has no meaning, DatasetError for stamps backwards or apart.
     """
     topics = {name: source.topic_of(name) for name in plan.columns} if isinstance(source, RosBag) else {}
     whole, filled = Columns(), dict[str, np.ndarray]()

@@ -63,8 +63,7 @@ class CompiledRobot(RigidBodyDynamics):
 
     Methods take, check and return what those of `Robot` do, to rounding. InvalidInput for derivatives, transforms of
     ``torch.func`` and other devices than the CPU; CompilerError where something must be compiled and no C compiler is
-    there. Code is kept in ``folder`` (``~/.cache/forcegp/compiled`` by default) and runs with the rights of the
-    process.
+    there. Code is kept in ``folder`` (``~/.cache/forcegp/compiled`` by default) and runs with your rights.
     """
 
     def __init__(self, robot: RobotStructure, folder: str | Path | None = None) -> None:

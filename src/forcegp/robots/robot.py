@@ -63,8 +63,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
     def from_urdf(cls, path: str | Path, **options: Any) -> "Robot":
         """Read a URDF file, or a .xacro file where the package xacro is installed. Meshes are not looked for.
 
-        ``options`` are those of :meth:`from_urdf_text`, and so are errors. MissingExtra for a .xacro file without the
-        package.
+        ``options`` are those of :meth:`from_urdf_text`, and so are errors. MissingExtra for .xacro without the package.
         """
         return cls.from_urdf_text(read_robot_file(path), source=str(path), **options)
 

@@ -267,8 +267,7 @@ WORSE_JOINT, LEAST_WORSE = 1.2, 0.1
 
 FEWEST_INSIDE = 0.9  # least coverage of 95 % intervals, over all joints, about which nothing is said
 MISSED, CHANCE = 0.15, 4.0
-"""How much less than 95 % the intervals of one joint may hold: this share, or so many deviations of a count by chance
-if that is more."""
+"""How much less than 95 % intervals of one joint may hold: this share, or if more, so many deviations by chance."""
 
 MARGIN, POSTURE = 0.25, 0.1
 """How far beyond the training range of a joint a value may lie: a fraction of that range, and of the widest range of

@@ -71,8 +71,7 @@ def training_subset(train: Dataset, points: int, seed: int) -> Dataset:
 class Experiment:
     """Everything that decides the scores, apart from the models and the number of seeds, which may grow later.
 
-    Fields are those of `score`. Raises InvalidInput for parts that do not fit, and DatasetError for splits whose sides
-    overlap.
+    Fields are those of `score`. InvalidInput for parts that do not fit, DatasetError for splits whose sides overlap.
     """
 
     rows: Dataset

@@ -185,8 +185,7 @@ TURNING, QUICKEST = 0.5, 12.0  # of attitude: in parts of 1 / lag, and in rad/s
 def simulate_quadrotor(config: QuadrotorConfig) -> Dataset:
     """Rows of q, v, commanded rotor speeds u and a; truth holds a and "Q_U", metadata the mean wind of each episode.
 
-    Q_U is all that the model does not contain: what air does, a thrust that differs from the data sheet,
-    and late rotors.
+    Q_U is all that the model does not contain: what air does, thrust unlike the data sheet, late rotors.
     """
     robot = Robot.from_urdf(Path(__file__).parent / "quadrotor.urdf", base="floating")
     propellers = Thrusters("body", PLACES.tolist(), DATASHEET, (TORQUE * DATASHEET).tolist(), power=2)

@@ -192,6 +192,7 @@ def recorded(
     nv, steps = model.robot.nv, len(motion["a"]) // config.episodes
     streams = [np.random.default_rng([config.seed, episode, 1]) for episode in range(config.episodes)]
     noise = np.concatenate([stream.standard_normal((steps, nv)) for stream in streams])
+    about = {"scenario": scenario, "config": dataclasses.asdict(config), "versions": {"forcegp": __version__}}
     return Dataset(
         **{
             "time": np.tile(np.arange(steps) / RATE, config.episodes),
@@ -202,8 +203,5 @@ def recorded(
         model=model,
         noise_std=np.full(nv, config.noise) if config.noise > 0 else None,
         truth={"a": motion["a"], **truth},
-        metadata={
-            **{"scenario": scenario, "config": dataclasses.asdict(config), "versions": {"forcegp": __version__}},
-            **(metadata or {}),
-        },
+        metadata=about | dict(metadata or {}),
     )
