@@ -109,7 +109,8 @@ def said(data):
 def test_units_of_mass_and_length_change_nothing(size):
     data = clean(two_links(size=size), 1, noise="qvu")
     assert said(data) == []
-    assert said(replace(data, u=data.u * np.array([1.0, -1.0])))[0].about == "torque sign"
+    found = said(replace(data, u=data.u * np.array([1.0, -1.0])))[0]
+    assert (found.about, found.correction) == ("torque sign", {"sign": {"u": (1.0, -1.0)}})
 
 
 def test_two_mistakes_are_both_named():

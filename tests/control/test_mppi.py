@@ -94,6 +94,7 @@ def test_motions_are_implicit_where_a_step_is_long_beside_the_rates(damping, wan
     model = Model(Robot.from_urdf_text(SLIDER))
     rng = np.random.default_rng(0)
     q, v, u = rng.uniform(-2.0, 2.0, (3, 20, 1))
+    v[0] = 0.0
     rows = Dataset(q=q, v=v, u=u, a=(u - damping * v) / MASS, time=np.arange(20) * 0.1, model=model)
     forces = (Viscous(damping), JointFriction())
     posterior = fit(model.with_forces(*forces, noise=Noise(0.01, learn=False)), rows, restarts=1)

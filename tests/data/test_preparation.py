@@ -12,6 +12,7 @@ from tests.posterior.arm import arm_model
 
 from forcegp.data import (
     Dataset,
+    Delay,
     Preparation,
     differentiated,
     estimate_delay,
@@ -94,6 +95,12 @@ def test_a_delay_is_found_to_a_fraction_of_a_sample(delay):
     prepared = Preparation(cutoff=20.0, delay="auto", trim=0.2).apply(arm_log(delay))
     assert prepared.metadata["preparation"]["delay"] == pytest.approx(delay, abs=4e-4)
     np.testing.assert_allclose(prepared.u, _at(prepared, low_pass(arm_log(0.0), 20.0)).u, atol=0.2)
+
+
+@pytest.mark.parametrize(("others", "common"), [(0.03, 0.0), (0.01, 0.01)])
+def test_more_than_half_of_the_joints_have_to_show_a_delay(others, common):
+    each, std = np.array([0.01, 0.01, others, 0.03]), np.full(4, 1e-4)
+    assert Delay(common=0.01, common_std=1e-4, seconds=each, std=std, remains=0.1).significant == common
 
 
 @pytest.mark.parametrize("delay", [-0.08, 0.12])

@@ -13,39 +13,24 @@ from forcegp.errors import InvalidInput
 from forcegp.forces.kernels import KERNELS, checked_kernel, kernel_of
 from forcegp.inference import LatentKernels
 
-
-class TestSquaredExponential(KernelConformance):
-    expression = "squared-exponential"
-
-
-class TestMatern12(KernelConformance):
-    expression = "matern-1/2"
-
-
-class TestMatern32(KernelConformance):
-    expression = "matern-3/2"
-
-
-class TestMatern52(KernelConformance):
-    expression = "matern-5/2"
-
-
-class TestConstant(KernelConformance):
-    expression = "constant"
-
-
-class TestLinear(KernelConformance):
-    expression = "linear"
+PLAIN = (
+    "squared-exponential",
+    "matern-1/2",
+    "matern-3/2",
+    "matern-5/2",
+    "constant",
+    "linear",
+    "linear + squared-exponential + constant",
+)
+for expression in PLAIN:
+    name = f"Test {expression}"
+    globals()[name] = type(name, (KernelConformance,), {"expression": expression, "__module__": __name__})
 
 
 class TestFriction(KernelConformance):
     expression = "friction"
     dimensions = (1,)
     variance_at_the_start = False  # tanh^2 is a little below 1
-
-
-class TestSum(KernelConformance):
-    expression = "linear + squared-exponential + constant"
 
 
 def test_every_name_is_tested():

@@ -23,13 +23,22 @@ from forcegp.forces import (
 THREE = [0.5, 0.4, 0.3]
 
 
-class TestViscous(LawConformance):
-    law = Viscous(THREE)
+PLAIN = {
+    "Viscous": Viscous(THREE),
+    "DirectionalFriction": DirectionalFriction(THREE),
+    "Coulomb": Coulomb(THREE, 0.2),
+    "DryFrictionThatFalls": Stribeck(THREE, [0.7, 0.4, 0.9], 0.6, 0.2),
+    "Spring": Spring([2.0, 1.0, 3.0], [0.5, 0.2, 0.3]),
+    "HardeningSpring": HardeningSpring([1.0, 2.0, 0.5], [3.0, 1.0, 2.0]),
+}
+for name, law in PLAIN.items():
+    globals()[f"Test{name}"] = type(f"Test{name}", (LawConformance,), {"law": law, "__module__": __name__})
 
 
 class TestSprungMotors(LawConformance):
     law = Spring([2.0, 1.0, 3.0], [0.5, 0.2, 0.3], transmission="bend+lift")
     given = ("transmission",)
+    shows_at_rest = ("rest",)  # of k q0, which is a constant at q = 0
 
 
 class TestGearsOfMotors(LawConformance):
@@ -37,29 +46,9 @@ class TestGearsOfMotors(LawConformance):
     given = ("velocity_scale", "transmission")
 
 
-class TestDirectionalFriction(LawConformance):
-    law = DirectionalFriction(THREE)
-
-
-class TestCoulomb(LawConformance):
-    law = Coulomb(THREE, 0.2)
-
-
-class TestDryFrictionThatFalls(LawConformance):
-    law = Stribeck(THREE, [0.7, 0.4, 0.9], 0.6, 0.2)
-
-
 class TestGearFriction(LawConformance):
     law = GearFriction(THREE, 0.1, 0.2, [0.2, -0.05, 0.1], 0.0, 0.6, memory=False)
     given = ("memory", "breakaway", "stribeck_velocity")
-
-
-class TestSpring(LawConformance):
-    law = Spring([2.0, 1.0, 3.0], [0.5, 0.2, 0.3])
-
-
-class TestHardeningSpring(LawConformance):
-    law = HardeningSpring([1.0, 2.0, 0.5], [3.0, 1.0, 2.0])
 
 
 class TestOffset(LawConformance):

@@ -67,6 +67,8 @@ def test_functions_have_mean_and_covariance_of_the_posterior(expression):
     mean, covariance = latent.mean(points), latent.covariance(points)
     std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     assert ((values.mean(0) - mean).abs() <= 4.5 * std / count**0.5).all()
+    unspread = draw_functions(latent, 2, seed=3, frequencies=16, widening=0.0)
+    torch.testing.assert_close(unspread([z.expand(2, -1, -1) for z in points])[0], mean)
     for n in range(5):
         scale = std[n][:, None] * std[n][None, :]
         assert ((torch.cov(values[:, n].mT) - covariance[n]).abs() <= 7.0 * scale / count**0.5).all()
