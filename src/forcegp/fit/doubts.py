@@ -14,7 +14,7 @@ from forcegp.data.strokes import motor_positions
 from forcegp.doubts import Doubt, Doubts, look
 from forcegp.errors import ContactWarning, InvalidInput
 from forcegp.evidence.likelihood import CONSTANT, FAR_FROM_SURFACE, MarginalLikelihood, checked_values
-from forcegp.evidence.parameter_space import force_title
+from forcegp.evidence.parameter_space import ParameterSpace, force_title
 from forcegp.forces import Force, Normal, Offset
 from forcegp.model import Model
 from forcegp.summary import listed
@@ -142,4 +142,17 @@ def doubts_of_reversals(model: Model, log: Dataset) -> Iterator[Doubt]:
                     what="steps of encoders [mrad or mm] are larger than the ways over which it turns: "
                     f"{', '.join(names)}.",
                     do="Do not rely on sigma there, or record finer positions.",
+                )
+
+
+def doubts_of_memory(space: ParameterSpace, x: np.ndarray) -> Iterator[Doubt]:
+    """Where its stiffness ended at a bound."""
+    for own, term in zip(space.split(x)[1], space.terms, strict=True):
+        joints = np.array(space.model.robot.joint_names)[list(term.joints or ())]
+        for ends, when in ((term.high, "sooner"), (term.low, "later")) if term.name == "sigma" else ():
+            if (own == ends).any():
+                yield look(
+                    about="friction that remembers",
+                    what=f"sigma of {listed(joints[own == ends])} is at its bound: it turns {when} than the log tells.",
+                    do="Leave it out of memory, or give a log of slower reversals.",
                 )

@@ -1,6 +1,6 @@
 """The numbers of laws and bodies from all rows of a log: Gauss-Newton steps of weighted least squares."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from forcegp.data import Dataset, evenly, with_memory
 from forcegp.data.views import at_rest, one_row_per_rest, postures, rests_alone
-from forcegp.doubts import Doubt, Doubts, look
+from forcegp.doubts import Doubts
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence import Accelerations, Torques
 from forcegp.evidence.bodies import thickened
@@ -28,6 +28,7 @@ from forcegp.evidence.least_squares import (
 )
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, RecordedRows
+from forcegp.fit.doubts import doubts_of_memory
 from forcegp.fit.payloads import changes_without_rests, doubts_of_payloads, misfit, with_payloads_placed
 from forcegp.fit.unseen import Unseen
 from forcegp.forces import Actuation, Payload
@@ -35,7 +36,6 @@ from forcegp.model import Model
 from forcegp.noise import Noise
 from forcegp.posterior.fitted import STRETCHES, Estimates
 from forcegp.progress import tell
-from forcegp.summary import listed
 
 
 class Equations:
@@ -281,7 +281,7 @@ def fit_physical(
             fit, noise = _with_accelerations_weighted(equations, search, fit.x, note)
     found = space.model_at(fit.x)
     residual = equations.a - equations.accelerations(fit.x)[0]
-    doubts = list(_doubts_of_memory(space, fit.x))
+    doubts = list(doubts_of_memory(space, fit.x))
     if equations.tell_bodies:  # noise of single rows hides what is left
         doubts += doubts_of_payloads(space, fit)
     cause = None
@@ -408,18 +408,6 @@ def typical_sizes(model: Model, logs: Sequence[Dataset]) -> dict[str, Float[np.n
     return {"force": torque, "velocity": velocity, "inertia": mass, "position": position}
 
 
-def _doubts_of_memory(space: ParameterSpace, x: np.ndarray) -> Iterator[Doubt]:
-    for own, term in zip(space.split(x)[1], space.terms, strict=True):
-        joints = np.array(space.model.robot.joint_names)[list(term.joints or ())]
-        for ends, when in ((term.high, "sooner"), (term.low, "later")) if term.name == "sigma" else ():
-            if (own == ends).any():
-                yield look(
-                    about="friction that remembers",
-                    what=f"sigma of {listed(joints[own == ends])} is at its bound: it turns {when} than the log tells.",
-                    do="Leave it out of memory, or give a log of slower reversals.",
-                )
-
-
 STRETCHES_LEFT_OUT = 4
 """Stretches of time that logs of fewer than three episodes are cut into."""
 
@@ -431,7 +419,8 @@ def held_out_noise(model: Model, dataset: Dataset, evidence: Torques | Accelerat
     model identified from the rest (block cross-validation; Burman, Chow & Nolan 1994): episodes, where there are three
     or more, else `STRETCHES_LEFT_OUT` stretches of time. Raises InvalidInput for too few rows.
     """
-    dataset = with_memory(require_type("dataset", dataset, Dataset), require_type("model", model, Model))
+    require_type("model", model, Model)
+    dataset = with_memory(require_type("dataset", dataset, Dataset), model)
     residuals, masses, mobilities, near = [], [], [], None
     for left_out in _left_out(dataset):
         kept = np.ones(len(dataset), dtype=bool)

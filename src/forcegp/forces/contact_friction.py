@@ -68,8 +68,7 @@ class TabulatedCurve:
 class ExpectedFriction:
     """What is expected of the friction that changes a normal force.
 
-    sliding: coefficient over the sliding speed (m/s); joints: name -> resisting force (Nm or N) over the joint's
-        velocity.
+    sliding: coefficient over the sliding speed (m/s); joints: name -> resisting force (Nm or N) over the velocity.
     """
 
     sliding: TabulatedCurve
