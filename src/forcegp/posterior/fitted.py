@@ -270,7 +270,7 @@ class MotionIntervals:
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> "MotionIntervals":
         """What `to_dict` gave."""
-        return cls(**{name: tuple(x) if name == "inputs" else np.array(x) for name, x in stored.items()})  # type: ignore[arg-type]  # of two kinds
+        return cls(**{name: np.array(x) if len(x) and name != "inputs" else tuple(x) for name, x in stored.items()})  # type: ignore[arg-type]  # of two kinds
 
 
 def _between(at: np.ndarray, ends: np.ndarray, values: np.ndarray) -> np.ndarray:
