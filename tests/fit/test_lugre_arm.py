@@ -85,5 +85,5 @@ def test_pushes_are_felt_through_gears(learned):
             found[laws, force] = float(np.mean(hits))
     print(found)
     assert found[GEARS, 5.0] >= 0.5
-    assert found[GEARS, 10.0] >= 0.9
-    assert found[GEARS, 10.0] > found[STEADY, 10.0] + 0.5
+    assert found[GEARS, 10.0] >= 0.95
+    assert all(found[GEARS, force] > found[STEADY, force] + 0.2 for force in (5.0, 10.0))  # which alarms falsely, too
