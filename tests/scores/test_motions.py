@@ -96,6 +96,7 @@ def test_what_cannot_be_predicted_is_said():
     found = held_out_motions(uneven, data.episode == 0, (0.5,))
     assert len(found) == 0
     assert "uneven" in found.notes[0]
+    assert len(held_out_motions(replace(uneven, time=0.02 * times + 0.98 * data.time), data.episode == 0, (0.5,)))
     mixed = data.rows(np.random.default_rng(0).permutation(len(data)))
     assert "not in the order of time" in held_out_motions(mixed, np.ones(len(data), bool), (0.5,)).notes[0]
 

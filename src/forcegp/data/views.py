@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from forcegp.data.dataset import Dataset
+from forcegp.data.filters import JITTER
 from forcegp.errors import InvalidInput
 from forcegp.model import Model
 from forcegp.robots.arguments import whole_number
@@ -17,7 +18,7 @@ Select = Callable[[Dataset, int], Int[np.ndarray, " chosen"]]
 """Which rows: numbers of at most so many of a log, such as `evenly` gives."""
 
 BLOCK = 4096  # rows
-EVEN_STEPS = 1e-3  # time steps of a recording count as equal within this fraction
+EVEN_STEPS = 1e-3  # of a duration: rounding
 LEAP = 0.3  # median step of a position over its standard deviation, from which rows are no motion (random states: 0.95)
 
 
@@ -283,7 +284,7 @@ def _even_steps(dataset: Dataset) -> tuple[float, Int[np.ndarray, " rows"]]:
     if not own.size:
         raise InvalidInput("every episode has one row only; a rollout is compared with a motion of several rows.")
     dt = float(np.median(own))
-    return dt, np.concatenate([[0], np.cumsum(np.abs(pauses - dt) > EVEN_STEPS * dt)])
+    return dt, np.concatenate([[0], np.cumsum(np.abs(pauses - dt) > JITTER * dt)])
 
 
 MOTION = 1.5  # ratio of noise as seen by third and by fourth differences above which they see motion instead

@@ -115,8 +115,7 @@ NOWHERE = 1e9  # the largest velocity before any is visited
 def friction(dimension: int, variance: float | Tensor) -> AdditiveKernel:
     """Friction as a function f(s) = phi(s) g(s) + d s of one velocity s, divided by its rms and not shifted.
 
-    phi(s) = tanh(s / w) is zero at rest, g = c + h(s) the level of dry friction, d viscous (Olsson et al. 1998, section
-    2):
+    phi(s) = tanh(s / w) is 0 at rest, g = c + h(s) the level of dry friction, d viscous (Olsson et al. 1998, sec. 2):
 
         k = tanh(s / w) tanh(s' / w) (c^2 + r^2 exp(-|x(s) - x(s')| / l)) + d^2 s s' + e(s) e(s'),  x(s) = asinh(s / w')
 
