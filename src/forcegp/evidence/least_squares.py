@@ -100,7 +100,7 @@ ROUNDS = 16
 MOST_EVALUATIONS = 300
 """Of the residuals in one round."""
 CONTENT, ROUGHLY = 0.01, 1.0
-"""Two steps in a row that lower the objective by less than so many nats end a round; a first one sooner."""
+"""Two steps in a row that lower the objective by less than so many nats end a round; `ROUGHLY` as noise changes."""
 PASSES = 20
 """Over the noise of residuals, in each round, where unknown forces are left out."""
 LEAST_NOISE = 1e-6

@@ -270,7 +270,8 @@ class MotionIntervals:
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> "MotionIntervals":
         """What `to_dict` gave."""
-        return cls(**{name: np.array(x) if len(x) and name != "inputs" else tuple(x) for name, x in stored.items()})  # type: ignore[arg-type]  # of two kinds
+        made: dict[str, Any] = {name: np.array(x) if len(x) else () for name, x in stored.items() if name != "inputs"}
+        return cls(**made, inputs=tuple(stored["inputs"]))
 
 
 def _between(at: np.ndarray, ends: np.ndarray, values: np.ndarray) -> np.ndarray:

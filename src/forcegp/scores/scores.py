@@ -41,8 +41,7 @@ class PairedDifference:
 
     `value` is the ratio of root mean square errors (0.8: a fifth less), with its interval; None for one stretch and one
     seed. The challenger was better in `wins` of `runs` and, over all seeds, in `ahead` of `stretches` (motions, for
-    that score). A ratio within `MARGIN` of 1 is no difference. The challenger diverged in `lost` of them more often,
-    which the ratio does not see; that alone makes it worse.
+    that score). A ratio within `MARGIN` of 1 is no difference; to diverge in `lost` of them more often is worse.
     """
 
     criterion: str
