@@ -144,11 +144,20 @@ def test_a_direction_is_chosen_where_it_is_listed():
     assert not any(name.startswith("direction") for name in posterior.parameters)
 
 
-def test_friction_that_takes_most_of_the_load_is_none():
-    assert not any(
-        "factor" in parts
-        for parts in parts_of(log_with(lambda v, rigid: 0.7 * np.abs(rigid) * sign(v)))[1]["parts"].values()
-    )
+@pytest.mark.parametrize(
+    ("part", "friction", "found"),
+    [
+        ("factor", lambda v, rigid: 0.7 * np.abs(rigid) * sign(v), False),  # most of the load
+        ("root", lambda v, rigid: LEVEL * (1.0 - 2.5 * np.sqrt(np.abs(v))) * sign(v) + 2.0 * v, False),  # it drives
+        (
+            "root",
+            lambda v, rigid: LEVEL * (1.0 - 1.1 * np.sqrt(np.abs(v))) * sign(v) + 2.0 * v,
+            True,
+        ),  # by three quarters
+    ],
+)
+def test_a_part_that_makes_no_friction_is_none(part, friction, found):
+    assert [part in parts for parts in parts_of(log_with(friction))[1]["parts"].values()] == [found] * 3
 
 
 @pytest.mark.parametrize(("rows", "enough"), [(700, False), (3000, True)])

@@ -160,6 +160,20 @@ def test_a_model_whose_motions_diverge_is_not_the_best():
     assert scores(cells, kinds).best_of(("force prior",), "motion") == "b"
 
 
+def test_a_model_that_is_usable_in_more_joints_is_taken_whatever_its_motions():
+    def leaves(*shares: float | None, motion: float, quantity: str = "torque", score: str = "share") -> list[dict]:
+        return [{**cell(k, 1.0, motion=motion + 0.01 * k), "table": {quantity: {score: list(shares)}}} for k in (0, 1)]
+
+    cells = {"ls": leaves(0.3, 0.2, motion=0.4), "ls2": leaves(0.1, 0.51, motion=0.1)}
+    assert (scores(cells).recommended, scores(cells).unusable("ls2"), scores(cells).unusable("ls")) == ("ls", 1, 0)
+    assert scores({**cells, "ls2": leaves(0.1, 0.49, motion=0.1)}).recommended == "ls2", "half of a torque is usable"
+    learned = scores({**cells, "gp": leaves(0.4, None, motion=0.01)})
+    assert learned.winner.why == "usable in 1 more joints", "a share that is not known is none"
+    assert (learned.recommended, scores({"ls2": cells["ls2"], "gp": cells["ls"]}).recommended) == ("ls", "gp")
+    light = leaves(0.9, 0.1, motion=0.1, quantity="acceleration", score="nrmse")
+    assert scores({"ls": light, "net": light}).left("net") == ("acceleration", [0.9, 0.1]), "no torque was measured"
+
+
 def test_a_model_that_is_not_there_is_named():
     with pytest.raises(InvalidInput, match="name one of urdf, gp"):
         scores({"urdf": [cell(0, 1.0)], "gp": [cell(0, 0.5)]}).value("mae")

@@ -31,6 +31,7 @@ from forcegp.doubts import Doubt, Doubts, wrong
 from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUnit, NumericalError
 from forcegp.scores.accuracy import ACCELERATION, TORQUE
 from forcegp.scores.page import number
+from forcegp.scores.scores import USABLE
 
 MOST_CORRECTIONS = 8
 SCORES = ("models", "joint_names", "units", "recommended", "winner", "failures")
@@ -323,7 +324,8 @@ def answer_lines(
     flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
     mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
     late, lag, rate = prepared["delay"], prepared["lag"], (len(dataset) - len(dataset.episodes)) / seconds
-    when = "late" if late > 0.0 else "early: a controller that holds u is half a time step"
+    early = "early: a controller that holds u is half a time step" if -late * rate < 1.0 else "early, or q and v late"
+    when = "late" if late > 0.0 else early
     on_time = "u shows no delay" if "delay" in prepared["why"] else "u is taken to be on time"
     shifted = f"u was logged {1e3 * abs(late):.1f} ms {when} (shifted)" if late else on_time
     shifted += f", rotors follow within {1e3 * lag:.0f} ms" if lag else ""
@@ -388,19 +390,15 @@ def left_of_torques(scores: forcegp.scores.Scores, best: str) -> list[tuple[str,
     return [("torque left", f"on unseen time, % of the recorded one of each joint: {told}")] if told else []
 
 
-USABLE, LEAST_COVERAGE = 0.5, 0.8
-"""Largest share of a torque's deviation, or of an acceleration's, that a joint may leave on unseen time, and the least
-coverage of 95 % intervals that is no reason to doubt them."""
+LEAST_COVERAGE = 0.8  # of 95 % intervals that is no reason to doubt them
 
 
 def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset, still: Sequence[str] = ()) -> str:
     """Use it, use it for these joints, or do not use it; what it was measured by, and against the URDF alone."""
     best = scores.recommended
     assert best is not None, "a model was scored"
-    quantity, score = (
-        (TORQUE, "share") if "share" in scores.quantities(best).get(TORQUE, ()) else (ACCELERATION, "nrmse")
-    )
-    left = [math.inf if x is None else x for x in scores.columns(score, quantity, best)]
+    quantity, shares = scores.left(best)
+    left = [math.inf if x is None else x for x in shares]
     good = [name for name, x in zip(scores.joint_names, left, strict=True) if x <= USABLE]
     lost = [f"{name} {100.0 * x:.0f} %" if math.isfinite(x) else f"{name} not known from this log"
             for name, x in zip(scores.joint_names, left, strict=True) if x > USABLE]  # fmt: skip

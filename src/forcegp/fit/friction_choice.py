@@ -176,6 +176,7 @@ class _Regression:
         self.speed = np.maximum(np.sqrt((v**2).mean(0)), 1e-12)
         one, falls = np.ones_like(v), (np.exp(-((v / (fall * self.speed)) ** 2)) for fall in FALLS)
         self.v, self.shapes = v, np.stack([v, one, load, np.sqrt(np.abs(v)), np.abs(v), one, *falls], axis=-1)
+        self.root = np.sqrt(np.abs(v)).mean(axis=0)  # where dry friction that falls with speed is still friction
         self.past: dict[int, torch.Tensor] = {}
         self.signs = [{-width: self._sums(j, -width) for width in WIDTHS} for j in range(self.nv)]
         self.at, self.fall = [-WIDTHS[1]] * self.nv, [len(FALLS) // 2] * self.nv
@@ -287,7 +288,9 @@ class _Regression:
                 normal = (whole - without[0]) / np.outer(scale, scale)
                 x = np.linalg.solve(normal + RIDGE * np.eye(len(x)), (given - without[1]) / scale) / scale
                 loads = "factor" not in parts or 0.0 <= x[n + 2] <= HIGHEST
-                if not loads or ("breakaway" in parts and not 0.0 <= x[-1] <= x[n + 1]):  # it falls by half at most
+                slows = "root" not in parts or x[n + 1] + x[n + 2 + ("factor" in parts)] * self.root[j] >= 0.0
+                falls = "breakaway" not in parts or 0.0 <= x[-1] <= x[n + 1]  # by half at most
+                if not (loads and slows and falls):
                     return np.full(self.count, np.inf)
             out[k] = squares[k] - 2.0 * x[own] @ own_b[k] + x[own] @ own_A[k] @ x[own]
         return out

@@ -18,13 +18,14 @@ from typing_extensions import override
 
 from forcegp.errors import FitError, InvalidInput, require_known
 from forcegp.posterior.posterior import Posterior
-from forcegp.scores.accuracy import ACCELERATION, median_and_range, over_columns
+from forcegp.scores.accuracy import ACCELERATION, TORQUE, median_and_range, over_columns
 from forcegp.summary import Summary, listed
 
 CERTAINTY = 0.95
 MARGIN = 0.02  # of a ratio: a difference below it matters to nobody, however sure it is
 CLEAR, MOSTLY = 0.67, 0.8  # ratio and share of stretches that decide where a log is too short to show anything
 MOST_LOG = 700.0  # of a ratio that is still a finite number
+USABLE = 0.5  # largest share of a torque's deviation, or of an acceleration's, that a model may leave in a joint
 
 CRITERIA: Mapping[str, str] = {
     "motion": "error of predicted motions",
@@ -230,6 +231,18 @@ class Scores(Summary):
 
     # ------------------------------------------------------------------ which model
 
+    def left(self, model: str) -> tuple[str, list[float | None]]:
+        """What a model leaves of each joint's torque, else of its acceleration: that quantity, and its shares."""
+        held = self.quantities(model)
+        for quantity, score in ((TORQUE, "share"), (ACCELERATION, "nrmse")):
+            if score in held.get(quantity, ()):
+                return quantity, self.columns(score, quantity, model)
+        return ACCELERATION, []
+
+    def unusable(self, model: str) -> int:
+        """In how many joints a model leaves more than `USABLE`, or it is not known what it leaves."""
+        return sum(share is None or share > USABLE for share in self.left(model)[1])
+
     def errors(self, criterion: str, model: str) -> dict[tuple[str, int], Float[np.ndarray, "horizons stretches"]]:
         """Squared errors by split and seed; one horizon but for motions."""
         out = {}
@@ -257,7 +270,7 @@ class Scores(Summary):
         return paired_difference(criterion, challenger, baseline, a, b)
 
     def best_of(self, kinds: Sequence[str], criterion: str, but: str | None = None) -> str | None:
-        """The model of these kinds with the lowest error, among those that failed least and diverged least."""
+        """The model of these kinds with the lowest error, among those that failed, lost joints and diverged least."""
         found = []
         for name, model in self.models.items():
             errors = self.errors(criterion, name)
@@ -270,16 +283,22 @@ class Scores(Summary):
                 means = [np.ma.masked_invalid(each).mean(axis=1).filled(np.nan) for each in errors.values()]
                 floor = np.finfo(float).tiny
                 level = float(np.median([np.log(np.maximum(each, floor)).mean() for each in means]))
-                found.append((len(self.runs[name]) - len(errors), int(np.isnan(every).sum()), level, name))
+                failed, diverged = len(self.runs[name]) - len(errors), int(np.isnan(every).sum())
+                found.append((failed, self.unusable(name), diverged, level, name))
         return min(found)[-1] if found else None
 
     @cached_property
     def winner(self) -> Winner | None:
-        """The best parametric model, unless another is shown to be better; None where no model was scored."""
+        """The best parametric model, unless another is shown to be better, or is usable in more joints.
+
+        None where no model was scored.
+        """
         for criterion in CRITERIA:
             simple, other = (self.best_of(kinds, criterion) for kinds in (PARAMETRIC, LEARNED))
             if simple is not None and other is not None:
-                found = self.difference(criterion, other, simple)
+                found, more = self.difference(criterion, other, simple), self.unusable(simple) - self.unusable(other)
+                if more:
+                    return Winner(other if more > 0 else simple, found, f"usable in {abs(more)} more joints")
                 if found is None or not found.favours_challenger:
                     return Winner(simple, found, "nothing is shown to be better than the best parametric")
                 sure = found.outcome == "better"
