@@ -195,7 +195,13 @@ def dropped(data: Dataset, names: str, share: float, seed: int = 0) -> Dataset:
 
 
 def registers(x: np.ndarray) -> np.ndarray:
-    return np.where(x < 0.0, 1.2 * np.abs(x).max() - x, x)
+    step = np.abs(x).max() / 7.0
+    raw = np.round(x / step)
+    return step * np.where(raw < 0.0, 10.0 - raw, raw)
+
+
+def limited(x: np.ndarray) -> np.ndarray:
+    return np.minimum(x, np.quantile(x, 0.97, axis=0))
 
 
 def held(x: np.ndarray) -> np.ndarray:
@@ -254,7 +260,7 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "frozen torque": (lambda d: column(d, "u", 0, held), "frozen"),
     "torque channel dead": (lambda d: column(d, "u", 1, lambda x: 0 * x), "constant channel"),
     "registers of sign and magnitude": (lambda d: column(d, "u", 0, registers), "register"),
-    "targets of the controller": (lambda d: replace(d, u=np.roll(d.q, -9, axis=0)), "targets"),
+    "targets of the controller": (lambda d: replace(d, u=limited(np.roll(d.q, -9, axis=0))), "targets"),
     "no torque": (lambda d: replace(d, u=0.0 * d.u), "no torque was measured"),
     "turns": (lambda d: at(d, "qva", [0.5 / np.pi] * 2), "turns"),
     "time in ms": (lambda d: replace(d, time=1000 * d.time), "velocity|acceleration|sampling"),

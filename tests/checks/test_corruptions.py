@@ -50,6 +50,7 @@ def test_a_corruption_is_named_by_check_and_before_a_fit(name):
     line = said_by_fit(data)
     assert "\n" not in line
     assert named(line, words), line
+    assert words not in ("register", "targets") or len(quick_check(data).at("wrong")) == 1, line
 
 
 def test_an_invented_contact_is_named_by_check_and_before_a_fit():

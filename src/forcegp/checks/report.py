@@ -138,7 +138,7 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
     if inputs.contacts:
         return [*doubts, TOUCHES], None
     if targets := target_doubts(inputs):
-        return [*doubts, *targets], None
+        return [*(each for each in doubts if each.about != "saturation"), *targets], None  # a target may stay
     if inputs.log.u.any() and not contacts:
         found, said = search(inputs)
         if said and moved and (held := held_points(inputs)):

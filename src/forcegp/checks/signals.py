@@ -36,7 +36,7 @@ def signal_doubts(inputs: CheckInput) -> list[Doubt]:
     return [*_jumps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *clipped]
 
 
-FEWEST_VALUES, GAPS = 20, 8  # on either side of a gap, and how many gaps are looked at
+FEWEST_VALUES, GAPS = 5, 8  # on either side of a gap, and how many gaps are looked at
 CALMER = 0.5  # square sum of steps of decoded registers over that of what was logged
 
 
