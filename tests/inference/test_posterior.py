@@ -163,10 +163,6 @@ def test_memory_is_that_of_the_matrices(engine, matrices):
     assert engine.required_bytes(SIZE) == sum(8 * rows * columns for rows, columns in matrices)
 
 
-def test_learning_needs_two_more_matrices_for_each_latent():
-    assert Exact().bytes_to_learn(SIZE) - Exact().required_bytes(SIZE) == 3 * 8 * 3 * 1000**2
-
-
 def test_the_engine_follows_rows_features_and_memory(free):
     assert choose_engine(replace(SIZE, rows=1500), CPU).engine == Exact()
     assert choose_engine(replace(SIZE, rows=8000), CPU).engine == Exact()  # rN = 16,000

@@ -205,10 +205,6 @@ class RowFunction:
         vectors = [ctypes.c_void_p, ctypes.c_long] * (inputs + len(outputs))
         self._evaluate.argtypes = [ctypes.c_long, ctypes.c_long, ctypes.c_void_p, *vectors]
 
-    def with_tables(self, tables: Sequence[Tensor]) -> "RowFunction":
-        """The same code with other numbers."""
-        return RowFunction(self.library, self.inputs, self.outputs, tables)
-
     def single(self, *inputs: Tensor) -> tuple[int, list[Tensor]]:
         """What is to be reported, and the outputs (size,) at one state (size,)."""
         made = [torch.empty(size, dtype=torch.float64) for size in self.outputs]

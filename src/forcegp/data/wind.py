@@ -76,7 +76,8 @@ def find_wind(dataset: Dataset) -> tuple[AirLaw, Float[np.ndarray, "rows 3"]] | 
     the rows nearby. Not for bases that do not fly freely, rows out of order, fewer than 400, drag that explains no more
     than its coefficients would of noise, winds beyond 40 m/s or deviations beyond 2 m/s.
     """
-    if not _flies(dataset) or not dataset.time_ordered:
+    flies = bool(dataset.model.robot.layout.groups) and not dataset.model.contacts
+    if not flies or not dataset.time_ordered:
         return None
     numbers, episode = np.unique(dataset.episode, return_inverse=True)
     thin = np.arange(0, len(dataset), max(1, len(dataset) // MOST_ROWS))
@@ -100,10 +101,6 @@ def with_wind(dataset: Dataset, wind: Float[np.ndarray, "rows 3"]) -> Dataset:
     first = model.inputs.index(forcegp.forces.ObservedWind.names[0])
     u = np.insert(dataset.u, [first] * 3, wind, axis=1)
     return replace(dataset, u=u, model=model)
-
-
-def _flies(dataset: Dataset) -> bool:
-    return bool(dataset.model.robot.layout.groups) and not dataset.model.contacts
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,8 @@ def require_memory_to_learn(likelihood: MarginalLikelihood) -> None:
         size = ProblemSize.of(likelihood.terms({ACCELERATION: one, SENSOR: one[:1]}))
     remedy = "find hyper-parameters on fewer rows: `learning_points=600`, or give fewer points"
     what = f"the likelihood of N={size.rows} rows with its gradients"
-    require_memory(Exact().bytes_to_learn(size), what, remedy, likelihood.training.q.device)
+    needed = Exact().required_bytes(size) + 24 * size.latents * size.rows**2  # gradients of the kernel matrices as well
+    require_memory(needed, what, remedy, likelihood.training.q.device)
 
 
 def on_all_rows(fitted: Posterior, rows: Dataset, engine: Engine | None, described: Mapping[str, Any]) -> Posterior:

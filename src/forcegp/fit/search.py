@@ -136,11 +136,6 @@ def default_options(points: int) -> OptimizerOptions:
     return LARGE if points > MOST_POINTS_FOR_RESTARTS else SMALL
 
 
-def default_restarts(points: int) -> int:
-    """Starts of the search where none are asked for."""
-    return 4 if points <= MOST_POINTS_FOR_RESTARTS else 1
-
-
 def started(moments: Mapping[str, Tensor], first: Mapping[str, Tensor], seed: int, index: int) -> Mapping[str, Tensor]:
     """`first`; of later starts the moments, with kernels shifted by seeded normal numbers on their log scale.
 
@@ -237,8 +232,8 @@ class Search:
 
     def resolved(self, rows: int) -> tuple[int, OptimizerOptions]:
         """Restarts and options for so many rows."""
-        restarts = default_restarts(rows) if self.restarts is None else self.restarts
-        return restarts, self.options or default_options(rows)
+        usual = 4 if rows <= MOST_POINTS_FOR_RESTARTS else 1
+        return usual if self.restarts is None else self.restarts, self.options or default_options(rows)
 
     def starts(self, moments: Mapping[str, Tensor], fixed: Mapping[str, Tensor]) -> Starts:
         """Start `index`: 0 is the moments, with what `start` gives in their place, others lie around the moments."""

@@ -285,15 +285,9 @@ class Law(Force):
     def learned(self) -> tuple[str, ...]:
         """Names of the coefficients that a fit estimates."""
         given = {name: getattr(self, name) for name in self.coefficients}
-        open_ = any(value is None for value in list(given.values())[:1])
-        return tuple(
-            name
-            for name, value in given.items()
-            if isinstance(value, Normal | LogNormal) or (value is None and (open_ or self._has_prior()))
-        )
-
-    def _has_prior(self) -> bool:
-        return any(isinstance(getattr(self, name), Normal | LogNormal) for name in list(self.coefficients)[:1])
+        free = {name for name, value in given.items() if value is None or isinstance(value, Normal | LogNormal)}
+        open_ = set(list(given)[:1]) <= free  # what has no first coefficient, or states none
+        return tuple(name for name, value in given.items() if name in free and (value is not None or open_))
 
     def with_values(self: AnyLaw, values: Mapping[str, Any]) -> AnyLaw:
         """The same law with these coefficients, which are known then."""

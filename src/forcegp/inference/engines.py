@@ -92,10 +92,6 @@ class Exact(Engine):
     def required_bytes(self, size: ProblemSize) -> int:
         return 8 * ((size.rows * size.rank) ** 2 + size.latents * size.rows**2)
 
-    def bytes_to_learn(self, size: ProblemSize) -> int:
-        """Memory that the likelihood with its gradients takes: those of the kernel matrices as well."""
-        return self.required_bytes(size) + 24 * size.latents * size.rows**2
-
     @override
     def condition(self, kernels: LatentKernels, terms: Terms) -> LatentPosterior:
         self.require_memory(ProblemSize.of(terms), terms.W.device)

@@ -387,4 +387,4 @@ class Programs:
         if (codes := self.drawn(samples, seed)) is None:
             return None
         first = codes[0].function(integrator)
-        return [first.with_tables(code.tables()) for code in codes]
+        return [RowFunction(first.library, first.inputs, first.outputs, code.tables()) for code in codes]

@@ -207,7 +207,9 @@ def difference(start: Float[Tensor, "*batch 7"], end: Float[Tensor, "*batch 7"])
     conjugate = _unit(start[..., TURN]) * start.new_tensor([-1.0, -1.0, -1.0, 1.0])
     turn = quaternion_product(conjugate, _unit(end[..., TURN]))
     turn = torch.where(turn[..., 3:] < 0.0, -turn, turn)
-    angular = 2.0 * _arc((turn[..., :3] ** 2).sum(-1, keepdim=True), turn[..., 3:]) * turn[..., :3]
+    sines = (turn[..., :3] ** 2).sum(-1, keepdim=True)
+    arc = _smooth(sines, _ARCSINE, lambda sine: torch.atan2(sine, turn[..., 3:]) / sine, small=1e-3)  # over its sine
+    angular = 2.0 * arc * turn[..., :3]
     square = (angular * angular).sum(-1, keepdim=True)
     linear = (first.mT @ (to - from_)[..., None])[..., 0]
     once = torch.linalg.cross(angular, linear)
@@ -280,8 +282,3 @@ _rest = partial(_smooth, series=_REST, closed=lambda t: (t - t.sin()) / t**3)
 """(t - sin t) / t^3."""
 _cotangent = partial(_smooth, series=_COTANGENT, closed=lambda t: (1.0 - 0.5 * t / (0.5 * t).tan()) / t**2)
 """(1 - t/2 cot(t/2)) / t^2."""
-
-
-def _arc(sine_square: Tensor, cosine: Tensor) -> Tensor:
-    """arc / sin(arc) of the squared sine and the cosine of an arc up to a right angle."""
-    return _smooth(sine_square, _ARCSINE, lambda sine: torch.atan2(sine, cosine) / sine, small=1e-3)
