@@ -200,8 +200,8 @@ def registers(x: np.ndarray) -> np.ndarray:
     return step * np.where(raw < 0.0, 10.0 - raw, raw)
 
 
-def limited(x: np.ndarray) -> np.ndarray:
-    return np.minimum(x, np.quantile(x, 0.97, axis=0))
+def limited(x: np.ndarray, share: float = 0.97) -> np.ndarray:
+    return np.minimum(x, np.quantile(x, share, axis=0))
 
 
 def held(x: np.ndarray) -> np.ndarray:
@@ -256,6 +256,10 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "3 % of q zero": (lambda d: dropped(d, "q", 0.03), "zero|drop|velocity"),
     "frozen position": (lambda d: column(d, "q", 1, held), "frozen"),
     "saturation": (lambda d: column(d, "u", 0, lambda x: np.clip(x, *np.quantile(x, [0.1, 0.9]))), "saturation"),
+    "saturation of a warm drive": (
+        lambda d: column(d, "u", 0, lambda x: np.r_[x[:300], limited(x[300:], 0.8)]),
+        "saturation",
+    ),
     "encoder zero off by .4": (lambda d: replace(d, q=d.q + np.array([0.0, 0.4])), "zero"),
     "frozen torque": (lambda d: column(d, "u", 0, held), "frozen"),
     "torque channel dead": (lambda d: column(d, "u", 1, lambda x: 0 * x), "constant channel"),

@@ -70,7 +70,7 @@ def test_a_load_on_the_trunk(folder, forcegp):
 
 @pytest.mark.nightly
 def test_auto_goes_from_a_flight_to_a_page(folder, forcegp):
-    models = ("--forces", "given", "--cutoff", "none")
+    models = ("--forces", "given", "--cutoff", "none", "--lag", 0.06)
     done = forcegp("auto", "flight.csv", *COLUMNS, "--identified", "drone.json", *models, "--out", "answer", "--json",
                    folder=folder)  # fmt: skip
     assert done.returncode == 0, done.stderr

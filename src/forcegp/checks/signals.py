@@ -205,9 +205,10 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
             start, length = begin, end - begin
     if not length or values[start] in (values.min(), values.max()):
         return
+    stays = np.ptp(runs(values == values[start]), axis=1)
     yield Doubt(
         level="look" if name == "u" and values[start] == 0.0 else "wrong",
-        about="frozen channel",
+        about="saturation" if name == "u" and (stays >= FROZEN_ROWS).sum() > 1 else "frozen channel",  # a limit recurs
         what=f"the {QUANTITY[name]} of {inputs.names[joint]} stands still at {values[start]:.6g} for "
         f"{length * step:.3g} s from row {start} at {log.time[start]:.3f} s, while its other signals change.",
         do="Leave this stretch out, and look at the logger.",

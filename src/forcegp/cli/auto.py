@@ -276,6 +276,7 @@ def short_name(name: str) -> str:
     laws, air = "gp:joint-friction" in name, "gp:aerodynamic" in name
     learned = " and ".join(what for what, has in (("friction", laws), ("air forces", air)) if has)
     plain = {"given": "the URDF", "identified@accelerations": "identified by accelerations"}
+    plain |= {"identified@torques:both": "identified by torques and accelerations"}
     return f"{learned} learned" if learned else plain.get(name, name)
 
 
@@ -290,7 +291,8 @@ def default_models(
 ) -> tuple[str, ...]:
     """What is compared: what thrusters fly through shows in no regression, so it is learned on the robot as given.
 
-    Accelerations are learned from as well where torques predict them by half, unlike of light or still joints.
+    Accelerations are learned from as well where torques predict them by half, unlike of light or still joints; beside
+    torques where they do so in most joints alone.
     """
     friction = bool(model.robot.single_joint_names)
     if forcegp.data.thruster_columns(model):
@@ -298,7 +300,8 @@ def default_models(
     models = ["given", "identified", *(["identified+gp:joint-friction"] if friction else [])]
     if model.robot.space.is_vector_space and not model.contacts and not still:
         missed = forcegp.evidence.motion_residuals(rows, identified.model)[1].std(axis=0)
-        models += ["identified@accelerations"] if (missed < USABLE * rows.a.std(axis=0)).mean() > 0.5 else []
+        share = (missed < USABLE * rows.a.std(axis=0)).mean()
+        models += [f"identified@{'accelerations' if share == 1.0 else 'torques:both'}"] if share > 0.5 else []
     return tuple(models)
 
 

@@ -276,14 +276,11 @@ class Scores(Summary):
             errors = self.errors(criterion, name)
             if model["kind"] not in kinds or not errors or name == but:
                 continue
-            finite = {run: np.where(np.isfinite(each), each, np.nan) for run, each in errors.items()}
-            every = np.concatenate([each.ravel() for each in finite.values()])
-            if np.isfinite(every).any():
-                # the median over runs of the error over stretches; of motions the geometric mean over horizons
-                means = [np.ma.masked_invalid(each).mean(axis=1).filled(np.nan) for each in errors.values()]
-                floor = np.finfo(float).tiny
-                level = float(np.median([np.log(np.maximum(each, floor)).mean() for each in means]))
-                failed, diverged = len(self.runs[name]) - len(errors), int(np.isnan(every).sum())
+            every = np.ma.masked_invalid(np.concatenate(list(errors.values()), axis=1))
+            if every.count():
+                # over runs and stretches as differences are; of motions the geometric mean over horizons
+                level = float(np.log(np.maximum(every.mean(axis=1).compressed(), np.finfo(float).tiny)).mean())
+                failed, diverged = len(self.runs[name]) - len(errors), int(every.mask.sum())
                 found.append((failed, self.unusable(name), diverged, level, name))
         return min(found)[-1] if found else None
 
