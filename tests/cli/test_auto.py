@@ -220,5 +220,10 @@ def test_accelerations_are_learned_from_where_torques_make_them_predictable():
     known = fit(data.model.with_forces(Viscous(0.1), Coulomb(0.2), noise=Noise(1.0)), data)
     assert default_models(data.model, known, data)[-1] == "identified@accelerations"
     assert default_models(data.model, known, data, ["elbow"])[-1] == "identified+gp:joint-friction"
+    arm = clean(0, noise=0.0)
+    exact = replace(arm, u=arm.u - 0.1 * arm.v - 0.2 * np.tanh(arm.v / 0.05))
+    assert default_models(arm.model, SimpleNamespace(model=arm.model), exact)[-1] == "identified@accelerations"
+    wrist = replace(exact, a=exact.a + np.array([0.0, 0.0, 100.0]) * np.random.default_rng(0).normal(size=arm.a.shape))
+    assert default_models(arm.model, SimpleNamespace(model=arm.model), wrist)[-1] == "identified@torques:both"
     loud = replace(data, u=data.u + 3.0 * np.random.default_rng(0).normal(size=data.u.shape))
     assert default_models(data.model, known, loud)[-1] == "identified+gp:joint-friction"
