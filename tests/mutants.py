@@ -32,9 +32,12 @@ UNSEEN = {"stacklevel", "figsize", "dpi", "fontsize", "labelsize", "linewidth", 
 LEFT_OUT = ast.Raise | ast.Assert | ast.JoinedStr | ast.ImportFrom | ast.Import
 EXCHANGED: dict[type[ast.AST], type[ast.AST]] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.MatMult: ast.Mult, ast.Lt: ast.GtE,
-    ast.LtE: ast.Lt, ast.Gt: ast.LtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.And: ast.Or,
+    ast.LtE: ast.Gt, ast.Gt: ast.LtE, ast.GtE: ast.Lt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.And: ast.Or,
     ast.Or: ast.And, ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
+    ast.BitOr: ast.BitAnd, ast.BitAnd: ast.BitOr,
 }  # fmt: skip
+COUNTED: dict[type[ast.AST], type[ast.AST]] = {ast.LtE: ast.Lt, ast.GtE: ast.Gt}
+"""Whether the bound belongs is a fault where it is counted; of real numbers none is ever equal to it."""
 
 
 def places(node: ast.AST) -> Iterator[ast.AST]:
@@ -53,6 +56,10 @@ def places(node: ast.AST) -> Iterator[ast.AST]:
                 yield from places(child)
 
 
+def _counts(node: ast.AST) -> bool:
+    return type(getattr(node, "value", None)) is int or ast.unparse(node).startswith("len(")
+
+
 def mutated(source: str, place: int) -> tuple[str, str]:
     """The source with a fault at this place, and what was changed."""
     tree = ast.parse(source)
@@ -63,7 +70,9 @@ def mutated(source: str, place: int) -> tuple[str, str]:
     elif isinstance(node, ast.If | ast.IfExp):
         node.test = ast.UnaryOp(ast.Not(), copy.copy(node.test))
     elif isinstance(node, ast.Compare):
-        node.ops[0] = EXCHANGED.get(type(node.ops[0]), ast.Is)()  # type: ignore[call-overload]  # of comparisons
+        counted = any(map(_counts, (node.left, *node.comparators)))
+        exchanged = EXCHANGED | COUNTED if counted else EXCHANGED
+        node.ops[0] = exchanged[type(node.ops[0])]()  # type: ignore[call-overload]  # of comparisons
     elif isinstance(node, ast.BinOp | ast.BoolOp):
         node.op = EXCHANGED.get(type(node.op), ast.Add)()  # type: ignore[assignment]  # of the same kind
     after = ast.unparse(node.test if isinstance(node, ast.If) else node)
