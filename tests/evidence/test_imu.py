@@ -1,79 +1,23 @@
-"""IMUs as evidence: against MuJoCo's accelerometers, and logs with a mistake planted."""
+"""IMUs as evidence: better accelerations, small turns, and from columns to a fit."""
 
 from dataclasses import replace
-from functools import cache
 
-import mujoco as untyped
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 from tests.cli.in_process import run_here
-from tests.posterior.arm import URDF, arm_model
-from tests.robots.mjcf_models import QUADRUPED
-from tests.robots.mujoco_oracle import MujocoOracle, states
-from tests.robots.test_mjcf import read
+from tests.data.test_imu import NAME, TURN, changed, recorded, turned
+from tests.posterior.arm import URDF
 
-from forcegp import Accelerations, FrameAcceleration, Torques, check, fit, load_posterior, save_posterior
+from forcegp import Accelerations, FrameAcceleration, Torques, fit, load_posterior, save_posterior
 from forcegp.data import Dataset, Preparation
 from forcegp.data.dataset import IMU, imu_place
-from forcegp.data.imu import expected, imu_doubts, specific_force
-from forcegp.doubts import Doubts
 from forcegp.errors import InvalidInput
 from forcegp.forces import JointForces, RigidBodies, Viscous
 from forcegp.inference import OptimizerOptions
 from forcegp.noise import Noise
 
-mujoco = untyped
-POINT, TURN = (0.03, -0.02, 0.1), (0.3, -0.5, 1.0)
-NAME = f"{IMU}hand@{','.join(map(str, (*POINT, *TURN)))}"
-RATE, MIDDLE = 500, np.array([0.0, 0.6, 0.7])
 QUICK = {"restarts": 1, "options": OptimizerOptions(iterations=8)}
-
-
-def with_accelerometer(spec, body):
-    spec.body(body).add_site(name="at", pos=POINT, quat=Rotation.from_euler("xyz", TURN).as_quat(scalar_first=True))
-    spec.add_sensor(type=mujoco.mjtSensor.mjSENS_ACCELEROMETER, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="at")
-    return spec.compile()
-
-
-def test_specific_forces_of_a_moving_base_are_those_of_mujoco():
-    robot, body = read(QUADRUPED), "fl_shank"
-    oracle = MujocoOracle(with_accelerometer(mujoco.MjSpec.from_string(QUADRUPED), body))
-    for q, v, push in zip(*states(robot), strict=True):
-        oracle.data.qfrc_applied[:] = 20.0 * push.numpy()
-        oracle.at(q.numpy(), v.numpy())
-        a = torch.tensor(np.linalg.solve(oracle.T, oracle.data.qacc - oracle.drift))
-        found = specific_force(robot.kinematics(q, v), NAME.replace("hand", body))(a)
-        np.testing.assert_allclose(found, oracle.data.sensordata, atol=1e-9 * abs(oracle.data.sensordata).max())
-
-
-@cache
-def recorded():
-    """An arm in MuJoCo with viscous friction that follows sines: as it was, and with an encoder and derived v and a."""
-    spec = mujoco.MjSpec.from_string(URDF)
-    spec.option.timestep, spec.option.integrator = 0.5 / RATE, mujoco.mjtIntegrator.mjINT_RK4
-    model = with_accelerometer(spec, "hand")
-    model.dof_damping[:], model.dof_frictionloss[:] = [0.8, 0.7, 0.5], 0.0
-    data, rng, out = mujoco.MjData(model), np.random.default_rng(0), []
-    f, shift = rng.uniform(0.2, 1.1, (3, 4)), rng.uniform(0.0, 6.0, (3, 4))
-    size = np.array([[0.25], [0.15], [0.2]]) / f**0.7
-    for k in range(16 * RATE):
-        phase = np.pi * f * k / RATE + shift
-        q, v = MIDDLE + (size * np.sin(phase)).sum(1), (size * 2.0 * np.pi * f * np.cos(phase)).sum(1)
-        if not k:
-            data.qpos[:], data.qvel[:] = q, v
-        mujoco.mj_forward(model, data)
-        data.qfrc_applied[:] = data.qfrc_bias + [60, 60, 25] * (q - data.qpos) + [6, 6, 2.5] * (v - data.qvel)
-        if not k % 2:
-            mujoco.mj_forward(model, data)
-            out.append(np.array([data.qpos, data.qvel, data.qfrc_applied, data.qacc, data.sensordata]))
-        mujoco.mj_step(model, data)
-    (q, v, u, a, f), time = np.array(out).transpose(1, 0, 2), np.arange(len(out)) / RATE
-    true = Dataset(q=q, v=v, u=u, a=a, time=time, model=arm_model(0), measured={NAME: f})
-    q, (u, f) = np.round(q / 5e-4) * 5e-4, (x + 0.05 * rng.standard_normal(x.shape) for x in (u, f))
-    v = np.gradient(q, time, axis=0)
-    return replace(true, q=q, v=v, u=u, a=np.gradient(v, time, axis=0), measured={NAME: f}), true
 
 
 def missed(posterior, true):
@@ -97,53 +41,6 @@ def test_an_imu_is_the_better_acceleration(rest, forces):
     alone = missed(fit(model, rows, rest, **how), true)
     beside = missed(fit(model, rows, [rest, FrameAcceleration(noise=0.05)], **how), true)
     assert np.linalg.norm(beside) < 0.75 * np.linalg.norm(alone)
-
-
-def changed(change, cutoff=10.0):
-    raw, _ = recorded()
-    at_rest = expected(replace(raw, v=0.0 * raw.v, a=0.0 * raw.a), raw.model, NAME)
-    f = change(raw.measured[NAME], at_rest, raw.time)
-    return Preparation(cutoff=cutoff).apply(replace(raw, measured={NAME: f}))
-
-
-def turned(y, bias=0.0):
-    return lambda f, *_: f @ Rotation.from_rotvec([0.0, y, 0.0]).as_matrix() + [0.0, bias, 0.0]
-
-
-def late(f, _, time):
-    return np.stack([np.interp(time - 0.012, time, x) for x in f.T], 1)
-
-
-@pytest.mark.parametrize(
-    ("change", "level", "words"),
-    [
-        (lambda f, *_: f, "ok", "differs by 0.0"),
-        (lambda f, *_: -f, "wrong", "1.0=-x,-y,-z"),
-        (lambda f, *_: f[:, [1, 0, 2]] * [1, -1, 1], "wrong", "it is -y,x,z of its frame's x,y,z"),
-        (lambda f, *_: f / 9.80665, "wrong", "it is in g. forcegp import --unit imu=g"),
-        (lambda f, at_rest, _: f - at_rest, "wrong", "it is without gravity"),
-        (lambda f, *_: 2.0 * f, "wrong", "Compare its frame, point, axes and unit"),
-        (turned(0.034), "look", "turned by 1.9 degrees"),
-        (turned(0.08), "wrong", "turned by 4.6 degrees"),
-        (turned(0.1, bias=0.6), "look", "Compare its frame"),
-        (turned(1.2), "wrong", "turned by 69 degrees. State it"),
-        (late, "look", "11.4 ms later than the motion"),
-    ],
-)
-def test_check_names_what_is_wrong(change, level, words):
-    rows = changed(change)
-    found = Doubts(imu_doubts(rows, rows.model))
-    assert (found.level, words in str(found)) == (level, True), str(found)
-    assert check(rows).doubts.of("imu").level == found.of("imu").level
-
-
-def test_differences_are_those_of_means_over_a_tenth_of_a_second():
-    rows = changed(late, cutoff=60.0)
-    difference = rows.measured[NAME] - expected(rows, rows.model, NAME)
-    means = np.stack([np.convolve(x, np.full(50, 0.02), "valid") for x in difference.T])
-    first, *others = imu_doubts(rows, rows.model)
-    assert first.numbers["error"] == pytest.approx(np.sqrt((means**2).sum(0).mean()))
-    assert not others  # noise hides the delay
 
 
 def test_a_small_turn_is_found_and_goes_through_files_and_updates(tmp_path):

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, lsq_linear
 
-from forcegp.evidence.least_squares import Chained, Regressor, correlation_time, weighted_least_squares
+from forcegp.evidence.least_squares import Chained, Regressor, _step, correlation_time, weighted_least_squares
 
 TRUTH = np.array([1.0, -0.5, 0.3])
 
@@ -48,6 +48,26 @@ def test_the_minimum_is_that_of_scipy_at_the_same_weights(bounds):
     spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
     np.testing.assert_allclose((fit.x - theirs.x) / spread, 0.0, atol=0.05)
     np.testing.assert_allclose(fit.noise, np.sqrt((fit.residual**2).mean(0)), rtol=0.05)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_steps_within_bounds_are_nearly_those_of_lsq_linear(seed):
+    """Inside the bounds the slope is zero, and a search of linear residuals by these steps ends at its minimum."""
+    generator, noise = np.random.default_rng(seed), np.array([1e-3, 4e-3])
+    A, y, low = generator.normal(size=(20, 2, 5)), generator.normal(size=(20, 2)), -generator.uniform(0.0, 0.2, 5)
+    bounds = low * [1.0, 1.0, 0.0, 1.0, 1.0], low + 0.2
+    J, target = (A / noise[:, None]).reshape(-1, 5), (y / noise).ravel()
+    best = lsq_linear(J, target, bounds, tol=1e-12)
+    step = _step(-J.T @ target, J.T @ J, *bounds)
+    slope, inside = J.T @ (J @ step - target), (step > bounds[0]) & (step < bounds[1])
+    np.testing.assert_allclose(slope[inside], 0.0, atol=1e-9 * abs(J.T @ target).max())
+    assert ((bounds[0] <= step) & (step <= bounds[1])).all()
+    lowered = 0.5 * (np.square(target).sum() - np.square(J @ step - target).sum())
+    assert lowered > 0.9 * (0.5 * np.square(target).sum() - best.cost)
+    fit = weighted_least_squares(lambda x: (A @ x - y, A), no_prior, np.zeros(5), bounds, known=noise)
+    np.testing.assert_allclose(fit.x, best.x, atol=1e-6)
+    assert (fit.settled, fit.evaluations) == (True, pytest.approx(3, abs=1))
+    assert fit.expected == pytest.approx(lowered, rel=1e-3)
 
 
 def test_the_noise_of_every_column_is_found_and_decides_the_weights():
