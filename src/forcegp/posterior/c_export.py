@@ -211,9 +211,10 @@ def _compared(export: CFiles, checks: Sequence[Check], folder: Path) -> dict[str
             found[check.function] = _difference(export, library[check.function], check)
         bounds = {check.function: check.tolerance for check in checks}
         if export.monitor is not None:
-            name = f"{export.name}_monitor_step"
-            found[name] = _monitored(export, library[name], checks[0].states[: STATES // 3])
-            bounds[name] = LOOSER["covariance"] * checks[0].tolerance
+            both = [f"{export.name}_monitor_{what}" for what in ("step", "place")]
+            apart = _monitored(export, *(library[name] for name in both), checks[0].states[: STATES // 3])
+            found |= dict(zip(both, apart, strict=True))
+            bounds |= dict.fromkeys(both, LOOSER["covariance"] * checks[0].tolerance)
         for name, worst in found.items():
             if not worst <= bounds[name]:
                 raise NumericalError(
@@ -224,21 +225,26 @@ def _compared(export: CFiles, checks: Sequence[Check], folder: Path) -> dict[str
     return found
 
 
-def _monitored(export: CFiles, function: Any, states: np.ndarray) -> float:
-    """The largest relative difference of torques and distances from those of the monitor, along these states."""
+def _monitored(export: CFiles, step: Any, place: Any, states: np.ndarray) -> tuple[float, float]:
+    """Largest relative differences from the monitor along these states: of torques and distances, and of places."""
     column, count = export.posterior.model.memory_column, len(export.posterior.model.memory.names)
-    state, found, wanted = np.zeros(10 * states.shape[1] + 10), [], []
-    export.monitor.restart()
+    monitor, rows, links = export.monitor, [], [*export.monitor.ends]
+    state = np.zeros(10 * states.shape[1] + 10)
+    monitor.restart()
     for row in states:
-        q, v, u = split(row, export.code.sizes)
+        q, v, u = (x.copy() for x in split(row, export.code.sizes))
         u = np.delete(u, np.arange(column, column + count))
-        made = [np.zeros(len(v)), np.zeros(1), np.zeros(1)]
-        function(*(ctypes.c_void_p(x.ctypes.data) for x in (state, q.copy(), v.copy(), u.copy(), *made)))
-        found.append(np.concatenate(made[:2]))
-        seen = export.monitor(q, v, u)
-        wanted.append(np.append(seen.torque.numpy(), float(seen.distance)))
-    export.monitor.restart()
-    return float((np.abs(np.array(found) - wanted).max(0) / np.abs(wanted).max(0).clip(1e-300)).max())
+        torque, distance, alarm, place_c = (np.zeros(size) for size in (len(v), 1, 1, 10 + len(links)))
+        step(*(ctypes.c_void_p(x.ctypes.data) for x in (state, q, v, u, torque, distance, alarm)))
+        place(*(ctypes.c_void_p(x.ctypes.data) for x in (q, torque, place_c)))
+        seen, at = monitor(q, v, u), monitor.place(q, torque)
+        found = torque, distance, *place_c[:9].reshape(3, 3), place_c[9:].view(np.int32)[: 1 + len(links)]
+        also = [links.index(at.link), *(name in at.also for name in links)]
+        rows.append((found, (seen.torque, seen.distance[None], at.point, at.force, at.force_std, also)))
+    monitor.restart()
+    made, wanted = ([np.array(x) for x in zip(*each, strict=True)] for each in zip(*rows, strict=True))
+    apart = [np.abs(x - y).max() / max(np.abs(y).max(), 1e-300) for x, y in zip(made, wanted, strict=True)]
+    return float(max(apart[:2])), float(max(apart[2:]))
 
 
 def _difference(export: CFiles, function: Any, check: Check) -> float:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from forcegp.codegen.c_writer import c_text, filled, head, sections, write_function
+from forcegp.codegen.tracing import trace
 from forcegp.data import units_for
 from forcegp.errors import InvalidInput
 from forcegp.posterior.posterior import Posterior
@@ -141,13 +142,11 @@ class CFiles:
         """What stands for a calibrated monitor of contacts."""
         if (monitor := self.monitor) is None:
             return {"STATE_OF_MONITOR": ""}
-        words: dict[str, object] = {"STATE_OF_MONITOR": program["monitor_state"], "PERIOD": repr(monitor.dt)}
-        words |= {"THRESHOLD": repr(monitor.threshold), "SHARE": repr(1.0 - monitor.keep)}
+        words: dict[str, object] = {"STATE_OF_MONITOR": program["monitor_state"], "LINKS": len(monitor.ends)}
         words |= {"REMEMBER": program["monitor_memory"] if self.posterior.model.memory.names else ""}
         words |= {"OPEN": program["monitor_open"] if "covariance" in self.kinds else ""}
-        noise = {"ACCELERATIONS": monitor.noise.acceleration, "FORCES": monitor.noise.force}
-        noise |= dict(zip(("AT_REST", "FADES", "LARGEST"), (*monitor.near_rest, monitor.largest), strict=True))
-        return words | {word: ", ".join(map(repr, x.tolist())) for word, x in noise.items()}
+        words["LINK_NAMES"] = ", ".join(f'"{_plain(name).replace(chr(34), chr(39))}"' for name in monitor.ends)
+        return words | {word: ", ".join(map(repr, np.ravel(x).tolist())) for word, x in monitor.numbers.items()}
 
     def _program(self) -> Iterator[str]:
         """Tables and static functions."""
@@ -170,6 +169,9 @@ class CFiles:
             yield code.covariance_source("covariance_of_parts", len(code.physics.terms) * code.sizes[1])
         yield from code.motion_source(1)
         yield from code.memory_source(1)
+        if self.monitor is not None:
+            graph, found = trace(self.monitor.levers, [code.space.neutral()])
+            yield write_function("levers", graph, [node for x in found for node in x.flatten().tolist()], 1)
         for kind, function in wanted.items():
             program = code.program(kind)
             called = [part.name + ("_slopes" if kind in WITH_SLOPES else "") for part in code.sums]
