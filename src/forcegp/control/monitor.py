@@ -102,7 +102,7 @@ class ContactMonitor:
 
     def restart(self) -> None:
         """Forget earlier calls, as at the beginning of a recording."""
-        self._torque = self._slow = self._inertial = torch.zeros(self.robot.nv, dtype=torch.float64)
+        self._filtered = torch.zeros(3, self.robot.nv, dtype=torch.float64)  # torque, time near rest, and M a
         self.past = Past(model_of(self.model))
         self._before: tuple[Tensor, Tensor, Tensor] | None = None
 
@@ -122,8 +122,7 @@ class ContactMonitor:
                 f"free motion of {seconds:.3g} s is too short for a threshold; give at least "
                 f"{LEAST_BLOCKS * BLOCK:g} s in stretches of {BLOCK:g} s or more."
             )
-        tau, M = torch.cat([each[0] for each in found]), torch.cat([each[1] for each in found])
-        v, inertial = torch.cat([each[3] for each in found]), torch.cat([each[4] for each in found])
+        tau, M, v, inertial = (torch.cat([each[k] for each in found]) for k in (0, 1, 3, 4))
         self.largest = inertial.abs().amax(0).clamp_min(1e-9)  # of a joint that rested, any motion is beyond
         self.noise = NoiseLevels.of(torch.linalg.solve(M, tau[..., None])[..., 0].numpy(), M.numpy())
         speed = np.maximum(v.square().mean(0).sqrt().numpy(), 1e-12)
@@ -150,16 +149,14 @@ class ContactMonitor:
         before, self._before = self._before, None  # of a broken sample the next one takes nothing over
         self._before = sample = self._motion(q, v, u)
         if before is None:
-            return self._state(self._torque, self._torque.new_zeros(()))
-        middle = 0.5 * (before[0] + sample[0]), 0.5 * (before[1] + sample[1])
-        step = (*middle, before[2], (sample[1] - before[1]) / self.dt)
-        tau, M, extra = self._torques(*(x[None] for x in step))
-        fades = torch.exp(-middle[1].abs() / torch.as_tensor(self.near_rest[1]))
-        self._torque = self._torque + (1.0 - self.keep) * (tau[0] - self._torque)
-        self._slow = self._slow + (1.0 - self.keep) * (fades - self._slow)
-        self._inertial = self._inertial + (1.0 - self.keep) * (M[0] @ step[3] - self._inertial)
-        covariance = self._covariance(M, extra, self._slow, self._inertial)
-        return self._state(self._torque, self._distance(self._torque[None], covariance)[0])
+            return self._state(self._filtered[0], self._filtered.new_zeros(()))
+        q, v = (0.5 * (old + new) for old, new in zip(before, sample[:2], strict=False))
+        a = (sample[1] - before[1]) / self.dt
+        tau, M, extra = self._torques(*(x[None] for x in (q, v, before[2], a)))
+        now = torch.stack([tau[0], torch.exp(-v.abs() / torch.as_tensor(self.near_rest[1])), M[0] @ a])
+        self._filtered = self._filtered + (1.0 - self.keep) * (now - self._filtered)
+        torque, slow, inertial = self._filtered
+        return self._state(torque, self._distance(torque[None], self._covariance(M, extra, slow, inertial))[0])
 
     def run(self, q: Any, v: Any, u: Any) -> ContactState:
         """The same of a whole recording (T, nv); nothing is known at its first row."""
@@ -201,20 +198,26 @@ class ContactMonitor:
     @property
     def numbers(self) -> dict[str, Any]:
         """What it learned and how it chooses, by their names in programs."""
-        fade = dict(zip(("AT_REST", "FADES"), self.near_rest, strict=True))
-        noise = {} if self.noise is None else {"ACCELERATIONS": self.noise.acceleration, "FORCES": self.noise.force}
-        own = {"PERIOD": self.dt, "SHARE": 1.0 - self.keep, "THRESHOLD": self.threshold, "SAME": SAME}
-        own |= {"LARGEST": self.largest, "USUAL": self.usual, "ENDS": np.stack([*self.ends.values()])}
-        return own | noise | fade | {"PLACES": PLACES, "UNSEEN": UNSEEN, "EXPLAINED": EXPLAINED}
+        noise, (at_rest, fades) = self.calibrated, self.near_rest
+        own = {"PERIOD": self.dt, "SHARE": 1.0 - self.keep, "THRESHOLD": self.threshold, "LARGEST": self.largest}
+        own |= {"ACCELERATIONS": noise.acceleration, "FORCES": noise.force, "AT_REST": at_rest, "FADES": fades}
+        own |= {"USUAL": self.usual, "ENDS": np.stack([*self.ends.values()]), "PLACES": PLACES}
+        return own | {"UNSEEN": UNSEEN, "SAME": SAME, "EXPLAINED": EXPLAINED}
+
+    @property
+    def calibrated(self) -> NoiseLevels:
+        """The noise of free motion. Raises InvalidInput before `calibrate`."""
+        if self.noise is None:
+            raise InvalidInput("this monitor is not calibrated: call calibrate([(q, v, u)]) with free motion first.")
+        return self.noise
 
     def _covariance(self, M: Tensor, extra: Tensor | None, slow: Tensor, inertial: Tensor) -> Tensor:
         """S (..., nv, nv) of filtered torques where the mass matrix is M, with what the posterior leaves open.
 
         `slow` (..., nv) is how much of the time of the filter joints were near rest, `inertial` (..., nv) M a.
         """
-        if self.noise is None:
-            raise InvalidInput("this monitor is not calibrated: call calibrate([(q, v, u)]) with free motion first.")
-        acceleration, force = (torch.as_tensor(x).square() for x in (self.noise.acceleration, self.noise.force))
+        noise = self.calibrated
+        acceleration, force = (torch.as_tensor(x).square() for x in (noise.acceleration, noise.force))
         at_rest = (torch.as_tensor(self.near_rest[0]) * slow).square()
         S = (M * acceleration) @ M + (force + at_rest).diag_embed()
         beyond = (inertial.abs() / self.largest).clamp_min(1.0)

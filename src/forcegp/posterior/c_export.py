@@ -110,10 +110,9 @@ def export_c(
 
 def _check_monitor(monitor: Any, posterior: Posterior, reference: Predictor) -> None:
     """Raise InvalidInput for one that is not calibrated, of another model, or that needs another covariance."""
-    if getattr(monitor, "noise", None) is None:
-        raise InvalidInput("this monitor is not calibrated: call calibrate([(q, v, u)]) with free motion first.")
-    same = monitor.model is posterior.model or getattr(monitor.model, "posterior", None) is posterior
-    kind = monitor.model.kind if monitor.open and posterior.latent_names else "none"
+    known = getattr(monitor, "calibrated", None) and monitor.model
+    same = known is posterior.model or getattr(known, "posterior", None) is posterior
+    kind = known.kind if same and monitor.open and posterior.latent_names else "none"
     if not same or kind != ("compressed" if reference.kind == "compressed" else "none"):
         raise InvalidInput(
             "the monitor is that of another model, or counts another covariance than the program has; make it of "
