@@ -87,17 +87,14 @@ class Export(Command):
 
 
 def _c(options: Export, terminal: Terminal, posterior: Any, folder: Path) -> dict[str, Any]:
-    same = {name: getattr(options, name) for name in ("covariance", "jacobian", "steps", "unchecked")}
-    integrator = options.integrator or "symplectic-euler"
-    monitor = None
+    given = {name: getattr(options, name) for name in ("covariance", "jacobian", "steps", "unchecked")}
+    given |= {"integrator": options.integrator or "symplectic-euler", "source": str(options.model)}
     if options.free is not None:
         free, dt = _motions(Path(options.free), posterior)
         with terminal.progress("calibrating"):
             predictor = posterior.predictor(covariance="compressed" if options.covariance else "none")
-            monitor = options.alarms.monitor(predictor, free, dt)
-    made = forcegp.export_c(
-        posterior, folder, **same, integrator=integrator, source=str(options.model), monitor=monitor
-    )
+            given["monitor"] = options.alarms.monitor(predictor, free, dt)
+    made = forcegp.export_c(posterior, folder, **given)
     terminal.show(
         columns(str(options.out), ["file", "bytes"], [[file, f"{size:,}"] for file, size in made.files.items()])
     )
@@ -171,19 +168,18 @@ class Monitor(Command):
         if not parts:
             raise InvalidInput(f"nothing is left of {self.log} after --free {self.free}.")
         contacts = [found for time, q, state in parts for found in _contacts(monitor, time, q, state)]
-        content = {
-            "run": str(self.model),
-            "log": str(self.log),
-            **{"free": self.free, **vars(self.alarms)},
-            **{"dt": dt, "threshold": monitor.threshold, "seconds": sum(len(time) for time, *_ in parts) * dt},
-        }
+        content = {"run": str(self.model), "log": str(self.log), "free": self.free, **vars(self.alarms), "dt": dt}
+        content |= {"threshold": monitor.threshold, "seconds": sum(len(time) for time, *_ in parts) * dt}
         title = f"{self.log.name}: {len(contacts)} contacts in {content['seconds']:.0f} s"
         with self.folder(self.out, content) as folder:
             write_json(folder / "contacts.json", {**content, "contacts": contacts})
-        limit = monitor.threshold
         header = ["on", "from [s]", "to [s]", "force [N]", "distance /\nthreshold"]
         rows = [
-            [each["link"], *(f"{each[name]:.2f}" for name in ("start", "end", "newton")), f"{each['peak'] / limit:.1f}"]
+            [
+                each["link"],
+                *(f"{each[name]:.2f}" for name in ("start", "end", "newton")),
+                f"{each['peak'] / monitor.threshold:.1f}",
+            ]
             for each in contacts
         ]
         terminal.show(columns(title, header, rows) if rows else title)

@@ -122,7 +122,8 @@ class ContactMonitor:
                 f"free motion of {seconds:.3g} s is too short for a threshold; give at least "
                 f"{LEAST_BLOCKS * BLOCK:g} s in stretches of {BLOCK:g} s or more."
             )
-        tau, M, v, inertial = (torch.cat([each[k] for each in found]) for k in (0, 1, 3, 4))
+        tau, M = torch.cat([each[0] for each in found]), torch.cat([each[1] for each in found])
+        v, inertial = torch.cat([each[3] for each in found]), torch.cat([each[4] for each in found])
         self.largest = inertial.abs().amax(0).clamp_min(1e-9)  # of a joint that rested, any motion is beyond
         self.noise = NoiseLevels.of(torch.linalg.solve(M, tau[..., None])[..., 0].numpy(), M.numpy())
         speed = np.maximum(v.square().mean(0).sqrt().numpy(), 1e-12)
