@@ -12,7 +12,7 @@ from forcegp import ContactMonitor, Dataset, load_posterior
 
 
 def contacts(monitor, player, view):
-    """(time in s, place) when a contact begins, and when its force has doubled, from lines of a socket."""
+    """(time in s, place) when a contact begins, and when it is twice as far from free motion."""
     names, last, told = monitor.robot.joint_names, None, 0.0
     for row in map(json.loads, player.makefile()):
         if not row["position"].keys() >= {*names}:
@@ -23,10 +23,10 @@ def contacts(monitor, player, view):
             monitor.restart()
         last, state = row["time"], monitor(q, v, u)
         place = monitor.place(q, state.torque) if state.alarm else None
-        newton = 0.0 if place is None else np.linalg.norm(place.force)
-        if newton > 2.0 * told:
+        told = told if place else 0.0
+        if place and state.distance > 4.0 * told:
+            told = float(state.distance)
             yield last, place
-        told = newton if newton > 2.0 * told or not newton else told
         view.show(last, q, place)
 
 
@@ -35,5 +35,5 @@ if __name__ == "__main__":
     monitor = ContactMonitor(posterior.predictor(), dt=float(free.time[1] - free.time[0]))
     monitor.calibrate([(free.q, free.v, free.u)])
     with socket.create_server(ADDRESS) as node, node.accept()[0] as player:
-        for time, found in contacts(monitor, player, LiveView(monitor.robot)):
-            print(f"{time:.3f} s: {found.link}, {np.linalg.norm(found.force):.1f} N", flush=True)
+        for t, at in contacts(monitor, player, LiveView(monitor.robot)):
+            print(f"{t:.3f} s: {at.link}, {np.linalg.norm(at.force):.1f} N (std {np.linalg.norm(at.force_std):.1f})")
