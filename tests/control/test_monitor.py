@@ -2,6 +2,7 @@
 
 import json
 import math
+from importlib.resources import files
 
 import numpy as np
 import pinocchio
@@ -11,10 +12,11 @@ from scipy.stats import norm
 from tests.control.test_tracking import ROBOT, TRUE, URDF, URDF_ALONE, VISCOUS
 from tests.posterior.arm import arm_model
 
-from forcegp import ContactMonitor, Dataset, JointFriction, fit, save_posterior
+from forcegp import ContactMonitor, Dataset, JointFriction, Model, Robot, Rotor, fit, save_posterior
 from forcegp.cli.main import main
-from forcegp.control.monitor import contact_points, errors_near_rest
+from forcegp.control.monitor import errors_near_rest, link_ends
 from forcegp.errors import DatasetError, InvalidInput
+from forcegp.evidence.least_squares import NoiseLevels
 
 DT = 0.01
 
@@ -127,7 +129,7 @@ def test_free_motion_raises_as_many_alarms_as_asked_for():
     assert 2 <= blocks.sum() <= 28
 
 
-def test_pushes_are_found_and_placed(monitor):
+def test_pushes_are_found(monitor):
     q, v, u = motion(4.0, 7)
     where, point, force = "fore", torch.tensor([0.0, 0.0, 0.0], dtype=torch.float64), np.array([4.0, 3.0, 2.0])
     J = ROBOT.kinematics(torch.from_numpy(q)).frame_jacobian(where, point)[:, :3].numpy()
@@ -138,17 +140,42 @@ def test_pushes_are_found_and_placed(monitor):
     assert state.alarm[206:].all()
     assert float(state.probability[-1]) > 0.999
     torch.testing.assert_close(state.torque[-1], torch.from_numpy(push[-1]), atol=0.1, rtol=0.1)
-    place = monitor.place(q[-1], push[-1])
-    explained = ROBOT.kinematics(torch.from_numpy(q[-1])).frame_jacobian(place.link, torch.tensor(place.point))[:3]
-    np.testing.assert_allclose(explained.mT.numpy() @ place.force, push[-1], atol=0.05)
-    assert where in {place.link, *place.also}
-    assert np.linalg.norm(place.force) <= np.linalg.norm(force) + 0.1
 
 
-def test_points_lie_along_the_links():
-    points = contact_points(ROBOT)
-    assert {link for link, _ in points} == {"upper", "fore"}
-    assert any(np.allclose(point, [0.0, 0.0, -0.4]) for link, point in points if link == "upper")  # the elbow
+def test_a_place_explains_the_torque_by_the_least_force():
+    """Against all points of all links one by one, with rotors in the metric; of links that meet it is the first."""
+    robot = Robot.from_urdf_text(files("forcegp.simulation").joinpath("ur5.urdf").read_text())
+    observer, rng = (
+        ContactMonitor(Model(robot, forces=(*Model(robot).forces, Rotor(0.2))), dt=DT),
+        np.random.default_rng(3),
+    )
+    observer.noise = noise = NoiseLevels(rng.uniform(0.1, 0.3, 6), rng.uniform(0.1, 0.5, 6))
+    places = [(link, k / 4 * end.numpy()) for link, end in link_ends(robot).items() for k in range(5)]
+    chosen = []
+    for _ in range(50):
+        q = torch.from_numpy(rng.uniform(-3.0, 3.0, 6))
+        kinematics, M = robot.kinematics(q), robot.mass_matrix(q).numpy() + 0.2 * np.eye(6)
+        L = np.linalg.cholesky(M @ np.diag(noise.acceleration**2) @ M + np.diag(noise.force**2))
+        levers = [np.linalg.solve(L, kinematics.frame_jacobian(link, x)[:3].mT.numpy()) for link, x in places]
+        tau = levers[rng.integers(len(places))] @ rng.normal(0.0, 30.0, 3) + rng.standard_normal(6)
+        inverse = [np.linalg.pinv(J, rcond=1e-9) * (np.abs(J).max() > 1e-9) for J in levers]
+        force = [B @ tau for B in inverse]
+        misfit = np.array([np.sum((tau - J @ f) ** 2) for J, f in zip(levers, force, strict=True)])
+        alike = np.flatnonzero(misfit <= misfit.min() + 3.8414588)  # as 95 in 100 that are right
+        best = min(alike, key=lambda k: round(float(np.linalg.norm(force[k])), 7))
+        found = observer.place(q, L @ tau)
+        assert found.link == places[best][0]
+        assert set(found.also) == {places[k][0] for k in alike} - {found.link}
+        wanted = [places[best][1], force[best], np.sqrt((inverse[best] ** 2).sum(1))]
+        np.testing.assert_allclose([found.point, found.force, found.force_std], wanted, rtol=1e-6, atol=1e-9)
+        chosen.append(best % 5)
+    assert {*chosen} == {0, 1, 2, 3, 4}
+
+
+def test_links_reach_from_their_joint_to_the_next_one():
+    ends = link_ends(ROBOT)
+    assert list(ends) == ["upper", "fore"]
+    np.testing.assert_allclose(ends["upper"], [0.0, 0.0, -0.4])  # the elbow
 
 
 @pytest.fixture(scope="module")

@@ -171,10 +171,12 @@ int main() {
   arm::Monitor monitor;
   for (int k = 0; k < 3; k++) monitor.step({0.1 * k, 0.2, 0.3}, {0.5, -0.5, 0.5}, found.value);
   const auto seen = monitor.step({0.4, 0.2, 0.3}, {0.5, -0.5, 0.5}, {90.0, 0.0, 0.0});
+  const auto where = monitor.place({0.4, 0.2, 0.3}, seen.torque);
   std::array<arm::Velocities, PARTS> force;
   const int bits = arm::forces({0.1, 0.2, 0.3}, {0.5, -0.5, 0.5}, {}, force);
   const auto z = arm::remember(MEMORY, {0.0, 0.0, 0.0}, {1.0, 0.0, 0.0}, 0.01);
-  std::printf("%.17g %.17g %d %g", found.value[0], seen.distance, bits + found.status + seen.status, z[0]);
+  std::printf("%.17g %.17g %d %g %s", found.value[0], seen.distance, bits + found.status + seen.status, z[0],
+              arm_links[where.link]);
 }"""
 
 
@@ -193,7 +195,7 @@ def test_friction_that_remembers_and_a_monitor_of_contacts(tmp_path):
     v, u = np.gradient(q, 0.01, axis=0), rng.normal(size=q.shape)
     monitor = ContactMonitor(posterior.predictor(), dt=0.01).calibrate([(q, v, u)])
     made = export_c(posterior, tmp_path / "arm", covariance=True, monitor=monitor)
-    assert made.differences["arm_monitor_step"] < 1e-9
+    assert max(made.differences[f"arm_monitor_{what}"] for what in ("step", "place")) < 1e-9
     library = compiled(tmp_path / "arm", "arm.c")
     z = [0.3, -0.9, 1.0]
     wanted = posterior.predictor(covariance="none").inverse_dynamics(q[7], v[7], u[7], memory=z).mean
@@ -210,6 +212,16 @@ def test_friction_that_remembers_and_a_monitor_of_contacts(tmp_path):
         np.testing.assert_allclose(torque, seen.torque[k], rtol=1e-9, atol=1e-12)
         assert bool(alarm) == bool(seen.alarm[k])
         np.testing.assert_allclose(distance, seen.distance[k], rtol=1e-7, atol=1e-12)
+    names, place = [x.decode() for x in (ctypes.c_char_p * 3).in_dll(library, "arm_links")], Place()
+    for at, torque in zip(rng.uniform(-3.0, 3.0, (50, 3)), rng.normal(0.0, [[9.0, 9.0, 0.1]], (50, 3)), strict=True):
+        assert not library.arm_monitor_place(pointer(at), pointer(torque), ctypes.byref(place))
+        wanted = monitor.place(at, torque)
+        assert names[place.link] == wanted.link
+        assert {name for name, alike in zip(names, place.also, strict=True) if alike} == {*wanted.also}
+        for found, each in zip(place.numbers, (wanted.point, wanted.force, wanted.force_std), strict=True):
+            np.testing.assert_allclose(found, each, rtol=1e-10, atol=1e-12)
+    assert library.arm_monitor_place(pointer(at), pointer(np.array([np.nan, 0.0, 0.0])), ctypes.byref(place)) == 1
+    assert place.link == -1
     with pytest.raises(InvalidInput, match="counts another covariance than the program has"):
         export_c(posterior, tmp_path / "other", monitor=monitor)
     laws = fit(free.with_forces(gear), replace(arm_data(30, 0), model=free, truth={}), restarts=1)
@@ -234,6 +246,11 @@ def test_friction_that_remembers_and_a_monitor_of_contacts(tmp_path):
         assert float(told[1]) > 0.0
         assert told[2] == "0"
         assert float(told[3]) == pytest.approx(1.0, abs=1e-6)  # a turn of 1 rad forgets everything
+        assert told[4] in names
+
+
+class Place(ctypes.Structure):
+    _fields_ = (("numbers", ctypes.c_double * 3 * 3), ("link", ctypes.c_int), ("also", ctypes.c_int * 3))
 
 
 def pointer(x):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -29,6 +29,11 @@ class AlarmOptions:
     """Accepted false alarms per hour."""
     bandwidth: Annotated[float, arg(metavar="HZ")] = 2.0
     """Cut-off of the low-pass filter on the torques. A higher one is faster, a lower one finds smaller forces."""
+
+    def monitor(self, predictor: Any, free: Sequence[Any], dt: float) -> forcegp.ContactMonitor:
+        """Calibrated on free motion of steps of `dt` s."""
+        monitor = forcegp.ContactMonitor(predictor, dt=dt, bandwidth=self.bandwidth)
+        return monitor.calibrate([each[1:] for each in free], false_alarms_per_hour=self.false_alarms)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,22 +87,14 @@ class Export(Command):
 
 
 def _c(options: Export, terminal: Terminal, posterior: Any, folder: Path) -> dict[str, Any]:
-    same = {name: getattr(options, name) for name in ("covariance", "jacobian", "steps", "unchecked")}
-    integrator = options.integrator or "symplectic-euler"
-    monitor = None
+    given = {name: getattr(options, name) for name in ("covariance", "jacobian", "steps", "unchecked")}
+    given |= {"integrator": options.integrator or "symplectic-euler", "source": str(options.model)}
     if options.free is not None:
-        free, log = Path(options.free), _dataset(Path(options.free), posterior)
-        dt = forcegp.data.filters.uniform_step(log.time[log.episode == log.episodes[0]], options.free)
-        spread = "compressed" if options.covariance else "none"
-        monitor = forcegp.ContactMonitor(
-            posterior.predictor(covariance=spread), dt=dt, bandwidth=options.alarms.bandwidth
-        )
+        free, dt = _motions(Path(options.free), posterior)
         with terminal.progress("calibrating"):
-            known = [each[1:] for each in _motions(log, free, dt)]
-            monitor.calibrate(known, false_alarms_per_hour=options.alarms.false_alarms)
-    made = forcegp.export_c(
-        posterior, folder, **same, integrator=integrator, source=str(options.model), monitor=monitor
-    )
+            predictor = posterior.predictor(covariance="compressed" if options.covariance else "none")
+            given["monitor"] = options.alarms.monitor(predictor, free, dt)
+    made = forcegp.export_c(posterior, folder, **given)
     terminal.show(
         columns(str(options.out), ["file", "bytes"], [[file, f"{size:,}"] for file, size in made.files.items()])
     )
@@ -159,57 +156,51 @@ class Monitor(Command):
             raise InvalidInput(f"--free is {self.free}; give seconds above 0, or a dataset that is there (.h5).")
         self.require_free(self.out)
         posterior = forcegp.load_posterior(self.model)
-        log = _dataset(self.log, posterior)
-        dt = forcegp.data.filters.uniform_step(log.time[log.episode == log.episodes[0]], str(self.log))
-        motions = list(_motions(log, self.log, dt))
+        motions, dt = _motions(self.log, posterior)
         if other is not None:
-            known = [each[1:] for each in _motions(_dataset(other, posterior), other, dt)]
+            known, _ = _motions(other, posterior, dt)
         else:
             first, rows = motions[0], round(min(seconds / dt, float(len(motions[0][0]))))
-            known, motions[0] = [tuple(x[:rows] for x in first[1:])], tuple(x[rows:] for x in first)
-        monitor = forcegp.ContactMonitor(posterior.predictor(), dt=dt, bandwidth=self.alarms.bandwidth)
+            known, motions[0] = [tuple(x[:rows] for x in first)], tuple(x[rows:] for x in first)
         with terminal.progress("looking"):
-            monitor.calibrate(known, false_alarms_per_hour=self.alarms.false_alarms)
+            monitor = self.alarms.monitor(posterior.predictor(), known, dt)
             parts = [(time, q, monitor.run(q, v, u)) for time, q, v, u in motions if len(time) > 1]
         if not parts:
             raise InvalidInput(f"nothing is left of {self.log} after --free {self.free}.")
         contacts = [found for time, q, state in parts for found in _contacts(monitor, time, q, state)]
-        content = {
-            "run": str(self.model),
-            "log": str(self.log),
-            **{"free": self.free, **vars(self.alarms)},
-            **{"dt": dt, "threshold": monitor.threshold, "seconds": sum(len(time) for time, *_ in parts) * dt},
-        }
+        content = {"run": str(self.model), "log": str(self.log), "free": self.free, **vars(self.alarms), "dt": dt}
+        content |= {"threshold": monitor.threshold, "seconds": sum(len(time) for time, *_ in parts) * dt}
         title = f"{self.log.name}: {len(contacts)} contacts in {content['seconds']:.0f} s"
         with self.folder(self.out, content) as folder:
             write_json(folder / "contacts.json", {**content, "contacts": contacts})
-        limit = monitor.threshold
         header = ["on", "from [s]", "to [s]", "force [N]", "distance /\nthreshold"]
         rows = [
-            [each["link"], *(f"{each[name]:.2f}" for name in ("start", "end", "newton")), f"{each['peak'] / limit:.1f}"]
+            [
+                each["link"],
+                *(f"{each[name]:.2f}" for name in ("start", "end", "newton")),
+                f"{each['peak'] / monitor.threshold:.1f}",
+            ]
             for each in contacts
         ]
         terminal.show(columns(title, header, rows) if rows else title)
         return {**content, "contacts": contacts}
 
 
-def _dataset(path: Path, posterior: Any) -> forcegp.Dataset:
-    """The dataset, of the joints of the model. Raises InvalidInput for others."""
-    dataset = forcegp.Dataset.load(path)
+def _motions(path: Path, posterior: Any, dt: float | None = None) -> tuple[list[tuple[Any, ...]], float]:
+    """time, q, v and u of every episode, and their step, that of the first one.
+
+    Raises InvalidInput for other joints than those of the model, and steps other than `dt`, where that is given.
+    """
+    dataset, motions = forcegp.Dataset.load(path), []
     require_same_joints(posterior, dataset, path)
-    return dataset
-
-
-def _motions(dataset: forcegp.Dataset, path: Path, dt: float) -> Iterator[tuple[Any, Any, Any, Any]]:
-    """time, q, v and u of every episode. Raises InvalidInput for other time steps."""
     for episode in dataset.episodes:
         at = dataset.episode == episode
         step = forcegp.data.filters.uniform_step(dataset.time[at], f"episode {episode} of {path}")
+        dt = dt or step
         if abs(step - dt) > 0.01 * dt:
-            raise InvalidInput(
-                f"{path} has steps of {step:.4g} s and the log of {dt:.4g} s; import both at one --rate."
-            )
-        yield dataset.time[at], dataset.q[at], dataset.v[at], dataset.u[at]
+            raise InvalidInput(f"{path} has steps of {step:.4g} s and not of {dt:.4g} s; import all at one --rate.")
+        motions.append((dataset.time[at], dataset.q[at], dataset.v[at], dataset.u[at]))
+    return motions, dt or 0.0
 
 
 def _contacts(monitor: forcegp.ContactMonitor, time: Any, q: Any, state: Any) -> Iterator[dict[str, Any]]:

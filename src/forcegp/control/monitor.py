@@ -31,6 +31,8 @@ SLOW = tuple(np.geomspace(0.01, 0.5, 8).tolist())
 """Of the root mean square velocity, over what errors of friction near rest may fade: Stribeck's velocity, or a part."""
 MOST_ROWS = 5000  # that these errors are found from: filtered, neighbours tell the same
 PLACES = 5  # points along each link where a contact is tried
+UNSEEN = 1e-6  # of the largest effect of a force on torques: what has less is rounding, as on the axis of a joint
+SAME = 1e-9  # relative; forces that differ by less are as large: one link ends where the next one begins
 EXPLAINED = float(chi2.ppf(0.95, 1))  # links whose misfit is larger by less explain a torque as well as the best
 
 
@@ -91,14 +93,16 @@ class ContactMonitor:
         """Standard deviations (nv,) of errors of friction at rest [Nm or N], and velocities v_s (nv,)."""
         self.largest = torch.full((self.robot.nv,), math.inf, dtype=torch.float64)
         """Of |M a| (nv,) in free motion [Nm or N], filtered."""
-        self._usual = torch.zeros(self.robot.nv, dtype=torch.float64)
+        self.usual = torch.zeros(self.robot.nv, dtype=torch.float64)
+        """Share of the time (nv,) that joints were near rest in free motion."""
+        self.ends = link_ends(self.robot)
         self.threshold = math.inf
         self._maxima = (0.0, 1.0)
         self.restart()
 
     def restart(self) -> None:
         """Forget earlier calls, as at the beginning of a recording."""
-        self._torque = self._slow = self._inertial = torch.zeros(self.robot.nv, dtype=torch.float64)
+        self._filtered = torch.zeros(3, self.robot.nv, dtype=torch.float64)  # torque, time near rest, and M a
         self.past = Past(model_of(self.model))
         self._before: tuple[Tensor, Tensor, Tensor] | None = None
 
@@ -134,7 +138,7 @@ class ContactMonitor:
         _, force, at_rest, share = np.array(best).T
         self.noise, self.near_rest = NoiseLevels(self.noise.acceleration, force), (at_rest, share * speed)
         fades = np.concatenate([self._near_rest(each[3], share * speed)[settle:] for each in found])
-        self._usual = torch.from_numpy(fades).square().mean(0).sqrt()
+        self.usual = torch.from_numpy(fades).square().mean(0).sqrt()
         distances = [self._distances(*each) for each in found]
         largest = torch.cat([d[: len(d) // block * block].view(-1, block).amax(1) for d in distances])
         self._maxima = gumbel_r.fit(largest.sqrt().numpy())
@@ -146,16 +150,14 @@ class ContactMonitor:
         before, self._before = self._before, None  # of a broken sample the next one takes nothing over
         self._before = sample = self._motion(q, v, u)
         if before is None:
-            return self._state(self._torque, self._torque.new_zeros(()))
-        middle = 0.5 * (before[0] + sample[0]), 0.5 * (before[1] + sample[1])
-        step = (*middle, before[2], (sample[1] - before[1]) / self.dt)
-        tau, M, extra = self._torques(*(x[None] for x in step))
-        fades = torch.exp(-middle[1].abs() / torch.as_tensor(self.near_rest[1]))
-        self._torque = self._torque + (1.0 - self.keep) * (tau[0] - self._torque)
-        self._slow = self._slow + (1.0 - self.keep) * (fades - self._slow)
-        self._inertial = self._inertial + (1.0 - self.keep) * (M[0] @ step[3] - self._inertial)
-        covariance = self._covariance(M, extra, self._slow, self._inertial)
-        return self._state(self._torque, self._distance(self._torque[None], covariance)[0])
+            return self._state(self._filtered[0], self._filtered.new_zeros(()))
+        q, v = (0.5 * (old + new) for old, new in zip(before, sample[:2], strict=False))
+        a = (sample[1] - before[1]) / self.dt
+        tau, M, extra = self._torques(*(x[None] for x in (q, v, before[2], a)))
+        now = torch.stack([tau[0], torch.exp(-v.abs() / torch.as_tensor(self.near_rest[1])), M[0] @ a])
+        self._filtered = self._filtered + (1.0 - self.keep) * (now - self._filtered)
+        torque, slow, inertial = self._filtered
+        return self._state(torque, self._distance(torque[None], self._covariance(M, extra, slow, inertial))[0])
 
     def run(self, q: Any, v: Any, u: Any) -> ContactState:
         """The same of a whole recording (T, nv); nothing is known at its first row."""
@@ -167,34 +169,56 @@ class ContactMonitor:
     def place(self, q: Any, torque: Any) -> ContactPlace:
         """The contact at q (nv,) that explains an external torque (nv,) by a force without a moment.
 
-        Least squares in the metric of the noise, at points along every link; of those alike the least force.
+        Least squares in the metric of the noise, at points along every link; of those alike the least force, and of
+        forces as large the link that is nearest to the base.
         """
         q, tau = (torch.as_tensor(finite_vector(n, x, self.robot.nv)) for n, x in (("q", q), ("torque", torque)))
-        white = torch.linalg.inv(
-            torch.linalg.cholesky(self._covariance(self.robot.mass_matrix(q), None, self._usual, 0.0 * tau))
-        )
-        kinematics, found = self.robot.kinematics(q), []
-        for link, point in contact_points(self.robot):
-            J = white @ kinematics.frame_jacobian(link, point)[:3].mT
-            inverse = torch.linalg.pinv(J, rtol=1e-6)
-            force = inverse @ (white @ tau)
-            found.append((float((white @ tau - J @ force).square().sum()), link, point, force, inverse))
-        least = min(each[0] for each in found) + EXPLAINED
-        alike = [each for each in found if each[0] <= least]
-        _, link, point, force, inverse = min(alike, key=lambda each: float(each[3].norm()))
-        also = dict.fromkeys(each[1] for each in alike if each[1] != link)
-        stds = inverse.square().sum(-1).sqrt()
-        x, y, z = (tuple(each.tolist()) for each in (point, force, stds))
-        return ContactPlace(link, x, y, z, tuple(also))
+        M, J = self.levers(q)
+        white = torch.linalg.inv(torch.linalg.cholesky(self._covariance(M, None, self.usual, 0.0 * tau)))
+        along = torch.linspace(0.0, 1.0, PLACES, dtype=q.dtype)
+        tau, J = white @ tau, (J[:, :1] + along[:, None, None] * (J[:, 1:] - J[:, :1])).flatten(0, 1) @ white.mT
+        seen = J.square().sum((-1, -2)).max().sqrt()
+        inverse = torch.linalg.pinv(J.mT, atol=UNSEEN * seen, rtol=0.0)
+        force = inverse @ tau
+        misfit = (tau - (force[:, None] @ J)[:, 0]).square().sum(-1)
+        newton, alike = force.norm(dim=-1), misfit <= misfit.min() + EXPLAINED
+        best = int((alike & (newton <= (1.0 + SAME) * newton[alike].min())).nonzero()[0])
+        links, ends = zip(*self.ends.items(), strict=True)
+        also = dict.fromkeys(links[k // PLACES] for k in alike.nonzero()[:, 0].tolist())
+        link, point = links[best // PLACES], ends[best // PLACES] * float(along[best % PLACES])
+        x, y, z = (tuple(each.tolist()) for each in (point, force[best], inverse[best].square().sum(-1).sqrt()))
+        return ContactPlace(link, x, y, z, tuple(name for name in also if name != link))
+
+    def levers(self, q: Float[Tensor, " nv"]) -> list[Tensor]:
+        """M (nv, nv), and Jacobians (L, 2, 3, nv) of both ends of every link, world axes; without branches."""
+        model = model_of(self.model)
+        kinematics = model.loaded_robot.kinematics(q)
+        J = [kinematics.frame_jacobian(link, k * end)[:3] for link, end in self.ends.items() for k in (0, 1)]
+        return [model.mass_matrix_at(kinematics), torch.stack(J).unflatten(0, (-1, 2))]
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What it learned and how it chooses, by their names in programs."""
+        noise, (at_rest, fades) = self.calibrated, self.near_rest
+        own = {"PERIOD": self.dt, "SHARE": 1.0 - self.keep, "THRESHOLD": self.threshold, "LARGEST": self.largest}
+        own |= {"ACCELERATIONS": noise.acceleration, "FORCES": noise.force, "AT_REST": at_rest, "FADES": fades}
+        own |= {"USUAL": self.usual, "ENDS": np.stack([*self.ends.values()]), "PLACES": PLACES}
+        return own | {"UNSEEN": UNSEEN, "SAME": SAME, "EXPLAINED": EXPLAINED}
+
+    @property
+    def calibrated(self) -> NoiseLevels:
+        """The noise of free motion. Raises InvalidInput before `calibrate`."""
+        if self.noise is None:
+            raise InvalidInput("this monitor is not calibrated: call calibrate([(q, v, u)]) with free motion first.")
+        return self.noise
 
     def _covariance(self, M: Tensor, extra: Tensor | None, slow: Tensor, inertial: Tensor) -> Tensor:
         """S (..., nv, nv) of filtered torques where the mass matrix is M, with what the posterior leaves open.
 
         `slow` (..., nv) is how much of the time of the filter joints were near rest, `inertial` (..., nv) M a.
         """
-        if self.noise is None:
-            raise InvalidInput("this monitor is not calibrated: call calibrate([(q, v, u)]) with free motion first.")
-        acceleration, force = (torch.as_tensor(x).square() for x in (self.noise.acceleration, self.noise.force))
+        noise = self.calibrated
+        acceleration, force = (torch.as_tensor(x).square() for x in (noise.acceleration, noise.force))
         at_rest = (torch.as_tensor(self.near_rest[0]) * slow).square()
         S = (M * acceleration) @ M + (force + at_rest).diag_embed()
         beyond = (inertial.abs() / self.largest).clamp_min(1.0)
@@ -285,14 +309,13 @@ def errors_near_rest(
     return (float(found.fun), *np.exp(found.x).tolist())
 
 
-def contact_points(robot: Robot) -> list[tuple[str, Float[Tensor, "3"]]]:
-    """Points (m) along every moving link from its joint to its farthest end."""
-    layout, points = robot.layout, []
+def link_ends(robot: Robot) -> dict[str, Float[Tensor, "3"]]:
+    """The point (m) of every moving link that is farthest from its joint."""
+    layout, found = robot.layout, {}
     for body, joint in enumerate(layout.bodies):
         ends = [origin[:3, 3] for origin, parent in zip(layout.origins, layout.parents, strict=True) if parent == body]
         ends += [placed.offset[:3, 3] for placed in layout.links.values() if placed.body == body]
         turn = layout.links[joint.child].offset[:3, :3]
         ends = [*(turn.T @ end for end in ends), robot.link(joint.child).center_of_mass]
-        end = torch.from_numpy(max(ends, key=np.linalg.norm))
-        points += [(joint.child, end * k / (PLACES - 1)) for k in range(PLACES if bool(end.any()) else 1)]
-    return points
+        found[joint.child] = torch.from_numpy(max(ends, key=np.linalg.norm))
+    return found

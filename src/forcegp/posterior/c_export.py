@@ -110,10 +110,9 @@ def export_c(
 
 def _check_monitor(monitor: Any, posterior: Posterior, reference: Predictor) -> None:
     """Raise InvalidInput for one that is not calibrated, of another model, or that needs another covariance."""
-    if getattr(monitor, "noise", None) is None:
-        raise InvalidInput("this monitor is not calibrated: call calibrate([(q, v, u)]) with free motion first.")
-    same = monitor.model is posterior.model or getattr(monitor.model, "posterior", None) is posterior
-    kind = monitor.model.kind if monitor.open and posterior.latent_names else "none"
+    known: Any = getattr(monitor, "calibrated", None) and monitor.model
+    same = known is posterior.model or getattr(known, "posterior", None) is posterior
+    kind = known.kind if same and monitor.open and posterior.latent_names else "none"
     if not same or kind != ("compressed" if reference.kind == "compressed" else "none"):
         raise InvalidInput(
             "the monitor is that of another model, or counts another covariance than the program has; make it of "
@@ -203,17 +202,14 @@ def _compared(export: CFiles, checks: Sequence[Check], folder: Path) -> dict[str
         warnings.warn(f"the exported program was not compared with forcegp: {error}", stacklevel=3)
         return {}
     options = ("-std=c99", "-O2", "-fPIC", "-shared", "-I", str(folder))
-    found = {}
     with tempfile.TemporaryDirectory() as place:
         path = Path(place) / "checked.so"
         library = compile_library(f'#include "{export.name}.c"\n', options, path, f"{export.name}_mean")
-        for check in checks:
-            found[check.function] = _difference(export, library[check.function], check)
+        found = {check.function: _difference(export, library[check.function], check) for check in checks}
         bounds = {check.function: check.tolerance for check in checks}
         if export.monitor is not None:
-            name = f"{export.name}_monitor_step"
-            found[name] = _monitored(export, library[name], checks[0].states[: STATES // 3])
-            bounds[name] = LOOSER["covariance"] * checks[0].tolerance
+            found |= (apart := _monitored(export, library, checks[0].states[: STATES // 3]))
+            bounds |= dict.fromkeys(apart, LOOSER["covariance"] * checks[0].tolerance)
         for name, worst in found.items():
             if not worst <= bounds[name]:
                 raise NumericalError(
@@ -224,21 +220,27 @@ def _compared(export: CFiles, checks: Sequence[Check], folder: Path) -> dict[str
     return found
 
 
-def _monitored(export: CFiles, function: Any, states: np.ndarray) -> float:
-    """The largest relative difference of torques and distances from those of the monitor, along these states."""
+def _monitored(export: CFiles, library: Any, states: np.ndarray) -> dict[str, float]:
+    """The largest relative differences of the monitor's functions along these states."""
+    step, place = (f"{export.name}_monitor_{what}" for what in ("step", "place"))
     column, count = export.posterior.model.memory_column, len(export.posterior.model.memory.names)
-    state, found, wanted = np.zeros(10 * states.shape[1] + 10), [], []
-    export.monitor.restart()
+    monitor, rows, links = export.monitor, [], [*export.monitor.ends]
+    state = np.zeros(10 * states.shape[1] + 10)
+    monitor.restart()
     for row in states:
-        q, v, u = split(row, export.code.sizes)
+        q, v, u = (x.copy() for x in split(row, export.code.sizes))
         u = np.delete(u, np.arange(column, column + count))
-        made = [np.zeros(len(v)), np.zeros(1), np.zeros(1)]
-        function(*(ctypes.c_void_p(x.ctypes.data) for x in (state, q.copy(), v.copy(), u.copy(), *made)))
-        found.append(np.concatenate(made[:2]))
-        seen = export.monitor(q, v, u)
-        wanted.append(np.append(seen.torque.numpy(), float(seen.distance)))
-    export.monitor.restart()
-    return float((np.abs(np.array(found) - wanted).max(0) / np.abs(wanted).max(0).clip(1e-300)).max())
+        torque, distance, alarm, place_c = (np.zeros(size) for size in (len(v), 1, 1, 10 + len(links)))
+        library[step](*(ctypes.c_void_p(x.ctypes.data) for x in (state, q, v, u, torque, distance, alarm)))
+        library[place](*(ctypes.c_void_p(x.ctypes.data) for x in (q, torque, place_c)))
+        seen, at = monitor(q, v, u), monitor.place(q, torque)
+        found = torque, distance, *place_c[:9].reshape(3, 3), place_c[9:].view(np.int32)[: 1 + len(links)]
+        also = [links.index(at.link), *(name in at.also for name in links)]
+        rows.append((found, (seen.torque, seen.distance[None], at.point, at.force, at.force_std, also)))
+    monitor.restart()
+    made, wanted = ([np.array(x) for x in zip(*each, strict=True)] for each in zip(*rows, strict=True))
+    apart = [np.abs(x - y).max() / max(np.abs(y).max(), 1e-300) for x, y in zip(made, wanted, strict=True)]
+    return {step: float(max(apart[:2])), place: float(max(apart[2:]))}
 
 
 def _difference(export: CFiles, function: Any, check: Check) -> float:

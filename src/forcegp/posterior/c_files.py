@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from forcegp.codegen.c_writer import c_text, filled, head, sections, write_function
+from forcegp.codegen.tracing import trace
 from forcegp.data import units_for
 from forcegp.errors import InvalidInput
 from forcegp.posterior.posterior import Posterior
@@ -19,7 +20,7 @@ from forcegp.posterior.programs import WITH_SLOPES, Programs
 
 STORED = 10
 """States of the self-test."""
-ALIKE = ("CMakeLists.txt", "example.c", "self_test.c", "README.txt")
+FILES = ("model.h", "model.hpp", "CMakeLists.txt", "example.c", "self_test.c", "README.txt")
 TAKEN = ("math", "string", "stdio", "stddef", "stdarg", "features", "example", "self_test", "jac", "hess", "null")
 """Names of other files, and those that CasADi does not take."""
 
@@ -89,20 +90,14 @@ class CFiles:
         nq, nv, nu = self.code.sizes
         start = [", ".join(map(repr, x.tolist())) for x in split(checks[0].states[0], self.code.sizes)]
         program = sections(__name__, "exported_c/model.c")
-        space = self.code.space
         stepped = "" if self.dt is None else self.code.step_source(self.integrator, self._stepped)
         words: dict[str, object] = {"NAME": self.name, "NV": nv, "NQ": nq, "NU": nu, "DT": self.dt}
         words |= dict(zip(("START_Q", "START_V", "START_U"), start, strict=True))
         words |= dict(zip(("STORED", "CALLS"), self._stored(checks), strict=True))
         words |= {"STEP": stepped, "SLOPES": program[self.integrator], "CHECKED": said}
-        words |= {
-            "COMMENT": self._comment(said),
-            "GIVEN": 0,
-            "GIVEN_PARTS": 0,
-            "IMPLICIT": int(self.integrator == "implicit-midpoint"),
-        }
+        words |= {"COMMENT": self._comment(said), "IMPLICIT": int(self.integrator == "implicit-midpoint")}
         words |= {"SOURCE": _plain(source or "not named"), "VERSION": importlib.metadata.version("forcegp")}
-        moving = not space.is_vector_space
+        moving = not self.code.space.is_vector_space
         words |= {"ALL": nq + nv + nu, "X": nq + nv, "COLUMNS": 2 * nv + nu, "TITLE": self._title}
         words["STATE"] = "step from q, v, u" if moving else "q, v, u"
         words["ADVANCE"] = sections(__name__, "exported_c/advance.c")["turned" if moving else "added"]
@@ -122,16 +117,12 @@ class CFiles:
         prototypes = re.findall(r"^(/\*[^{}]*?\*/\nint [^{]*?) {", functions, re.MULTILINE)
         words["PROTOTYPES"] = "\n".join(f"{found};" for found in prototypes)
         parts = [filled(program["head"], words), *self._program(), filled(program["calls"], words), functions]
-        files = {
-            f"{self.name}.c": "\n".join(parts),
-            f"{self.name}.h": filled(c_text(__name__, "exported_c/model.h"), words),
-        }
         wrapped = sections(__name__, "exported_c/wrapped.hpp")
         words["CPP"] = filled("\n".join(wrapped[kind] for kind in kinds if kind in wrapped), words)
-        files[f"{self.name}.hpp"] = filled(c_text(__name__, "exported_c/model.hpp"), words)
-        files |= {file: filled(c_text(__name__, f"exported_c/{file}"), words) for file in ALIKE}
-        for file, content in files.items():
-            (folder / file).write_text(content, encoding="ascii")
+        (folder / f"{self.name}.c").write_text("\n".join(parts), encoding="ascii")
+        for file in FILES:
+            text = filled(c_text(__name__, f"exported_c/{file}"), words)
+            (folder / file.replace("model", self.name)).write_text(text, encoding="ascii")
 
     @property
     def _stepped(self) -> str:
@@ -141,13 +132,11 @@ class CFiles:
         """What stands for a calibrated monitor of contacts."""
         if (monitor := self.monitor) is None:
             return {"STATE_OF_MONITOR": ""}
-        words: dict[str, object] = {"STATE_OF_MONITOR": program["monitor_state"], "PERIOD": repr(monitor.dt)}
-        words |= {"THRESHOLD": repr(monitor.threshold), "SHARE": repr(1.0 - monitor.keep)}
+        words: dict[str, object] = {"STATE_OF_MONITOR": program["monitor_state"], "LINKS": len(monitor.ends)}
         words |= {"REMEMBER": program["monitor_memory"] if self.posterior.model.memory.names else ""}
         words |= {"OPEN": program["monitor_open"] if "covariance" in self.kinds else ""}
-        noise = {"ACCELERATIONS": monitor.noise.acceleration, "FORCES": monitor.noise.force}
-        noise |= dict(zip(("AT_REST", "FADES", "LARGEST"), (*monitor.near_rest, monitor.largest), strict=True))
-        return words | {word: ", ".join(map(repr, x.tolist())) for word, x in noise.items()}
+        words["LINK_NAMES"] = ", ".join(f'"{_plain(name).replace(chr(34), chr(39))}"' for name in monitor.ends)
+        return words | {word: ", ".join(map(repr, np.ravel(x).tolist())) for word, x in monitor.numbers.items()}
 
     def _program(self) -> Iterator[str]:
         """Tables and static functions."""
@@ -170,6 +159,9 @@ class CFiles:
             yield code.covariance_source("covariance_of_parts", len(code.physics.terms) * code.sizes[1])
         yield from code.motion_source(1)
         yield from code.memory_source(1)
+        if self.monitor is not None:
+            graph, found = trace(self.monitor.levers, [code.space.neutral()])
+            yield write_function("levers", graph, [node for x in found for node in x.flatten().tolist()], 1)
         for kind, function in wanted.items():
             program = code.program(kind)
             called = [part.name + ("_slopes" if kind in WITH_SLOPES else "") for part in code.sums]

@@ -113,6 +113,41 @@ int @NAME@_inverse_dynamics(const double q[@NQ@], const double v[@NV@], const do
 }
 
 //// monitor
+const char *const @NAME@_links[@LINKS@] = {@LINK_NAMES@};
+
+/* the lower triangle of the covariance of filtered torques in free motion: `slow` is how much of the time joints were
+   near rest, `inertial` M a, filtered, beyond whose largest value errors grow in proportion */
+static void spread_of(const double *mass, const double *slow, const double *inertial, double S[][@NV@]) {
+  enum {N = @NV@};
+  static const double accelerations[] = {@ACCELERATIONS@}, forces[] = {@FORCES@};
+  static const double at_rest[] = {@AT_REST@}; /* errors of friction near rest */
+  static const double largest[] = {@LARGEST@}; /* |M a| of free motion */
+  for (int i = 0; i < N; i++) for (int j = 0; j <= i; j++) {
+    S[i][j] = i == j ? forces[i] * forces[i] + at_rest[i] * at_rest[i] * slow[i] * slow[i] : 0.0;
+    for (int k = 0; k < N; k++) S[i][j] += mass[N * i + k] * accelerations[k] * accelerations[k] * mass[N * k + j];
+    S[i][j] *= fmax(1.0, fabs(inertial[i]) / largest[i]) * fmax(1.0, fabs(inertial[j]) / largest[j]);
+  }
+}
+
+/* S = L L^T in the place of S */
+static void factored(double S[][@NV@]) {
+  for (int j = 0; j < @NV@; j++) for (int i = j; i < @NV@; i++) {
+    for (int k = 0; k < j; k++) S[i][j] -= S[i][k] * S[j][k];
+    S[i][j] = i == j ? sqrt(S[i][j]) : S[i][j] / S[j][j];
+  }
+}
+
+/* L^-1 y in the place of y; what is returned is its squared length */
+static double whitened(double S[][@NV@], double *y) {
+  double square = 0.0;
+  for (int i = 0; i < @NV@; i++) {
+    for (int k = 0; k < i; k++) y[i] -= S[i][k] * y[k];
+    y[i] /= S[i][i];
+    square += y[i] * y[i];
+  }
+  return square;
+}
+
 /* what touches the robot since the last sample: the external joint torque, low-pass filtered, the squared Mahalanobis
    distance from free motion, and whether that is over the threshold of @THRESHOLD@. To be called every @PERIOD@ s with
    u of the actuators, which acts from now on; the first call only looks. The state belongs to the caller, zeros at
@@ -120,10 +155,8 @@ int @NAME@_inverse_dynamics(const double q[@NQ@], const double v[@NV@], const do
 int @NAME@_monitor_step(@NAME@_monitor_state *state, const double q[@NQ@], const double v[@NV@], const double u[@NV@],
                       double torque[@NV@], double *distance, int *alarm) {
   enum {N = @NV@, NU = @NU@, K = @MEMORY@, AT = @COLUMN@, M = @CONTACTS@};
-  static const double accelerations[] = {@ACCELERATIONS@}, forces[] = {@FORCES@};
-  static const double at_rest[] = {@AT_REST@}, fades[] = {@FADES@}; /* errors of friction near rest */
-  static const double largest[] = {@LARGEST@}; /* |M a| of free motion, beyond which errors grow in proportion */
-  double x[@ALL@], y[N + N * NU + N * N + M * N + 2 * M], S[N][N + 1], C[N * N], MC[N * N], d = 0.0;
+  static const double fades[] = {@FADES@}; /* velocities over which errors near rest fade */
+  double x[@ALL@], y[N + N * NU + N * N + M * N + 2 * M], S[N][N], C[N * N], MC[N * N], d = 0.0;
   const double *mass = y + N + N * NU;
   int found = stored(q, x, N) | stored(v, x + N, N) | stored(u, x + 2 * N, N), begun = state->begun;
   (void)MC;
@@ -148,27 +181,102 @@ int @NAME@_monitor_step(@NAME@_monitor_state *state, const double q[@NQ@], const
       state->inertial[i] += @SHARE@ * (inertial - state->inertial[i]);
       state->slow[i] += @SHARE@ * (exp(-fabs(x[N + i]) / fades[i]) - state->slow[i]);
     }
-    for (int i = 0; i < N; i++) for (int j = 0; j <= i; j++) {
-      S[i][j] = i == j ? forces[i] * forces[i] + at_rest[i] * at_rest[i] * state->slow[i] * state->slow[i] : 0.0;
-      for (int k = 0; k < N; k++)
-        S[i][j] += mass[N * i + k] * accelerations[k] * accelerations[k] * mass[N * k + j];
-    }
-    for (int i = 0; i < N; i++) for (int j = 0; j <= i; j++)
-      S[i][j] *= fmax(1.0, fabs(state->inertial[i]) / largest[i]) * fmax(1.0, fabs(state->inertial[j]) / largest[j]);
+    spread_of(mass, state->slow, state->inertial, S);
     @OPEN@
-    for (int j = 0; j < N; j++) for (int i = j; i < N; i++) { /* S = L L^T; the distance is |L^-1 torque|^2 */
-      for (int k = 0; k < j; k++) S[i][j] -= S[i][k] * S[j][k];
-      S[i][j] = i == j ? sqrt(S[i][j]) : S[i][j] / S[j][j];
-    }
-    for (int i = 0; i < N; i++) {
-      S[i][N] = state->torque[i];
-      for (int k = 0; k < i; k++) S[i][N] -= S[i][k] * S[k][N];
-      S[i][N] /= S[i][i];
-      d += S[i][N] * S[i][N];
-    }
+    factored(S);
+    stored(state->torque, C, N);
+    d = whitened(S, C);
   }
   *alarm = d > @THRESHOLD@;
   return stored(state->torque, torque, N) | stored(&d, distance, 1);
+}
+
+/* the force (3) without a moment at a point, whose effect J (3, N) on torques y stands between J0 and J1, that leaves
+   least of y, its variance, and what it leaves; from the singular values of J over `cut` (one-sided Jacobi rotations,
+   Hestenes 1958) */
+static double explained(const double *J0, const double *J1, double along, double cut, const double *y, double *force,
+                        double *variance) {
+  enum {N = @NV@, SWEEPS = 30};
+  double J[3][N], V[3][3], left[N], square = 0.0;
+  for (int i = 0; i < 3; i++) {
+    for (int j = 0; j < N; j++) J[i][j] = J0[N * i + j] + along * (J1[N * i + j] - J0[N * i + j]);
+    for (int j = 0; j < 3; j++) V[i][j] = i == j;
+    force[i] = variance[i] = 0.0;
+  }
+  for (int sweep = 0, turned = 1; turned && sweep < SWEEPS; sweep++) {
+    turned = 0;
+    for (int p = 0; p < 2; p++) for (int q = p + 1; q < 3; q++) {
+      double a = 0.0, b = 0.0, c = 0.0;
+      for (int j = 0; j < N; j++) { a += J[p][j] * J[p][j]; b += J[q][j] * J[q][j]; c += J[p][j] * J[q][j]; }
+      if (c * c <= 1e-28 * a * b || a + b <= cut) continue;
+      const double z = (b - a) / (2.0 * c), t = (z < 0.0 ? -1.0 : 1.0) / (fabs(z) + sqrt(1.0 + z * z));
+      const double cosine = 1.0 / sqrt(1.0 + t * t), sine = cosine * t;
+      turned = 1;
+      for (int j = 0; j < N; j++) {
+        const double w = J[p][j];
+        J[p][j] = cosine * w - sine * J[q][j]; J[q][j] = sine * w + cosine * J[q][j];
+      }
+      for (int j = 0; j < 3; j++) {
+        const double w = V[p][j];
+        V[p][j] = cosine * w - sine * V[q][j]; V[q][j] = sine * w + cosine * V[q][j];
+      }
+    }
+  }
+  for (int j = 0; j < N; j++) left[j] = y[j];
+  for (int p = 0; p < 3; p++) {
+    double a = 0.0, c = 0.0;
+    for (int j = 0; j < N; j++) { a += J[p][j] * J[p][j]; c += J[p][j] * y[j]; }
+    if (a <= cut) continue;
+    for (int j = 0; j < N; j++) left[j] -= c / a * J[p][j];
+    for (int j = 0; j < 3; j++) { force[j] += c / a * V[p][j]; variance[j] += V[p][j] * V[p][j] / a; }
+  }
+  for (int j = 0; j < N; j++) square += left[j] * left[j];
+  return square;
+}
+
+/* where on which link a force without a moment explains an external torque at q: least squares in the metric of the
+   noise, at points along every link; of those alike the least force, and of forces as large the link nearest to the
+   base. Not called by @NAME@_monitor_step: one torque after an alarm is enough */
+int @NAME@_monitor_place(const double q[@NQ@], const double torque[@NV@], @NAME@_contact_place *place) {
+  enum {N = @NV@, L = @LINKS@, P = @PLACES@};
+  static const double usual[] = {@USUAL@}, still[@NV@] = {0.0}, ends[] = {@ENDS@};
+  double x[N], y[N], at[N * N + 6 * N * L], S[N][N], force[L * P][3], variance[L * P][3], misfit[L * P], newton[L * P];
+  double *J = at + N * N, cut = 0.0, least = HUGE_VAL, smallest = HUGE_VAL;
+  const int refuses = stored(q, x, N) | stored(torque, y, N);
+  memset(place, 0, sizeof *place);
+  place->link = -1;
+  for (int i = 0; i < 3; i++) place->point[i] = place->force[i] = place->deviation[i] = NAN;
+  if (refuses) return @NAME@_INPUT_NOT_FINITE;
+  levers(tables, 1, x, at);
+  spread_of(at, usual, still, S);
+  factored(S);
+  whitened(S, y);
+  for (int k = 0; k < 2 * L; k++) {
+    double square = 0.0;
+    for (int i = 0; i < 3; i++) square += whitened(S, J + N * (3 * k + i));
+    cut = fmax(cut, @UNSEEN@ * @UNSEEN@ * square);
+  }
+  for (int k = 0; k < L * P; k++) {
+    const double *J0 = J + 6 * N * (k / P);
+    misfit[k] = explained(J0, J0 + 3 * N, (k % P) / (P - 1.0), cut, y, force[k], variance[k]);
+    newton[k] = sqrt(force[k][0] * force[k][0] + force[k][1] * force[k][1] + force[k][2] * force[k][2]);
+    least = fmin(least, misfit[k] + @EXPLAINED@);
+  }
+  for (int k = 0; k < L * P; k++) if (misfit[k] <= least) {
+    smallest = fmin(smallest, (1.0 + @SAME@) * newton[k]);
+    place->also[k / P] = 1;
+  }
+  for (int k = L * P - 1; k >= 0; k--) if (misfit[k] <= least && newton[k] <= smallest) {
+    place->link = k / P;
+    for (int i = 0; i < 3; i++) {
+      place->point[i] = ends[3 * (k / P) + i] * (k % P) / (P - 1.0);
+      place->force[i] = force[k][i];
+      place->deviation[i] = sqrt(variance[k][i]);
+    }
+  }
+  if (place->link < 0) return @NAME@_RESULT_NOT_FINITE;
+  place->also[place->link] = 0;
+  return @NAME@_OK;
 }
 
 //// monitor_memory
@@ -331,4 +439,11 @@ typedef struct { /* of one robot, zeros at first */
   double q[@NQ@], v[@NV@], u[@NV@], torque[@NV@], slow[@NV@], inertial[@NV@], middle[@NQ@], memory[@MEMORY@ + 1];
   int begun, moved;
 } @NAME@_monitor_state;
+
+enum { @NAME@_LINKS = @LINKS@ };
+typedef struct { /* a force in N, world axes, with its standard deviation, at a point of the link in m */
+  double point[3], force[3], deviation[3];
+  int link, also[@LINKS@]; /* its place in @NAME@_links, -1 for none; 1 for others that explain the torque as well */
+} @NAME@_contact_place;
+extern const char *const @NAME@_links[@LINKS@];
 

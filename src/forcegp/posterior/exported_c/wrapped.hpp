@@ -42,6 +42,12 @@ class Monitor {
     return found;
   }
   void restart() { state_ = {}; }
+  /* where a torque comes from, as @NAME@_monitor_place; link is -1 where that is not known */
+  static @NAME@_contact_place place(const Positions &q, const Velocities &torque) {
+    @NAME@_contact_place found;
+    @NAME@_monitor_place(q.data(), torque.data(), &found);
+    return found;
+  }
 
  private:
   @NAME@_monitor_state state_{};
