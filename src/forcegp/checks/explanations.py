@@ -256,7 +256,9 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         )
         cause = number("joint zero", what, joint, x, NUMBER + 0.3)
         if abs(x) > 0.05:
-            found.append((left, cause, lambda x=x, one=one: now.after(_offset(x * one))))
+            found.append(
+                (left, cause, lambda x=x, one=one: now.after(lambda rows: replace(changed()(rows), q=rows.q + x * one)))
+            )
     for body, drive in enumerate(robot.layout.drives):
         length = float(torch.linalg.vector_norm(robot.tree.rest[body, :3, 3, 0]))
         if length == 0.0 or robot.layout.parents[body] < 0:
@@ -271,10 +273,6 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
             found.append((left, cause, lambda x=x, b=body: now.after(changed(), _with_length(robot, b, x))))
     for _, cause, made in sorted(found, key=lambda each: each[0])[:SCANNED]:
         yield cause, made()
-
-
-def _offset(by: np.ndarray) -> Change:
-    return lambda rows: replace(changed()(rows), q=rows.q + by)
 
 
 def _with_length(robot: Robot, body: int, factor: float) -> Robot:

@@ -306,10 +306,6 @@ def _negated(graph: Graph, m: Any) -> _Numbers:
     return _elementwise(graph, lambda a: graph.apply("subtract", ONE, a), m)
 
 
-def _either(graph: Graph, x: Any, y: Any) -> _Numbers:
-    return _elementwise(graph, lambda a, b: graph.apply("choose", a, ONE, b), x, y)
-
-
 def _power(graph: Graph, x: Any, exponent: Any) -> _Numbers:
     def one(a: int, b: int) -> int:
         match graph.value(b):
@@ -413,7 +409,10 @@ HANDLERS: dict[str, Callable[..., Any]] = {
     "ne": lambda graph, x, y: _negated(graph, _binary("equal")(graph, x, y)),
     **dict.fromkeys(("logical_not", "bitwise_not"), _negated),
     **dict.fromkeys(("logical_and", "bitwise_and"), _binary("multiply")),
-    **dict.fromkeys(("logical_or", "bitwise_or"), _either),
+    **dict.fromkeys(
+        ("logical_or", "bitwise_or"),
+        lambda graph, x, y: _elementwise(graph, lambda a, b: graph.apply("choose", a, ONE, b), x, y),
+    ),
     "where": lambda graph, m, x, y: _elementwise(graph, lambda *nodes: graph.apply("choose", *nodes), m, x, y),
     "reciprocal": lambda graph, x: _binary("divide")(graph, 1.0, x),
     "rsqrt": lambda graph, x: _power(graph, x, -0.5),

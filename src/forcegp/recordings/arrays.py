@@ -66,7 +66,9 @@ class ArrayFile(Source):
             raise InvalidInput(
                 f"no array or group of {self.path} matches {pattern!r}; it has {listed(names, MOST_NAMES)}."
             )
-        return sorted(found, key=_by_numbers)
+        return sorted(
+            found, key=lambda name: [x.zfill(20) for x in re.findall(r"\d+|\D", name)]
+        )  # demo_10 after demo_9
 
     @cached_property
     def _places(self) -> dict[str, tuple[str, int | None]]:
@@ -107,11 +109,6 @@ class ArrayFile(Source):
         tables = {name: content() for name, (_, content) in chosen.items()}
         places = {name: self._places[name] for name in names}
         return {name: tables[own] if at is None else tables[own][:, at] for name, (own, at) in places.items()}
-
-
-def _by_numbers(name: str) -> list[tuple[int, int, str]]:
-    """So that demo_10 comes after demo_9."""
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.findall(r"\d+|\D", name)]
 
 
 NUMPY = "a NumPy archive", zipfile.BadZipFile, NotImplementedError
