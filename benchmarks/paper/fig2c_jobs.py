@@ -43,7 +43,7 @@ def estimate(results: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[s
         "std": {name: found[name].std for name in NAMES},
         "decided_by": {name: found[name].decided_by for name in NAMES},
         "center_error": math.hypot(*(error[name] for name in NAMES[1:])),
-        "inside": {name: found[name].interval[0] <= true[name] <= found[name].interval[1] for name in NAMES},
+        "inside": {name: bool(found[name].interval[0] <= true[name] <= found[name].interval[1]) for name in NAMES},
         "mae": score(posterior, scored_rows(results, spec["data"])).value("mae"),
     }
 

@@ -82,9 +82,9 @@ def cell(seed: int, force: float | None, diverged: int = 0, motion: float = 0.1)
 KINDS = {"urdf": "given", "ls": "identified", "ls2": "identified", "gp": "force prior", "net": "black box"}
 
 
-def scores(runs: dict[str, list[dict]], kinds: dict[str, str] = KINDS) -> Scores:
+def scores(runs: dict[str, list[dict]], kinds: dict[str, str] = KINDS, joints: tuple[str, ...] = ("j",)) -> Scores:
     models = {name: {"kind": kinds[name], "summary": ""} for name in runs}
-    return Scores(models=models, runs=runs, joint_names=("j",), units={})
+    return Scores(models=models, runs=runs, joint_names=joints, units={})
 
 
 def test_models_are_compared_over_the_runs_that_both_finished():
@@ -164,14 +164,19 @@ def test_a_model_that_is_usable_in_more_joints_is_taken_whatever_its_motions():
     def leaves(*shares: float | None, motion: float, quantity: str = "torque", score: str = "share") -> list[dict]:
         return [{**cell(k, 1.0, motion=motion + 0.01 * k), "table": {quantity: {score: list(shares)}}} for k in (0, 1)]
 
-    cells = {"ls": leaves(0.3, 0.2, motion=0.4), "ls2": leaves(0.1, 0.51, motion=0.1)}
-    assert (scores(cells).recommended, scores(cells).unusable("ls2"), scores(cells).unusable("ls")) == ("ls", 1, 0)
-    assert scores({**cells, "ls2": leaves(0.1, 0.49, motion=0.1)}).recommended == "ls2", "half of a torque is usable"
-    learned = scores({**cells, "gp": leaves(0.4, None, motion=0.01)})
-    assert learned.winner.why == "usable in 1 more joints", "a share that is not known is none"
-    assert (learned.recommended, scores({"ls2": cells["ls2"], "gp": cells["ls"]}).recommended) == ("ls", "gp")
-    light = leaves(0.9, 0.1, motion=0.1, quantity="acceleration", score="nrmse")
-    assert scores({"ls": light, "net": light}).left("net") == ("acceleration", [0.9, 0.1]), "no torque was measured"
+    def of(**runs: list[dict]) -> Scores:
+        return scores(runs, joints=("base", "hip", "knee"))
+
+    ls, ls2 = leaves(None, 0.3, 0.2, motion=0.4), leaves(None, 0.1, 0.51, motion=0.1)
+    found = of(ls=ls, ls2=ls2)
+    assert (found.recommended, found.unusable("ls2"), found.unusable("ls")) == ("ls", 1, 0), "no torque acts on a base"
+    assert of(ls=ls, ls2=leaves(None, 0.1, 0.49, motion=0.1)).recommended == "ls2", "half of a torque is usable"
+    learned = of(ls=ls, ls2=ls2, gp=leaves(None, 0.4, 0.6, motion=0.01))
+    assert (learned.recommended, learned.winner.why) == ("ls", "usable in 1 more joints")
+    assert of(ls2=ls2, gp=ls).recommended == "gp"
+    light = leaves(None, 0.9, 0.1, motion=0.1, quantity="acceleration", score="nrmse")
+    net = of(ls=light, net=light)
+    assert (net.left("net")[0], net.unusable("net")) == ("acceleration", 2), "what is not known is not usable"
 
 
 def test_a_model_that_is_not_there_is_named():

@@ -385,11 +385,10 @@ def left_of_torques(scores: forcegp.scores.Scores, best: str) -> list[tuple[str,
     """The line on what each model leaves of the recorded torques of the joints; none where u has other columns."""
     shares = {}
     for name in dict.fromkeys(("given", "identified", best)):
-        if name in scores.models and "share" in scores.quantities(name).get(TORQUE, ()):
-            numbers = scores.columns("share", TORQUE, name)
-            shares[short_name(name)] = " ".join(
-                shown(x, "{:.2g}" if x and x < 0.1 else "{:.0f}", 100.0) for x in numbers
-            )
+        quantity, left = scores.left(name) if name in scores.models else (ACCELERATION, {})
+        if quantity == TORQUE:
+            numbers = (shown(x, "{:.2g}" if x and x < 0.1 else "{:.0f}", 100.0) for x in left.values())
+            shares[short_name(name)] = " ".join(numbers)
     told = "; ".join(f"{name} {numbers}" for name, numbers in shares.items())
     return [("torque left", f"on unseen time, % of the recorded one of each joint: {told}")] if told else []
 
@@ -402,17 +401,17 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset, still: Sequ
     best = scores.recommended
     assert best is not None, "a model was scored"
     quantity, shares = scores.left(best)
-    left = [math.inf if x is None else x for x in shares]
-    good = [name for name, x in zip(scores.joint_names, left, strict=True) if x <= USABLE]
+    left = {name: math.inf if x is None else x for name, x in shares.items()}
+    good = [name for name, x in left.items() if x <= USABLE]
     lost = [f"{name} {100.0 * x:.0f} %" if math.isfinite(x) else f"{name} not known from this log"
-            for name, x in zip(scores.joint_names, left, strict=True) if x > USABLE]  # fmt: skip
+            for name, x in left.items() if x > USABLE]  # fmt: skip
     use = f"“{short_name(best)}”"
     if not good:
         return (
             f"Do not use any of these models: on unseen time the best one, {use}, leaves of the {quantity} of "
             f"{', '.join(lost)}. Forces, flags of stance, units or the robot's file are wrong, or it hardly moves."
         )
-    ends = dict.fromkeys(f"{100.0 * x:.2g}" for x in (min(left), max(x for x in left if x <= USABLE)))
+    ends = dict.fromkeys(f"{100.0 * x:.2g}" for x in (min(left.values()), max(left[name] for name in good)))
     told = f"on unseen time it leaves {' to '.join(ends)} % of each {quantity}"
     motion, urdf = _motion(scores, best), _motion(scores, "given")
     if motion is not None:

@@ -135,7 +135,7 @@ def preparation_report(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
     return report if isinstance(report, Mapping) and {"cutoff", "why", "rows"} <= report.keys() else {}
 
 
-BEYOND_BASE = 8.0
+BEYOND_BASE = 1.5
 """The cut-off of a robot on contacts is at most so many times that of its base, whose accelerations are noise there."""
 
 

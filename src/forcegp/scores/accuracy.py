@@ -13,8 +13,8 @@ from scipy.stats import norm
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from forcegp.data import Dataset, repeated_rows, with_memory
-from forcegp.data.views import in_blocks
+from forcegp.data import Dataset, repeated_rows, thruster_columns, with_memory
+from forcegp.data.views import in_blocks, tensors
 from forcegp.doubts import Doubt, look
 from forcegp.errors import NumericalError
 from forcegp.evidence.recorded_rows import sensed_of
@@ -134,11 +134,12 @@ def row_scores(
     measured = table[ACCELERATION]
     whole = test if whole is None else whole
     measured["nrmse"] = plain(np.array(measured["rmse"], dtype=float) / _spread(whole.a))
-    if len(test.model.actuators) == test.nv and not posterior.is_black_box:
+    if test.model.actuation.names and not thruster_columns(test.model) and not posterior.is_black_box:
         # of the torques that the model needs for the measured motion; a share of 1 is no better than their mean
         mass = rows["mass"]  # its own: u is there to compare with
         rms = np.sqrt(np.square(force_errors(rows["mean"], test.a, mass)).mean(axis=0))
-        table[TORQUE] = {"rmse": plain(rms), "share": plain(rms / _spread(whole.u[:, : test.nv]))}
+        delivered = whole.model.state(*tensors(whole, whole.model.robot.device)[:3]).delivered.cpu().numpy()
+        table[TORQUE] = {"rmse": plain(rms), "share": plain(rms / _spread(delivered))}
     density = norm.logpdf(test.a, rows["mean"], np.sqrt(rows["measurement_variance"]))
     measured["nlpd"] = plain(-np.asarray(density).mean(axis=0))
     measured["noise_std"] = plain(posterior.noise_std.detach().cpu().numpy())

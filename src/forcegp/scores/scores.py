@@ -231,17 +231,18 @@ class Scores(Summary):
 
     # ------------------------------------------------------------------ which model
 
-    def left(self, model: str) -> tuple[str, list[float | None]]:
-        """What a model leaves of each joint's torque, else of its acceleration: that quantity, and its shares."""
+    def left(self, model: str) -> tuple[str, dict[str, float | None]]:
+        """What a model leaves of the torque where one acts, else of accelerations: that quantity, and shares by joint."""
         held = self.quantities(model)
-        for quantity, score in ((TORQUE, "share"), (ACCELERATION, "nrmse")):
-            if score in held.get(quantity, ()):
-                return quantity, self.columns(score, quantity, model)
-        return ACCELERATION, []
+        if "share" in held.get(TORQUE, ()):
+            shares = zip(self.joint_names, self.columns("share", TORQUE, model), strict=True)
+            return TORQUE, {name: share for name, share in shares if share is not None}
+        known = self.columns("nrmse", ACCELERATION, model) if "nrmse" in held.get(ACCELERATION, ()) else ()
+        return ACCELERATION, dict(zip(self.joint_names, known, strict=False))
 
     def unusable(self, model: str) -> int:
         """In how many joints a model leaves more than `USABLE`, or it is not known what it leaves."""
-        return sum(share is None or share > USABLE for share in self.left(model)[1])
+        return sum(share is None or share > USABLE for share in self.left(model)[1].values())
 
     def errors(self, criterion: str, model: str) -> dict[tuple[str, int], Float[np.ndarray, "horizons stretches"]]:
         """Squared errors by split and seed; one horizon but for motions."""
