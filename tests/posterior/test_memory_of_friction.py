@@ -5,7 +5,7 @@ import subprocess
 import numpy as np
 import pytest
 import torch
-from tests.forces.test_presliding import DT, JOINTS, SIGMA, log_of, lugre_log, motion  # noqa: F401  # a fixture
+from tests.forces.test_presliding import DT, lugre_log  # noqa: F401  # a fixture
 from tests.posterior.arm import arm_model
 
 from forcegp import Torques, export_c, fit
