@@ -34,14 +34,14 @@ def test_recorded_motions_are_spread_over_the_log_and_hold_u_of_each_row():
             for name, end in (("q", 6), ("v", 6), ("u", 5)):
                 np.testing.assert_array_equal(getattr(found, name)[k], getattr(log, name)[row : row + end])
     assert recorded_motions(log.rows(np.delete(np.arange(40), 26)), 20, 0.1).rows[-4:] == (9, 26, 27, 28)
-    jitter = np.where(np.arange(40) == 10, 1.0, 0.0)
+    late = 3e-3 * (np.arange(40) > 9)
     for starts, seconds, changed, words in (
         ((15,), 0.05, log, "no motion of 0.05 s begins at row 15 of the 40 rows"),
         (5, 0.004, log, "at least one step of the recording, 0.01 s"),
         (0, 0.05, log, "the number of starts is 0; it must be at least 1"),
         (5, 0.2, log, "no episode lasts 0.2 s: the longest has 0.19 s"),
         ((22,), 0.05, log.rows(np.delete(np.arange(40), 26)), r"0.02 s after row 25, 0.01 s elsewhere"),
-        ((8,), 0.05, replace(log, time=log.time + 2e-3 * jitter), r"0.012 s after row 9, 0.01 s elsewhere"),
+        ((8,), 0.05, replace(log, time=log.time + late), r"0.013 s after row 9, 0.01 s elsewhere"),
         (5, 0.05, replace(log, time_ordered=False), "not in the order of time"),
     ):
         with pytest.raises(InvalidInput, match=words):
