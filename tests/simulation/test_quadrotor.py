@@ -82,15 +82,6 @@ def test_it_flies_by_newton_euler_and_the_published_air(wind, monkeypatch):
             speeds = data.u[k] + (speeds - data.u[k]) * np.exp(-dt / lag)
 
 
-def test_without_wind_at_rest_only_thrust_and_lag_are_unknown():
-    calm = simulate_quadrotor(QuadrotorConfig(seconds=1.0, seed=1, wind=0.0, noise=0.0))
-    windy = simulate_quadrotor(QuadrotorConfig(seconds=1.0, seed=1, wind=12.0, noise=0.0))
-    assert np.abs(calm.truth["Q_U"][:, :2]).max() < 0.25 * np.abs(windy.truth["Q_U"][:, :2]).max()
-    known = calm.model.dynamics(*(torch.tensor(x) for x in (calm.q, calm.v, calm.u)))
-    a = known.acceleration(torch.tensor(calm.truth["Q_U"]))
-    np.testing.assert_allclose(a, calm.truth["a"], atol=1e-9)
-
-
 def test_new_wind_is_observed_from_the_past(posterior, test):
     rows = acting(test)
     seeing, seen = observing(posterior, rows, seconds=0.05)
