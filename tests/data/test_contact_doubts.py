@@ -61,12 +61,6 @@ def test_clean_logs_of_many_seeds_are_not_doubted(seed):
                 assert wrong(rows) == []
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("seed", range(5))
-def test_wrong_contacts_of_five_seeds_are_doubted(seed):
-    assert wrong(moved(on_a_line(seed), (0.02, 0.0, 0.0))) == [0]
-
-
 def test_noise_of_positions_is_no_motion_of_feet_that_stand():
     """At .03 mm and .1 mrad a standing foot is differentiated to .02 m/s, and swings in some rows."""
     clean_walk = simulate_quadruped(QuadrupedConfig(seconds=4.0, seed=1))
