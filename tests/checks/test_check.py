@@ -127,6 +127,14 @@ def test_a_dead_torque_is_wrong_where_the_motion_needs_a_share_of_the_others(sha
     assert (found.level, found.joints) == (level, ("elbow",))
 
 
+def test_repeated_rows_are_told():
+    data = clean(7)
+    kept = np.arange(len(data)) // 4 * 4
+    repeated = replace(data, q=data.q[kept], v=data.v[kept], u=data.u[kept])
+    (found,) = check(repeated).doubts.of("repeated rows")
+    assert found.numbers["share"] == pytest.approx(0.75, abs=0.02)
+
+
 def test_an_angle_that_wraps_is_told():
     data = clean(3, pendulum())
     wrapped = column(data, "q", 0, lambda x: (x + 2 * np.pi * data.time / 3 + np.pi) % (2 * np.pi) - np.pi)

@@ -9,9 +9,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from forcegp import AerodynamicForce, fit
-from forcegp.data import lagged, recorded_motions
+from forcegp.data import lagged
 from forcegp.errors import InvalidInput
-from forcegp.fit import calibrated
 from forcegp.posterior import export_c, load_posterior, observing, save_posterior
 from forcegp.simulation import QuadrotorConfig, moving_bases, simulate_quadrotor
 
@@ -153,25 +152,6 @@ def test_a_predictor_takes_what_observers_report(posterior, test, tmp_path):
         expected = seeing.predict(q, v, u, covariance=False).mean
         np.testing.assert_allclose(predictor.mean(q, v, u), expected, rtol=1e-9, atol=1e-9)
     assert export_c(seeing, tmp_path / "c").differences
-
-
-@pytest.mark.nightly
-def test_intervals_of_motions_are_those_of_observed_wind(posterior, train):
-    """They are found, and used, where wind is observed; the model alone, in whatever wind, has none."""
-    rows = acting(train).rows(np.arange(480))
-    widened = calibrated(posterior, rows, (0.1,))
-    assert widened.motion_intervals is None
-    seeing, seen = observing(widened, acting(train).rows(np.arange(1600, 2400)))
-    assert seeing.motion_intervals.inputs == seen.model.inputs
-    moved = recorded_motions(seen, 30, 0.1)
-    found = seeing.rollout(moved.q[:, 0], moved.v[:, 0], moved.u, moved.dt, integrator="rk4")
-    low, high = found.interval()
-    off = seen.model.robot.difference(found.q, torch.tensor(moved.q))
-    assert float(((low <= off) & (off <= high))[:, -1].double().mean()) > 0.8
-    other, _ = observing(widened, rows, seconds=0.05)
-    assert other.motion_intervals is None
-    with pytest.raises(InvalidInput, match="before `observing`"):
-        calibrated(seeing, seen, (0.05,))
 
 
 def test_without_columns_the_air_moves_as_in_the_training(posterior, train):
