@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 import torch
 from scipy.linalg import eigh, null_space
-from tests.mechanics.test_thrusters import DRONE
+from tests.forces.test_thrusters import DRONE
 from tests.robots.random_positions import random_positions
 from tests.robots.test_moving_bases import LIMBS, ROOTS, Pair
 

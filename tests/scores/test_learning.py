@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from tests.fit.test_motion_fit import bump, line, recording, slide
-from tests.mechanics.test_thrusters import DRONE
+from tests.forces.test_thrusters import DRONE
 from tests.posterior.arm import arm_data, arm_model
 from tests.robots.test_moving_bases import LIMBS
 
