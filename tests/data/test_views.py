@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 from tests.data.samples import dataset
 
-from forcegp.data.views import all_motions, postures, recorded_motions, repeated_rows, rests, rests_alone, white_noise
+from forcegp.data.views import (
+    all_motions,
+    one_row_per_rest,
+    postures,
+    recorded_motions,
+    repeated_rows,
+    rests,
+    rests_alone,
+    white_noise,
+)
 from forcegp.errors import InvalidInput
 
 
@@ -77,7 +86,18 @@ def test_white_noise_is_seen_beside_motion_and_not_in_it(width):
     log = dataset(4000, a=smooth + [0.2, 0.05] * rng.standard_normal((4000, 2)), u=smooth, episode=np.zeros(4000, int))
     np.testing.assert_allclose(white_noise(log, width), np.array([0.2, 0.05]) / width**0.5, rtol=0.08)
     assert np.isnan(white_noise(log, width, "u")).all()
-    few = 30 + 5 * width - 1  # windows of five means each
+    few = 30 + 5 * width - 1
     assert white_noise(log.rows(slice(0, few)), width) is not None
     assert white_noise(log.rows(slice(0, few - 1)), width) is None
-    assert white_noise(replace(log, time_ordered=False), width) is None
+
+
+@pytest.mark.parametrize(("postures", "moves"), [(3, 0.0), (2, 0.0), (3, 0.05)])
+def test_a_log_of_postures_alone_becomes_the_median_of_each(postures, moves):
+    rng, episode = np.random.default_rng(0), np.repeat(np.arange(postures), 9)
+    q = np.array([[0.0, 1.0], [0.5, -1.0], [1.0, 0.2]])[episode] + moves * rng.standard_normal((len(episode), 2))
+    log = dataset(len(episode), q=q, u=rng.standard_normal((len(episode), 2)), episode=episode)
+    found = one_row_per_rest(log)
+    assert len(found) == (3 if postures == 3 and not moves else len(log))
+    if len(found) == 3:
+        np.testing.assert_array_equal(np.c_[found.q, found.v], np.c_[q[::9], 0.0 * q[::9]])
+        np.testing.assert_array_equal(found.u, np.median(log.u.reshape(3, 9, 2), axis=1))
