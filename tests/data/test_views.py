@@ -47,7 +47,6 @@ def test_recorded_motions_are_spread_over_the_log_and_hold_u_of_each_row():
     for starts, seconds, changed, words in (
         ((15,), 0.05, log, "no motion of 0.05 s begins at row 15 of the 40 rows"),
         (5, 0.004, log, "at least one step of the recording, 0.01 s"),
-        (0, 0.05, log, "the number of starts is 0; it must be at least 1"),
         (5, 0.2, log, "no episode lasts 0.2 s: the longest has 0.19 s"),
         ((8,), 0.05, replace(log, time=log.time + late), r"0.013 s after row 9, 0.01 s elsewhere"),
         (5, 0.05, replace(log, time_ordered=False), "not in the order of time"),
