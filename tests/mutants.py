@@ -45,7 +45,7 @@ def places(node: ast.AST) -> Iterator[ast.AST]:
         return
     if getattr(node, "arg", "") in UNSEEN or (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"):
         return
-    if isinstance(node, ast.Constant) and type(node.value) in (int, float) and abs(node.value) > GUARD:
+    if isinstance(node, ast.Constant) and type(node.value) in (int, float) and abs(node.value) > GUARD:  # type: ignore[arg-type]  # a number
         yield node
     if isinstance(node, ast.BinOp | ast.BoolOp | ast.Compare | ast.If | ast.IfExp):
         yield node
