@@ -25,8 +25,7 @@ ENOUGH = 0.9
 """Share of killed mutants that is asked for."""
 NOT_COPIED = ".git", ".venv", ".*_cache", "build", "__pycache__"
 LONGEST = 1200.0  # seconds of one run: a guard against a fault that never ends
-GUARD = 1e-9
-"""Largest number that guards against zero or rounding."""
+GUARD = 1e-9  # the largest number that guards against zero or rounding
 UNSEEN = {"stacklevel", "figsize", "dpi", "fontsize", "labelsize", "linewidth", "linestyle", "markersize", "zorder",
           "markeredgewidth", "nbins", "bar_width", "cell_size"}  # fmt: skip
 LEFT_OUT = ast.Raise | ast.Assert | ast.JoinedStr | ast.ImportFrom | ast.Import
@@ -46,7 +45,7 @@ def places(node: ast.AST) -> Iterator[ast.AST]:
         return
     if getattr(node, "arg", "") in UNSEEN or (isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"):
         return
-    if isinstance(node, ast.Constant) and type(node.value) in (int, float) and abs(node.value) > GUARD:
+    if isinstance(node, ast.Constant) and type(node.value) in (int, float) and abs(node.value) > GUARD:  # type: ignore[arg-type]  # a number
         yield node
     if isinstance(node, ast.BinOp | ast.BoolOp | ast.Compare | ast.If | ast.IfExp):
         yield node

@@ -1,6 +1,5 @@
 """Everything computes on the device of its robot: on a pretended one here, on real ones where they are."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +9,10 @@ from tests.devices import DEVICES, PRETEND, MixedDevices, PretendTensor, pretend
 from tests.inference.dense import dense_covariance
 from tests.posterior.arm import arm_data, arm_model
 
-from forcegp import score
 from forcegp.errors import InvalidInput
 from forcegp.evidence import MarginalLikelihood, TrainingData
 from forcegp.fit import fit
-from forcegp.forces import Coulomb, JointForces, RigidBodies, Viscous, parse_forces
+from forcegp.forces import Coulomb, JointForces, Viscous, parse_forces
 from forcegp.inference import OptimizerOptions
 from forcegp.noise import Noise
 from forcegp.posterior import load_posterior, save_posterior
@@ -184,30 +182,6 @@ def test_structured_models_on_the_pretended_device(prior, integrators, tmp_path)
         save_posterior(there, tmp_path / "model")
     loaded = load_posterior(tmp_path / "model")
     assert torch.equal(loaded.predict(test.q, test.v, test.u).mean, expected.mean)
-
-
-@pytest.mark.nightly
-def test_fits_with_several_starts_on_the_pretended_device():
-    data, test = arm_data(12, seed=3), arm_data(3, seed=4)
-    how = {"restarts": 2, "options": QUICK}
-    expected = fit(data.model.with_forces(JointForces(), noise=Noise(0.05, learn=True)), data, **how)
-    with pretend_device():
-        model = data.model.to(PRETEND)
-        posterior = fit(model.with_forces(JointForces(), noise=Noise(0.05, learn=True)), data, **how)
-        assert all(isinstance(value, PretendTensor) for value in posterior.hyperparameters.values())
-        assert posterior.result.value == pytest.approx(expected.result.value, rel=1e-8)
-        assert score(posterior, test, horizons=()).value("mae") == pytest.approx(
-            score(expected, test, horizons=()).value("mae"), rel=1e-6
-        )
-        learned = fit(model.with_forces(RigidBodies(learn=("hand",)), JointForces()), data, restarts=1, options=QUICK)
-        assert math.isfinite(learned.result.value)
-        forces = fit(
-            model.with_forces(JointForces(), noise=Noise(0.05, 0.02, learn=True)).without_mean(),
-            data,
-            restarts=1,
-            options=QUICK,
-        )
-        assert math.isfinite(forces.result.value)
 
 
 def test_inducing_points_on_the_pretended_device():

@@ -8,8 +8,6 @@ from benchmarks.paper.reproduction import NAME, PRESETS, as_csv, experiments_of,
 
 from forcegp.errors import InvalidInput
 from forcegp.jobs import Job
-from forcegp.scores.accuracy import median_and_range
-from forcegp.scores.page import formatted, markdown_table, number
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "paper"
 
@@ -58,13 +56,3 @@ def test_the_committed_page_is_made_of_the_committed_numbers():
         document = documents[experiment.name]
         assert (folder / f"{experiment.name}.csv").read_text() == as_csv(experiment.rows(document["summary"]))
         assert all((folder / f"{name}.png").exists() for name in document["figures"])
-
-
-def test_spreads_and_tables():
-    assert median_and_range([3.0, 1.0, 2.0]) == {"median": 2.0, "min": 1.0, "max": 3.0, "values": [3.0, 1.0, 2.0]}
-    assert median_and_range([1.0, None]) is None
-    assert formatted(median_and_range([0.1, 0.3, 0.2]), 2) == "0.20 (0.10–0.30)"
-    assert formatted(median_and_range([0.5])) == "0.5000"
-    assert formatted(None) == "–"
-    assert [number(value) for value in (0.0, 1.2e-9, 0.08311, 23456.7)] == ["0.0000", "1.2e-09", "0.0831", "2.3e+04"]
-    assert markdown_table(["a", "b"], [["x", "1"]]) == "| a | b |\n|---|---:|\n| x | 1 |"

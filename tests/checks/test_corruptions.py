@@ -153,8 +153,8 @@ def test_torques_in_steps_are_right_and_friction_that_fades_is_named():
     step = np.ptp(data.u) / 100.0
     assert not check(replace(data, u=step * np.round(data.u / step))).doubts.at("wrong")
     dry = np.std(data.u, axis=0) * np.tanh(data.v / 0.05)
-    warm = replace(data, u=data.u + 0.5 * dry * np.exp(-data.time / 4.0)[:, None])
-    assert check(warm).doubts.of("drift")[0].joints == ("joint1", "joint2")
+    warm = replace(data, u=data.u + 0.5 * dry * (1.0 - 0.1 * data.time)[:, None])  # beside .1 that stays
+    assert check(warm).doubts.of("drift")[0].numbers["ratio"] == pytest.approx({"joint1": 0.4, "joint2": 0.4}, abs=0.05)
     assert not check(replace(data, u=data.u + 0.5 * dry)).doubts.of("drift")
 
 

@@ -96,17 +96,6 @@ def test_the_answer_holds_what_was_simulated(answered):
     assert 8 <= len(content["answer"]) <= 12
 
 
-@pytest.mark.nightly
-def test_a_second_run_takes_what_is_finished(folder, answered, forcegp):
-    command, content = answered
-    jobs = folder / "answer" / "validation" / "jobs"
-    before = {path: path.stat().st_mtime_ns for path in jobs.rglob("job.json")}
-    again = forcegp(*shlex.split(command)[1:], "--json", folder=folder)
-    assert again.returncode == 0, again.stderr
-    assert {path: path.stat().st_mtime_ns for path in jobs.rglob("job.json")} == before
-    assert json.loads(again.stdout)["answer"] == content["answer"]
-
-
 def test_correct_does_it_at_once(folder, forcegp, monkeypatch):
     """Up to the check: what comes after it is the same."""
     monkeypatch.setattr("forcegp.cli.auto.Auto._prepared_rows", _stopped)

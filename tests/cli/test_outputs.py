@@ -204,22 +204,6 @@ def test_overwriting_is_for_files_of_the_same_kind(folder, capfd, name):
     assert Path(name).read_bytes() == before
 
 
-@pytest.mark.parametrize("name", ["import", "fit"])
-@pytest.mark.nightly
-def test_a_disk_that_fills_up_leaves_the_old_output(folder, capfd, monkeypatch, limited_file_size, name):
-    arm_data(80, seed=0).save("arm.h5")
-    monkeypatch.setattr("forcegp.atomic_files.TRIAL", 1)  # a file is larger than the trial, whatever its size
-    words = filled(name, "out") + (QUICK.split() if name == "fit" else [])
-    assert main(words) == 0, capfd.readouterr().err
-    old = {file: file.read_bytes() for file in [Path("out"), *Path("out").rglob("*")] if file.is_file()}
-    with limited_file_size(1500):
-        told = refused(words, capfd)
-    assert "free some space" in told
-    assert {file: file.read_bytes() for file in [Path("out"), *Path("out").rglob("*")] if file.is_file()} == old
-    assert not hidden(folder)
-    assert main(words) == 0
-
-
 def test_a_changed_model_of_an_identification_is_refused(folder, capfd):
     Path("found").mkdir()
     model = arm_data(5, seed=0).model.to_json()

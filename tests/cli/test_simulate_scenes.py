@@ -17,28 +17,6 @@ def test_options_of_other_scenarios_are_refused(forcegp, tmp_path):
         assert message in refused.stderr
 
 
-@pytest.mark.nightly
-def test_a_quadruped_moves_on_a_floating_base(forcegp, tmp_path):
-    made = forcegp("simulate", "quadruped", "--seconds", 0.5, "--seed", 3, "--out", "log.h5", "--json", folder=tmp_path)
-    assert made.returncode == 0, made.stderr
-    data = Dataset.load(tmp_path / "log.h5")
-    assert (len(data), data.q.shape[1], data.nv, data.u.shape[1]) == (120, 19, 18, 16)
-    words = ("fit", "log.h5", "--forces", "gp:joint-friction", "--points", 25)
-    words = (*words, "--restarts", 1, "--iterations", 20, "--out", "run")
-    done = forcegp(*words, folder=tmp_path)
-    assert done.returncode == 0, done.stderr
-    words = ("score", "run", "log.h5", "--every", 40, "--out", "plots")
-    scored = forcegp(*words, folder=tmp_path)
-    assert scored.returncode == 0, scored.stderr
-    assert (tmp_path / "plots" / "normal_force.png").exists()
-    found = forcegp("import", "log.h5", "--stance", "auto", "--out", "found.h5", folder=tmp_path)
-    assert found.returncode == 0, found.stderr
-    assert "front_left_stands 100%" in found.stdout
-    flags = Dataset.load(tmp_path / "found.h5").u[:, 12:]
-    assert len(flags) > 100
-    assert (flags == 1.0).all()
-
-
 @pytest.mark.parametrize(
     ("options", "expected"),
     [

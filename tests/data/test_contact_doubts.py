@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.checks.clean_logs import clean_logs
 from tests.checks.corruptions import clean, invented, moved, on_a_line, two_links
 
 from forcegp.data import Dataset, contact_doubts, differentiate
@@ -47,24 +46,6 @@ def test_an_arm_on_a_line(noise):
     assert wrong(data) == []
     assert wrong(moved(data, (0.02, 0.0, 0.0))) == [0]
     assert wrong(invented(clean(two_links(), 4))) == [0]
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("seed", range(10, 30))
-def test_clean_logs_of_many_seeds_are_not_doubted(seed):
-    for _, data in clean_logs(seed):
-        assert contact_doubts(data) == ()
-    for surface in ("plane", "tilted"):
-        for noise in (0.0, 0.1):
-            data = simulated(seed, surface, noise)
-            for rows in (data, data.rows(slice(None, None, len(data) // 20)), data.rows(slice(None, None, 240))):
-                assert wrong(rows) == []
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("seed", range(5))
-def test_wrong_contacts_of_five_seeds_are_doubted(seed):
-    assert wrong(moved(on_a_line(seed), (0.02, 0.0, 0.0))) == [0]
 
 
 def test_noise_of_positions_is_no_motion_of_feet_that_stand():

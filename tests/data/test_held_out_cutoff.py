@@ -30,7 +30,6 @@ def raw(seed, noise, late=0.0, seconds=10.0):
     return replace(rows, q=q, v=v, u=u, a=np.gradient(v, STEP, axis=0), time=time, episode=np.zeros(len(time), int))
 
 
-@pytest.mark.nightly
 def test_a_spectrum_that_shows_too_low_a_cutoff_is_overruled():
     """From a tenth of the right cut-off the search comes to where friction is not smeared."""
     rows = raw(2, 1e-5, seconds=30.0)

@@ -20,6 +20,7 @@ from forcegp.data import (
     low_pass,
     motion_spectrum,
 )
+from forcegp.data.spectrum import _knee_and_floor
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 
 RATE = 500.0
@@ -68,6 +69,32 @@ def test_noise_floor_and_acceleration_noise_are_those_of_white_noise(seed):
     np.testing.assert_allclose(spectrum.acceleration_noise(), np.sqrt(6) / 4 * SIGMA * RATE**2, rtol=0.05)
 
 
+@pytest.mark.parametrize(
+    ("derivatives", "turn", "top", "segments", "found"),
+    [
+        (2, 12.0, 250.0, 1e9, True),
+        (2, 100.0, 250.0, 1.0, True),
+        (1, 12.0, 250.0, 4.0, True),
+        (2, 215.0, 250.0, 9.0, False),
+        (2, 12.0, 28.0, 9.0, True),
+        (2, 12.0, 24.0, 9.0, False),
+    ],
+)
+def test_knee_floor_and_cutoff_of_a_power_law_over_white_noise(derivatives, turn, top, segments, found):
+    """2 F where F (turn / f)^8 is the floor F; the knee is where f^(2 d) times the density is least."""
+    frequency = np.arange(0.25, top + 0.1, 0.25)
+    density = 3.0 * (1.0 + (turn / frequency) ** 8)
+    knee, floor, cutoff = _knee_and_floor(frequency, density, segments, derivatives)
+    if not found:
+        assert np.isnan([knee, floor, cutoff]).all()  # above .8 of all, or noise that rises tenfold nowhere
+        return
+    assert knee == pytest.approx(turn * (4.0 / derivatives - 1.0) ** 0.125, rel=0.09)
+    seen = density[(frequency >= 1.2 * knee) & (frequency <= min(5.0 * knee, 0.95 * top))]
+    assert floor == pytest.approx(np.median(seen) / (1.0 - 1.0 / (9.0 * segments)) ** 3)
+    reached = turn * (2.0 * floor / 3.0 - 1.0) ** -0.125
+    assert cutoff == pytest.approx(reached, rel=0.02)
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_automatic_cutoff_is_nearly_the_best_of_all(seed):
     data, exact = noisy(seed=seed, sigma=1e-3)
@@ -97,10 +124,35 @@ def test_a_delay_is_found_to_a_fraction_of_a_sample(delay):
     np.testing.assert_allclose(prepared.u, _at(prepared, low_pass(arm_log(0.0), 20.0)).u, atol=0.2)
 
 
-@pytest.mark.parametrize(("others", "common"), [(0.03, 0.0), (0.01, 0.01)])
-def test_more_than_half_of_the_joints_have_to_show_a_delay(others, common):
-    each, std = np.array([0.01, 0.01, others, 0.03]), np.full(4, 1e-4)
-    assert Delay(common=0.01, common_std=1e-4, seconds=each, std=std, remains=0.1).significant == common
+NONE = "not more than three standard deviations"
+SHOWN = [
+    ({}, 0.01, "10.0 ms ± 0.1 ms, which leaves 10 %"),
+    ({"seconds": [0.01, 0.01, 0.03, 0.03]}, 0.0, NONE),  # most joints have to show it
+    ({"seconds": [0.01, 0.01, 0.0149, 0.03]}, 0.01, "which leaves"),  # by half of it, or three deviations
+    ({"seconds": [0.01, 0.01, 0.0151, 0.03]}, 0.0, NONE),
+    ({"seconds": [0.01, 0.01, 0.0159, 0.03], "std": [2e-3] * 4}, 0.01, "which leaves"),
+    ({"seconds": [0.01, 0.01, 0.0161, 0.03], "std": [2e-3] * 4}, 0.0, NONE),
+    ({"seconds": [0.0055, 0.0145]}, 0.01, "which leaves"),  # 3 * 4.5 ms / sqrt(2)
+    ({"seconds": [0.0051, 0.0149]}, 0.0, NONE),
+    ({"seconds": [0.01, np.nan, np.nan], "std": [1e-4, np.nan, np.nan]}, 0.01, "which leaves"),
+    ({"common_std": 0.0032}, 0.01, "which leaves"),
+    ({"common_std": 0.0034}, 0.0, "3 to 17 ms cannot be told apart"),
+    ({"common_std": 0.15}, 0.0, "-200 to 200 ms cannot be told apart"),
+    ({"common_std": 0.0026, "remains": 0.99}, 0.0, "5 to 15 ms cannot be told apart"),
+    ({"remains": 0.97}, 0.01, "leaves 97 %"),
+    ({"common": 6e-4, "common_std": 1e-6, "seconds": [6e-4]}, 6e-4, "0.6 ms ± 0.0 ms, which leaves"),
+    ({"common": 4e-4, "common_std": 1e-6, "seconds": [4e-4]}, 0.0, NONE),
+    ({"common": np.nan}, 0.0, "the torques show no common delay"),
+]
+
+
+@pytest.mark.parametrize(("numbers", "used", "words"), SHOWN)
+def test_a_delay_is_used_where_most_joints_show_it_and_it_explains_something(numbers, used, words):
+    told = {"common": 0.01, "common_std": 1e-4, "seconds": [0.01, 0.01, 0.01], "remains": 0.1} | numbers
+    each = np.array(told.pop("seconds"))
+    delay = Delay(seconds=each, std=np.array(told.pop("std", np.full(len(each), 1e-4))), **told)
+    assert delay.significant == used
+    assert words in delay.reason
 
 
 @pytest.mark.parametrize("delay", [-0.08, 0.12])
@@ -112,11 +164,6 @@ def test_a_long_delay_is_found_where_no_short_one_fits(delay):
 
 def _at(prepared: Dataset, whole: Dataset) -> Dataset:
     return whole.rows(np.isin(whole.time, prepared.time))
-
-
-def test_a_common_delay_that_no_joint_shows_is_none():
-    found = replace(estimate_delay(arm_log(0.02)), seconds=np.full(3, np.nan), std=np.full(3, np.nan))
-    assert found.significant == 0.0
 
 
 def test_what_a_delay_needs_is_said():

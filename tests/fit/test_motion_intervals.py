@@ -34,7 +34,6 @@ def calibrated(request, log):
 
 
 @pytest.mark.parametrize("samples", [0, 12])
-@pytest.mark.nightly
 def test_they_hold_in_another_recording(calibrated, samples):
     fresh = recorded_motions(recording(bump, 2), 40, 0.5)
     found = calibrated.rollout(fresh.q[:, 0], fresh.v[:, 0], fresh.u, fresh.dt, integrator="rk4", samples=samples)
@@ -102,7 +101,6 @@ def floating():
     return fit(log.model, log, points=20, restarts=1), log
 
 
-@pytest.mark.nightly
 def test_where_the_base_moves_they_hold_as_steps(floating):
     fitted, log = floating
     calibrated = with_intervals(fitted, log, HORIZONS)
@@ -120,7 +118,6 @@ def test_where_the_base_moves_they_hold_as_steps(floating):
     np.testing.assert_array_equal(inside[:, 1:], ((low <= off) & (off <= high)).numpy()[:, 1:])
 
 
-@pytest.mark.nightly
 def test_where_the_base_moves_samples_spread_as_steps(floating):
     fitted, log = floating
     robot, widths = log.model.robot, MotionIntervals(np.ones(1), np.zeros((1, 2, 7)), np.ones((2, 1, 2, 7)))

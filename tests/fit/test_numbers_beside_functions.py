@@ -15,10 +15,8 @@ from forcegp.evidence.likelihood import MarginalLikelihood
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.fit.joint import Slopes, Whitening, with_free_numbers
 from forcegp.fit.physical import typical_sizes
-from forcegp.forces import JointForces, JointFriction, Payload, RigidBodies, Viscous
+from forcegp.forces import JointForces, JointFriction, RigidBodies, Viscous
 from forcegp.noise import Noise
-from forcegp.simulation.moving_bases import simulate_quadruped
-from forcegp.simulation.scenarios import QuadrupedConfig
 
 HAND = ("mass", "center_of_mass.x", "center_of_mass.y", "center_of_mass.z")
 
@@ -62,14 +60,6 @@ def test_rounds_end_unsettled_after_the_tenth(monkeypatch):
     monkeypatch.setattr(importlib.import_module("forcegp.fit.fit"), "CHANGE", 0.0)
     found = beside_functions_of_v(16, 1)
     assert (found.settings["rounds"], found.parameters.settled) == (10, False)
-
-
-@pytest.mark.nightly
-def test_a_load_on_a_walker_beside_unknown_friction():
-    """Its inertia is hardly seen, its mass is, by whatever stands on feet."""
-    log = simulate_quadruped(QuadrupedConfig(seconds=3.0, seed=1, payload=2.0))
-    found = fit(log.model.with_forces(Payload("trunk"), JointFriction()), log, Accelerations(), points=40, restarts=1)
-    assert found.parameters["payload.mass"].value == pytest.approx(2.0, abs=0.1)
 
 
 def likelihood_of(model, data, points=12):

@@ -1,6 +1,5 @@
 """Several starts of one search: when they end, which are dropped; the same in any number of processes."""
 
-import numpy as np
 import pytest
 import torch
 from tests.posterior.arm import arm_data
@@ -81,12 +80,3 @@ def test_who_is_compared_with_whom_does_not_depend_on_the_processes_or_the_numbe
     assert serial == run_restarts(seen, 5, 100, 2)
     assert serial[:3] == run_restarts(seen, 3, 100, 1)
     assert all(before == [] for _, before in run_restarts(seen, 5, 0, 1))
-
-
-@pytest.mark.nightly
-def test_a_fit_that_drops_starts_is_the_same_in_several_processes(train):
-    how = {"points": 15, "restarts": 4, "seed": 3, "options": OptimizerOptions(iterations=25, patience=2)}
-    one, two = (fit(train.model.with_forces(JointForces()), train, jobs=jobs, **how) for jobs in (1, 2))
-    assert one.settings["restart_status"] == two.settings["restart_status"]
-    assert "dropped" in str(one.settings["restart_status"])
-    np.testing.assert_allclose(one.settings["restart_objective"], two.settings["restart_objective"], rtol=1e-9)

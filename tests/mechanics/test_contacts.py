@@ -93,6 +93,7 @@ def test_baumgarte_turns_the_distance_into_a_damped_oscillator(surface, omega, z
         (("tool", "123", FLOOR), "Contact point is '123'"),
         ((7, (0, 0, 0), FLOOR), "Contact frame is 7; give the name of a link"),
         (("tool", (0, 0, 0), lambda p: p[2]), "Contact surface is a function; give a Plane"),
+        (("tool", (0, 0, 0), FLOOR, ""), "Contact switch is ''; give the name of an input"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",  # a function's address would differ between processes
 )

@@ -25,13 +25,7 @@ PRIORS = {
 }
 
 
-OFTEN = "friction under load", "matern", "none"  # the other one has no kernel that "matern" lacks
-
-
-@pytest.fixture(
-    scope="module",
-    params=[name if name in OFTEN else pytest.param(name, marks=pytest.mark.nightly) for name in PRIORS],
-)
+@pytest.fixture(scope="module", params=PRIORS)
 def posterior(request) -> Posterior:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a search of three iterations is not the subject

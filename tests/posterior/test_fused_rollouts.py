@@ -57,7 +57,6 @@ def close(found, expected, tolerance=1e-8):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("prior", ["sums over centres", "pieces"])
-@pytest.mark.nightly
 def test_every_integrator_is_that_of_torch(friction, starts, integrator, prior):
     posterior = friction if prior == "pieces" else fitted(JointForces(inputs=("q", "v")))
     found = posterior.predictor(covariance="none").rollouts(*starts, DT, integrator=integrator)

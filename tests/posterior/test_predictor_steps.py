@@ -30,13 +30,7 @@ def fitted(*forces, model=None) -> Posterior:
         return fit(model or arm_model().with_forces(*forces), arm_data(30, 0), **options)
 
 
-OFTEN = "friction under load", "tool forces with load", "none"  # the others are like these, or like `smooth`
-
-
-@pytest.fixture(
-    scope="module",
-    params=[name if name in OFTEN else pytest.param(name, marks=pytest.mark.nightly) for name in PRIORS],
-)
+@pytest.fixture(scope="module", params=PRIORS)
 def posterior(request) -> Posterior:
     return fitted(PRIORS[request.param])
 

@@ -4,10 +4,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
+from scipy.special import bernoulli, comb, factorial
 from tests.robots.random_positions import random_positions
 
 from forcegp.errors import InvalidInput
-from forcegp.robots import Robot
+from forcegp.robots import Robot, manifold
 from forcegp.robots.manifold import ConfigurationSpace
 
 LIMBS = """<robot name="crab">
@@ -169,6 +170,14 @@ def test_the_chart_is_that_of_the_exponential(pair):
     ends = [pair.robot.integrate(pair.q, step + sign * dt * rate) for sign in (-1, 1)]
     found = pair.robot.difference(*ends) / (2 * dt)
     torch.testing.assert_close(found, v, rtol=0, atol=3e-8 * float(v.abs().max()))
+
+
+def test_series_near_zero_are_those_of_taylor():
+    k, n = np.arange(6), np.arange(7)
+    for series, first in ((manifold._SINE, 1), (manifold._VERSINE, 2), (manifold._REST, 3)):
+        np.testing.assert_allclose(series, (-1.0) ** k / factorial(2 * k + first), rtol=1e-12)
+    np.testing.assert_allclose(manifold._COTANGENT, abs(bernoulli(12)[2::2]) / factorial(2 * k + 2), rtol=1e-9)
+    np.testing.assert_allclose(manifold._ARCSINE, comb(2 * n, n) / (4.0**n * (2 * n + 1)), rtol=1e-12)
 
 
 def test_turns_of_other_length_are_refused():

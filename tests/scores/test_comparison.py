@@ -124,16 +124,6 @@ def test_a_run_resumes_and_grows(data, tmp_path):
         scored(["given"], data, folder)
 
 
-@pytest.mark.nightly
-def test_processes_find_the_same_as_this_one(data, tmp_path):
-    models = ("bodies+viscous@torques", "identified+gp:joint-friction")
-    one, two = (scored(models, data, tmp_path / str(jobs), seeds=2, jobs=jobs) for jobs in (1, 2))
-    for name in models:
-        for quantity, score_ in (("acceleration", "nrmse"), ("force", "rmse"), ("position after 0.2 s", "rmse")):
-            here, there = (each.spread(score_, quantity, name)["values"] for each in (one, two))
-            assert here == pytest.approx(there, rel=1e-6)  # searches end where rounding lets them
-
-
 def test_an_identification_that_fails_leaves_the_mass_matrix_as_given(data, tmp_path, monkeypatch):
     def fail(name, model, rows):
         raise InvalidInput("too still")

@@ -3,7 +3,8 @@
 import pytest
 
 from forcegp.scores import Scores, model_table, overall
-from forcegp.scores.page import columns_of, formatted, number, page, preparation_lines
+from forcegp.scores.accuracy import median_and_range
+from forcegp.scores.page import columns_of, formatted, markdown_table, number, page, preparation_lines
 
 UNITS = {"q": "rad", "v": "rad/s", "u": ("Nm", "N"), "a": "rad/s^2"}
 
@@ -100,3 +101,13 @@ def test_what_was_done_with_a_log_is_told_the_last_step_first():
 )  # fmt: skip
 def test_numbers_as_text(value, digits, text):
     assert number(value, digits) == text == formatted(value, digits)
+
+
+def test_spreads_and_tables():
+    assert median_and_range([3.0, 1.0, 2.0]) == {"median": 2.0, "min": 1.0, "max": 3.0, "values": [3.0, 1.0, 2.0]}
+    assert median_and_range([1.0, None]) is None
+    assert formatted(median_and_range([0.1, 0.3, 0.2]), 2) == "0.20 (0.10–0.30)"
+    assert formatted(median_and_range([0.5])) == "0.5000"
+    assert formatted(None) == "–"
+    assert [number(value) for value in (0.0, 1.2e-9, 0.08311, 23456.7)] == ["0.0000", "1.2e-09", "0.0831", "2.3e+04"]
+    assert markdown_table(["a", "b"], [["x", "1"]]) == "| a | b |\n|---|---:|\n| x | 1 |"

@@ -229,7 +229,6 @@ def test_the_robot_of_the_scenario_is_the_papers(paper, data):
     np.testing.assert_allclose(dynamics.multiplier(unknown), paper["test_lambda"], atol=1e-8)
 
 
-@pytest.mark.nightly  # 30 s of motion
 def test_motion_and_forces_are_distributed_as_in_the_paper(paper):
     data = simulate_kuka_surface(KukaSurfaceConfig(seconds=30.0, seed=0))
     columns = {"q": data.q, "v": data.v, "u": data.u[:, :6], "a": data.truth["a"], "Q_U": data.truth["Q_U"][:, :6]}
