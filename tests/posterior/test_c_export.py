@@ -3,14 +3,12 @@
 import ctypes
 import shutil
 import subprocess
-import warnings
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from tests.posterior.arm import arm_data, arm_model
+from tests.posterior.arm import arm_data, arm_model, arm_that_remembers, quick_fit
 from tests.posterior.exported_program import PLAIN_AND_SANITIZED, compiled, ran
 
 from forcegp import ContactMonitor, Dataset, Model, Robot, export_c
@@ -18,8 +16,6 @@ from forcegp.codegen.c_writer import write_function
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
-from forcegp.forces.joint_laws import GearFriction
-from forcegp.inference import OptimizerOptions
 from forcegp.posterior import Posterior, c_files
 from forcegp.posterior.c_export import rounding
 from forcegp.posterior.c_files import identifier
@@ -27,13 +23,6 @@ from forcegp.posterior.c_files import identifier
 DT = 0.02
 
 pytestmark = pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
-
-
-def fitted(*forces, **more) -> Posterior:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a search of three iterations is not the subject
-        options = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
-        return fit(arm_model().with_forces(*forces, **more), arm_data(30, 0), **options)
 
 
 def call(function, sizes, *arrays) -> tuple[int, list[np.ndarray]]:
@@ -44,12 +33,12 @@ def call(function, sizes, *arrays) -> tuple[int, list[np.ndarray]]:
 
 @pytest.fixture(scope="module")
 def posterior() -> Posterior:
-    return fitted(JointForces())
+    return quick_fit(arm_model().with_forces(JointForces()))
 
 
 @pytest.fixture(scope="module")
 def friction() -> Posterior:
-    return fitted(JointFriction(), ContactFriction(load=True, expected=0.2))
+    return quick_fit(arm_model().with_forces(JointFriction(), ContactFriction(load=True, expected=0.2)))
 
 
 ONE = """<robot name="Größe */ 1"><link name="base"/><link name="l"><inertial><origin xyz="0.1 0 0"/><mass value="1"/>
@@ -60,11 +49,8 @@ ONE = """<robot name="Größe */ 1"><link name="base"/><link name="l"><inertial>
 def test_one_joint_with_any_name_compiles_without_a_warning(tmp_path):
     model = Model(Robot.from_urdf_text(ONE))
     q, v, u = np.random.default_rng(0).normal(size=(3, 12, 1))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        data = Dataset(q=q, v=v, u=u, a=u - v, time=np.arange(12.0), model=model, noise_std=[0.1])
-        options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
-        model = fit(model.with_forces(JointForces()), data, **options)
+    data = Dataset(q=q, v=v, u=u, a=u - v, time=np.arange(12.0), model=model, noise_std=[0.1])
+    model = quick_fit(model.with_forces(JointForces()), data, 1)
     made = export_c(model, tmp_path / "one", covariance=True, jacobian=True, steps=DT, integrator="implicit-midpoint")
     function = compiled(tmp_path / "one", f"{made.name}.c").gr_e_1_mean_covariance
     _, (a, spread) = call(function, [1, 1], q[0], v[0], u[0])
@@ -175,12 +161,7 @@ int main() {
 @PLAIN_AND_SANITIZED
 def test_friction_that_remembers_and_a_monitor_of_contacts(tmp_path, options):
     """The torques for a motion with what was remembered, the monitor sample by sample, and both from C++."""
-    gear = GearFriction(0.8, 0.1, 0.05, 0.2, 0.3, 0.1, sigma=40.0, memory=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        free, quick = arm_model().with_contacts([]), OptimizerOptions(iterations=3)
-        data = replace(arm_data(30, 0), model=free, truth={})
-        posterior = fit(free.with_forces(gear, JointFriction()), data, restarts=1, options=quick)
+    posterior, data = arm_that_remembers()
     rng, time = np.random.default_rng(0), np.arange(6000)[:, None] * 0.01
     q = 0.4 * np.sin(time * [0.7, 1.1, 1.3] + [0.0, 1.0, 2.0])
     v, u = np.gradient(q, 0.01, axis=0), rng.normal(size=q.shape)
@@ -215,7 +196,7 @@ def test_friction_that_remembers_and_a_monitor_of_contacts(tmp_path, options):
     assert place.link == -1
     with pytest.raises(InvalidInput, match="counts another covariance than the program has"):
         export_c(posterior, tmp_path / "other", monitor=monitor)
-    laws = fit(free.with_forces(gear), data, restarts=1)
+    laws = fit(posterior.model.known, data, restarts=1)
     for model in (laws.predictor(), laws.model):  # nothing is open where nothing is unknown
         known = ContactMonitor(model, dt=0.01).calibrate([(q, v, u)])
         made = export_c(laws, tmp_path / type(model).__name__, monitor=known)
@@ -291,10 +272,7 @@ def test_an_implicit_step_that_is_not_found_is_reported_as_such(friction, states
 
 def test_sums_that_cancel_may_differ_by_their_rounding(tmp_path, states):
     """Without an analytical mean, processes sum gravity and inertia up from terms thousands of times as large."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        model = arm_model().with_forces(JointForces()).without_mean()
-        smooth = fit(model, arm_data(60, 0), restarts=1, options=OptimizerOptions(iterations=60))
+    smooth = quick_fit(arm_model().with_forces(JointForces()).without_mean(), arm_data(60, 0), 60)
     rows = [torch.tensor(x) for x in states]
     q, v, u = (x[None] if x.dim() == 1 else x for x in rows)
     dynamics = smooth.dynamics(q, v, u)
