@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from tests.posterior.arm import quick_fit
 
-from forcegp.fit import fit
 from forcegp.forces import JointForces
-from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Baumgarte
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
@@ -16,9 +15,7 @@ DT, STARTS = 1 / 240, (0, 100, 200, 300)
 @pytest.fixture(scope="module")
 def posterior():
     train = simulate_kuka_surface(KukaSurfaceConfig(seconds=8, seed=31))
-    return fit(
-        train.model.with_forces(JointForces()), train, points=60, restarts=1, options=OptimizerOptions(iterations=30)
-    )
+    return quick_fit(train.model.with_forces(JointForces()), train, 30, points=60)
 
 
 @pytest.fixture(scope="module")
