@@ -5,14 +5,19 @@ under PD and gravity. Every model is that of 100 rows of one motion (20 s); ever
 motion of 3 min, to one false alarm in 10 hours. A third motion of 10 min is free: its alarms are false. In a fourth one
 forces act at the elbow for 0.5 s every 2 s, 100 each of 5 N and 3 N, in random directions across the upper arm.
 Velocities have noise of 0.002 rad/s, torques 0.05 Nm. Found: an alarm within the 0.5 s. Five seeds, medians.
+The same monitor in C (gcc -O2, through ctypes) sees 5,000 rows with pushes; a place follows every step.
 
     python -m benchmarks contact_monitor
 """
 
 from __future__ import annotations
 
+import ctypes
 import statistics
+import subprocess
+import tempfile
 import time
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -30,9 +35,10 @@ from benchmarks.tracking import (
     robot_of,
     rows_of,
 )
-from forcegp import ContactMonitor, Model, Robot, Viscous
+from forcegp import ContactMonitor, Model, Robot, Viscous, export_c
 from forcegp.control.monitor import ContactState
 from forcegp.forces import Stribeck
+from forcegp.posterior import Predictor
 from forcegp.simulation.kuka_surface import joint_friction_of
 
 SEEDS = (1, 2, 3, 4, 5)
@@ -121,9 +127,44 @@ def seconds_per_call(monitor: ContactMonitor, motion: dict[str, np.ndarray]) -> 
     return (time.process_time() - begun) / len(samples)
 
 
+def in_c(monitor: ContactMonitor, motion: dict[str, np.ndarray]) -> dict[str, float]:
+    """Times of a step and of a place, and the largest difference from Python relative to the largest value."""
+    assert isinstance(monitor.model, Predictor), "of what was learned"
+    links, samples = [*monitor.ends], list(zip(*(np.ascontiguousarray(x[:5000]) for x in qvu(motion)), strict=True))
+    made = [np.zeros((len(samples), size)) for size in (7, 1, 10 + len(links))]
+    state, alarm, times = np.zeros(100), np.zeros(1, np.int32), []
+    with tempfile.TemporaryDirectory() as folder:
+        export_c(monitor.model.posterior, Path(folder) / "c", covariance=monitor.open, monitor=monitor, name="arm")
+        build = ["gcc", "-std=c99", "-O2", "-fPIC", "-shared", "arm.c", "-o", "arm.so", "-lm"]
+        subprocess.run(build, cwd=Path(folder) / "c", check=True)
+        library = ctypes.CDLL(str(Path(folder) / "c" / "arm.so"))
+        for sample, *results in zip(samples, *made, strict=True):
+            q, v, u, torque, distance, place, *own = (
+                ctypes.c_void_p(x.ctypes.data) for x in (*sample, *results, state, alarm)
+            )
+            begun = time.perf_counter()
+            library.arm_monitor_step(own[0], q, v, u, torque, distance, own[1])
+            between = time.perf_counter()
+            library.arm_monitor_place(q, torque, place)
+            times.append((between - begun, time.perf_counter() - between))
+    monitor.restart()
+    wanted = []
+    for q, v, u in samples:
+        seen = monitor(q, v, u)
+        at = monitor.place(q, seen.torque)
+        also = [links.index(at.link), *(name in at.also for name in links)]
+        wanted.append((seen.torque.numpy(), seen.distance[None].numpy(), at.point, at.force, at.force_std, also))
+    numbers, which = made[2][:, :9].reshape(-1, 3, 3), made[2][:, 9:].copy().view(np.int32)[:, : 1 + len(links)]
+    pairs = zip((*made[:2], *numbers.swapaxes(0, 1), which), map(np.array, zip(*wanted, strict=True)), strict=True)
+    apart = max(float(np.abs(x - y).max() / np.abs(y).max()) for x, y in pairs)
+    step, placed = 1e6 * np.median(times, axis=0)
+    return {"step_us": float(step), "place_us": float(placed), "apart": apart}
+
+
 def run() -> dict[str, float]:
     found: dict[str, dict[str, list[float]]] = {}
-    calls = []
+    calls: list[float] = []
+    programs: dict[str, dict[str, float]] = {}
     for seed in SEEDS:
         motions = recordings(seed)
         made = monitors(seed, motions["calibration"])
@@ -137,6 +178,10 @@ def run() -> dict[str, float]:
                 found.setdefault(name, {}).setdefault(score, []).append(value)
             print(f"seed {seed}, {name:32s}", ", ".join(f"{k} {v:.3g}" for k, v in each.items()), flush=True)
         calls.append(1e3 * seconds_per_call(made["learned"], motions["free"]))
+        if not programs:
+            for name in ("learned, noise alone", "learned"):
+                programs[name] = in_c(made[name], motions["5 N"])
+                print(name, "in C:", programs[name])
     for name, each in found.items():
         middle = {score: f"{statistics.median(v):.3g} ({min(v):.3g} to {max(v):.3g})" for score, v in each.items()}
         print(f"{name:32s}", middle)
@@ -149,4 +194,8 @@ def run() -> dict[str, float]:
         "monitor_3n_laws": statistics.median(found["Coulomb's and viscous friction"]["3 N"]),
         "monitor_3n_urdf": statistics.median(found["URDF"]["3 N"]),
         "monitor_call_ms": statistics.median(calls),
+        "monitor_c_step_mean_us": programs["learned, noise alone"]["step_us"],
+        "monitor_c_step_us": programs["learned"]["step_us"],
+        "monitor_c_place_us": max(each["place_us"] for each in programs.values()),
+        "monitor_c_apart": max(each["apart"] for each in programs.values()),
     }

@@ -2,17 +2,13 @@
 
 import shutil
 import subprocess
-import warnings
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.posterior.arm import arm_data, arm_model
+from tests.posterior.arm import arm_that_remembers
 
-from forcegp import ComputedTorque, JointFriction, export_c, fit
-from forcegp.forces.joint_laws import GearFriction
-from forcegp.inference import OptimizerOptions
+from forcegp import ComputedTorque, export_c
 
 HERE = Path(__file__).parent
 EXAMPLE = HERE.parent / "examples" / "ros2_control"
@@ -27,14 +23,7 @@ pytestmark = pytest.mark.skipif(not (shutil.which("cc") and shutil.which("c++"))
 
 
 def test_the_controller_commands_what_computed_torque_does(tmp_path):
-    free = arm_model().with_contacts([])
-    gear = GearFriction(0.8, 0.1, 0.05, 0.2, 0.3, 0.1, sigma=40.0, memory=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        data = replace(arm_data(30, 0), model=free, truth={})
-        posterior = fit(
-            free.with_forces(gear, JointFriction()), data, restarts=1, options=OptimizerOptions(iterations=3)
-        )
+    posterior, _ = arm_that_remembers()
     export_c(posterior, tmp_path / "model")
     for header in HEADERS:
         (tmp_path / header).parent.mkdir(parents=True, exist_ok=True)

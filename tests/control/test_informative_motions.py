@@ -1,18 +1,15 @@
 """Chosen motions: limits at every time, against Pinocchio; what they teach, against real updates; what is refused."""
 
-import warnings
-
 import numpy as np
 import pinocchio
 import pytest
 import scipy.linalg
-from tests.posterior.arm import URDF, arm_data, arm_model
+from tests.posterior.arm import URDF, arm_data, arm_model, quick_fit
 
-from forcegp import Contact, Dataset, Plane, excitation, fit
+from forcegp import Contact, Dataset, Plane, excitation
 from forcegp.control.informative_motions import far_apart
 from forcegp.errors import InvalidInput
 from forcegp.forces import JointFriction
-from forcegp.inference import OptimizerOptions
 
 FREE = arm_model(0)
 START = [0.3, 0.8, -0.6]
@@ -21,11 +18,7 @@ LIMITS = {"position": [0.5, 1.0, 0.7], "velocity": [1.0, 2.0, 1.5], "acceleratio
 
 
 def fitted(prior, model=FREE, rows=12):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return fit(
-            model.with_forces(prior), arm_data(rows, 1, model), restarts=1, options=OptimizerOptions(iterations=8)
-        )
+    return quick_fit(model.with_forces(prior), arm_data(rows, 1, model), 8)
 
 
 @pytest.fixture(scope="module")

@@ -1,18 +1,15 @@
 """Learned forces in MuJoCo: accelerations against `predict`, threads, drawn functions, and what is refused."""
 
-import warnings
-
 import numpy as np
 import pytest
 from tests.control.test_monitor import DT, motion, posterior
 from tests.control.test_tracking import ROBOT, URDF, VISCOUS
-from tests.posterior.arm import arm_data, arm_model
+from tests.posterior.arm import arm_data, arm_model, quick_fit
 
 from forcegp import Dataset, JointForces, JointFriction, Model, Viscous, fit
 from forcegp.control.mujoco_forces import MujocoForces
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.forces import Actuation, RigidBodies
-from forcegp.inference import OptimizerOptions
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 rollout = pytest.importorskip("mujoco.rollout")
@@ -140,11 +137,8 @@ def test_forces_that_mujoco_cannot_have(posterior, predictor):
         MujocoForces(posterior.predictor(compile=False), model_of())
     with pytest.raises(InvalidInput, match=r"predictor is a Posterior; .*posterior\.predictor\(\)"):
         MujocoForces(posterior, model_of())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a search of two iterations is not the subject
-        quick = {"restarts": 1, "options": OptimizerOptions(iterations=2)}
-        touching = fit(arm_model().with_forces(JointFriction()), arm_data(20, 0), **quick)
-        by_torque = fit(arm_model(0).with_forces(JointForces()), arm_data(20, 0, arm_model(0)), **quick)
+    touching = quick_fit(arm_model().with_forces(JointFriction()))
+    by_torque = quick_fit(arm_model(0).with_forces(JointForces()), arm_data(20, 0, arm_model(0)))
     with pytest.raises(InvalidInput, match=r"with_contacts\(\[\]\)"):
         MujocoForces(touching.predictor(covariance="none"), model_of())
     model = model_of(arm_model(0).robot.urdf_text)

@@ -1,17 +1,14 @@
 """Tracking controllers: torques against Pinocchio, errors against the size of a step, and what is refused."""
 
-import warnings
-
 import numpy as np
 import pinocchio
 import pytest
 import torch
-from tests.posterior.arm import arm_data, arm_model
+from tests.posterior.arm import arm_data, arm_model, quick_fit
 
 from forcegp import ComputedTorque, HybridForce, Model, Robot, Viscous, fit
 from forcegp.errors import ContactError, InvalidInput, NumericalError
 from forcegp.forces import Actuation, ContactFriction, Coulomb, JointForces, JointFriction, RigidBodies
-from forcegp.inference import OptimizerOptions
 
 LINK = """<link name="{0}"><inertial><origin xyz="0 0.02 -0.2"/><mass value="{1}"/>
 <inertia ixx="0.02" iyy="0.02" izz="0.004" ixy="0" ixz="0.001" iyz="0"/></inertial></link>"""
@@ -59,10 +56,7 @@ def test_torques_keep_their_limits():
 def touching():
     """What was learned of an arm of three joints on a sphere, with friction under load."""
     forces = JointFriction(), ContactFriction(load=True, expected=0.2)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a search of three iterations is not the subject
-        options = OptimizerOptions(iterations=3)
-        return fit(arm_model().with_forces(forces), arm_data(30, 0), restarts=1, options=options)
+    return quick_fit(arm_model().with_forces(forces))
 
 
 def state(posterior):
@@ -80,12 +74,7 @@ def test_learned_forces_are_compensated_and_uncertainty_stiffens(touching):
 
 
 def test_forces_that_depend_on_the_torque_are_compensated():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        model = fit(
-            arm_model().with_forces(JointForces()), arm_data(30, 0), restarts=1, options=OptimizerOptions(iterations=3)
-        )
-    free = model.with_contacts([])
+    free = quick_fit(arm_model().with_forces(JointForces())).with_contacts([])
     q, v = state(free)
     wanted = np.array([1.0, -2.0, 0.5])
     control = ComputedTorque(free.predictor(covariance="none"), **GAINS, torque_limits=1e6)

@@ -155,11 +155,11 @@ def test_the_cutoff_of_a_robot_on_feet_is_not_far_beyond_that_of_its_base():
     noisy = replace(log, q=q, noise_std=None)
     each = motion_spectrum(noisy).cutoff
     found = Preparation(cutoff="auto").apply(noisy)
-    assert found.metadata["preparation"]["cutoff"] == pytest.approx(8.0 * np.nanmax(each[:6]), rel=0.01)
+    assert found.metadata["preparation"]["cutoff"] == pytest.approx(1.5 * np.nanmax(each[:6]), rel=0.01)
     assert "joints do up to" in found.metadata["preparation"]["why"]["cutoff"]
     free = replace(noisy, u=noisy.u[:, :12], model=log.model.with_contacts([]))
     assert Preparation(cutoff="auto").resolved(free).cutoff == pytest.approx(np.nanmax(each), rel=0.01)
-    assert np.nanmax(each) > 25.0 > 8.0 * np.nanmax(each[:6])
+    assert np.nanmax(each) > 25.0 > 3.0 * np.nanmax(each[:6])
 
 
 def test_what_stance_needs_is_named():

@@ -1,14 +1,20 @@
 """A three-joint arm that holds its tool on a plane, and data from it with a friction that nobody told the model."""
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 
 from forcegp.data import Dataset
-from forcegp.forces import Actuation, RigidBodies, Unknown, kernel_of
+from forcegp.fit import fit
+from forcegp.forces import Actuation, JointFriction, RigidBodies, Unknown, kernel_of
+from forcegp.forces.joint_laws import GearFriction
+from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Baumgarte, Contact, Plane
 from forcegp.model import Model
+from forcegp.posterior import Posterior
 from forcegp.robots import Robot
 
 LINK = """<link name="{name}"><inertial><origin xyz="0.02 -0.01 {com}" rpy="0.1 0 0.2"/><mass value="{mass}"/>
@@ -107,3 +113,18 @@ def arm_data(rows: int, seed: int, model: Model | None = None) -> Dataset:
         noise_std=np.full(3, NOISE),
         truth={"a": a, "lambda": dynamics.multiplier(Q_U).numpy(), "Q_U": Q_U.numpy()},
     )
+
+
+def quick_fit(model: Model, data: Dataset | None = None, iterations: int = 3, **options: Any) -> Posterior:
+    """What a short search finds, of which nothing is asked; by default of 30 rows with the tool on the plane."""
+    search = OptimizerOptions(iterations=iterations)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return fit(model, arm_data(30, 0) if data is None else data, restarts=1, options=search, **options)
+
+
+def arm_that_remembers() -> tuple[Posterior, Dataset]:
+    """The arm in the air with friction that remembers, and learned friction beside it; and its rows."""
+    gear, free = GearFriction(0.8, 0.1, 0.05, 0.2, 0.3, 0.1, sigma=40.0, memory=True), arm_model().with_contacts([])
+    data = replace(arm_data(30, 0), model=free, truth={})
+    return quick_fit(free.with_forces(gear, JointFriction()), data), data

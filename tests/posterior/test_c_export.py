@@ -3,45 +3,26 @@
 import ctypes
 import shutil
 import subprocess
-import warnings
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from tests.posterior.arm import arm_data, arm_model
+from tests.posterior.arm import arm_data, arm_model, arm_that_remembers, quick_fit
+from tests.posterior.exported_program import PLAIN_AND_SANITIZED, compiled, ran
 
 from forcegp import ContactMonitor, Dataset, Model, Robot, export_c
 from forcegp.codegen.c_writer import write_function
 from forcegp.errors import InvalidInput, NumericalError
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
-from forcegp.forces.joint_laws import GearFriction
-from forcegp.inference import OptimizerOptions
 from forcegp.posterior import Posterior, c_files
 from forcegp.posterior.c_export import rounding
 from forcegp.posterior.c_files import identifier
 
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 DT = 0.02
 
 pytestmark = pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
-
-
-def fitted(*forces, **more) -> Posterior:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a search of three iterations is not the subject
-        options = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
-        return fit(arm_model().with_forces(*forces, **more), arm_data(30, 0), **options)
-
-
-def compiled(folder: Path, *files: str, optimized: int = 0) -> ctypes.CDLL:
-    """The files as a library, without a warning."""
-    command = ["cc", *STRICT, f"-O{optimized}", "-shared", "-fPIC", *files, "-o", "lib.so", "-lm"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return ctypes.CDLL(str(folder / "lib.so"))
 
 
 def call(function, sizes, *arrays) -> tuple[int, list[np.ndarray]]:
@@ -52,12 +33,12 @@ def call(function, sizes, *arrays) -> tuple[int, list[np.ndarray]]:
 
 @pytest.fixture(scope="module")
 def posterior() -> Posterior:
-    return fitted(JointForces())
+    return quick_fit(arm_model().with_forces(JointForces()))
 
 
 @pytest.fixture(scope="module")
 def friction() -> Posterior:
-    return fitted(JointFriction(), ContactFriction(load=True, expected=0.2))
+    return quick_fit(arm_model().with_forces(JointFriction(), ContactFriction(load=True, expected=0.2)))
 
 
 ONE = """<robot name="Größe */ 1"><link name="base"/><link name="l"><inertial><origin xyz="0.1 0 0"/><mass value="1"/>
@@ -68,11 +49,8 @@ ONE = """<robot name="Größe */ 1"><link name="base"/><link name="l"><inertial>
 def test_one_joint_with_any_name_compiles_without_a_warning(tmp_path):
     model = Model(Robot.from_urdf_text(ONE))
     q, v, u = np.random.default_rng(0).normal(size=(3, 12, 1))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        data = Dataset(q=q, v=v, u=u, a=u - v, time=np.arange(12.0), model=model, noise_std=[0.1])
-        options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
-        model = fit(model.with_forces(JointForces()), data, **options)
+    data = Dataset(q=q, v=v, u=u, a=u - v, time=np.arange(12.0), model=model, noise_std=[0.1])
+    model = quick_fit(model.with_forces(JointForces()), data, 1)
     made = export_c(model, tmp_path / "one", covariance=True, jacobian=True, steps=DT, integrator="implicit-midpoint")
     function = compiled(tmp_path / "one", f"{made.name}.c").gr_e_1_mean_covariance
     _, (a, spread) = call(function, [1, 1], q[0], v[0], u[0])
@@ -180,16 +158,10 @@ int main() {
 }"""
 
 
-def test_friction_that_remembers_and_a_monitor_of_contacts(tmp_path):
+@PLAIN_AND_SANITIZED
+def test_friction_that_remembers_and_a_monitor_of_contacts(tmp_path, options):
     """The torques for a motion with what was remembered, the monitor sample by sample, and both from C++."""
-    gear = GearFriction(0.8, 0.1, 0.05, 0.2, 0.3, 0.1, sigma=40.0, memory=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        options = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
-        free = arm_model().with_contacts([])
-        posterior = fit(
-            free.with_forces(gear, JointFriction()), replace(arm_data(30, 0), model=free, truth={}), **options
-        )
+    posterior, data = arm_that_remembers()
     rng, time = np.random.default_rng(0), np.arange(6000)[:, None] * 0.01
     q = 0.4 * np.sin(time * [0.7, 1.1, 1.3] + [0.0, 1.0, 2.0])
     v, u = np.gradient(q, 0.01, axis=0), rng.normal(size=q.shape)
@@ -224,7 +196,7 @@ def test_friction_that_remembers_and_a_monitor_of_contacts(tmp_path):
     assert place.link == -1
     with pytest.raises(InvalidInput, match="counts another covariance than the program has"):
         export_c(posterior, tmp_path / "other", monitor=monitor)
-    laws = fit(free.with_forces(gear), replace(arm_data(30, 0), model=free, truth={}), restarts=1)
+    laws = fit(posterior.model.known, data, restarts=1)
     for model in (laws.predictor(), laws.model):  # nothing is open where nothing is unknown
         known = ContactMonitor(model, dt=0.01).calibrate([(q, v, u)])
         made = export_c(laws, tmp_path / type(model).__name__, monitor=known)
@@ -232,16 +204,12 @@ def test_friction_that_remembers_and_a_monitor_of_contacts(tmp_path):
     if shutil.which("c++"):
         memory = "{0.3, -0.9, 1.0}"
         (tmp_path / "arm" / "main.cpp").write_text(CPP.replace("MEMORY", memory).replace("PARTS", "2"))
-        steps = [
-            "cc -std=c99 -c arm.c",
-            "c++ -std=c++17 -Wall -Wextra -Wconversion -Wshadow -Werror main.cpp arm.o -o x",
-        ]
-        for step in steps:
-            subprocess.run(step.split(), cwd=tmp_path / "arm", check=True)
+        strict = ["-std=c++17", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror"]
+        for command in (["cc", "-std=c99", "-c", "arm.c"], ["c++", *strict, "main.cpp", "arm.o", "-o", "x"]):
+            subprocess.run([*command, *options], cwd=tmp_path / "arm", check=True)
         told = subprocess.run(["./x"], cwd=tmp_path / "arm", capture_output=True, text=True, check=True).stdout.split()
-        again = call(library.arm_inverse_dynamics, [3], [0.1, 0.2, 0.3], [0.5, -0.5, 0.5], [1.0, 0.0, -1.0], [], z)[1][
-            0
-        ]
+        given = [0.1, 0.2, 0.3], [0.5, -0.5, 0.5], [1.0, 0.0, -1.0]
+        _, (again,) = call(library.arm_inverse_dynamics, [3], *given, [], z)
         assert float(told[0]) == pytest.approx(again[0], rel=1e-12)
         assert float(told[1]) > 0.0
         assert told[2] == "0"
@@ -257,7 +225,8 @@ def pointer(x):
     return ctypes.c_void_p(x.ctypes.data)
 
 
-def test_the_self_test_the_example_and_the_commands_of_the_readme_work(complete, tmp_path):
+@PLAIN_AND_SANITIZED
+def test_the_self_test_the_example_and_the_commands_of_the_readme_work(complete, tmp_path, options):
     folder = tmp_path / "copy"
     shutil.copytree(complete, folder)
     commands = [line.partition("#")[0] for line in (folder / "README.txt").read_text().splitlines() if "cc " in line]
@@ -266,14 +235,12 @@ def test_the_self_test_the_example_and_the_commands_of_the_readme_work(complete,
         quick = command.replace("-O2", "-O0")
         done = subprocess.run(quick, shell=True, cwd=folder, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
-    for program in ("example.c", "self_test.c"):
-        subprocess.run(["cc", *STRICT, program, "arm.c", "-o", "x", "-lm"], cwd=folder, check=True)
+    assert all(ran(folder, program, "arm.c", *options).returncode == 0 for program in ("example.c", "self_test.c"))
     text = (folder / "arm.c").read_text()
     first = text.index("table0[]")
     place = text.index("0x1.", first)
     (folder / "arm.c").write_text(f"{text[:place]}-{text[place:]}")  # one weight or centre of the model
-    subprocess.run(["cc", *STRICT, "self_test.c", "arm.c", "-o", "x", "-lm"], cwd=folder, check=True)
-    broken = subprocess.run(["./x"], cwd=folder, capture_output=True, text=True, check=False)
+    broken = ran(folder, "self_test.c", "arm.c")
     assert broken.returncode == 1
     assert "differs by" in broken.stdout
 
@@ -305,10 +272,7 @@ def test_an_implicit_step_that_is_not_found_is_reported_as_such(friction, states
 
 def test_sums_that_cancel_may_differ_by_their_rounding(tmp_path, states):
     """Without an analytical mean, processes sum gravity and inertia up from terms thousands of times as large."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        model = arm_model().with_forces(JointForces()).without_mean()
-        smooth = fit(model, arm_data(60, 0), restarts=1, options=OptimizerOptions(iterations=60))
+    smooth = quick_fit(arm_model().with_forces(JointForces()).without_mean(), arm_data(60, 0), 60)
     rows = [torch.tensor(x) for x in states]
     q, v, u = (x[None] if x.dim() == 1 else x for x in rows)
     dynamics = smooth.dynamics(q, v, u)

@@ -1,18 +1,15 @@
 """A posterior as a CasADi function: `predict`, its derivatives, and what CasADi makes of it."""
 
 import sys
-import warnings
 
 import numpy as np
 import pytest
 import torch
-from tests.posterior.arm import arm_data, arm_model
+from tests.posterior.arm import arm_data, arm_model, quick_fit
 
 from forcegp.codegen.library import compile_library
 from forcegp.errors import InvalidInput, MissingExtra, NumericalError
-from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction
-from forcegp.inference import OptimizerOptions
 from forcegp.posterior import Posterior, casadi_function, export_casadi
 
 casadi = pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
@@ -27,18 +24,12 @@ PRIORS = {
 
 @pytest.fixture(scope="module", params=PRIORS)
 def posterior(request) -> Posterior:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a search of three iterations is not the subject
-        options = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
-        return fit(arm_model().with_forces(PRIORS[request.param]), arm_data(30, 0), **options)
+    return quick_fit(arm_model().with_forces(PRIORS[request.param]))
 
 
 @pytest.fixture(scope="module")
 def friction() -> Posterior:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
-        return fit(arm_model().with_forces(JointFriction()), arm_data(12, 0), **options)
+    return quick_fit(arm_model().with_forces(JointFriction()), arm_data(12, 0), 1)
 
 
 @pytest.fixture(scope="module")
@@ -87,10 +78,7 @@ def test_its_own_code_compiles_to_the_same(posterior, states, tmp_path, monkeypa
 
 
 def test_a_kernel_that_is_the_same_for_all_centres(states):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        options = {"restarts": 1, "options": OptimizerOptions(iterations=1)}
-        model = fit(arm_model().with_forces(JointForces(kernel="constant", inputs=("q",))), arm_data(12, 0), **options)
+    model = quick_fit(arm_model().with_forces(JointForces(kernel="constant", inputs=("q",))), arm_data(12, 0), 1)
     expected = model.predict(*states).mean[0].numpy()
     found = np.array(casadi_function(model)(*(x[0].numpy() for x in states))).ravel()
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * abs(expected).max())  # weights that cancel

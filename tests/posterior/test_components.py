@@ -5,12 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from tests.posterior.arm import URDF, Weight, arm_data, arm_model
+from tests.posterior.arm import URDF, Weight, arm_data, arm_model, quick_fit
 
 from forcegp.errors import InvalidInput, UnknownName
-from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction, UnknownForces
-from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Contact, Plane, Sphere
 from forcegp.robots import Robot
 
@@ -32,7 +30,7 @@ def train():
 
 @pytest.fixture(scope="module")
 def posterior(train):
-    return fit(train.model.with_forces(PRIOR.terms), train, restarts=1, options=OptimizerOptions(iterations=5))
+    return quick_fit(train.model.with_forces(PRIOR.terms), train, 5)
 
 
 @pytest.fixture(scope="module")
@@ -178,7 +176,7 @@ def test_wrong_curves_are_refused(posterior, train):
         posterior.curve("joint-friction lift", [math.nan])
     with pytest.raises(InvalidInput, match="points=0"):
         posterior.curve("joint-friction lift", points=0)
-    joint = fit(train.model.with_forces(JointForces()), train, restarts=1, options=OptimizerOptions(iterations=1))
+    joint = quick_fit(train.model.with_forces(JointForces()), train, 1)
     with pytest.raises(InvalidInput, match=r"'pan' .*\(n, 9\)"):
         joint.curve("pan")
     assert joint.curve("pan", np.zeros((2, 9))).mean.shape == (2,)
@@ -192,8 +190,7 @@ def test_what_cannot_move_is_refused(posterior, train):
     handless = Robot.from_urdf_text(URDF.replace('"hand"', '"claw"'))
     with pytest.raises(UnknownName, match="hand"):
         posterior.with_model(arm_model(contacts=0).with_robot(handless))
-    once = OptimizerOptions(iterations=1)
-    zero = fit(train.model.with_forces(JointForces()).without_mean(), train, restarts=1, options=once)
+    zero = quick_fit(train.model.with_forces(JointForces()).without_mean(), train, 1)
     with pytest.raises(InvalidInput, match=r"no rigid bodies.* fit a model with RigidBodies\(\)"):
         zero.with_model(zero.model.with_robot(heavier))
     assert zero.with_contacts([]).predict(train.q, train.v, train.u).multiplier.mean.shape == (16, 0)

@@ -4,27 +4,19 @@ import warnings
 
 import pytest
 import torch
-from tests.posterior.arm import arm_data, arm_model
+from tests.posterior.arm import arm_data, arm_model, quick_fit
 
 from forcegp.errors import NumericalWarning
-from forcegp.fit import fit
 from forcegp.forces import JointForces, JointFriction
-from forcegp.inference import OptimizerOptions
 from forcegp.posterior import Posterior, Predictor, rollout
 
 DT, STEPS = 0.01, 12
 INTEGRATORS = ["symplectic-euler", "rk4", "implicit-midpoint"]
 
 
-def fitted(prior) -> Posterior:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a search of three iterations is not the subject
-        return fit(arm_model().with_forces(prior), arm_data(30, 0), restarts=1, options=OptimizerOptions(iterations=3))
-
-
 @pytest.fixture(scope="module")
 def friction() -> Posterior:
-    return fitted(JointFriction())
+    return quick_fit(arm_model().with_forces(JointFriction()))
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +50,7 @@ def close(found, expected, tolerance=1e-8):
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("prior", ["sums over centres", "pieces"])
 def test_every_integrator_is_that_of_torch(friction, starts, integrator, prior):
-    posterior = friction if prior == "pieces" else fitted(JointForces(inputs=("q", "v")))
+    posterior = friction if prior == "pieces" else quick_fit(arm_model().with_forces(JointForces(inputs=("q", "v"))))
     found = posterior.predictor(covariance="none").rollouts(*starts, DT, integrator=integrator)
     close(found, rolled_out(posterior, starts, integrator=integrator))
 

@@ -1,19 +1,15 @@
 """The predictor says what `predict` says, faster; its compressed covariance is never below the exact one."""
 
 import pickle
-import warnings
 
 import pytest
 import torch
-from tests.posterior.arm import arm_data, arm_model
+from tests.posterior.arm import arm_data, arm_model, quick_fit
 from torch.autograd import forward_ad
 
 from forcegp.errors import InvalidInput, NumericalError, NumericalWarning
-from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction, ToolForces
-from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Contact, ImplicitSurface, Plane, Sphere
-from forcegp.model import Model
 from forcegp.posterior import Posterior, Predictor, preparation
 
 TIP = (0.0, 0.0, 0.2)
@@ -27,18 +23,11 @@ CONTACTS = {
     ],
     "redundant": [Contact("hand", TIP, Plane((0.2, 0.0, 1.0), 0.4))] * 2,
 }
-SHORT = OptimizerOptions(iterations=3)
-
-
-def fitted(model: Model, rows: int = 30) -> Posterior:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a search of three iterations is not the subject
-        return fit(model, arm_data(rows, 0), restarts=1, options=SHORT)
 
 
 @pytest.fixture(scope="module")
 def posterior() -> Posterior:
-    return fitted(arm_model().with_forces(JointForces()))
+    return quick_fit(arm_model().with_forces(JointForces()))
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +87,7 @@ def test_it_is_predict_under_any_contacts(posterior, states, contacts: str):
     ids=["friction under load", "tool forces", "no forces", "zero mean"],
 )
 def test_it_is_predict_with_any_prior(states, model):
-    check(fitted(model), states)
+    check(quick_fit(model), states)
 
 
 def test_gradients_of_mean_and_covariance_are_those_of_torch(posterior, states, monkeypatch):
@@ -219,10 +208,7 @@ def test_operations_that_no_tape_holds_are_named(posterior, states):
 
 
 def test_it_takes_what_another_engine_knows(states):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        model = arm_model().with_forces(JointFriction())
-        posterior = fit(model, arm_data(30, 0), restarts=1, options=SHORT, engine="inducing")
+    posterior = quick_fit(arm_model().with_forces(JointFriction()), engine="inducing")
     check(posterior, states)
     with pytest.raises(InvalidInput, match=r"InducingPosterior .*covariance='exact'"):
         posterior.predictor(covariance="compressed")

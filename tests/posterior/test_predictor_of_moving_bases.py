@@ -1,11 +1,11 @@
 """Predictors and exported C of robots whose base moves, against `predict`, torch's rollouts and differences."""
 
 import ctypes
-import subprocess
 
 import numpy as np
 import pytest
 import torch
+from tests.posterior.exported_program import PLAIN_AND_SANITIZED, compiled, ran
 from tests.robots.random_positions import random_positions
 
 from forcegp import Contact, Dataset, JointFriction, Model, Noise, Plane, Robot, export_c, fit
@@ -157,32 +157,17 @@ def test_a_linear_step_is_that_of_differences(case, integrator):
         close(step.A[..., j], (ends[0] - ends[1]) / (2 * size), 1e-6)
 
 
-def test_the_program_in_c(floating, tmp_path):
+@PLAIN_AND_SANITIZED
+def test_the_program_in_c(floating, tmp_path, options):
     posterior, q, v, _ = floating
     written = export_c(posterior, tmp_path / "c", covariance=True, steps=0.005, integrator="rk4")
     # standard deviations are roots of differences
     assert max(x for name, x in written.differences.items() if not name.endswith("deviation")) < 1e-10
     assert max(written.differences.values()) < 1e-9
     folder = tmp_path / "c"
-    for program in ("self_test", "example"):
-        build = [
-            "cc",
-            "-std=c99",
-            "-Wall",
-            "-Wextra",
-            "-Werror",
-            "-O1",
-            f"{program}.c",
-            "hopper.c",
-            "-o",
-            program,
-            "-lm",
-        ]
-        subprocess.run(build, cwd=folder, check=True)
-        subprocess.run([f"./{program}"], cwd=folder, check=True, stdout=subprocess.DEVNULL)
-    shared = ["cc", "-O1", "-shared", "-fPIC", "hopper.c", "-o", "hopper.so", "-lm"]
-    subprocess.run(shared, cwd=folder, check=True)
-    library, made = ctypes.CDLL(str(folder / "hopper.so")), np.zeros(8)
+    for program in ("self_test.c", "example.c"):
+        assert ran(folder, program, "hopper.c", *options).returncode == 0
+    library, made = compiled(folder, "hopper.c"), np.zeros(8)
     step = 0.3 * v[0]
     given = [x.contiguous().numpy() for x in (q[0], step)]
     assert library.hopper_integrate(*(ctypes.c_void_p(x.ctypes.data) for x in (*given, made))) == 0

@@ -1,15 +1,11 @@
 """Steps, forces and inverse dynamics of a predictor: against rollouts, finite differences and `predict`."""
 
-import warnings
-
 import pytest
 import torch
-from tests.posterior.arm import arm_data, arm_model
+from tests.posterior.arm import arm_data, arm_model, quick_fit
 
 from forcegp.errors import InvalidInput
-from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointForces, JointFriction, RigidBodies, ToolForces
-from forcegp.inference import OptimizerOptions
 from forcegp.posterior import Posterior
 
 DT = 0.02
@@ -23,21 +19,14 @@ PRIORS = {
 }
 
 
-def fitted(*forces, model=None) -> Posterior:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a search of three iterations is not the subject
-        options = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
-        return fit(model or arm_model().with_forces(*forces), arm_data(30, 0), **options)
-
-
 @pytest.fixture(scope="module", params=PRIORS)
 def posterior(request) -> Posterior:
-    return fitted(PRIORS[request.param])
+    return quick_fit(arm_model().with_forces(PRIORS[request.param]))
 
 
 @pytest.fixture(scope="module")
 def smooth() -> Posterior:
-    return fitted(JointForces())
+    return quick_fit(arm_model().with_forces(JointForces()))
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +120,7 @@ def test_inverse_dynamics_refuses_what_it_cannot_solve(smooth, states):
         predictor.inverse_dynamics(*states, [1.0, 2.0])
     with pytest.raises(InvalidInput, match=r"q \(4, 3\), v \(4, 3\), a \(3,\)"):
         predictor.inverse_dynamics(*states[:2], torch.zeros(3))
-    carried = fitted(model=arm_model().with_forces(JointForces()).without_mean())
+    carried = quick_fit(arm_model().with_forces(JointForces()).without_mean())
     with pytest.raises(InvalidInput, match="no RigidBodies"):
         carried.predictor(covariance="none", compile=False).inverse_dynamics(*states)
     passive = smooth.with_model(arm_model(forces=(RigidBodies(),)))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from tests.posterior.arm import NOISE, URDF, arm_data, arm_model
+from tests.posterior.arm import NOISE, URDF, arm_data, arm_model, quick_fit
 
 from forcegp.data import Dataset
 from forcegp.errors import ContactError, DataWarning, InvalidInput
@@ -13,8 +13,6 @@ from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Contact, Plane
 from forcegp.noise import Noise
 from forcegp.robots import Robot
-
-QUICK = OptimizerOptions(iterations=40)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +27,7 @@ def test():
 
 @pytest.fixture(scope="module")
 def posterior(train):
-    return fit(train.model.with_forces(JointForces()), train, restarts=1, options=QUICK)
+    return quick_fit(train.model.with_forces(JointForces()), train, 40)
 
 
 def test_learns_the_friction_and_is_calibrated(posterior, test):
@@ -103,22 +101,12 @@ def test_equals_dense_gaussian_conditioning(posterior, train, test):
 
 
 def test_the_noise_is_learned(train):
-    fitted = fit(
-        train.model.with_forces(JointForces(), noise=Noise(0.2, learn=True)),
-        train,
-        restarts=1,
-        options=OptimizerOptions(iterations=60),
-    )
+    fitted = quick_fit(train.model.with_forces(JointForces(), noise=Noise(0.2, learn=True)), train, 60)
     assert np.allclose(fitted.noise_std.numpy(), NOISE, rtol=0.5)
 
 
 def test_force_level_noise_widens_along_H(train, test):
-    fitted = fit(
-        train.model.with_forces(JointForces(), noise=Noise(NOISE, 0.3)),
-        train,
-        restarts=1,
-        options=OptimizerOptions(iterations=3),
-    )
+    fitted = quick_fit(train.model.with_forces(JointForces(), noise=Noise(NOISE, 0.3)), train)
     prediction = fitted.predict(test.q[:4], test.v[:4], test.u[:4])
     H = test.model.dynamics(*(torch.tensor(x[:4]) for x in (test.q, test.v, test.u))).H
     expected = NOISE**2 * torch.eye(3).double() + 0.09 * H @ H.mT

@@ -4,12 +4,10 @@ import warnings
 
 import pytest
 import torch
-from tests.posterior.arm import arm_data, arm_model
+from tests.posterior.arm import arm_data, arm_model, quick_fit
 
 from forcegp.errors import NumericalWarning
-from forcegp.fit import fit
 from forcegp.forces import JointForces, JointFriction
-from forcegp.inference import OptimizerOptions
 from forcegp.posterior import Posterior
 
 SLOWER = "predictions are computed by torch, some hundred times slower: "
@@ -17,10 +15,7 @@ SLOWER = "predictions are computed by torch, some hundred times slower: "
 
 @pytest.fixture(scope="module")
 def posterior() -> Posterior:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a search of three iterations is not the subject
-        options = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
-        return fit(arm_model().with_forces(JointFriction(), JointForces()), arm_data(20, 0), **options)
+    return quick_fit(arm_model().with_forces(JointFriction(), JointForces()), arm_data(20, 0))
 
 
 @pytest.fixture

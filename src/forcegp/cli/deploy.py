@@ -260,15 +260,10 @@ class Excite(Command):
             numbers = numbers_of(values, f"--limits {word}: give numbers, for example --limits velocity=1.5.")
             limits[name] = numbers[0] if len(numbers) == 1 else numbers
         given = {name: getattr(self, name) for name in ("seconds", "clearance", "seed")}
+        given |= {"motions": self.tries, "limits": limits, "start": list(self.posture) or None}
+        given["surfaces"] = parse_contacts(self.avoid) if self.avoid else None
         with terminal.progress(f"choosing a motion of {self.seconds:g} s"):
-            chosen = forcegp.excitation(
-                model or forcegp.load_posterior(str(self.model)),
-                **given,
-                motions=self.tries,
-                limits=limits,
-                start=list(self.posture) or None,
-                surfaces=parse_contacts(self.avoid) if self.avoid else None,
-            )
+            chosen = forcegp.excitation(model or forcegp.load_posterior(str(self.model)), **given)
         chosen.save_csv(self.out)
         usage = {name: values.tolist() for name, values in chosen.usage.items()}
         table = {f"{name}\nover limit": values for name, values in usage.items()}

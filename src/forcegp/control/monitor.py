@@ -74,9 +74,9 @@ class ContactMonitor:
     """
 
     def __init__(self, model: Moving, *, dt: float, bandwidth: float = 2.0) -> None:
-        self.model, plain = model, model_of(model)
-        plain.robot.require_vectors("monitors of contacts")
-        if plain.contacts:
+        self.model, self.known = model, model_of(model)
+        self.known.robot.require_vectors("monitors of contacts")
+        if self.known.contacts:
             raise InvalidInput(
                 "ContactMonitor looks for contacts that are not modelled, and this model has one; fit a log of free "
                 "motion, or give posterior.with_contacts([])."
@@ -85,7 +85,7 @@ class ContactMonitor:
         check_time_step(dt)
         words = f"give Hz above 0 and below {0.5 / dt:g}, half the rate"
         require_number("bandwidth", bandwidth, words, below=0.5 / dt)
-        self.robot: Robot = plain.robot
+        self.robot: Robot = self.known.robot
         self.dt, self.bandwidth = float(dt), float(bandwidth)
         self.keep = math.exp(-2.0 * math.pi * bandwidth * dt)
         self.noise: NoiseLevels | None = None
@@ -103,7 +103,7 @@ class ContactMonitor:
     def restart(self) -> None:
         """Forget earlier calls, as at the beginning of a recording."""
         self._filtered = torch.zeros(3, self.robot.nv, dtype=torch.float64)  # torque, time near rest, and M a
-        self.past = Past(model_of(self.model))
+        self.past = Past(self.known)
         self._before: tuple[Tensor, Tensor, Tensor] | None = None
 
     def calibrate(self, free: Sequence[Motion], *, false_alarms_per_hour: float = 0.1) -> "ContactMonitor":
@@ -131,14 +131,14 @@ class ContactMonitor:
         some = slice(None, None, max(1, len(tau) // MOST_ROWS))
         known = (M[some].square() @ torch.as_tensor(self.noise.acceleration).square()).numpy()
         best = [
-            min((*errors_near_rest(tau[some, j].numpy(), known[:, j], each[some, j]), share)
-                for share, each in zip(SLOW, slow, strict=True))
+            min((*errors_near_rest(tau[some, j].numpy(), known[:, j], each[some, j]), k) for k, each in enumerate(slow))
             for j in range(self.robot.nv)
-        ]  # fmt: skip
-        _, force, at_rest, share = np.array(best).T
-        self.noise, self.near_rest = NoiseLevels(self.noise.acceleration, force), (at_rest, share * speed)
-        fades = np.concatenate([self._near_rest(each[3], share * speed)[settle:] for each in found])
-        self.usual = torch.from_numpy(fades).square().mean(0).sqrt()
+        ]
+        (_, force, at_rest, _), which = np.array(best).T, [each[-1] for each in best]
+        self.noise = NoiseLevels(self.noise.acceleration, force)
+        self.near_rest = at_rest, np.take(SLOW, which) * speed
+        usual = np.stack(slow)[which, :, range(self.robot.nv)]
+        self.usual = torch.from_numpy(np.sqrt(np.mean(usual**2, axis=1)))
         distances = [self._distances(*each) for each in found]
         largest = torch.cat([d[: len(d) // block * block].view(-1, block).amax(1) for d in distances])
         self._maxima = gumbel_r.fit(largest.sqrt().numpy())
@@ -161,10 +161,8 @@ class ContactMonitor:
 
     def run(self, q: Any, v: Any, u: Any) -> ContactState:
         """The same of a whole recording (T, nv); nothing is known at its first row."""
-        found = self._residuals(q, v, u)
-        tau, distance = found[0], self._distances(*found)
-        none = tau.new_zeros(1, tau.shape[1])
-        return self._state(torch.cat([none, tau]), torch.cat([none[:, 0], distance]))
+        found, pad = self._residuals(q, v, u), torch.nn.functional.pad
+        return self._state(pad(found[0], (0, 0, 1, 0)), pad(self._distances(*found), (1, 0)))
 
     def place(self, q: Any, torque: Any) -> ContactPlace:
         """The contact at q (nv,) that explains an external torque (nv,) by a force without a moment.
@@ -191,10 +189,9 @@ class ContactMonitor:
 
     def levers(self, q: Float[Tensor, " nv"]) -> list[Tensor]:
         """M (nv, nv), and Jacobians (L, 2, 3, nv) of both ends of every link, world axes; without branches."""
-        model = model_of(self.model)
-        kinematics = model.loaded_robot.kinematics(q)
+        kinematics = self.known.loaded_robot.kinematics(q)
         J = [kinematics.frame_jacobian(link, k * end)[:3] for link, end in self.ends.items() for k in (0, 1)]
-        return [model.mass_matrix_at(kinematics), torch.stack(J).unflatten(0, (-1, 2))]
+        return [self.known.mass_matrix_at(kinematics), torch.stack(J).unflatten(0, (-1, 2))]
 
     @property
     def numbers(self) -> dict[str, Any]:
@@ -257,7 +254,7 @@ class ContactMonitor:
             raise InvalidInput(
                 f"a recording has shape {tuple(q.shape)}; give (T, {self.robot.nv}) of two rows or more."
             )
-        self.past = Past(model_of(self.model))
+        self.past = Past(self.known)
         middle = 0.5 * (q[1:] + q[:-1]), 0.5 * (v[1:] + v[:-1])
         a = (v[1:] - v[:-1]) / self.dt
         tau, M, extra = self._torques(*middle, u[:-1], a)
