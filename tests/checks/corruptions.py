@@ -269,23 +269,6 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "turns": (lambda d: at(d, "qva", [0.5 / np.pi] * 2), "turns"),
     "time in ms": (lambda d: replace(d, time=1000 * d.time), "velocity|acceleration|sampling"),
 }
-UNSEEN: Mapping[str, tuple[str, ...]] = {
-    "crane": ("length .4 -> .6",),  # these change no torque, or a constant
-}
-
-
-def cases(seed: int) -> Mapping[str, Dataset]:
-    """The clean logs of one seed."""
-    settings = np.random.default_rng(seed)
-    made = {
-        f"{name}, {noise}": clean(
-            robot(), seed, rate=float(settings.choice([100.0, 200.0, 500.0])), seconds=float(settings.uniform(6, 15)),
-            noise=noise,
-        )
-        for name, robot in ROBOTS.items()
-        for noise in ("a", "qvu")
-    }  # fmt: skip
-    return made
 
 
 def named(said: str, words: str) -> bool:

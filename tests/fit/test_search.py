@@ -8,7 +8,6 @@ from forcegp.fit import fit
 from forcegp.fit.search import AT_ONCE, best_value, run_restarts
 from forcegp.forces import JointForces
 from forcegp.inference import OptimizerOptions, minimize_objective
-from forcegp.model import Model
 
 UNTIL_CONVERGED = OptimizerOptions()
 """The search as it was: few steps remembered, and all starts to the end."""
@@ -28,23 +27,6 @@ def valley(parameters):
 def from_place(index, before=(), *, options, places=(0.5, 4.5, 5.0, -0.5, 5.5)):
     start = {"x": torch.tensor([places[index], 2.0], dtype=torch.float64)}
     return minimize_objective(valley, start, options, rival=best_value(before))
-
-
-@pytest.mark.parametrize(
-    ("model", "fraction"), [(lambda model: model.with_forces(JointForces()), 0.8), (Model.black_box, 0.7)]
-)
-@pytest.mark.nightly
-def test_a_fit_ends_as_low_with_fewer_evaluations(train, model, fraction):
-    """With 154 parameters of seven joints less than half (docs/benchmarks/performance.md); here there are 30.
-
-    Of four seeds together, since one gives 0.54 to 0.86 by the starts that it draws.
-    """
-    fast, slow = (
-        [fit(model(train.model), train, seed=seed, options=options).result for seed in range(1, 5)]
-        for options in (None, UNTIL_CONVERGED)
-    )
-    assert sum(each.evaluations for each in fast) <= fraction * sum(each.evaluations for each in slow)
-    assert all(each.value < other.value + 0.5 and each.converged for each, other in zip(fast, slow, strict=True))
 
 
 def test_starts_behind_those_before_are_dropped_and_say_so():

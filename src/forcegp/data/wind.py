@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,9 +34,9 @@ class AirLaw:
     unexplained, `wind` the mean velocity of the air [m/s] in the recording that they were found from.
     """
 
-    coefficients: tuple[tuple[float, ...], ...]
-    deviations: tuple[float, ...]
-    wind: tuple[float, float, float]
+    coefficients: Sequence[Sequence[float]]
+    deviations: Sequence[float]
+    wind: Sequence[float]
 
     def wind_before(self, dataset: Dataset, seconds: float = SECONDS) -> Float[np.ndarray, "rows 3"]:
         """The wind [m/s, world] that the rows before each one of its episode show; at the first, that of the law.

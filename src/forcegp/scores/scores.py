@@ -232,7 +232,7 @@ class Scores(Summary):
     # ------------------------------------------------------------------ which model
 
     def left(self, model: str) -> tuple[str, dict[str, float | None]]:
-        """What a model leaves of the torque where one acts, else of accelerations: that quantity, and shares by joint."""
+        """What a model leaves of torques where these act, else of accelerations: the quantity, and shares by joint."""
         held = self.quantities(model)
         if "share" in held.get(TORQUE, ()):
             shares = zip(self.joint_names, self.columns("share", TORQUE, model), strict=True)
