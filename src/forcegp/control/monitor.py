@@ -187,7 +187,7 @@ class ContactMonitor:
         x, y, z = (tuple(each.tolist()) for each in (point, force[best], inverse[best].square().sum(-1).sqrt()))
         return ContactPlace(link, x, y, z, tuple(name for name in also if name != link))
 
-    def levers(self, q: Float[Tensor, " nv"]) -> list[Tensor]:
+    def levers(self, q: Float[Tensor, " nq"]) -> list[Tensor]:
         """M (nv, nv), and Jacobians (L, 2, 3, nv) of both ends of every link, world axes; without branches."""
         kinematics = self.known.loaded_robot.kinematics(q)
         J = [kinematics.frame_jacobian(link, k * end)[:3] for link, end in self.ends.items() for k in (0, 1)]
