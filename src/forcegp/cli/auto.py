@@ -329,7 +329,7 @@ def answer_lines(
     late, lag, rate = prepared["delay"], prepared["lag"], (len(dataset) - len(dataset.episodes)) / seconds
     early = "early: a controller that holds u is half a time step" if -late * rate < 1.0 else "early, or q and v late"
     when = "late" if late > 0.0 else early
-    why = prepared["why"].get("delay", "u is taken to be on time").partition(";")[0]
+    why = prepared["why"].get("delay", "u is taken to be on time").partition(";")[0].rstrip(".")
     on_time = why if why.startswith("u is") else f"delay of u: {why}"
     shifted = f"u was logged {1e3 * abs(late):.1f} ms {when} (shifted)" if late else on_time
     shifted += f", rotors follow within {1e3 * lag:.0f} ms" if lag else ""
