@@ -73,7 +73,7 @@ def test_steps_of_an_encoder_are_no_reversals():
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.012])
-def test_hysteresis_is_no_delay(delay, lugre_log):  # noqa: F811
+def test_hysteresis_is_no_delay(delay, lugre_log):  # noqa: F811  # the fixture
     """With friction of velocity alone the same logs show 20 ms more."""
     few = lugre_log.rows(slice(0, 6000, 2))
     late = replace(few, u=CubicSpline(few.time, few.u)(few.time - delay))

@@ -22,7 +22,7 @@ from forcegp.posterior import casadi_function
     ("integrator", "transmission"),
     [("symplectic-euler", None), ("rk4", None), ("implicit-midpoint", None), ("rk4", "bend+lift")],
 )
-def test_compiled_motions_carry_the_state_along(integrator, transmission, lugre_log):  # noqa: F811
+def test_compiled_motions_carry_the_state_along(integrator, transmission, lugre_log):  # noqa: F811  # the fixture
     law = Coulomb([0.8, 0.5, 0.3], 0.1, sigma=300.0, memory=("pan", "bend"), transmission=transmission)
     model = arm_model(0).with_forces(law, noise=Noise(0.1))
     posterior = fit(model, lugre_log.rows(slice(0, 200)))
@@ -45,7 +45,7 @@ def test_compiled_motions_carry_the_state_along(integrator, transmission, lugre_
 
 @pytest.mark.usefixtures("unchecked")  # explicit steps add and scale CasADi's expressions as they do tensors
 @pytest.mark.parametrize("transmission", [None, "bend-0.5*lift"])
-def test_programs_carry_the_state_along(transmission, lugre_log, tmp_path):  # noqa: F811
+def test_programs_carry_the_state_along(transmission, lugre_log, tmp_path):  # noqa: F811  # the fixture
     casadi = pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
     law = Coulomb([0.8, 0.5, 0.3], 0.1, sigma=300.0, memory=("pan", "bend"), transmission=transmission)
     model = arm_model(0).with_forces(law, noise=Noise(0.1))
@@ -71,7 +71,7 @@ def test_programs_carry_the_state_along(transmission, lugre_log, tmp_path):  # n
     np.testing.assert_allclose([float(x) for x in printed.split()], z, rtol=1e-12)
 
 
-def test_a_past_that_is_not_known_is_in_the_interval(lugre_log):  # noqa: F811
+def test_a_past_that_is_not_known_is_in_the_interval(lugre_log):  # noqa: F811  # the fixture
     model = arm_model(0).with_forces(Coulomb(memory=True), Viscous(), noise=Noise(0.1))
     posterior = fit(model, lugre_log.rows(slice(0, 4000)), Torques(), rows=1500)
     test = lugre_log.rows(slice(4000, 6000, 10))
@@ -95,7 +95,7 @@ def test_a_past_that_is_not_known_is_in_the_interval(lugre_log):  # noqa: F811
     assert float((added.sqrt() / spread.sqrt()).median()) == pytest.approx(1.0, abs=0.15)
 
 
-def test_intervals_of_motions_under_gears_hold(lugre_log):  # noqa: F811
+def test_intervals_of_motions_under_gears_hold(lugre_log):  # noqa: F811  # the fixture
     posterior = fit(arm_model(0).with_forces(Viscous(), Coulomb(memory=True)), lugre_log, Torques(), rows=1500)
     found = calibrated(posterior, lugre_log, (0.05, 0.2))
     motions = recorded_motions(with_memory(lugre_log, found.model), 30, 0.2)

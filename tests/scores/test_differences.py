@@ -172,9 +172,12 @@ def test_a_model_that_is_usable_in_more_joints_is_taken_whatever_its_motions():
     assert (found.recommended, found.unusable("ls2"), found.unusable("ls")) == ("ls", 1, 0), "no torque acts on a base"
     assert of(ls=ls, ls2=leaves(None, 0.1, 0.49, motion=0.1)).recommended == "ls2", "half of a torque is usable"
     learned = of(ls=ls, ls2=ls2, gp=leaves(None, 0.4, 0.6, motion=0.01))
-    assert (learned.recommended, learned.winner.why) == ("ls", "usable in 1 more joints")
+    assert (learned.recommended, learned.winner.why) == ("ls", "usable in 1 more joint")
     assert of(ls2=ls2, gp=ls).recommended == "gp"
     light = leaves(None, 0.9, 0.1, motion=0.1, quantity="acceleration", score="nrmse")
+    near = leaves(0.1, 0.2, 0.1, motion=0.1, quantity="acceleration", score="nrmse")
+    both = [{**run, "table": {**leaves(None, 0.6, 0.6, motion=0.1)[0]["table"], **near[0]["table"]}} for run in near]
+    assert of(ls=both, net=near).recommended == "ls", "torques of one are not compared with accelerations of another"
     net = of(ls=light, net=light)
     assert (net.left("net")[0], net.unusable("net")) == ("acceleration", 2), "what is not known is not usable"
 

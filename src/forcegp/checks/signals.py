@@ -206,12 +206,13 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
     if not length or values[start] in (values.min(), values.max()):
         return
     stays = np.ptp(runs(values == values[start]), axis=1)
+    limit = name == "u" and (stays >= FROZEN_ROWS).sum() > 1  # which recurs
     yield Doubt(
         level="look" if name == "u" and values[start] == 0.0 else "wrong",
-        about="saturation" if name == "u" and (stays >= FROZEN_ROWS).sum() > 1 else "frozen channel",  # a limit recurs
+        about="saturation" if limit else "frozen channel",
         what=f"the {QUANTITY[name]} of {inputs.names[joint]} stands still at {values[start]:.6g} for "
         f"{length * step:.3g} s from row {start} at {log.time[start]:.3f} s, while its other signals change.",
-        do="Leave this stretch out, and look at the logger.",
+        do=f"Leave such stretches out, and look at the {'limits of the drive' if limit else 'logger'}.",
         joints=(inputs.names[joint],),
         numbers={"quantity": name, "row": start, "seconds": length * step},
     )

@@ -231,18 +231,18 @@ class Scores(Summary):
 
     # ------------------------------------------------------------------ which model
 
-    def left(self, model: str) -> tuple[str, dict[str, float | None]]:
-        """What a model leaves of torques where these act, else of accelerations: the quantity, and shares by joint."""
+    def left(self, model: str, beside: Iterable[str] = ()) -> tuple[str, dict[str, float | None]]:
+        """What a model leaves of torques where it and those beside it tell, else of accelerations; by joint."""
         held = self.quantities(model)
-        if "share" in held.get(TORQUE, ()):
+        if all("share" in self.quantities(name).get(TORQUE, ()) for name in (model, *beside)):
             shares = zip(self.joint_names, self.columns("share", TORQUE, model), strict=True)
             return TORQUE, {name: share for name, share in shares if share is not None}
         known = self.columns("nrmse", ACCELERATION, model) if "nrmse" in held.get(ACCELERATION, ()) else ()
         return ACCELERATION, dict(zip(self.joint_names, known, strict=False))
 
-    def unusable(self, model: str) -> int:
+    def unusable(self, model: str, beside: Iterable[str] = ()) -> int:
         """In how many joints a model leaves more than `USABLE`, or it is not known what it leaves."""
-        return sum(share is None or share > USABLE for share in self.left(model)[1].values())
+        return sum(share is None or share > USABLE for share in self.left(model, beside)[1].values())
 
     def errors(self, criterion: str, model: str) -> dict[tuple[str, int], Float[np.ndarray, "horizons stretches"]]:
         """Squared errors by split and seed; one horizon but for motions."""
@@ -272,17 +272,16 @@ class Scores(Summary):
 
     def best_of(self, kinds: Sequence[str], criterion: str, but: str | None = None) -> str | None:
         """The model of these kinds with the lowest error, among those that failed, lost joints and diverged least."""
-        found = []
-        for name, model in self.models.items():
+        found, asked = [], (name for name, model in self.models.items() if model["kind"] in kinds and name != but)
+        beside = [name for name in asked if self.errors(criterion, name)]
+        for name in beside:
             errors = self.errors(criterion, name)
-            if model["kind"] not in kinds or not errors or name == but:
-                continue
             every = np.ma.masked_invalid(np.concatenate(list(errors.values()), axis=1))
             if every.count():
                 # over runs and stretches as differences are; of motions the geometric mean over horizons
                 level = float(np.log(np.maximum(every.mean(axis=1).compressed(), np.finfo(float).tiny)).mean())
                 failed, diverged = len(self.runs[name]) - len(errors), int(every.mask.sum())
-                found.append((failed, self.unusable(name), diverged, level, name))
+                found.append((failed, self.unusable(name, beside), diverged, level, name))
         return min(found)[-1] if found else None
 
     @cached_property
@@ -294,9 +293,10 @@ class Scores(Summary):
         for criterion in CRITERIA:
             simple, other = (self.best_of(kinds, criterion) for kinds in (PARAMETRIC, LEARNED))
             if simple is not None and other is not None:
-                found, more = self.difference(criterion, other, simple), self.unusable(simple) - self.unusable(other)
-                if more:
-                    return Winner(other if more > 0 else simple, found, f"usable in {abs(more)} more joints")
+                found = self.difference(criterion, other, simple)
+                if more := self.unusable(simple, [other]) - self.unusable(other, [simple]):
+                    why = f"usable in {abs(more)} more joint{'s' if abs(more) > 1 else ''}"
+                    return Winner(other if more > 0 else simple, found, why)
                 if found is None or not found.favours_challenger:
                     return Winner(simple, found, "nothing is shown to be better than the best parametric")
                 sure = found.outcome == "better"
