@@ -83,6 +83,13 @@ def test_hysteresis_is_no_delay(delay, lugre_log):  # noqa: F811  # the fixture
     assert alone.significant > delay + 0.01
 
 
+def test_friction_behind_the_filter_of_the_log_is_not_early(lugre_log):  # noqa: F811  # the fixture
+    """A filter rounds the turn of friction from before the reversal on, which reads as torque that is early."""
+    filtered = Preparation(cutoff=6.0).rows(lugre_log.rows(slice(0, 6000, 2)))
+    sharp, alike = (estimate_delay(filtered, cutoff).common for cutoff in (None, 6.0))
+    assert abs(alike) < 0.5 * abs(sharp) < 0.01
+
+
 def test_noise_of_positions_is_no_reversal():
     """Its size is found at any rate, and motion is not taken for it."""
     time, rng = DT * np.arange(8000), np.random.default_rng(0)

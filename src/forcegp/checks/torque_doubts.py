@@ -95,9 +95,10 @@ def elastic_doubts(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
 def _delays(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
     if inputs.prepared is None:
         return  # without an order
-    data = log.changed(inputs.even if inputs.most_rows == QUICK_ROWS else inputs.prepared)
+    quick = inputs.most_rows == QUICK_ROWS
+    data = log.changed(inputs.even if quick else inputs.prepared)
     try:
-        delay = estimate_delay(replace(data, model=Model(log.robot)))
+        delay = estimate_delay(replace(data, model=Model(log.robot)), None if quick else inputs.cutoff)
     except DatasetError:
         return  # too short
     seconds, remains = delay.significant, delay.remains

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 
 from forcegp.data.dataset import Dataset
-from forcegp.data.filters import episodes_in_order
+from forcegp.data.filters import LowPass, episodes_in_order
 from forcegp.data.strokes import joint_positions, with_strokes
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.forces.joint_laws import law_columns, usual_columns
@@ -34,7 +35,7 @@ ROWS_PER_PARAMETER = 3
 
 APART = 0.01
 """Width of the 95 % interval of a delay [s] beyond which the log is said not to tell it."""
-WORTH = 0.98
+WORTH = 0.95
 """Unexplained torque with the common delay, relative to that without, above which the delay explains nothing."""
 
 
@@ -74,16 +75,19 @@ class Delay:
         low, high = 1e3 * np.clip(ends, -LARGEST_DELAY, LARGEST_DELAY)
         if high - low > 1e3 * APART:
             return f"{low:.0f} to {high:.0f} ms cannot be told apart here from friction: none is assumed"
+        if self.remains >= WORTH:
+            return f"{size}, which explains hardly anything: none is assumed"
         return f"{size}, but not more than three standard deviations in most joints: none is assumed"
 
 
-def estimate_delay(dataset: Dataset) -> Delay:
+def estimate_delay(dataset: Dataset, cutoff: float | None = None) -> Delay:
     """The delay of u behind the motion, joint by joint: `u_logged(t + delay)` acts at t.
 
     For every shift up to .2 s, u is fitted by least squares to the torque regressor of the model's robot, a rotor,
     friction of several widths, a constant, and the model's laws; and to friction that remembers, which
     may take the delay's place. The best shift is the vertex of a parabola; its standard deviation is a block jackknife
-    (Kuensch 1989). Filter q, v, u and a alike before. Raises InvalidInput with contacts, or without torques;
+    (Kuensch 1989). Filter q, v, u and a alike before, by a `LowPass` at `cutoff` Hz: friction is filtered as u is, else
+    it seems to turn late. Raises InvalidInput with contacts, or without torques;
     DatasetError for a log shorter than .4 s.
     """
     if dataset.model.contacts:
@@ -96,13 +100,13 @@ def estimate_delay(dataset: Dataset) -> Delay:
             "a delay is found from the torque of every joint, which u does not hold for a base that moves or actuators "
             "of another kind; give the delay in s."
         )
-    near = _told_apart(dataset, USUAL_DELAY)
+    near = _told_apart(dataset, USUAL_DELAY, cutoff)
     open_ones = np.isnan(near.seconds) & np.array([bool(np.ptp(u)) for u in dataset.u.T])
     at_end = np.isnan(near.common + near.common_std)  # that of a part of the log lies beyond
     if not (open_ones.any() or at_end):
         return near
     try:
-        far = _told_apart(dataset, LARGEST_DELAY)
+        far = _told_apart(dataset, LARGEST_DELAY, cutoff)
     except DatasetError:  # too short for that
         return near
     if at_end:
@@ -111,10 +115,10 @@ def estimate_delay(dataset: Dataset) -> Delay:
     return replace(near, **parts)
 
 
-def _told_apart(dataset: Dataset, largest: float) -> Delay:
+def _told_apart(dataset: Dataset, largest: float, cutoff: float | None) -> Delay:
     """The delay under friction of velocity if it shows beside friction that remembers, too, else that beside memory."""
     (alone, left), (beside, least) = (
-        _estimated(log, largest) for log in (replace(dataset, strokes=None), with_strokes(dataset))
+        _estimated(log, largest, cutoff) for log in (replace(dataset, strokes=None), with_strokes(dataset))
     )
     if least < REMEMBERS * left:
         return beside
@@ -123,7 +127,7 @@ def _told_apart(dataset: Dataset, largest: float) -> Delay:
     return alone if not used or (not apart and (beside.significant or width <= APART)) else beside
 
 
-def _estimated(dataset: Dataset, largest: float) -> tuple[Delay, float]:
+def _estimated(dataset: Dataset, largest: float, cutoff: float | None) -> tuple[Delay, float]:
     """The delay, and the geometric mean over joints of what it leaves of the square sums."""
     thin, shifts = max(1, -(-len(dataset) // MOST_ROWS)), np.linspace(-largest, largest, 2 * STEPS + 1)
     episodes = []
@@ -137,7 +141,7 @@ def _estimated(dataset: Dataset, largest: float) -> tuple[Delay, float]:
             f"{len(compared)} rows lie more than {largest} s from the ends of their episodes; a delay needs at "
             f"least {10 * BLOCKS}. Record longer, or give the delay in s."
         )
-    features = torque_columns(dataset.rows(compared))
+    features = torque_columns(dataset, compared, cutoff)
     profiles = np.full((dataset.nv, BLOCKS + 1, len(shifts)), np.nan)  # of all rows, and of all but one block
     for joint in range(dataset.nv):
         splines = [(CubicSpline(dataset.time[own], dataset.u[own, joint]), dataset.time[at]) for own, at in episodes]
@@ -181,12 +185,17 @@ def jackknife(each: Float[np.ndarray, "estimates blocks"]) -> np.ndarray:
     return np.sqrt((each.shape[-1] - 1) * np.var(each, axis=-1))
 
 
-def torque_columns(dataset: Dataset) -> Float[np.ndarray, "nv rows columns"]:
-    """What the torque of each joint may be made of, except for its parameters; with the laws of the dataset's model."""
-    robot = dataset.model.robot
-    q, v, a = (torch.tensor(getattr(dataset, name), device=robot.device) for name in ("q", "v", "a"))
+def torque_columns(
+    dataset: Dataset, chosen: Int[np.ndarray, " n"] | slice = slice(None), cutoff: float | None = None
+) -> Float[np.ndarray, "nv n columns"]:
+    """What the torque of each joint may be made of in the `chosen` rows, except for its parameters.
+
+    The laws of the dataset's model are among it. Forces of laws are behind a low-pass at `cutoff` Hz.
+    """
+    robot, some = dataset.model.robot, dataset.rows(chosen)
+    q, v, a = (torch.tensor(getattr(some, name), device=robot.device) for name in ("q", "v", "a"))
     with torch.no_grad():
-        if len(dataset) > ROWS_PER_PARAMETER * 10 * robot.nv:
+        if len(some) > ROWS_PER_PARAMETER * 10 * robot.nv:
             torque = robot.kinematics(q, v).torque_regressor(a).flatten(-2)
         else:  # factors of the robot's own torques, of which there are three
             gravity, bias = robot.gravity_forces(q), robot.bias_forces(q, v)
@@ -195,7 +204,19 @@ def torque_columns(dataset: Dataset) -> Float[np.ndarray, "nv rows columns"]:
     rows = dataset.q, dataset.v, dataset.u, dataset.a
     own = [*usual_columns(robot, *rows, FRICTION_WIDTHS), *law_columns(dataset.model.laws, robot, *rows)]
     own += _memory_columns(dataset)
-    return np.concatenate([torque.cpu().numpy(), np.stack(own, axis=-1)], axis=-1).transpose(1, 0, 2)
+    forces = np.stack([each[chosen] for each in (own if cutoff is None else _behind(cutoff, own, dataset))], axis=-1)
+    return np.concatenate([torque.cpu().numpy(), forces], axis=-1).transpose(1, 0, 2)
+
+
+def _behind(
+    cutoff: float, forces: Sequence[Float[np.ndarray, "rows nv"]], dataset: Dataset
+) -> Iterator[Float[np.ndarray, "rows nv"]]:
+    """The forces behind a low-pass, episode by episode."""
+    smooth, episodes = LowPass(cutoff), [dataset.episode == number for number in dataset.episodes]
+    for force in forces:
+        for own in episodes:
+            force[own] = smooth(force[own], dataset.time[own])
+        yield force
 
 
 def _memory_columns(dataset: Dataset) -> list[Float[np.ndarray, "rows nv"]]:

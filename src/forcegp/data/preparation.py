@@ -98,7 +98,7 @@ class Preparation:
         elif self.delay == "auto":
             chosen = replace(chosen, delay=0.0)
             try:
-                found = estimate_delay(_filtered(chosen, dataset))
+                found = estimate_delay(_filtered(chosen, dataset), chosen.cutoff)
                 chosen, reasons["delay"] = replace(chosen, delay=found.significant), found.reason
             except InvalidInput as error:
                 reasons["delay"] = f"u is taken to be on time: {error}"

@@ -199,7 +199,7 @@ def _judged(dataset: Dataset, cutoff: float, source: Literal["q", "v"]) -> tuple
     def behind(frequency: float) -> Dataset:
         return differentiated(low_pass(log, frequency, signals=signals), source)
 
-    delay = np.nan_to_num(estimate_delay(behind(cutoff)).common)  # the best guess, sure or not
+    delay = np.nan_to_num(estimate_delay(behind(cutoff), cutoff).common)  # the best guess, sure or not
     log = shifted(log, float(delay))
     away = SETTLED / tried[0] + abs(delay)
     times = [rows.time for _, rows, _ in episodes_in_order(log)]
