@@ -12,6 +12,7 @@ from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import Dataset
 from forcegp.data.delay import estimate_delay, torque_columns
 from forcegp.data.filters import LowPass, Signal, differentiated, episodes_in_order, low_pass, shifted, uniform_step
+from forcegp.data.strokes import with_strokes
 from forcegp.errors import DatasetError
 
 SEGMENT = 4.0  # s
@@ -197,7 +198,7 @@ def _judged(dataset: Dataset, cutoff: float, source: Literal["q", "v"]) -> tuple
     signals: tuple[Signal, ...] = ("q", "u") if source == "q" else ("q", "v", "u")
 
     def behind(frequency: float) -> Dataset:
-        return differentiated(low_pass(log, frequency, signals=signals), source)
+        return with_strokes(differentiated(low_pass(log, frequency, signals=signals), source))
 
     delay = np.nan_to_num(estimate_delay(behind(cutoff), cutoff).common)  # the best guess, sure or not
     log = shifted(log, float(delay))
