@@ -88,7 +88,8 @@ def test_friction_behind_the_filter_of_the_log_is_not_early(lugre_log):  # noqa:
     """A filter rounds the turn of friction from before the reversal on, which reads as torque that is early."""
     filtered = Preparation(cutoff=6.0).rows(lugre_log.rows(slice(0, 6000, 2)))
     sharp, alike = (estimate_delay(filtered, cutoff).common for cutoff in (None, 6.0))
-    assert abs(alike) < 0.001 and sharp < -0.01
+    assert abs(alike) < 0.001
+    assert sharp < -0.01
 
 
 def test_a_cutoff_is_judged_beside_friction_that_remembers(lugre_log):  # noqa: F811  # the fixture
@@ -96,7 +97,8 @@ def test_a_cutoff_is_judged_beside_friction_that_remembers(lugre_log):  # noqa: 
     few = lugre_log.rows(slice(0, 6000, 2))
     noisy = replace(few, q=few.q + 1e-4 * np.random.default_rng(0).standard_normal(few.q.shape))
     best, shares = held_out_cutoff(noisy, 20.0)
-    assert best == 14.0 and shares[best] < 5e-4 < shares[40.0]
+    assert best == 14.0
+    assert shares[best] < 5e-4 < shares[40.0]
 
 
 def test_noise_of_positions_is_no_reversal():
