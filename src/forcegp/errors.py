@@ -129,12 +129,16 @@ def require_plausible(stored: Any, name: str = "") -> None:
             raise ValueError(f"{name}{key} is {value:g}, more than {LARGEST:g} in SI units")
 
 
+ACTING = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+"""What acts on a terminal; compiled here, for at its first use there may be no memory left to say so."""
+
+
 def printable(text: str) -> str:
     r"""The text with what would act on a terminal instead of being seen written out, as in \x1b.
 
     Control characters but line breaks and tabs, and what turns the direction of writing round (Unicode, TR 36, 2.10).
     """
-    return re.sub(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]", _written, text)
+    return ACTING.sub(_written, text)
 
 
 def _written(found: re.Match[str]) -> str:

@@ -147,7 +147,7 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
             sharp, heard = search(replace(inputs, compared=inputs.sharper))
             if not heard or heard[-1].about != UNKNOWN:
                 found, said = sharp, heard
-        if said and said[-1].about == UNKNOWN:
+        if said[-1].about == UNKNOWN if said else inputs.sharper is not None:  # a filter may hide a resonance
             said = [*said, *elastic_doubts(inputs, found.log)]
         doubts, comparison = [*doubts, *said, *torque_doubts(inputs, found)], found
     return doubts, comparison

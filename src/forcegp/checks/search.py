@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from forcegp.checks.check_input import CheckInput
 from forcegp.checks.explanations import NUMBER, SIGN, Cause, candidates, changed
 from forcegp.checks.torques import Comparison, positive_fit, positive_solution, torque_noise
+from forcegp.data import Dataset
 from forcegp.data.views import white_noise
 from forcegp.doubts import Doubt, listed, look, wrong
 from forcegp.evidence import Torques, motion_residuals
@@ -21,6 +22,7 @@ from forcegp.model import Model
 
 UNKNOWN = "unknown cause"
 FEWEST_ROWS = 30
+AT_REST = 0.1  # of the root mean square velocity of a joint
 GAIN = np.log(4.0)  # by which the product over all joints of what remains must fall at least
 LEAST = 1e-4  # shares of a torque's power below this are all the same
 NOISE = 3.0  # how much of the power of the noise is left to every explanation
@@ -273,8 +275,15 @@ def _all_turned(root: Explanation, inputs: CheckInput) -> tuple[Explanation, lis
     return replace(root, log=turned, turned=tuple(range(log.rows.nv))), [doubt]
 
 
+def moving(rows: Dataset) -> Dataset:
+    """The rows in which some joint moves: at rest, stiction holds any torque. All, where they are too few."""
+    speed = np.abs(rows.v) / np.maximum(np.sqrt(np.square(rows.v).mean(axis=0)), 1e-300)
+    moves = speed.max(axis=1) > AT_REST
+    return rows.rows(moves) if moves.sum() >= FEWEST_ROWS else rows
+
+
 def _root(inputs: CheckInput) -> Explanation:
-    rows = inputs.rows()
+    rows = moving(inputs.rows())
     log = Comparison(robot=inputs.robot, laws=inputs.laws, rows=rows, given=rows).after(changed())
     seen = white_noise(inputs.mended, signal="u") if inputs.log.time_ordered else None
     noise = np.zeros(log.rows.nv) if seen is None else np.nan_to_num(seen)

@@ -58,7 +58,7 @@ def elastic_doubts(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
     With a gear of stiffness k between rotor J and link, u = tau + J a + (J / k) tau'' where the encoder is at the link
     (Spong 1987, J. Dyn. Sys. Meas. Control 109).
     """
-    rows = inputs.compared
+    rows = inputs.sharper or inputs.compared  # the cut-off that a rigid robot asks for lies below the resonance
     if rows is None or not rows.time_ordered or np.unique(rows.episode, return_counts=True)[1].min() < FEWEST_ROWS:
         return  # without an order, or too short to be differentiated
     log = replace(log, rows=log.changed(rows))
