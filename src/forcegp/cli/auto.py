@@ -112,20 +112,18 @@ class Auto(Command):
         with terminal.progress("preparing"):
             rows, recording = self._prepared_rows(terminal, dataset, bool(done["open_switches"]))
         settings = dict(rows.metadata["preparation"])
-        named = forcegp.scores.named_model
-        expression, _, evidence = identification(model).partition("@")
-        laws = forcegp.scores.summands(expression)
         with terminal.progress("identifying"):
-            given = forcegp.evidence.parse_evidence(evidence)
-            identified: Any = forcegp.scores.learn(named(recording.model, laws), recording, given)[0]
+            expression, found = forcegp.scores.identify(recording, identification(model))
+        identified: Any = found
+        laws = forcegp.scores.summands(expression.partition("@")[0])[1:]
         payload: dict[str, Any] = {}
         with terminal.progress("looking for a payload"):
             try:
-                found = with_payload(named(recording.model, laws[1:]), recording, self.link)
-                payload, held = payload_dict(found, False), payload_text(found)
+                loaded = with_payload(forcegp.scores.named_model(recording.model, laws), recording, self.link)
+                payload, held = payload_dict(loaded, False), payload_text(loaded)
             except DatasetError as error:
                 held = f"not estimated: {error}"
-        scores, posterior = self._scored(terminal, rows, recording, model, identified, still)
+        scores, posterior = self._scored(terminal, rows, recording, expression, identified, still)
         content: dict[str, Any] = {
             "out": str(self.out),
             "seconds": (len(dataset) - len(dataset.episodes))
@@ -210,12 +208,13 @@ class Auto(Command):
         terminal: Terminal,
         rows: forcegp.Dataset,
         recording: forcegp.Dataset,
-        model: forcegp.Model,
+        expression: str,
         identified: forcegp.Posterior,
         still: Sequence[str],
     ) -> tuple[forcegp.scores.Scores, forcegp.posterior.Posterior]:
         """The scores of the models, and the recommended one, learned from all rows and stored."""
-        how: dict[str, Any] = {"model": model, "recording": recording, "identification": identification(model)}
+        model = recording.model
+        how: dict[str, Any] = {"model": model, "recording": recording, "identification": expression}
         how |= {"points": min(100, len(rows) // 4), "restarts": 1}
         models = self.models.names() or default_models(model, identified, rows, still)
         with terminal.progress("scoring"):

@@ -98,7 +98,8 @@ class Preparation:
         elif self.delay == "auto":
             chosen = replace(chosen, delay=0.0)
             try:
-                found = estimate_delay(_filtered(chosen, dataset), chosen.cutoff)
+                cutoff = None if chosen.cutoff is None else float(chosen.cutoff)
+                found = estimate_delay(_filtered(chosen, dataset), cutoff)
                 chosen, reasons["delay"] = replace(chosen, delay=found.significant), found.reason
             except InvalidInput as error:
                 reasons["delay"] = f"u is taken to be on time: {error}"

@@ -5,7 +5,7 @@ from .figures.model import (
 )
 from .figures.style import Picture as Picture, save_figure as save_figure
 from .models import (
-    learn as learn, named_model as named_model, summands as summands,
+    identify as identify, learn as learn, named_model as named_model, summands as summands,
     usual_forces as usual_forces, with_intervals_of_motions as with_intervals_of_motions,
 )
 from .page import (

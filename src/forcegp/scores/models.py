@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from forcegp.checks.residuals import pushed_where_they_are
 from forcegp.data import Dataset, thruster_columns, with_memory
 from forcegp.errors import FitError, InvalidInput
 from forcegp.evidence import Accelerations, Evidence, Motions, Sensor, Torques, parse_evidence
@@ -64,6 +65,17 @@ def named_model(model: Model, words: Sequence[str], noise: Noise | None = None) 
             raise InvalidInput("gp:independent has no physics, so no other force can stand beside it; leave these out.")
         return model.black_box(noise)
     return (model.without_mean() if first == ONLY else model).with_forces(*forces, noise=noise)
+
+
+def identify(recording: Dataset, expression: str) -> tuple[str, Posterior]:
+    """The robot identified as FORCES@EVIDENCE says, and that expression: with springs where the log asks for them."""
+    forces, _, evidence = expression.partition("@")
+    given = parse_evidence(evidence)
+    identified = learn(named_model(recording.model, summands(forces)), recording, given)[0]
+    if not recording.model.robot.space.is_vector_space or not pushed_where_they_are(recording, identified.model):
+        return expression, identified
+    forces = f"{forces}+spring"
+    return f"{forces}@{evidence}", learn(named_model(recording.model, summands(forces)), recording, given)[0]
 
 
 def usual_forces(model: Model) -> str:
