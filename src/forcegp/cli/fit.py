@@ -288,19 +288,14 @@ def estimates_table(title: str, estimates: Mapping[str, forcegp.posterior.Estima
         size = factor * each.std if 0.0 < each.std < math.inf else 1e-3 * abs(factor * each.value)
         digits = max(0, 1 - math.floor(math.log10(size))) if size > 0.0 else 4
         show = (f"{{:.{digits}f}}" if digits < 10 else "{:.2g}").format
-        of, part = owner_and_part(name)
+        # law or body, and number: viscous and elbow, tool0 and center_of_mass.x
+        split = re.fullmatch(r"(.*?)\.((?:mass|center_of_mass|inertia).*)", name)
+        of, _, part = (split[1], "", split[2]) if split else name.partition(".")
         rows += [[of]] if of != owner else []
         owner = of
         numbers = show(factor * each.start), show(factor * each.value), f"{show(low)} … {show(high)}"
         rows.append([f"  {part}", *numbers, "" if unit == "1" else unit, each.decided_by])
     return columns(title, ["parameter", "start", "estimate", "95 % interval", "unit", "decided\nby the"], rows)
-
-
-def owner_and_part(name: str) -> tuple[str, str]:
-    """Law or body, and number: viscous and elbow, tool0 and center_of_mass.x."""
-    found = re.fullmatch(r"(.*?)\.((?:mass|center_of_mass|inertia).*)", name) or re.fullmatch(r"([^.]*)\.?(.*)", name)
-    assert found is not None, "every name matches"
-    return found[1], found[2]
 
 
 def what_is_open(estimates: forcegp.posterior.Estimates) -> list[str]:

@@ -334,7 +334,10 @@ def farthest_point_sampling(
     """
     rows = len(points)
     count = whole_number("count", count, 1, rows, "the number of rows")
-    columns = _standardized_columns(points)
+    columns = np.ascontiguousarray(points.T, dtype=np.float64)
+    columns = columns / np.maximum(np.abs(columns).max(axis=1, keepdims=True), 1e-300)  # so that std cannot overflow
+    centred, spread = columns - columns.mean(axis=1, keepdims=True), columns.std(axis=1, keepdims=True)
+    columns = np.where(spread >= ROUNDING, centred / np.maximum(spread, ROUNDING), 0.0)
     distance = np.full(rows, np.inf)
     chosen = np.empty(count, dtype=np.int64)
     chosen[0] = whole_number("start", start, 0, rows - 1, "the last row")
@@ -356,11 +359,3 @@ def farthest_rows(dataset: Dataset, count: int, *, start: int = 0) -> Dataset:
     """The rows that cover the inputs (q, v, u) best, in order: for fewer points, take the first of them."""
     inputs = np.hstack([dataset.q, dataset.v, dataset.u])
     return dataset.rows(farthest_point_sampling(inputs, count, start=start))
-
-
-def _standardized_columns(table: np.ndarray) -> np.ndarray:
-    """(features, rows): contiguous columns with zero mean and unit standard deviation; constant ones become zero."""
-    columns = np.ascontiguousarray(table.T, dtype=np.float64)
-    columns = columns / np.maximum(np.abs(columns).max(axis=1, keepdims=True), 1e-300)  # so that std cannot overflow
-    centred, spread = columns - columns.mean(axis=1, keepdims=True), columns.std(axis=1, keepdims=True)
-    return np.where(spread >= ROUNDING, centred / np.maximum(spread, ROUNDING), 0.0)

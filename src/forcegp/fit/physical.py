@@ -58,7 +58,9 @@ class Equations:
         self.a = np.concatenate([log.a for log in logs])
         self.ends = np.cumsum([len(log) for log in logs])[:-1]
         self.measured = [part.moving(a) for part, a in zip(self.parts, self.each(self.a), strict=True)]
-        self.held = _stacked([part.open if evidence.of_torque else part.held for part in self.parts])
+        held = [part.open if evidence.of_torque else part.held for part in self.parts]
+        most = max(each.shape[1] for each in held)  # zeros where a log has fewer directions of contact forces
+        self.held = np.concatenate([np.pad(each, ((0, 0), (0, most - each.shape[1]), (0, 0))) for each in held])
         gains = any(isinstance(space.model.laws[term.law], Actuation) for term in space.terms)
         self.in_units_of_log = gains and not self.held.shape[1]
         seconds = evidence.mean if isinstance(evidence, Torques) else None
@@ -189,12 +191,6 @@ class WindowMeans:
         """(rows, ...) as (windows, ...)."""
         sums = np.add.reduceat(values, self.starts, axis=0)
         return sums / self.roots.reshape(-1, *(1,) * (values.ndim - 1))
-
-
-def _stacked(held: Sequence[np.ndarray]) -> np.ndarray:
-    """Directions of contact forces of all logs, as many in every row: zeros where a log has fewer."""
-    most = max(each.shape[1] for each in held)
-    return np.concatenate([np.pad(each, ((0, 0), (0, most - each.shape[1]), (0, 0))) for each in held])
 
 
 ROWS = 5_000

@@ -160,15 +160,12 @@ class ToolForces(SharedInputs):
         return ("N", "N")
 
     def _directions(self, dynamics: ConstrainedDynamics, where: ToolPoint) -> Float[Tensor, "*batch 3 2"]:
-        return _containing(contact_axes(dynamics, self.contact), where.velocity(dynamics.state.v)[..., :3])
-
-
-def _containing(axes: Float[Tensor, "*batch 3 3"], velocity: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 2"]:
-    """Tangents t + n (t v_t) v_n / |v|^2, since what resists a point resists its drift off the surface, too."""
-    tangents, normal = axes[..., :2], axes[..., 2:]
-    along, off = _along(tangents, velocity), _along(normal, velocity)
-    tilt = along * off / velocity.square().sum(-1, keepdim=True).clamp_min(SMALLEST_SPEED**2)
-    return tangents + normal * tilt[..., None, :]
+        """Tangents t + n (t v_t) v_n / |v|^2, since what resists a point resists its drift off the surface, too."""
+        axes, velocity = contact_axes(dynamics, self.contact), where.velocity(dynamics.state.v)[..., :3]
+        tangents, normal = axes[..., :2], axes[..., 2:]
+        along, off = _along(tangents, velocity), _along(normal, velocity)
+        tilt = along * off / velocity.square().sum(-1, keepdim=True).clamp_min(SMALLEST_SPEED**2)
+        return tangents + normal * tilt[..., None, :]
 
 
 def _along(axes: Float[Tensor, "*batch 3 k"], vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch k"]:
@@ -253,9 +250,8 @@ class AerodynamicForce(SharedInputs):
     def columns(self, dynamics: ConstrainedDynamics) -> dict[str, Callable[[], Tensor]]:
         state, where = dynamics.state, self._point(dynamics)
         moving, turning = where.velocity(state.v).split(3, dim=-1)
-        linear, angular = (
-            (where.orientation.mT @ part[..., None])[..., 0] for part in (moving - self._flow(state), turning)
-        )
+        flow = state.v.new_tensor(self.wind) if (wind := ObservedWind.at(state)) is None else wind
+        linear, angular = ((where.orientation.mT @ part[..., None])[..., 0] for part in (moving - flow, turning))
         return {
             "velocity": lambda: linear,
             "drag": lambda: (linear.square().sum(-1, keepdim=True) + 1e-12).sqrt() * linear,
@@ -265,11 +261,6 @@ class AerodynamicForce(SharedInputs):
             "height": lambda: where.position[..., 2:],
             "attitude": lambda: where.orientation.flatten(-2),
         }
-
-    def _flow(self, state: State) -> Tensor:
-        """The velocity of the air, along the axes of the world."""
-        wind = ObservedWind.at(state)
-        return state.v.new_tensor(self.wind) if wind is None else wind
 
     @override
     def labels(self, robot: Robot) -> dict[str, Sequence[str]]:

@@ -124,7 +124,8 @@ class Posterior(Fitted):
         def through(affine: AffineMap) -> Gaussian:
             return whole.through(affine.matrix, affine.offset)
 
-        predicted, noise = moving, _noise_covariance(given, dynamics)
+        predicted, noise = moving, Noise.covariance(given, dynamics.H)
+        noise = torch.diag_embed(noise).expand_as(dynamics.H) if noise.dim() == 2 else noise
         if self.is_black_box:  # its functions hold what contacts do, so forces are not those of anything
             return Prediction(predicted.mean, predicted.covariance, None, None, None, noise)
         multiplier = through(dynamics.multiplier_map())
@@ -358,8 +359,3 @@ def _has_its_place(force: Force, model: Model) -> bool:
     except InvalidInput:
         return False
     return True
-
-
-def _noise_covariance(parameters: Mapping[str, Tensor], dynamics: ConstrainedDynamics) -> Tensor:
-    noise = Noise.covariance(parameters, dynamics.H)
-    return torch.diag_embed(noise).expand_as(dynamics.H) if noise.dim() == 2 else noise

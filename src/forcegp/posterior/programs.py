@@ -219,7 +219,9 @@ class Programs:
             case "components" | "deviations":
                 outputs = {"Q": [node for part in at.parts for node in copied(part)]}
                 if kind == "deviations":
-                    outputs["covariance"] = self._terms(graph, copied, features, self._of_terms(at.B))
+                    kept = [range(len(self._latents))[which] for which in self.physics.terms.values()]
+                    rows = [[x if c in own else ZERO for c, x in enumerate(row)] for own in kept for row in at.B]
+                    outputs["covariance"] = self._terms(graph, copied, features, rows)
             case "mean":
                 outputs = {"a": copied(at.a)}
             case "linearize" if at.held:
@@ -243,11 +245,6 @@ class Programs:
         terms = copied([row[c] for row in rows for c in self._latents])
         terms += [node for part, z in zip(self.sums, features, strict=True) for node in part.variance(graph, z)]
         return terms + [node for part, z in zip(self.sums, features, strict=True) for node in part.given(graph, z)]
-
-    def _of_terms(self, B: list[list[int]]) -> list[list[int]]:
-        """A row of mixing for each joint and unknown force."""
-        kept = [range(len(self._latents))[which] for which in self.physics.terms.values()]
-        return [[node if c in own else ZERO for c, node in enumerate(row)] for own in kept for row in B]
 
     def _implicit(self, graph: Graph, copied: Copier, a: list[int]) -> tuple[Graph, dict[str, list[int]]]:
         """The acceleration and its derivatives in a step from q, in v and in u, by `Physics.held`."""

@@ -7,7 +7,7 @@ import torch
 
 from forcegp.data import Dataset
 from forcegp.evidence.likelihood import MarginalLikelihood, TrainingData, check_distance
-from forcegp.inference import ExactPosterior, exact
+from forcegp.inference import exact
 from forcegp.inference.memory import blas_threads, require_memory
 from forcegp.inference.posterior import with_rows
 
@@ -18,7 +18,11 @@ Structured = Any
 def learn_more_rows(posterior: Structured, rows: Dataset) -> Structured:
     """What `Posterior.update` documents."""
     latent, training = exact(posterior.latent, "learning from more rows"), posterior.training
-    _require_memory(latent, len(rows))
+    count, rank, latents = latent.system.deflation.C.shape
+    size, new = rank * (count + len(rows)), rank * len(rows)
+    needed = 8 * (size**2 + 2 * new * size + latents * len(rows) ** 2)  # the factor, blocks of new rows, their copies
+    what = f"a posterior of {count} + {len(rows)} rows"
+    require_memory(needed, what, "give fewer rows", latent.system.alpha.device)
     more = _on_rows(posterior, rows)
     with torch.no_grad(), blas_threads(training.q.numel()):
         terms = more.terms(posterior.hyperparameters)
@@ -45,12 +49,3 @@ def _on_rows(posterior: Structured, rows: Dataset) -> MarginalLikelihood:
     likelihood.model.check_states(added.q, added.v, added.u)
     check_distance(likelihood.model, added)
     return replace(likelihood, training=added, fixed_standardization=likelihood.standardization)
-
-
-def _require_memory(latent: ExactPosterior, added: int) -> None:
-    """Raise NotEnoughMemory where `added` rows do not fit: before anything is computed."""
-    count, rank, latents = latent.system.deflation.C.shape
-    size, new = rank * (count + added), rank * added
-    needed = 8 * (size**2 + 2 * new * size + latents * added**2)  # the new factor, blocks of new rows and their copies
-    what = f"a posterior of {count} + {added} rows"
-    require_memory(needed, what, "give fewer rows", latent.system.alpha.device)
