@@ -351,18 +351,24 @@ def _estimates(
 ) -> Estimates:
     """The numbers at the end of the search."""
     white = np.concatenate([fit.white_jacobian, fit.white[..., None]], axis=-1)
-    each = np.arange(white.shape[1])  # equations of a row: of joints, and of sensors
+    columns = np.arange(white.shape[1])  # equations of a row: of joints, and of sensors
     prior = space.prior(fit.x)[1]
     by_body = None
     everything = len(space.carried) == len(space.own) and all(each.payload is None for each in space.carried)
     if everything and space.carried:
-        by_body = _weak_directions(space, fit.information, prior.T @ prior)
+        # of ten directions of each body, those of which the data hold less than the prior, as if others were known
+        G, weak = prior.T @ prior, {}
+        for body, each in enumerate(space.carried):
+            own = slice(10 * body, 10 * body + 10), slice(10 * body, 10 * body + 10)
+            few = np.linalg.eigvalsh(fit.information[own]) < np.linalg.eigvalsh(G[own]).mean()
+            weak[each.name] = int(few.sum())
+        by_body = {name: count for name, count in sorted(weak.items(), key=lambda entry: -entry[1]) if count}
     return Estimates.of_search(
         space.parameters,
         space.numbers(fit.x),
         space.number_slopes(fit.x),
         white.reshape(-1, white.shape[-1]),
-        [(len(each) * rows[:, None] + each).ravel() for rows in equations.stretches()],
+        [(len(columns) * rows[:, None] + columns).ravel() for rows in equations.stretches()],
         prior,
         changes,
         move,
@@ -373,16 +379,6 @@ def _estimates(
         settled=fit.settled,
         thickened=thick,
     )
-
-
-def _weak_directions(space: ParameterSpace, information: np.ndarray, prior: np.ndarray) -> dict[str, int]:
-    """Of ten directions of each body, those of which the data hold less than the prior, as if others were known."""
-    out = {}
-    for body, each in enumerate(space.carried):
-        own = slice(10 * body, 10 * body + 10)
-        weak = np.linalg.eigvalsh(information[own, own]) < np.linalg.eigvalsh(prior[own, own]).mean()
-        out[each.name] = int(weak.sum())
-    return {name: count for name, count in sorted(out.items(), key=lambda entry: -entry[1]) if count}
 
 
 def typical_sizes(model: Model, logs: Sequence[Dataset]) -> dict[str, Float[np.ndarray, " nv"]]:

@@ -18,6 +18,7 @@ from forcegp.posterior.prediction import ROWS_PER_BLOCK
 Posterior = Any
 """A `Posterior`, whose module imports this one."""
 
+OBSERVERS = ObservedWind | ObservedWrench
 TRIED = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s
 MEMORY, LEAST = 1.0, 0.1  # s, of how much each time missed, and of the past that the first row needs
 
@@ -67,7 +68,8 @@ def in_air(model: Model, dataset: Dataset) -> tuple[Mapping[str, Any], Dataset] 
     None where the model has no `AerodynamicForce` or observes nothing, observes already, or rows show no wind.
     """
     of_air = [term for term in model.unknown_forces if isinstance(term, AerodynamicForce) and term.observe != 0.0]
-    if not of_air or _observes(model) or dataset.u.shape[1] != model.sizes[2]:
+    observes = any(isinstance(force, OBSERVERS) for force in model.forces)
+    if not of_air or observes or dataset.u.shape[1] != model.sizes[2]:
         return None
     rows = replace(dataset, model=model, truth={})
     if (found := find_wind(rows)) is None:
@@ -75,10 +77,6 @@ def in_air(model: Model, dataset: Dataset) -> tuple[Mapping[str, Any], Dataset] 
     law, wind = found
     windy = (replace(x, wind=law.wind) if isinstance(x, AerodynamicForce) else x for x in model.forces)
     return {"air": asdict(law)}, with_wind(replace(rows, model=replace(model, forces=tuple(windy))), wind)
-
-
-def _observes(model: Model) -> bool:
-    return any(isinstance(force, ObservedWind | ObservedWrench) for force in model.forces)
 
 
 def unobserved(model: Model) -> Model:
@@ -130,7 +128,7 @@ def _with_past(dataset: Dataset, seconds: float) -> Int[np.ndarray, " late"]:
 def _in_observed_wind(posterior: Posterior, dataset: Dataset) -> tuple[Posterior, Dataset]:
     """Both with the wind that the rows before each one show, where the fit found a law of air."""
     stored = posterior.settings.get("air")
-    if stored is None or _observes(posterior.model):
+    if stored is None or any(isinstance(force, OBSERVERS) for force in posterior.model.forces):
         return posterior, dataset
     rows = replace(dataset, model=posterior.model)
     seen = with_wind(rows, AirLaw(**stored).wind_before(rows))

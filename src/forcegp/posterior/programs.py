@@ -67,7 +67,7 @@ class Physics:
     def mixing(self, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, list[Tensor]]:
         """W (n, nv, C) of a = offset + W f, and the features of every process (n, d)."""
         dynamics = self.model.dynamics(q, v, u)
-        return dynamics.H @ self.forces.direction(dynamics), self._features(dynamics)
+        return dynamics.H @ self.forces.direction(dynamics), [*self.standardization(self.forces.features(dynamics))]
 
     @property
     def passive(self) -> list[Law]:
@@ -96,7 +96,8 @@ class Physics:
         B = self.forces.direction(dynamics)
         Q = (B @ f[..., None])[..., 0] + dynamics.Q_K
         around = self.parts(dynamics, B, f), B, dynamics.M, dynamics.A, dynamics.b, dynamics.off()
-        return [dynamics.acceleration_under(Q), dynamics.H @ B, Q, *around, *self._features(dynamics)]
+        features = self.standardization(self.forces.features(dynamics))
+        return [dynamics.acceleration_under(Q), dynamics.H @ B, Q, *around, *features]
 
     def held(
         self, q: Tensor, v: Tensor, u: Tensor, f: Tensor, a: Tensor, multiplier: Tensor, left: Tensor
@@ -121,9 +122,6 @@ class Physics:
         r = Q - inertial + (A.mT @ multiplier[..., None])[..., 0]
         s, t = dynamics.b - (A @ a[..., None])[..., 0], (A.mT @ left[..., None])[..., 0]
         return [*found, r, s, t, dynamics.H, lower.mT @ inverse]
-
-    def _features(self, dynamics: ConstrainedDynamics) -> list[Tensor]:
-        return list(self.standardization(self.forces.features(dynamics)))
 
 
 class Traced(NamedTuple):
