@@ -70,13 +70,6 @@ class Unknowns:
         opened = replace(model, forces=tuple(forces))
         return cls(replace(posterior, target=model), ParameterSpace(opened, typical_sizes(opened, [dataset])))
 
-    @cached_property
-    def limits(self) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"], Float[Tensor, " P"]]:
-        """Least and largest values, and the most that one step should change."""
-        low, high = self.space.bounds
-        least, most, step = (torch.as_tensor(x) for x in (low, high, self.space.longest_steps))
-        return least, most, step
-
     def prior(self, x: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, "P P"]]:
         """Standardised distance from the prior, and its Jacobian."""
         distance, jacobian = (torch.as_tensor(part) for part in self.space.prior(x.numpy()))
@@ -212,11 +205,11 @@ class MotionFit:
 
     def minimized(self, here: _Point, noise: Tensor, sigma: Tensor, damping: float) -> tuple[_Point, float]:
         """Levenberg-Marquardt for given noise, from that damping; the last damping as well."""
-        here, (low, high, longest) = self.at(here.x, here.states, noise, sigma, here.motions), self.unknowns.limits
+        here, space = self.at(here.x, here.states, noise, sigma, here.motions), self.unknowns.space
         for _ in range(ITERATIONS):
             N, right, G, g = self.curvature(here, noise, sigma, damping)
-            step = step_within(*(each.numpy() for each in (-right, N, low - here.x, high - here.x)))
-            dx = torch.as_tensor(step / (abs(step) / longest.numpy()).max(initial=1.0))
+            step = step_within(-right.numpy(), N.numpy(), *(end - here.x.numpy() for end in space.bounds))
+            dx = torch.as_tensor(step / (abs(step) / space.longest_steps).max(initial=1.0))
             change = g - G @ dx
             foreseen = here.cost - self.expected(here, noise, sigma, dx, change)
             if not foreseen > CONTENT or damping > MOST_DAMPING:

@@ -5,15 +5,15 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
+from torch import Tensor
 
 from forcegp.data import AirLaw, Dataset, find_wind, with_memory, with_wind
 from forcegp.data.filters import episodes_in_order, sums_before
+from forcegp.data.views import in_blocks
 from forcegp.errors import InvalidInput
 from forcegp.forces import AerodynamicForce, ObservedWind, ObservedWrench
 from forcegp.model import Model
-from forcegp.posterior.prediction import ROWS_PER_BLOCK
 
 Posterior = Any
 """A `Posterior`, whose module imports this one."""
@@ -50,8 +50,15 @@ def observing(
         raise InvalidInput(f"seconds is {seconds!r}; give the time in s that an observer looks back.")
     frame = (own or AerodynamicForce()).link(posterior.model.robot)
     posterior, dataset = _in_observed_wind(posterior, dataset)
-    unexplained, effect = _unexplained(posterior, dataset, frame)
-    wrench = np.einsum("nij,nj->ni", np.linalg.pinv(effect, rcond=1e-9), unexplained)
+
+    def unexplained(q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+        """Accelerations less their predicted mean, and how a wrench of the world on the link changes them."""
+        dynamics = posterior.dynamics(q, v, u)
+        effect = dynamics.H @ dynamics.state.kinematics.frame_jacobian(frame).mT
+        return a - posterior.predict(q, v, u, covariance=False).mean, effect
+
+    missed, effect = in_blocks(dataset, unexplained, posterior.model.robot.device)
+    wrench = np.einsum("nij,nj->ni", np.linalg.pinv(effect, rcond=1e-9), missed)
     observed = _observed(wrench, dataset, times)
     model = replace(posterior.model, forces=(*posterior.model.forces, ObservedWrench(frame)))
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
@@ -133,21 +140,6 @@ def _in_observed_wind(posterior: Posterior, dataset: Dataset) -> tuple[Posterior
     rows = replace(dataset, model=posterior.model)
     seen = with_wind(rows, AirLaw(**stored).wind_before(rows))
     return posterior.with_model(seen.model), seen
-
-
-def _unexplained(
-    posterior: Posterior, dataset: Dataset, frame: str
-) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv 6"]]:
-    """Accelerations less their predicted mean, and how a wrench of the world on the link changes them."""
-    device, parts = posterior.model.robot.device, []
-    rows = (torch.tensor(x, device=device).split(ROWS_PER_BLOCK) for x in (dataset.q, dataset.v, dataset.u, dataset.a))
-    for q, v, u, a in zip(*rows, strict=True):
-        with torch.no_grad():
-            dynamics = posterior.dynamics(q, v, u)
-            effect = dynamics.H @ dynamics.state.kinematics.frame_jacobian(frame).mT
-            parts.append((a - posterior.predict(q, v, u, covariance=False).mean, effect))
-    unexplained, effects = (torch.cat(part).cpu().numpy() for part in zip(*parts, strict=True))
-    return unexplained, effects
 
 
 def _observed(
