@@ -174,21 +174,14 @@ def test_values_that_are_not_finite_are_named_by_row(value):
             negative_log_likelihood(*given_problem.data, given_problem.kernels(given_problem.features))
 
 
-@pytest.mark.parametrize("variance", [0.0, -1.0, math.nan])
-def test_noise_variances_must_be_positive(variance):
-    given_problem = problem(count=6, outputs=3)
-    given_problem.noise[2, 1] = variance
-    given_problem.noise.requires_grad_()
-    with pytest.raises(NumericalError, match="noise variances must be positive"):
-        negative_log_likelihood(*given_problem.data, given_problem.kernels(given_problem.features))
-
-
-@pytest.mark.parametrize("entry", [-1.0, math.nan])
-def test_noise_covariances_must_be_positive_definite(entry):
-    given_problem = problem(count=6, outputs=3)
-    given_problem.noise = torch.diag_embed(given_problem.noise)
-    given_problem.noise[4, 1, 1] = entry
-    with pytest.raises(NumericalError, match="noise covariance of row 4"):
+@pytest.mark.parametrize("covariances", [False, True])
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
+def test_noise_must_be_positive(covariances, value):
+    given_problem, place = problem(count=6, outputs=3), (4, 1, 1) if covariances else (4, 1)
+    noise = torch.diag_embed(given_problem.noise) if covariances else given_problem.noise
+    noise[place] = value
+    given_problem.noise = noise.requires_grad_()
+    with pytest.raises(NumericalError, match="covariance of row 4" if covariances else "variances must be positive"):
         negative_log_likelihood(*given_problem.data, given_problem.kernels(given_problem.features))
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from forcegp.data import Dataset, Preparation, preparation_report, resample, uniform_step
 from forcegp.data.dataset import ROTATION, TRANSLATION
 from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST, motion_spectrum
-from forcegp.data.views import consecutive, move_on, runs, white_noise, whole_windows, window_means
+from forcegp.data.views import consecutive, move_on, resolution, runs, white_noise, whole_windows, window_means
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.forces import JointLaw
 from forcegp.model import Model
@@ -185,11 +185,6 @@ def _drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
         for start, stop in zeros[sudden] if sudden.sum() >= FEWEST_DROPS else []:
             lost[start:stop, joint] = True
     return lost
-
-
-def resolution(values: Float[np.ndarray, " rows"]) -> float:
-    """The least step between two values of a channel that is not constant."""
-    return float(np.diff(np.unique(np.round(values / np.ptp(values), 9))).min() * np.ptp(values))
 
 
 def _few_stretches(dataset: Dataset) -> Dataset:

@@ -248,8 +248,9 @@ class Offset(JointLaw):
 
 @dataclass(frozen=True, eq=False)
 class Spring(JointLaw):
-    """-k (q - q0): a spring of `stiffness` k (Nm/rad or N/m) in each joint, at rest at the position `rest` q0."""
+    """-k (q - q0): a spring of `stiffness` k (Nm/rad or N/m) between links, at rest at the position `rest` q0."""
 
+    in_gear: ClassVar[bool] = False
     stiffness: Number = None
     rest: Number = None
     coefficients: ClassVar[Mapping[str, Coefficient]] = {
