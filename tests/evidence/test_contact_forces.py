@@ -79,6 +79,12 @@ def with_imu(log):
     return replace(log, measured={**log.measured, ACCELEROMETER: values})
 
 
+def assert_slopes(residual, x, slopes):
+    for k, step in enumerate(1e-6 * np.eye(len(x))):
+        numeric = (residual(x + step) - residual(x - step)) / 2e-6
+        np.testing.assert_allclose(slopes[..., k], numeric, atol=1e-5 * (1.0 + abs(numeric).max()))
+
+
 def test_stacked_rows_have_the_density_of_one_large_gaussian():
     model = replace(on_plane(JointForces(("q",))), noise=Noise(0.05, 0.02, learn=True, sensor=(0.3, 0.2, 0.2, 0.2)))
     log = with_imu(measured(on_plane(Viscous(0.7)), model.known, rows=12, noise=0.05))
@@ -114,17 +120,11 @@ def test_slopes_of_stacked_residuals_are_those_of_finite_differences(contact):
     rows = RecordedRows(space, log.q, log.v, log.u, any_contact=True, sensed=log.measured)
     x = 0.3 + 0.1 * np.random.default_rng(1).standard_normal(space.size)
 
-    def residual(x):
-        return rows.in_acceleration(x, log.a)[0]
-
     r, Y, in_terms = rows.in_acceleration(x, log.a)
     slopes = np.concatenate([space.bodies.chained(x[: space.bodies.size], Y), in_terms], axis=-1)
     assert r.shape[1] == 3 + (3 if contact is held else 1) + 3
     assert rows.felt_noise.tolist() == [0.1, 0.2, 0.3]
-    for k in range(space.size):
-        step = 1e-6 * np.eye(space.size)[k]
-        numeric = (residual(x + step) - residual(x - step)) / 2e-6
-        np.testing.assert_allclose(slopes[..., k], numeric, atol=2e-6 * (1.0 + abs(numeric).max()))
+    assert_slopes(lambda x: rows.in_acceleration(x, log.a)[0], x, slopes)
 
 
 def test_gains_are_found_beside_a_sensor_and_not_without():
@@ -153,10 +153,7 @@ def test_friction_under_load_counts_the_gain():
     x = space.start + 0.05
     motion = rows.moving(free.a)
     in_x = rows.in_torque(x, motion)[2]
-    for k in range(space.size):
-        step = 1e-6 * np.eye(space.size)[k]
-        numeric = (rows.in_torque(x + step, motion)[0] - rows.in_torque(x - step, motion)[0]) / 2e-6
-        np.testing.assert_allclose(in_x[..., k], numeric, atol=1e-5 * (1.0 + abs(numeric).max()))
+    assert_slopes(lambda x: rows.in_torque(x, motion)[0], x, in_x)
     found = fit(model, free, Torques()).parameters
     assert [found[f"gain.{j}"].value for j in ("pan", "lift", "bend")] == pytest.approx([0.8, 0.9, 1.2], rel=1e-3)
 
