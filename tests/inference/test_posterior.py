@@ -154,7 +154,9 @@ def test_the_engine_follows_rows_features_and_memory(free):
     assert choose_engine(replace(SIZE, rows=1500), CPU).engine == Exact()
     assert choose_engine(replace(SIZE, rows=8000), CPU).engine == Exact()  # rN = 16,000
     assert choose_engine(replace(SIZE, rows=8001), CPU).engine == Inducing(points=1000)
-    assert choose_engine(replace(SIZE, rows=60_000), CPU).engine == Inducing(points=1000)
+    chosen = choose_engine(replace(SIZE, rows=60_000), CPU)
+    assert chosen.engine == Inducing(points=1000)
+    assert chosen.reason.startswith("inducing: the exact covariance of 60000 rows needs")
     assert choose_engine(replace(SIZE, rows=1501, features=3), CPU).engine == Inducing()
     assert choose_engine(replace(SIZE, rows=1501, features=4), CPU).engine == Exact()
     assert choose_engine(replace(SIZE, rows=1501, features=3), CPU, inducing=False).engine == Exact()
