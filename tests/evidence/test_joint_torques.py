@@ -156,7 +156,11 @@ def test_from_columns_that_are_clipped_to_a_fit(tmp_path):
     assert abs(found.value - GAIN[1]) < 0.02
     done = run_here("payload", "log.h5", "--forces", "gain,viscous,coulomb,rotor", folder=tmp_path)
     assert "as right as the torques of the log" in done.stderr
+    two = {name: x for name, x in rows.measured.items() if "lift" not in name}
+    replace(rows, measured=two).save(tmp_path / "two.h5")
+    refused = run_here("payload", "log.h5", "--baseline", "two.h5", folder=tmp_path)
+    assert "a baseline needs torque sensors at the same links as the log" in refused.stderr
     mass = next(line.split() for line in done.stdout.splitlines() if line.split()[:1] == ["mass"])
     assert abs(float(mass[2])) < 0.01  # it carries nothing; without the sensors .1 +- .2 kg
     said = check(changed(lift=np.maximum(at("lift"), -2.9))).doubts.of("saturation")
-    assert f"sensor torque.lift (x) stays at its smallest value -2.9 in {clipped} rows of motion" in str(said)
+    assert f"sensor torque.lift (torque) stays at its smallest value -2.9 in {clipped} rows of motion" in str(said)

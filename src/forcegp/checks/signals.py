@@ -221,7 +221,8 @@ def _clipped(inputs: CheckInput) -> Iterator[Doubt]:
     moves = speed > MOVES * np.sqrt(np.square(speed).mean(axis=0))
     channels = [(f"torque of {name}", (name,), log.u[:, j], moves[:, j]) for j, name in enumerate(inputs.names)]
     for name, values in log.measured.items():
-        channels += [(f"sensor {name} ({axis})", (), x, moves.any(1)) for axis, x in zip("xyz", values.T, strict=False)]
+        axes = "xyz" if len(values.T) == 3 else ("torque",)
+        channels += [(f"sensor {name} ({axis})", (), x, moves.any(1)) for axis, x in zip(axes, values.T, strict=True)]
     for which, joints, values, moving in channels:
         for extreme, there in ends_of_range(values, moving):
             start, stop = max(runs(there).tolist(), key=lambda run: run[1] - run[0])

@@ -20,7 +20,6 @@ from forcegp.cli.fit import estimates_table, quick_doubts, write_estimates
 from forcegp.cli.logs import FilterOptions
 from forcegp.cli.robot_options import SYSTEM_FILE, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal
-from forcegp.data.dataset import TORQUE
 from forcegp.errors import InvalidInput
 
 WINDOW = 0.4
@@ -87,10 +86,11 @@ class Payload(Command):
                 write_estimates(folder, found, "loaded")
                 if self.mass is not None:
                     write_text(folder / SYSTEM_FILE, calibrated(found).to_json() + "\n")
-        known = "torques of the log" if _at_links(rows) or not model.actuation.learned else "masses of the URDF"
-        known = (
-            known if self.mass is None else f"{known} and the payload's mass" if baseline is None else "payload's mass"
-        )
+        known, sensors = "torques of the log", forcegp.JointTorques()
+        if model.actuation.learned and not sensors.names(rows):
+            known = "masses of the URDF"
+        if self.mass is not None:
+            known = f"{known} and the payload's mass" if baseline is None else "payload's mass"
         notes.append(f"numbers are as right as the {known}: a factor of these is one of all masses")
         content["conditional_on"] = known
         for note in notes:
@@ -133,13 +133,10 @@ def with_payload(
     """The posterior of a model that carries something, of this `mass`; with a baseline links are estimated, too."""
     bodies = () if baseline is None else (forcegp.RigidBodies("all"),)
     noisy = "u" if model.robot.space.is_vector_space else "both"
-    evidence = (forcegp.Torques(noisy, mean=WINDOW), *[forcegp.JointTorques()] * _at_links(rows))
+    sensors = forcegp.JointTorques()
+    evidence = (forcegp.Torques(noisy, mean=WINDOW), *[sensors] * bool(sensors.names(rows)))
     loaded = model.with_forces(*bodies, forcegp.Payload(link, mass, None))
     return forcegp.scores.learn(loaded, rows, evidence, baseline=baseline)[0]
-
-
-def _at_links(rows: forcegp.Dataset) -> bool:
-    return any(name.startswith(TORQUE) for name in rows.measured)
 
 
 def calibrated(found: Any) -> forcegp.Model:

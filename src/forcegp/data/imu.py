@@ -76,7 +76,7 @@ def delay_doubts(
         yield look(about="sensor delay", what=what, do="Shift its columns before an import.", numbers={"delay": late})
 
 
-def _rms(values: Float[np.ndarray, "rows 3"]) -> float:
+def _rms(values: Float[np.ndarray, "rows k"]) -> float:
     return float(np.sqrt(np.square(values).sum(1).mean()))
 
 

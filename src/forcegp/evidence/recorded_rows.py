@@ -164,7 +164,7 @@ class RecordedRows:
         self.felt_noise, self.link_noise = np.split(level, [3 * len(imus)])
         self.links = [robot.joint_names.index(name.removeprefix(TORQUE)) for name in at_links]
         """Joints with a torque sensor at the link, which measured `at_links` (rows, k)."""
-        self._equations = [*range(robot.nv), *self.links]
+        self.equations = [*range(robot.nv), *self.links]
         self.at_links = np.concatenate([np.zeros((len(self.v), 0)), *at_links.values()], axis=1)
         self.sensed = sensed = {n.removeprefix(FORCE): x for n, x in (sensed or {}).items() if n.startswith(FORCE)}
         arms = {frame: arm(self.kinematics, model, frame).cpu().numpy() for frame in sensed}
@@ -220,7 +220,7 @@ class RecordedRows:
         fixed = fixed - self.at_contacts if given else fixed
         regressor = Y[:, :, self._carriers] * self._there[:, None]
         beside = (fixed - a @ (self.inertia + self._armature) + self.in_gears)[:, self.links] - self.at_links
-        return Motion(a, regressor[:, self._equations], np.concatenate([fixed, beside], axis=1))
+        return Motion(a, regressor[:, self.equations], np.concatenate([fixed, beside], axis=1))
 
     def by_body(self, a: Rows) -> Float[np.ndarray, "rows nv bodies"]:
         """What each body needs, without what is estimated of it."""

@@ -62,8 +62,9 @@ class Equations:
         held = [part.open if evidence.of_torque else part.held for part in self.parts]
         most = max(each.shape[1] for each in held)  # zeros where a log has fewer directions of contact forces
         self.held = np.concatenate([np.pad(each, ((0, 0), (0, most - each.shape[1]), (0, 0))) for each in held])
-        self.links = self.parts[0].links
-        each = [*range(space.model.robot.nv), *self.links]
+        self.links, each = self.parts[0].links, self.parts[0].equations
+        if any(part.links != self.links for part in self.parts):
+            raise InvalidInput("a baseline needs torque sensors at the same links as the log; leave others out.")
         self.sizes, self.hidden = space.typical["force"][each], self.held[:, :, each]
         """Of the equations of joints and of sensors at links: typical torques, and directions that contacts hide."""
         gains = any(isinstance(space.model.laws[term.law], Actuation) for term in space.terms)
