@@ -30,7 +30,7 @@ from .simulation import KukaSurfaceConfig as KukaSurfaceConfig, simulate_kuka_su
 # learning from it
 from .evidence import (
     Accelerations as Accelerations, ContactForces as ContactForces, FrameAcceleration as FrameAcceleration,
-    Motions as Motions, Torques as Torques,
+    JointTorques as JointTorques, Motions as Motions, Torques as Torques,
 )
 from .fit import fit as fit
 from .posterior import (

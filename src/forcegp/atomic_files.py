@@ -128,7 +128,7 @@ def read_json(path: Path, remedy: str) -> dict[str, Any]:
     """Return the JSON object in a file. Raises FileFormatError, which ends in the remedy, for anything else."""
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # also numbers of 5000 digits
         raise FileFormatError(f"{path} is half written or damaged ({error}); {remedy}.") from None
     if not isinstance(stored, dict):
         raise FileFormatError(f"{path} is damaged; {remedy}.")

@@ -61,22 +61,18 @@ def change(file: Path, name: str, values: object = None) -> None:
             opened[name] = values
 
 
-@pytest.mark.parametrize("kind", ["another", 1.0, np.zeros(0), h5py.Empty("f8")], ids=repr)
-def test_files_of_another_kind_are_refused(file, kind):
-    with h5py.File(file, "a") as opened:
-        opened.attrs["format"] = kind
-    assert not is_dataset(file)
-    with pytest.raises(FileFormatError, match="not a forcegp dataset"):
-        Dataset.load(file)
+OTHERS = {"format": ["another", 1.0, np.zeros(0), h5py.Empty("f8")], "format_version": [2, 1000, 0, -1, "one", 1.5]}
 
 
-@pytest.mark.parametrize("version", [2, 1000, 0, -1, "one", 1.5])
-def test_another_version_is_refused(file, version):
+@pytest.mark.parametrize(
+    ("name", "value"), [(name, each) for name, values in OTHERS.items() for each in values], ids=repr
+)
+def test_files_of_another_kind_or_version_are_refused(file, name, value):
     with h5py.File(file, "a") as opened:
-        opened.attrs["format_version"] = version
-    with pytest.raises(
-        FileFormatError, match=rf"format version .*{version}.*; this forcegp .* reads 1\. Use what wrote"
-    ):
+        opened.attrs[name] = value
+    assert is_dataset(file) == (name == "format_version")
+    said = rf"format version .*{value}.*; this forcegp .* reads 1\. Use what wrote"
+    with pytest.raises(FileFormatError, match=said if name == "format_version" else "not a forcegp dataset"):
         Dataset.load(file)
 
 

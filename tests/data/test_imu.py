@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from tests.posterior.arm import URDF, arm_model
+from tests.evidence.arm_in_mujoco import followed
+from tests.posterior.arm import arm_model
 from tests.robots.mjcf_models import QUADRUPED
 from tests.robots.mujoco_oracle import MujocoOracle, states
 from tests.robots.test_mjcf import read
@@ -22,7 +23,7 @@ from forcegp.doubts import Doubts
 mujoco = untyped
 POINT, TURN = (0.03, -0.02, 0.1), (0.3, -0.5, 1.0)
 NAME = f"{IMU}hand@{','.join(map(str, (*POINT, *TURN)))}"
-RATE, MIDDLE = 500, np.array([0.0, 0.6, 0.7])
+RATE = 500
 
 
 def with_accelerometer(spec, body):
@@ -44,26 +45,9 @@ def test_specific_forces_of_a_moving_base_are_those_of_mujoco():
 
 @cache
 def recorded():
-    """An arm in MuJoCo with viscous friction that follows sines: as it was, and with an encoder and derived v and a."""
-    spec = mujoco.MjSpec.from_string(URDF)
-    spec.option.timestep, spec.option.integrator = 0.5 / RATE, mujoco.mjtIntegrator.mjINT_RK4
-    model = with_accelerometer(spec, "hand")
-    model.dof_damping[:], model.dof_frictionloss[:] = [0.8, 0.7, 0.5], 0.0
-    data, rng, out = mujoco.MjData(model), np.random.default_rng(0), []
-    f, shift = rng.uniform(0.2, 1.1, (3, 4)), rng.uniform(0.0, 6.0, (3, 4))
-    size = np.array([[0.25], [0.15], [0.2]]) / f**0.7
-    for k in range(16 * RATE):
-        phase = np.pi * f * k / RATE + shift
-        q, v = MIDDLE + (size * np.sin(phase)).sum(1), (size * 2.0 * np.pi * f * np.cos(phase)).sum(1)
-        if not k:
-            data.qpos[:], data.qvel[:] = q, v
-        mujoco.mj_forward(model, data)
-        data.qfrc_applied[:] = data.qfrc_bias + [60, 60, 25] * (q - data.qpos) + [6, 6, 2.5] * (v - data.qvel)
-        if not k % 2:
-            mujoco.mj_forward(model, data)
-            out.append(np.array([data.qpos, data.qvel, data.qfrc_applied, data.qacc, data.sensordata]))
-        mujoco.mj_step(model, data)
-    (q, v, u, a, f), time = np.array(out).transpose(1, 0, 2), np.arange(len(out)) / RATE
+    """An arm with viscous friction that follows sines: as it was, and with an encoder and derived v and a."""
+    (q, v, u, a, f), rng = followed(lambda spec: with_accelerometer(spec, "hand"), 8, RATE, 2)
+    time = np.arange(len(q)) / RATE
     true = Dataset(q=q, v=v, u=u, a=a, time=time, model=arm_model(0), measured={NAME: f})
     q, (u, f) = np.round(q / 5e-4) * 5e-4, (x + 0.05 * rng.standard_normal(x.shape) for x in (u, f))
     v = np.gradient(q, time, axis=0)

@@ -9,9 +9,9 @@ import torch
 from tests.forces.world_forces import WorldForces
 from tests.posterior.arm import arm_data, arm_model
 
-from forcegp import Accelerations, ContactForces, Torques, fit, load_posterior, save_posterior
+from forcegp import Accelerations, ContactForces, JointTorques, Torques, fit, load_posterior, save_posterior
 from forcegp.data import Dataset, Preparation, low_pass, resample, with_memory
-from forcegp.data.dataset import FORCE, IMU
+from forcegp.data.dataset import FORCE, IMU, TORQUE
 from forcegp.data.imu import specific_force
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 from forcegp.evidence.likelihood import MarginalLikelihood, TrainingData
@@ -79,6 +79,12 @@ def with_imu(log):
     return replace(log, measured={**log.measured, ACCELEROMETER: values})
 
 
+def assert_slopes(residual, x, slopes):
+    for k, step in enumerate(1e-6 * np.eye(len(x))):
+        numeric = (residual(x + step) - residual(x - step)) / 2e-6
+        np.testing.assert_allclose(slopes[..., k], numeric, atol=1e-5 * (1.0 + abs(numeric).max()))
+
+
 def test_stacked_rows_have_the_density_of_one_large_gaussian():
     model = replace(on_plane(JointForces(("q",))), noise=Noise(0.05, 0.02, learn=True, sensor=(0.3, 0.2, 0.2, 0.2)))
     log = with_imu(measured(on_plane(Viscous(0.7)), model.known, rows=12, noise=0.05))
@@ -114,29 +120,26 @@ def test_slopes_of_stacked_residuals_are_those_of_finite_differences(contact):
     rows = RecordedRows(space, log.q, log.v, log.u, any_contact=True, sensed=log.measured)
     x = 0.3 + 0.1 * np.random.default_rng(1).standard_normal(space.size)
 
-    def residual(x):
-        return rows.in_acceleration(x, log.a)[0]
-
     r, Y, in_terms = rows.in_acceleration(x, log.a)
     slopes = np.concatenate([space.bodies.chained(x[: space.bodies.size], Y), in_terms], axis=-1)
     assert r.shape[1] == 3 + (3 if contact is held else 1) + 3
     assert rows.felt_noise.tolist() == [0.1, 0.2, 0.3]
-    for k in range(space.size):
-        step = 1e-6 * np.eye(space.size)[k]
-        numeric = (residual(x + step) - residual(x - step)) / 2e-6
-        np.testing.assert_allclose(slopes[..., k], numeric, atol=2e-6 * (1.0 + abs(numeric).max()))
+    assert_slopes(lambda x: rows.in_acceleration(x, log.a)[0], x, slopes)
 
 
 def test_gains_are_found_beside_a_sensor_and_not_without():
     truth = held(Actuation(gain=[0.8, 0.9, 1.2]), Viscous(0.5))
     log = measured(truth, held())
     model = held(Actuation(gain=LogNormal(1.0, 0.3)), Viscous())
-    found = fit(model, log).parameters
-    for joint, gain in zip(("pan", "lift", "bend"), (0.8, 0.9, 1.2), strict=True):
-        assert found[f"gain.{joint}"].value == pytest.approx(gain, abs=2e-3)
-        assert found[f"viscous.{joint}"].value == pytest.approx(0.5, abs=2e-2)
+    gains = dict(zip(("pan", "lift", "bend"), (0.8, 0.9, 1.2), strict=True))
+    behind = {f"{TORQUE}{name}": (gain * log.u - 0.5 * log.v)[:, [j]] for j, (name, gain) in enumerate(gains.items())}
     alone = fit(model, log, Torques()).parameters
-    assert alone["gain.bend"].std > 3.0 * found["gain.bend"].std
+    for sensors in (log.measured, behind):  # at the hand, or behind the gears, which do not see the hand
+        found = fit(model, replace(log, measured=sensors)).parameters
+        for joint, gain in gains.items():
+            assert found[f"gain.{joint}"].value == pytest.approx(gain, abs=2e-3)
+            assert found[f"viscous.{joint}"].value == pytest.approx(0.5, abs=2e-2)
+        assert alone["gain.bend"].std > 2.0 * found["gain.bend"].std
 
 
 def test_friction_under_load_counts_the_gain():
@@ -150,10 +153,7 @@ def test_friction_under_load_counts_the_gain():
     x = space.start + 0.05
     motion = rows.moving(free.a)
     in_x = rows.in_torque(x, motion)[2]
-    for k in range(space.size):
-        step = 1e-6 * np.eye(space.size)[k]
-        numeric = (rows.in_torque(x + step, motion)[0] - rows.in_torque(x - step, motion)[0]) / 2e-6
-        np.testing.assert_allclose(in_x[..., k], numeric, atol=1e-5 * (1.0 + abs(numeric).max()))
+    assert_slopes(lambda x: rows.in_torque(x, motion)[0], x, in_x)
     found = fit(model, free, Torques()).parameters
     assert [found[f"gain.{j}"].value for j in ("pan", "lift", "bend")] == pytest.approx([0.8, 0.9, 1.2], rel=1e-3)
 
@@ -273,10 +273,12 @@ class TestLogsOfSensors:
         return measured(on_plane(Viscous(0.7)), on_plane(), rows=80)
 
     def test_a_sensor_goes_through_files_filters_and_choices_of_rows(self, log, tmp_path):
-        log = replace(log, time=0.01 * np.arange(80), a=0.0 * log.a)
+        behind = {f"{TORQUE}lift": log.u[:, :1]}
+        log = replace(log, time=0.01 * np.arange(80), a=0.0 * log.a, measured=log.measured | behind)
         log.save(tmp_path / "log.h5")
         again = Dataset.load(tmp_path / "log.h5")
-        assert np.array_equal(again.measured[SENSOR], log.measured[SENSOR])
+        for name, values in log.measured.items():
+            assert np.array_equal(again.measured[name], values)
         assert np.array_equal(again.rows([3, 5]).measured[SENSOR], log.measured[SENSOR][[3, 5]])
         slow = replace(log, q=np.zeros_like(log.q), measured={SENSOR: np.ones((80, 3))})
         assert low_pass(slow, 5.0).measured[SENSOR] == pytest.approx(np.ones((80, 3)))
@@ -285,7 +287,8 @@ class TestLogsOfSensors:
     @pytest.mark.parametrize(
         ("given", "words"),
         [
-            ({"torque.hand": np.zeros((80, 3))}, "allowed: force.FRAME"),
+            ({"weight.hand": np.zeros((80, 3))}, "allowed: force.FRAME"),
+            ({"torque.hand": np.zeros((80, 1))}, "joint 'hand'"),
             ({SENSOR: np.zeros((80, 2))}, r"expected \(rows, 3\)"),
             ({SENSOR: np.full((80, 3), np.nan)}, "not finite"),
             ({"imu.hand@1,2": np.zeros((80, 3))}, "no place in its frame"),
@@ -303,6 +306,9 @@ class TestLogsOfSensors:
             fit(on_plane(Viscous()), replace(log, measured={}), [Torques(), ContactForces()])
         with pytest.raises(InvalidInput, match="beside torques"):
             fit(on_plane(Viscous()), log, [Accelerations(), ContactForces()])
+        behind = replace(log, measured={f"{TORQUE}lift": log.u[:, :1]})
+        with pytest.raises(InvalidInput, match="torque sensors at links teach numbers of laws and bodies, beside"):
+            fit(on_plane(JointForces()), behind, [Accelerations(), JointTorques()])
         with pytest.raises(InvalidInput, match="has no contact"):
             fit(arm_model(0).with_forces(JointForces()), log, [Accelerations(), ContactForces()])
         with pytest.raises(InvalidInput, match="noise of contact-forces"):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, lsq_linear
 
-from forcegp.evidence.least_squares import Chained, Regressor, _step, correlation_time, weighted_least_squares
+from forcegp.evidence.least_squares import Chained, Regressor, correlation_time, step_within, weighted_least_squares
 
 TRUTH = np.array([1.0, -0.5, 0.3])
 
@@ -58,7 +58,7 @@ def test_steps_within_bounds_are_nearly_those_of_lsq_linear(seed):
     bounds = low * [1.0, 1.0, 0.0, 1.0, 1.0], low + 0.2
     J, target = (A / noise[:, None]).reshape(-1, 5), (y / noise).ravel()
     best = lsq_linear(J, target, bounds, tol=1e-12)
-    step = _step(-J.T @ target, J.T @ J, *bounds)
+    step = step_within(-J.T @ target, J.T @ J, *bounds)
     slope, inside = J.T @ (J @ step - target), (step > bounds[0]) & (step < bounds[1])
     np.testing.assert_allclose(slope[inside], 0.0, atol=1e-9 * abs(J.T @ target).max())
     assert ((bounds[0] <= step) & (step <= bounds[1])).all()

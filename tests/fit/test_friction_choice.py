@@ -193,10 +193,8 @@ def test_stated_numbers_are_left_as_they_are():
 
 @pytest.mark.parametrize("noise", [None, Noise((0.3, 0.2, 0.5), (0.05, 0.1, 0.02))], ids=["forces", "both"])
 def test_normal_equations_are_those_of_weighted_least_squares(noise):
-    log, model = (
-        log_with(lambda v, rigid: LEVEL * (1.0 + np.sqrt(np.abs(v))) * sign(v)).rows(slice(None, None, 5)),
-        arm_model(0).with_forces(Viscous(0.0), Coulomb(0.0)),
-    )
+    log = log_with(lambda v, rigid: LEVEL * (1.0 + np.sqrt(np.abs(v))) * sign(v)).rows(slice(None, None, 5))
+    model = arm_model(0).with_forces(Viscous(0.0), Coulomb(0.0))
     P, torque = _precision(model, log, noise), motion_residuals(log, model)[0]
     state = model.state(*(torch.tensor(np.array(x)) for x in (log.q, log.v, log.u)))
     regression = _Regression(P, Coulomb(), log, state, torque)

@@ -223,7 +223,7 @@ def test_rotor_inertias_are_whole_in_reports_and_in_files(tmp_path):
 def test_searches_beside_noise_of_accelerations_end_where_little_is_left_to_gain():
     one, gains = np.ones(1), iter([5.0, 1.0, 0.06, 0.03, 0.0])  # nats, of two numbers
     levels = SimpleNamespace(scaled=lambda factor: None)
-    equations = SimpleNamespace(levels=lambda *_: levels, parts=[], measured=[], a=one[None], whitened=max)
+    equations = SimpleNamespace(levels=lambda *_: levels, parts=[], measured=[], sizes=one, whitened=max)
 
     def search(*_, start, **more) -> Fit:
         return Fit(start, one[None], np.zeros((1, 1, 2)), one, np.eye(2), 1, True, expected=next(gains))

@@ -91,35 +91,24 @@ class UnknownConformance:
             return fit(model, data, restarts=1, options=OptimizerOptions(iterations=3))
 
     def values(self, model, *states) -> torch.Tensor:
-        """Mixing and features of one state as one vector."""
+        """Mixing and features of each state as one vector."""
         dynamics = model.dynamics(*states)
-        return torch.cat([self.prior.direction(dynamics).flatten(), *self.prior.features(dynamics)])
-
-    def rows(self, model, *states) -> torch.Tensor:
-        """The same, one row for each of several states."""
-        dynamics = model.dynamics(*states)
-        return torch.cat([self.prior.direction(dynamics).flatten(1), *self.prior.features(dynamics)], dim=-1)
+        return torch.cat([self.prior.direction(dynamics).flatten(-2), *self.prior.features(dynamics)], dim=-1)
 
     @pytest.mark.parametrize("batch", BATCHES, ids=str)
     def test_shapes_names_and_units_agree(self, model, batch):
         robot, dynamics = model.robot, model.dynamics(*some_states(*batch))
         names = self.prior.latent_names(robot)
-        B, features, point_force = (
-            self.prior.direction(dynamics),
-            self.prior.features(dynamics),
-            self.prior.point_force(dynamics),
-        )
+        B, features = self.prior.direction(dynamics), self.prior.features(dynamics)
+        point_force = self.prior.point_force(dynamics)
         assert len(set(names)) == len(names)
         assert B.shape == (*batch, robot.nv, len(names))
         assert all(z.shape[:-1] == batch and z.dim() == len(batch) + 1 for z in features)
         assert point_force is None or point_force.shape == (*batch, 3, len(names))
         assert all(value.dtype == torch.float64 for value in (B, *features))
         assert all(bool(torch.isfinite(value).all()) for value in (B, *features))
-        scalings, labels, units = (
-            self.prior.scalings(robot),
-            self.prior.feature_names(robot),
-            self.prior.latent_units(robot),
-        )
+        scalings, labels = self.prior.scalings(robot), self.prior.feature_names(robot)
+        units = self.prior.latent_units(robot)
         assert len(features) == len(scalings) == len(units) == len(names)
         assert all(isinstance(text, str) for text in (*names, *units))
         for scaling, z in zip(scalings, features, strict=True):
@@ -145,7 +134,7 @@ class UnknownConformance:
     def test_every_state_stands_for_itself_under_vmap_too(self, model):
         states = some_states(4)
         single = torch.stack([self.values(model, *(x[row] for x in states)) for row in range(4)])
-        assert_close(self.rows(model, *states), single, 1e-12)
+        assert_close(self.values(model, *states), single, 1e-12)
         mapped = torch.func.vmap(lambda *given: self.values(model, *given))(*states)
         assert_close(mapped, single, 1e-12)
 
@@ -153,7 +142,9 @@ class UnknownConformance:
         states = some_states()
         jacobians = torch.func.jacrev(lambda *given: self.values(model, *given), (0, 1, 2))(*states)
         steps = STEP * torch.eye(9, dtype=torch.float64)
-        ahead, behind = (self.rows(model, *(torch.cat(states) + sign * steps).split(3, dim=-1)) for sign in (1.0, -1.0))
+        ahead, behind = (
+            self.values(model, *(torch.cat(states) + sign * steps).split(3, dim=-1)) for sign in (1.0, -1.0)
+        )
         assert_close(torch.cat(jacobians, dim=-1), (ahead - behind).mT / (2.0 * STEP), 1e-6)
 
     def test_values_and_derivatives_are_finite_at_rest(self, model):
@@ -206,9 +197,8 @@ class UnknownConformance:
         assert all(map(torch.equal, total.features(dynamics), given))
         count = len(self.prior.latent_names(model.robot))
         assert total.slices(model.robot)[-1] == slice(count, count + 3)
-        assert [which.start for which in total.slices(model.robot)[1:]] == [
-            which.stop for which in total.slices(model.robot)[:-1]
-        ]
+        ends = [[which.start, which.stop] for which in total.slices(model.robot)]
+        assert [start for start, _ in ends[1:]] == [stop for _, stop in ends[:-1]]
         names = total.latent_names(model.robot)
         assert len(set(names)) == len(names) == count + 3
         assert names[count].startswith("joint-position-forces")

@@ -43,22 +43,14 @@ class TestTabulatedCurve:
     at, values = (-1.0, -0.5, 0.25, 2.0), (3.0, -1.0, 0.5, 0.0)
 
     def test_it_is_linear_in_between_and_beyond(self):
-        x = torch.linspace(-3.0, 4.0, 41, dtype=torch.float64).reshape(41, 1)
+        x = torch.cat([torch.tensor(self.at), torch.linspace(-3.0, 4.0, 41)]).double()[:, None]
         line = interp1d(self.at, self.values, fill_value="extrapolate")
         found = TabulatedCurve(self.at, self.values)(x)
         torch.testing.assert_close(found, torch.tensor(line(x.numpy())), rtol=1e-13, atol=1e-13)
 
-    def test_it_holds_the_values_at_the_places(self):
-        found = TabulatedCurve(self.at, self.values)(torch.tensor(self.at, dtype=torch.float64))
-        torch.testing.assert_close(found, torch.tensor(self.values, dtype=torch.float64), rtol=0.0, atol=1e-15)
-
     def test_gradients(self):
         x = torch.tensor([-2.0, -0.7, 0.1, 1.0, 5.0], dtype=torch.float64, requires_grad=True)
-        curve = TabulatedCurve(self.at, self.values)
-        assert torch.autograd.gradcheck(curve, x)
-        (slope,) = torch.autograd.grad(curve(x).sum(), x)
-        expected = torch.tensor([-8.0, -8.0, 2.0, -2.0 / 7.0, -2.0 / 7.0], dtype=torch.float64)
-        torch.testing.assert_close(slope, expected, rtol=1e-13, atol=0.0)
+        assert torch.autograd.gradcheck(TabulatedCurve(self.at, self.values), x)
 
     @pytest.mark.parametrize(
         ("at", "values", "message"),

@@ -209,18 +209,14 @@ def test_noise_of_an_encoder_does_not_wear_the_state_down():
 def test_what_a_log_does_not_tell_of_memory_is_said(kind, lugre_log):  # the fixture
     log, few = lugre_log.rows(slice(0, 3000)), 1000
     if kind == "short":
-        log, said = (
-            replace(log, episode=np.arange(3000) // 10),
-            r"counts as 0 before the first row .* in \d\d% of the rows",
-        )
+        log = replace(log, episode=np.arange(3000) // 10)
+        said = r"counts as 0 before the first row .* in \d\d% of the rows"
     elif kind == "coarse":
         log, said = replace(log, q=np.round(log.q / 2e-3) * 2e-3), r"larger than the ways .*: pan \(2\), lift \(2\)"
     else:
         u = arm_model(0).robot.inverse_dynamics(*map(torch.tensor, (log.q, log.v, log.a))).numpy()
-        log, said = (
-            replace(log, u=u + 0.5 * np.sign(log.v)),
-            "sigma of pan, lift, bend is at its bound: it turns sooner",
-        )
+        log = replace(log, u=u + 0.5 * np.sign(log.v))
+        said = "sigma of pan, lift, bend is at its bound: it turns sooner"
     with pytest.warns(DataWarning, match=said):
         fit(arm_model(0).with_forces(Viscous(), Coulomb(memory=True)), log, Torques(), rows=few)
 

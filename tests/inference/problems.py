@@ -9,8 +9,21 @@ from gpytorch.kernels import RBFKernel, ScaleKernel
 from forcegp.codegen.c_writer import Program, head, write_entry, write_function
 from forcegp.codegen.graph import Graph, jacobian
 from forcegp.codegen.library import RowFunction, aligned, compile_library
-from forcegp.inference import LatentKernels, Terms
+from forcegp.inference import ExactPosterior, LatentKernels, Terms
 from forcegp.inference.prepared_kernels import KernelSum
+
+SHAPES = {
+    "no constraint": {"constraints": 0},
+    "one constraint": {"constraints": 1},
+    "three constraints": {"constraints": 3},
+    "fewer latents than outputs": {"latents": 2, "constraints": 0},
+    "fewer latents than the rank of H": {"latents": 2, "constraints": 1},
+    "more latents than outputs": {"latents": 6, "outputs": 3, "constraints": 1},
+    "one latent": {"latents": 1},
+    "one output": {"outputs": 1, "constraints": 0},
+    "one point": {"count": 1},
+    "two points": {"count": 2},
+}
 
 
 def normal(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -71,6 +84,10 @@ def problem(
         features=[normal(count, dimension, seed=seed + 5 + c) for c in range(W.shape[-1])],
         kernels=squared_exponential_kernels(W.shape[-1], dimension, seed),
     )
+
+
+def condition(given_problem: Problem) -> ExactPosterior:
+    return ExactPosterior.condition(given_problem.kernels, given_problem.terms)
 
 
 def rows_of_call(part: KernelSum, lanes: int, folder: Path) -> RowFunction:

@@ -9,24 +9,11 @@ from gpytorch.kernels import LinearKernel, MaternKernel, RBFKernel, ScaleKernel
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.inference.dense import dense_posterior
-from tests.inference.problems import Problem, normal, problem
+from tests.inference.problems import SHAPES, Problem, condition, normal, problem
 
 from forcegp.errors import InvalidInput, NotEnoughMemory
-from forcegp.inference import ExactPosterior, LatentKernels, engines, memory, posterior
+from forcegp.inference import LatentKernels, engines, memory, posterior
 from forcegp.inference.engines import Exact, Inducing, ProblemSize, choose_engine, engine_from_dict
-
-SHAPES = {
-    "no constraint": {"constraints": 0},
-    "one constraint": {"constraints": 1},
-    "three constraints": {"constraints": 3},
-    "fewer latents than outputs": {"latents": 2},
-    "more latents than outputs": {"latents": 6, "outputs": 3},
-    "one point": {"count": 1},
-}
-
-
-def condition(given_problem: Problem) -> ExactPosterior:
-    return ExactPosterior.condition(given_problem.kernels, given_problem.terms)
 
 
 def new_features(given_problem: Problem, points: int = 6) -> list[torch.Tensor]:
@@ -167,7 +154,9 @@ def test_the_engine_follows_rows_features_and_memory(free):
     assert choose_engine(replace(SIZE, rows=1500), CPU).engine == Exact()
     assert choose_engine(replace(SIZE, rows=8000), CPU).engine == Exact()  # rN = 16,000
     assert choose_engine(replace(SIZE, rows=8001), CPU).engine == Inducing(points=1000)
-    assert choose_engine(replace(SIZE, rows=60_000), CPU).engine == Inducing(points=1000)
+    chosen = choose_engine(replace(SIZE, rows=60_000), CPU)
+    assert chosen.engine == Inducing(points=1000)
+    assert chosen.reason.startswith("inducing: the exact covariance of 60000 rows needs")
     assert choose_engine(replace(SIZE, rows=1501, features=3), CPU).engine == Inducing()
     assert choose_engine(replace(SIZE, rows=1501, features=4), CPU).engine == Exact()
     assert choose_engine(replace(SIZE, rows=1501, features=3), CPU, inducing=False).engine == Exact()
@@ -182,20 +171,12 @@ def test_the_engine_follows_rows_features_and_memory(free):
         choose_engine(SIZE, CPU)
 
 
-@pytest.mark.parametrize(
-    ("kind", "fine", "wrong"),
-    [
-        (Inducing, {"points": 1}, {"points": 0}),
-        (Inducing, {"tolerance": 0.0}, {"tolerance": -1e-9}),
-    ],
-    ids=str,
-)
-def test_settings_up_to_their_bounds(kind, fine, wrong):
-    engine = kind(**fine)
+@pytest.mark.parametrize(("name", "fine", "wrong"), [("points", 1, 0), ("tolerance", 0.0, -1e-9)])
+def test_settings_up_to_their_bounds(name, fine, wrong):
+    engine = Inducing(**{name: fine})
     assert engine_from_dict(engine.to_dict()) == engine
-    ((name, value),) = wrong.items()
-    with pytest.raises(InvalidInput, match=f"{name} is {value!r}"):
-        kind(**wrong)
+    with pytest.raises(InvalidInput, match=f"{name} is {wrong!r}"):
+        Inducing(**{name: wrong})
 
 
 @pytest.mark.parametrize("stored", [None, ["exact"], {"name": "gone"}, {"name": "exact", "points": 3}, {"points": 3}])

@@ -34,10 +34,8 @@ ARM = """<robot name="arm"><link name="base"/>
 ROWS = 24
 
 
-def hopper(base):
-    robot = Robot.from_urdf_text(HOPPER, base=base)
-    if base != "floating":
-        return Model(robot)
+def hopper():
+    robot = Robot.from_urdf_text(HOPPER, base="floating")
     arms = ((0.2, 0.0, 0.0), (-0.1, 0.15, 0.0))
     forces = (Actuation(), Thrusters("trunk", arms, thrust=1.3, torque=(0.05, -0.05)), RigidBodies())
     return Model(robot, fixed_point("foot", (0.0, 0.0, -0.2), switch="stance"), forces)
@@ -60,21 +58,33 @@ def fitted(model, prior, seed=0):
     return posterior, q, v, u
 
 
-@pytest.fixture(
-    scope="module",
-    params=["floating"],
-)
-def case(request):
-    return fitted(hopper(request.param), JointFriction())
+@pytest.fixture(scope="module")
+def case():
+    return fitted(hopper(), JointFriction())
 
 
 @pytest.fixture(scope="module")
 def floating():
-    return fitted(hopper("floating"), JointForces())
+    return fitted(hopper(), JointForces())
 
 
 def close(found, expected, tolerance=1e-10):
     torch.testing.assert_close(found, expected, rtol=0, atol=tolerance * max(1.0, float(expected.abs().max())))
+
+
+def assert_slopes_of_torch(predictor, posterior, states, tolerance=1e-10):
+    found = predictor.linearize(*states)
+    expected = posterior.predictor(covariance="none", compile=False).linearize(*states)
+    for mine, other in zip(found, expected, strict=True):
+        close(mine, other, tolerance)
+    return found
+
+
+def assert_motions_of_torch(predictor, posterior, start, integrator):
+    found, expected = (each(*start, integrator=integrator) for each in (predictor.rollouts, posterior.rollout))
+    for name in "qva":
+        close(getattr(found, name), getattr(expected, name), 1e-9)
+    return found
 
 
 @pytest.mark.parametrize("covariance", ["compressed", "none"])
@@ -96,10 +106,7 @@ def test_derivatives_are_those_in_a_step_from_q(case):
     posterior, q, v, u = case
     space, size = posterior.model.robot.space, 1e-5
     predictor = posterior.predictor(covariance="none")
-    found = predictor.linearize(q, v, u)
-    by_torch = posterior.predictor(covariance="none", compile=False).linearize(q, v, u)
-    for mine, expected in zip(found, by_torch, strict=True):
-        close(mine, expected)
+    found = assert_slopes_of_torch(predictor, posterior, (q, v, u))
     for j in range(space.nv):
         step = torch.zeros(ROWS, space.nv, dtype=torch.float64)
         step[:, j] = size
@@ -123,10 +130,7 @@ def test_compiled_motions_stay_on_the_manifold(case, integrator):
     posterior, q, v, u = case
     u = u[:3, None].expand(-1, 6, -1).clone()
     predictor = posterior.predictor(covariance="none")
-    found = predictor.rollouts(q[:3], v[:3], u, 0.004, integrator=integrator)
-    expected = posterior.rollout(q[:3], v[:3], u, 0.004, integrator=integrator)
-    for name in "qva":
-        close(getattr(found, name), getattr(expected, name), 1e-9)
+    found = assert_motions_of_torch(predictor, posterior, (q[:3], v[:3], u, 0.004), integrator)
     space = posterior.model.robot.space
     close(space.normalized(found.q[:, 1:].contiguous()), found.q[:, 1:], 1e-14)
     assert isinstance(predictor._made.get((integrator, 0, 0)), list) == (integrator != "implicit-midpoint")
@@ -220,16 +224,8 @@ def test_an_arm_with_a_switch(integrator, tmp_path):
     stance = Contact("hand", (0.0, 0.0, 0.2), Plane((0.0, 0.0, 1.0), 0.3), switch="stance")
     posterior, q, v, u = fitted(Model(robot, (stance,)), JointFriction())
     predictor, held, dt = posterior.predictor(covariance="none"), u[:3, None].expand(-1, 6, -1), 0.004
-    for found, expected in zip(
-        predictor.linearize(q, v, u),
-        posterior.predictor(covariance="none", compile=False).linearize(q, v, u),
-        strict=True,
-    ):
-        close(found, expected)
-    found = predictor.rollouts(q[:3], v[:3], held, dt, integrator=integrator)
-    expected = posterior.rollout(q[:3], v[:3], held, dt, integrator=integrator)
-    for name in "qva":
-        close(getattr(found, name), getattr(expected, name), 1e-9)
+    assert_slopes_of_torch(predictor, posterior, (q, v, u))
+    assert_motions_of_torch(predictor, posterior, (q[:3], v[:3], held, dt), integrator)
     step, size = predictor.linearize_step(q, v, u, dt, integrator), 1e-5
     for j in range(3):
         change = torch.eye(3, dtype=torch.float64)[j] * size
@@ -245,6 +241,4 @@ def test_redundant_contacts_have_right_derivatives():
     posterior, q, v, u = fitted(Model(robot, fixed_frame("foot")), JointFriction())
     predictor = posterior.predictor(covariance="none")
     close(predictor.mean(q, v, u), posterior.predict(q, v, u).mean)
-    expected = posterior.predictor(covariance="none", compile=False).linearize(q, v, u)
-    for found, other in zip(predictor.linearize(q, v, u), expected, strict=True):
-        close(found, other, 1e-9)
+    assert_slopes_of_torch(predictor, posterior, (q, v, u), 1e-9)

@@ -78,9 +78,6 @@ class Oracle:
         regressor = pin.computeJointTorqueRegressor(self.model, self.data, *args)
         return regressor.reshape(self.model.nv, -1, 10)[self.columns]
 
-    def kinetic_energy(self, q, v):
-        return pin.computeKineticEnergy(self.model, self.data, self.configuration(q), self._theirs(v))
-
     def carrier(self, link: str):
         """Index of the joint that carries a link (0: the world), and the link's placement (4, 4) in its frame."""
         frame = self.model.frames[self.model.getFrameId(link, pin.FrameType.BODY)]

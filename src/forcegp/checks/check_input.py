@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from forcegp.data import Dataset, Preparation, preparation_report, resample, uniform_step
 from forcegp.data.dataset import ROTATION, TRANSLATION
 from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST, motion_spectrum
-from forcegp.data.views import consecutive, move_on, runs, white_noise, whole_windows, window_means
+from forcegp.data.views import consecutive, move_on, resolution, runs, white_noise, whole_windows, window_means
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.forces import JointLaw
 from forcegp.model import Model
@@ -113,7 +113,10 @@ class CheckInput:
 
             chosen = chosen if chosen.cutoff is None else trimmed(float(chosen.cutoff))
             found["prepared"] = found["compared"] = prepared = chosen.apply(even)
-            lower = COMPARED * float(chosen.cutoff or _earlier(dataset).get("cutoff") or np.inf)
+            report = preparation_report(dataset.metadata)
+            while report and report.get("cutoff") is None:  # to the last one with a filter
+                report = preparation_report({"preparation": report.get("earlier")})
+            lower = COMPARED * float(chosen.cutoff or report.get("cutoff") or np.inf)
             if lower < HIGHEST * 0.5 / uniform_step(even.time[even.episode == even.episode[0]]):
                 with contextlib.suppress(DatasetError):  # too short for that
                     found["compared"] = trimmed(lower).rows(even)
@@ -182,19 +185,6 @@ def _drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
         for start, stop in zeros[sudden] if sudden.sum() >= FEWEST_DROPS else []:
             lost[start:stop, joint] = True
     return lost
-
-
-def resolution(values: Float[np.ndarray, " rows"]) -> float:
-    """The least step between two values of a channel that is not constant."""
-    return float(np.diff(np.unique(np.round(values / np.ptp(values), 9))).min() * np.ptp(values))
-
-
-def _earlier(dataset: Dataset) -> Mapping[str, Any]:
-    """The report of a preparation with a filter that this dataset went through; empty without one."""
-    report = preparation_report(dataset.metadata)
-    while report and report.get("cutoff") is None:
-        report = preparation_report({"preparation": report.get("earlier")})
-    return report
 
 
 def _few_stretches(dataset: Dataset) -> Dataset:

@@ -30,6 +30,7 @@ from forcegp.data.dataset import require_rows
 from forcegp.data.imu import imu_doubts
 from forcegp.doubts import LEVELS, Doubt, Doubts, listed, look
 from forcegp.errors import InvalidInput, require_type
+from forcegp.fit.sensors import torque_sensor_doubts
 from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.summary import Summary, plain
@@ -130,7 +131,7 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
     moved = Doubts(doubts).of("velocity").level != "wrong"
     contacts = contact_doubts(inputs.mended, model)
     if moved and inputs.prepared is not None:
-        doubts += imu_doubts(inputs.prepared, model)
+        doubts += [*imu_doubts(inputs.prepared, model), *torque_sensor_doubts(inputs.prepared, model)]
     doubts += [*contacts, *stance_doubts(inputs.log, model)]
     comparison = None
     if inputs.compared is None or any(each.numbers.get("quantity") == "q" for each in registers):

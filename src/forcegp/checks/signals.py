@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from forcegp.checks.check_input import DEGREE, STEPS, CheckInput, resolution
+from forcegp.checks.check_input import DEGREE, STEPS, CheckInput
 from forcegp.checks.torques import needed_torques
 from forcegp.data import Dataset, differentiate, low_pass
 from forcegp.data.delay import lowest
-from forcegp.data.views import consecutive, runs
+from forcegp.data.views import consecutive, ends_of_range, resolution, runs
 from forcegp.doubts import Doubt, Level, listed, look, ok, wrong
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
@@ -24,16 +24,13 @@ FROZEN_ROWS = 10
 NEEDED = 0.1  # of the largest torque of the joints that have one: less is that of a wrong mass
 PASSIVE = 0.5  # of the inertial torque: a mechanism that swings by itself needs less
 MOVES = 0.2  # of its root mean square speed, above which a joint moves
-CLIPPED_RATIO = 8.0  # rows at the extreme value over rows in the next thousandth of the range: a smooth peak has 2.4
-CLIPPED_ROWS = 10
 
 
 def signal_doubts(inputs: CheckInput) -> list[Doubt]:
     """Constant, frozen and clipped channels, angles that jump."""
     joints = range(inputs.log.nv)
     frozen = chain.from_iterable(_frozen(inputs, name, joint) for name in QUANTITY for joint in joints)
-    clipped = chain.from_iterable(_clipped(inputs, joint) for joint in joints)
-    return [*_jumps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *clipped]
+    return [*_jumps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *_clipped(inputs)]
 
 
 FEWEST_VALUES, GAPS = 5, 8  # on either side of a gap, and how many gaps are looked at
@@ -218,31 +215,29 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
     )
 
 
-def _clipped(inputs: CheckInput, joint: int) -> Iterator[Doubt]:
-    """Torque that stays at its extreme while the joint moves: far more rows there than just below."""
-    log, every = inputs.log, inputs.log.u[:, joint]
-    speed = np.abs(log.v[:, joint])
-    u = every[speed > MOVES * np.sqrt(np.square(speed).mean())]
-    if len(u) < CLIPPED_ROWS or np.ptp(every) == 0.0:
-        return
-    same, width = 1e-9 * np.ptp(u), max(np.ptp(u) / 1000.0, 1.5 * resolution(every))
-    for sign, side in ((1.0, "largest"), (-1.0, "smallest")):
-        extreme = float((sign * every).max())
-        below = extreme - sign * u
-        at = int((below <= same).sum())
-        near = int(((below > same) & (below <= same + width)).sum())
-        extremes = runs(np.abs(every - sign * extreme) <= same).tolist()
-        start, stop = max(extremes, key=lambda run: run[1] - run[0], default=(0, 0))
-        if at >= CLIPPED_ROWS and at > CLIPPED_RATIO * max(near, 1) and stop - start >= 3:
+def _clipped(inputs: CheckInput) -> Iterator[Doubt]:
+    """Torques of joints, or what sensors measured, that stay at their extremes while these joints, or any, move."""
+    log, speed = inputs.log, np.abs(inputs.log.v)
+    moves = speed > MOVES * np.sqrt(np.square(speed).mean(axis=0))
+    channels = [(f"torque of {name}", (name,), log.u[:, j], moves[:, j]) for j, name in enumerate(inputs.names)]
+    for name, values in log.measured.items():
+        axes = "xyz" if len(values.T) == 3 else ("torque",)
+        channels += [(f"sensor {name} ({axis})", (), x, moves.any(1)) for axis, x in zip(axes, values.T, strict=True)]
+    for which, joints, values, moving in channels:
+        for extreme, there in ends_of_range(values, moving):
+            start, stop = max(runs(there).tolist(), key=lambda run: run[1] - run[0])
+            at = int((there & moving).sum())
+            if not joints and extreme == 0.0:  # nothing touches it
+                continue
             yield wrong(
                 about="saturation",
-                what=f"the torque of {inputs.names[joint]} stays at its {side} value {sign * extreme:.5g} in "
-                f"{at} rows of motion; the longest stretch, {stop - start} rows, begins at row {start} at "
-                f"{log.time[start]:.3f} s.",
+                what=f"the {which} stays at its {'largest' if extreme == values.max() else 'smallest'} value "
+                f"{extreme:.5g} in {at} rows of motion; the longest stretch, {stop - start} rows, begins at row "
+                f"{start} at {log.time[start]:.3f} s.",
                 do="The robot received another torque than the log states, or the sensor is at its end: leave "
                 "these stretches out, or move more gently.",
-                joints=(inputs.names[joint],),
-                numbers={"value": sign * extreme, "rows": at, "row": start},
+                joints=joints,
+                numbers={"value": extreme, "rows": at, "row": start},
             )
 
 

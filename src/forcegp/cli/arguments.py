@@ -64,17 +64,12 @@ def command_class(name: str) -> type[Command]:
     return getattr(module, name.capitalize())
 
 
-def front_page() -> str:
-    """The page of `forcegp --help`; that of a command is tyro's."""
-    rows = [f"  {name.ljust(10)}{summary}" for name, summary in COMMANDS.items()]
-    return "\n".join(["usage: forcegp COMMAND [OPTIONS]", "", DESCRIPTION, "", "Commands:", *rows])
-
-
 def parsed(words: Sequence[str]) -> Command:
     """The command that the words ask for. --help prints and raises SystemExit(0)."""
     name, *others = words or [""]
     if name in ("-h", "--help"):
-        print(front_page())
+        rows = [f"  {name.ljust(10)}{summary}" for name, summary in COMMANDS.items()]
+        print("\n".join(["usage: forcegp COMMAND [OPTIONS]", "", DESCRIPTION, "", "Commands:", *rows]))
         raise SystemExit(0)
     if name not in COMMANDS:
         close = difflib.get_close_matches(name, COMMANDS, n=1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
 import platform
 import re
@@ -20,7 +19,15 @@ from tyro.conf import Positional, UseAppendAction, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
 import forcegp.data
-from forcegp.atomic_files import SUMS, atomic_folder, require_replaceable, require_writable, write_digests, write_json
+from forcegp.atomic_files import (
+    SUMS,
+    atomic_folder,
+    read_json,
+    require_replaceable,
+    require_writable,
+    write_digests,
+    write_json,
+)
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import FileFormatError, InvalidInput
 
@@ -253,10 +260,11 @@ class Command(ABC):
         """Refuse what exists, but empty folders, and with --overwrite what only this command wrote."""
         if path is None:
             return
-        kind = self.kind
-        require_replaceable(
-            path, f"`{kind}`", lambda folder: _config(folder).get("kind") == kind, overwrite=self.overwrite
-        )
+
+        def own(folder: Path) -> bool:
+            return read_json(folder / CONFIG, "choose another name").get("kind") == self.kind
+
+        require_replaceable(path, f"`{self.kind}`", own, overwrite=self.overwrite)
         require_writable(path)
 
     def require_free_file(
@@ -312,11 +320,3 @@ def begins(mark: bytes) -> Callable[[Path], bool]:
             return file.read(len(mark)) == mark
 
     return own
-
-
-def _config(path: Path) -> dict[str, Any]:
-    try:
-        config = json.loads((path / CONFIG).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return config if isinstance(config, dict) else {}

@@ -261,7 +261,12 @@ def fit_report(run: Path, posterior: Any, found: Mapping[str, Any]) -> list[Any]
     title = f"{run}: {found['model']}, learned from {found['points']} points{fewer}"
     shown: list[Any] = [facts(title, {name: text for name, text in values.items() if text is not None})]
     if posterior.estimates:
-        shown += [estimates_table("estimates", posterior.estimates), *what_is_open(posterior.estimates)]
+        shown.append(estimates_table("estimates", posterior.estimates))
+    if bodies := posterior.estimates.by_body:
+        weak = ", ".join(f"{name} ({number} of 10)" for name, number in bodies.items())
+        shown.append(f"Directions of single bodies that the prior decides: {weak}.")
+    if thick := posterior.estimates.thickened:
+        shown.append(f"Links that were lines, plates or points got some thickness: {', '.join(thick)}.")
     if motions := settings.get("motions"):
         units = ["mm" if joint.type == "prismatic" else "mrad" for joint in posterior.model.robot.joints]
         error = ", ".join(f"{1e3 * rms:.3g} {unit}" for rms, unit in zip(motions["rms"], units, strict=False))
@@ -288,27 +293,11 @@ def estimates_table(title: str, estimates: Mapping[str, forcegp.posterior.Estima
         size = factor * each.std if 0.0 < each.std < math.inf else 1e-3 * abs(factor * each.value)
         digits = max(0, 1 - math.floor(math.log10(size))) if size > 0.0 else 4
         show = (f"{{:.{digits}f}}" if digits < 10 else "{:.2g}").format
-        of, part = owner_and_part(name)
+        # law or body, and number: viscous and elbow, tool0 and center_of_mass.x
+        split = re.fullmatch(r"(.*?)\.((?:mass|center_of_mass|inertia).*)", name)
+        of, _, part = (split[1], "", split[2]) if split else name.partition(".")
         rows += [[of]] if of != owner else []
         owner = of
         numbers = show(factor * each.start), show(factor * each.value), f"{show(low)} … {show(high)}"
         rows.append([f"  {part}", *numbers, "" if unit == "1" else unit, each.decided_by])
     return columns(title, ["parameter", "start", "estimate", "95 % interval", "unit", "decided\nby the"], rows)
-
-
-def owner_and_part(name: str) -> tuple[str, str]:
-    """Law or body, and number: viscous and elbow, tool0 and center_of_mass.x."""
-    found = re.fullmatch(r"(.*?)\.((?:mass|center_of_mass|inertia).*)", name) or re.fullmatch(r"([^.]*)\.?(.*)", name)
-    assert found is not None, "every name matches"
-    return found[1], found[2]
-
-
-def what_is_open(estimates: forcegp.posterior.Estimates) -> list[str]:
-    """Sentences about what the prior decides, and what was changed."""
-    lines, bodies = [], estimates.by_body or {}
-    if bodies:
-        weak = ", ".join(f"{name} ({number} of 10)" for name, number in bodies.items())
-        lines.append(f"Directions of single bodies that the prior decides: {weak}.")
-    if estimates.thickened:
-        lines.append(f"Links that were lines, plates or points got some thickness: {', '.join(estimates.thickened)}.")
-    return lines

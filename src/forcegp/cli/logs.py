@@ -104,7 +104,8 @@ class ColumnOptions:
     force: Annotated[str | None, unless_given("FRAME=COLUMNS,...", "none", str)] = None
     """Force sensors: at a frame of the robot the force on it, x, y, z in the world's axes; with `--axes force=body` in
     those of the frame. For instance foot=fx,fy,fz. And accelerometers, in their own axes, at rest 9.81 upwards:
-    imu:hand=ax,ay,az, or imu:hand@x,y,z for a point of the frame, and imu:hand@x,y,z,roll,pitch,yaw."""
+    imu:hand=ax,ay,az, or imu:hand@x,y,z for a point of the frame, and imu:hand@x,y,z,roll,pitch,yaw.
+    And torques between gears and links, which move these: torque=t1,t2,t3 of all joints, torque:lift=t2 of one."""
     joints: Annotated[str | None, unless_given("NAMES", "those of --robot", str)] = None
     """Names of the joints in the order of the columns."""
     orientation: Annotated[Literal["xyzw", "wxyz", "angles"] | None, unless_given("xyzw|wxyz|angles", "xyzw")] = None

@@ -86,10 +86,11 @@ class Payload(Command):
                 write_estimates(folder, found, "loaded")
                 if self.mass is not None:
                     write_text(folder / SYSTEM_FILE, calibrated(found).to_json() + "\n")
-        known = "torques of the log" if not model.actuation.learned else "masses of the URDF"
-        known = (
-            known if self.mass is None else f"{known} and the payload's mass" if baseline is None else "payload's mass"
-        )
+        known, sensors = "torques of the log", forcegp.JointTorques()
+        if model.actuation.learned and not sensors.names(rows):
+            known = "masses of the URDF"
+        if self.mass is not None:
+            known = f"{known} and the payload's mass" if baseline is None else "payload's mass"
         notes.append(f"numbers are as right as the {known}: a factor of these is one of all masses")
         content["conditional_on"] = known
         for note in notes:
@@ -132,7 +133,8 @@ def with_payload(
     """The posterior of a model that carries something, of this `mass`; with a baseline links are estimated, too."""
     bodies = () if baseline is None else (forcegp.RigidBodies("all"),)
     noisy = "u" if model.robot.space.is_vector_space else "both"
-    evidence = (forcegp.Torques(noisy, mean=WINDOW),)
+    sensors = forcegp.JointTorques()
+    evidence = (forcegp.Torques(noisy, mean=WINDOW), *[sensors] * bool(sensors.names(rows)))
     loaded = model.with_forces(*bodies, forcegp.Payload(link, mass, None))
     return forcegp.scores.learn(loaded, rows, evidence, baseline=baseline)[0]
 

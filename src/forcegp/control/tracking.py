@@ -112,10 +112,7 @@ class TrackingController(Controller):
 
     def __call__(self, q: Any, v: Any, q_d: Any, v_d: Any, a_d: Any) -> Float[Tensor, " nv"]:
         """The torques (nv,) in Nm (N) at the state q, v under this reference, in rad, rad/s, rad/s^2 (m, ...)."""
-        return self.limited(self._asked(*self.vectors(q=q, v=v, q_d=q_d, v_d=v_d, a_d=a_d)))
-
-    def _asked(self, q: Tensor, v: Tensor, q_d: Tensor, v_d: Tensor, a_d: Tensor) -> Tensor:
-        """Before limits, under a reference that the joints can reach."""
+        q, v, q_d, v_d, a_d = self.vectors(q=q, v=v, q_d=q_d, v_d=v_d, a_d=a_d)
         low, high = self._range
         beyond = torch.nonzero((q_d < low) | (q_d > high))[:, 0].tolist()
         if beyond:
@@ -124,7 +121,7 @@ class TrackingController(Controller):
                 f"the reference asks {self.robot.joint_names[j]} to be at {float(q_d[j]):.4g}, and it moves "
                 f"between {float(low[j]):.4g} and {float(high[j]):.4g}; change q_d, or the limits in the URDF."
             )
-        return self._torques(q, v, v_d, a_d, q_d - q, v_d - v)
+        return self.limited(self._torques(q, v, v_d, a_d, q_d - q, v_d - v))
 
     def feedback(self, e: Tensor, e_v: Tensor) -> Tensor:
         """The acceleration against errors of position and velocity."""

@@ -18,7 +18,7 @@ from typing_extensions import override
 import forcegp.model
 import forcegp.robots
 from forcegp.data.hdf5 import read_fields, write_fields
-from forcegp.errors import DatasetError, FileFormatError, InvalidInput, require_type, usable_arguments
+from forcegp.errors import DatasetError, FileFormatError, InvalidInput, require_known, require_type, usable_arguments
 from forcegp.robots.arguments import real_array
 from forcegp.robots.inertia import rotation_from_rpy
 from forcegp.summary import Summary, listed, rounded
@@ -222,8 +222,8 @@ def _noise_std(given: object, joint_names: tuple[str, ...]) -> np.ndarray | None
     return values
 
 
-FORCE, IMU = "force.", "imu."
-"""Begin the names of measured forces, and of what accelerometers measure; the frame follows."""
+SENSORS = FORCE, IMU, TORQUE = "force.", "imu.", "torque."
+"""Begin names of measured forces and what accelerometers measure, by frame, and of torques at links, by joint."""
 
 
 def imu_place(name: str) -> tuple[str, list[float], Float[np.ndarray, "3 3"]]:
@@ -242,12 +242,16 @@ def imu_place(name: str) -> tuple[str, list[float], Float[np.ndarray, "3 3"]]:
 
 def _measured(given: Mapping[str, object], rows: int, robot: forcegp.robots.Robot) -> dict[str, np.ndarray]:
     for name in given:
-        if not str(name).startswith((FORCE, IMU)):
-            raise DatasetError(f"measured has {name!r}; allowed: {FORCE}FRAME and {IMU}FRAME, of frames of the robot.")
+        if not str(name).startswith(SENSORS):
+            raise DatasetError(f"measured has {name!r}; allowed: force.FRAME, imu.FRAME and torque.JOINT of the robot.")
+        if name.startswith(TORQUE):
+            require_known("joint", name.removeprefix(TORQUE), robot.name, robot.single_joint_names, DatasetError)
+            continue
         body, _ = robot.frame(imu_place(name)[0] if name.startswith(IMU) else name.removeprefix(FORCE))
         if name.startswith(IMU) and body < 0:
             raise DatasetError(f"{name!r} is fixed in the world, so it measures no motion; name a link that moves.")
-    return {name: finite_columns(f"measured[{name!r}]", given[name], ("x", "y", "z"), rows) for name in sorted(given)}
+    axes = {name: ("torque",) if name.startswith(TORQUE) else ("x", "y", "z") for name in sorted(given)}
+    return {name: finite_columns(f"measured[{name!r}]", given[name], own, rows) for name, own in axes.items()}
 
 
 def _truth(

@@ -148,7 +148,10 @@ def _estimated(dataset: Dataset, largest: float, cutoff: float | None) -> tuple[
         shifted = np.concatenate([spline(at + shifts[:, None]) for spline, at in splines], axis=1)
         spread = np.square(shifted - shifted.mean(axis=1, keepdims=True)).sum(axis=1)
         if spread.min() > 1e-12 * np.square(shifted).sum(axis=1).max():  # else it has no delay
-            profiles[joint] = least_squares(_orthonormal(features[joint]), shifted.T)
+            size = np.linalg.norm(features[joint], axis=0)
+            used = size > 1e-9 * size.max()
+            basis, values, _ = np.linalg.svd(features[joint][:, used] / size[used], full_matrices=False)
+            profiles[joint] = least_squares(basis[:, values > 1e-6 * values[0]], shifted.T)
     seconds = np.array([[lowest(profile, shifts) for profile in own] for own in profiles])
     # Noise of every joint is unknown: the likelihood of one delay is the product of powers of the residuals.
     finite = profiles[np.isfinite(profiles[:, 0, 0])]
@@ -203,7 +206,10 @@ def torque_columns(
             torque = torch.stack(parts, dim=-1)
     rows = dataset.q, dataset.v, dataset.u, dataset.a
     own = [*usual_columns(robot, *rows, FRICTION_WIDTHS), *law_columns(dataset.model.laws, robot, *rows)]
-    own += _memory_columns(dataset)
+    if dataset.strokes is not None:  # friction that remembers, of several stiffnesses and as it rises with speed
+        past, spread = torch.tensor(dataset.strokes), torch.tensor(joint_positions(dataset).std(0)).clamp_min(1e-9)
+        states = [after_strokes(past, sigma / spread).numpy() for sigma in STIFFNESSES]
+        own += [part for z in states for part in (z, z * np.sqrt(np.abs(dataset.v)))]
     forces = np.stack([each[chosen] for each in (own if cutoff is None else _behind(cutoff, own, dataset))], axis=-1)
     return np.concatenate([torque.cpu().numpy(), forces], axis=-1).transpose(1, 0, 2)
 
@@ -214,26 +220,10 @@ def _behind(
     """The forces behind a low-pass, episode by episode."""
     smooth, episodes = LowPass(cutoff), [dataset.episode == number for number in dataset.episodes]
     for force in forces:
+        passed = np.empty_like(force)
         for own in episodes:
-            force[own] = smooth(force[own], dataset.time[own])
-        yield force
-
-
-def _memory_columns(dataset: Dataset) -> list[Float[np.ndarray, "rows nv"]]:
-    """Dry friction that remembers, of several stiffnesses and as it rises with speed, where rows know their past."""
-    if dataset.strokes is None:
-        return []
-    past, spread = torch.tensor(dataset.strokes), torch.tensor(joint_positions(dataset).std(0)).clamp_min(1e-9)
-    states = [after_strokes(past, sigma / spread).numpy() for sigma in STIFFNESSES]
-    return [part for z in states for part in (z, z * np.sqrt(np.abs(dataset.v)))]
-
-
-def _orthonormal(features: Float[np.ndarray, "rows columns"]) -> np.ndarray:
-    """Orthonormal columns that span the same space."""
-    size = np.linalg.norm(features, axis=0)
-    used = features[:, size > 1e-9 * size.max()]
-    left, values, _ = np.linalg.svd(used / np.linalg.norm(used, axis=0), full_matrices=False)
-    return left[:, values > 1e-6 * values[0]]
+            passed[own] = smooth(force[own], dataset.time[own])
+        yield passed
 
 
 def _unexplained(normal: np.ndarray, right: np.ndarray, square: np.ndarray) -> Float[np.ndarray, " shifts"]:

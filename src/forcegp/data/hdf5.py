@@ -29,7 +29,8 @@ def write_fields(path: Path, fields: Mapping[str, Any], units: Mapping[str, Any]
     arrays = {name: fields[name] for name in (*COLUMNS, "noise_std") if fields[name] is not None}
     arrays |= {f"truth/{name}": values for name, values in fields["truth"].items()}
     if names := list(fields["measured"]):  # of frames, which may hold a slash
-        arrays["measured"] = np.stack([fields["measured"][name] for name in names])
+        # a torque is the first of three columns
+        arrays["measured"] = np.stack([np.pad(x, ((0, 0), (0, 3 - x.shape[1]))) for x in fields["measured"].values()])
     if fields["strokes"] is not None and fields["transmission"] is None:
         arrays["strokes"] = fields["strokes"]
     with atomic_file(path) as temporary, new_file(temporary) as file:
@@ -118,7 +119,8 @@ class _Reader:
         measured = self.texts("measured_names") if "measured_names" in file else []
         arrays = self.array("measured") if measured else ()
         self.require(len(arrays) == len(measured), ": 'measured' needs one table for each of 'measured_names'.")
-        values["measured"] = dict(zip(measured, arrays, strict=True))
+        pairs = zip(measured, arrays, strict=True)
+        values["measured"] = {name: x[:, :1] if name.startswith("torque.") else x for name, x in pairs}
         values["time_ordered"] = bool(file.attrs.get("time_ordered", True))
         try:
             values["model"] = forcegp.Model.from_json(self.text("model"))

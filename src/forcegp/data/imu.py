@@ -50,7 +50,33 @@ def expected(dataset: Dataset, model: forcegp.model.Model, name: str) -> Float[n
         return specific_force(model.robot.kinematics(q, v), name)(a).cpu().numpy()
 
 
-def _rms(values: Float[np.ndarray, "rows 3"]) -> float:
+def short_means(dataset: Dataset, *values: Float[np.ndarray, "rows k"]) -> list[Float[np.ndarray, "windows k"]]:
+    """Over a tenth of a second each."""
+    steps = np.diff(dataset.time)[consecutive(dataset)[:-1]]
+    width = int(max(1.0, SECONDS / np.median(steps))) if dataset.time_ordered and len(steps) else 1
+    first = whole_windows(dataset, width)
+    return [window_means(x, first, width) for x in values]
+
+
+def delay_doubts(
+    dataset: Dataset, which: str, f: Float[np.ndarray, "rows k"], p: Float[np.ndarray, "rows k"]
+) -> Iterator[Doubt]:
+    """A sensor whose values f, those of the first episode, fit what was expected, p, far better at other times."""
+    first = dataset.episode == dataset.episodes[0]
+    time, f, p = dataset.time[first], f[first], p[first]
+    inner = np.flatnonzero((time >= time[0] + SHIFTS[-1]) & (time <= time[-1] + SHIFTS[0]))[:MOST_ROWS]
+    if not dataset.time_ordered or len(inner) < len(SHIFTS):
+        return
+    moved = (np.stack([np.interp(time[inner] + s, time, x) for x in f.T], 1) for s in SHIFTS)
+    left = np.array([_rms(each - p[inner]) for each in moved])
+    late = lowest(left, SHIFTS)
+    if abs(late) > max(LEAST_DELAY, float(np.median(np.diff(time)))) and left.min() < LATE * left[len(SHIFTS) // 2]:
+        when = f"{1e3 * abs(late):.1f} ms {'later' if late > 0.0 else 'earlier'} than the motion that it measures"
+        what = f"the {which} is logged {when}."
+        yield look(about="sensor delay", what=what, do="Shift its columns before an import.", numbers={"delay": late})
+
+
+def _rms(values: Float[np.ndarray, "rows k"]) -> float:
     return float(np.sqrt(np.square(values).sum(1).mean()))
 
 
@@ -75,12 +101,9 @@ class BesideMotion:
     @classmethod
     def of(cls, dataset: Dataset, model: forcegp.model.Model, name: str) -> BesideMotion:
         """That of a log, of means over short windows."""
-        steps = np.diff(dataset.time)[consecutive(dataset)[:-1]]
-        width = int(max(1.0, SECONDS / np.median(steps))) if dataset.time_ordered and len(steps) else 1
-        first = whole_windows(dataset, width)
         rest = replace(dataset, v=0.0 * dataset.v, a=0.0 * dataset.a)
         both = expected(dataset, model, name), dataset.measured[name], expected(rest, model, name)
-        p, f, still = (window_means(x, first, width) for x in both)
+        p, f, still = short_means(dataset, *both)
         left, s, right = np.linalg.svd(f.T @ p)
         if s[2] < AGREES**2 * s[0] and np.linalg.det(left @ right) < 0.0:  # in a plane nothing shows a reflection
             left[:, 2] *= -1.0
@@ -129,15 +152,5 @@ def imu_doubts(dataset: Dataset, model: forcegp.model.Model) -> Iterator[Doubt]:
     for name in (name for name in dataset.measured if name.startswith(IMU)):
         beside = BesideMotion.of(dataset, model, name)
         yield beside.doubt()
-        log = dataset.select_episodes(dataset.episodes[:1])
-        time, f, p = log.time, log.measured[name], beside.factor * expected(log, model, name) @ beside.Q.T
-        inner = np.flatnonzero((time >= time[0] + SHIFTS[-1]) & (time <= time[-1] + SHIFTS[0]))[:MOST_ROWS]
-        if not dataset.time_ordered or len(inner) < len(SHIFTS):
-            continue
-        moved = (np.stack([np.interp(time[inner] + s, time, x) for x in f.T], 1) for s in SHIFTS)
-        left = np.array([_rms(each - p[inner]) for each in moved])
-        late = lowest(left, SHIFTS)
-        if abs(late) > max(LEAST_DELAY, float(np.median(np.diff(time)))) and left.min() < LATE * left[len(SHIFTS) // 2]:
-            when = f"{1e3 * abs(late):.1f} ms {'later' if late > 0.0 else 'earlier'} than the motion that it measures"
-            what = f"the IMU at {imu_place(name)[0]} is logged {when}."
-            yield look(about="imu delay", what=what, do="Shift its columns before an import.", numbers={"delay": late})
+        f, p = dataset.measured[name], beside.factor * expected(dataset, model, name) @ beside.Q.T
+        yield from delay_doubts(dataset, f"IMU at {imu_place(name)[0]}", f, p)

@@ -131,7 +131,10 @@ def _knee_and_floor(
     power = np.cumsum(density)
     if not power[-1] > 0.0:
         return nothing
-    centers, smooth = _bands(frequency, density)
+    # of bands of a sixth of an octave, or of single frequencies where those are wider
+    band = np.unique(np.round(BANDS_PER_OCTAVE * np.log2(frequency / frequency[0])), return_inverse=True)[1]
+    centers, smooth = (np.bincount(band, x) / np.bincount(band) for x in (np.log(frequency), density))
+    centers = np.exp(centers)
     envelope = np.maximum.accumulate(smooth[::-1])[::-1]  # a gap between two harmonics is no end of the motion
     start = frequency[np.searchsorted(power, MOTION_SHARE * power[-1])]
     allowed = (centers >= start) & (centers <= HIGHEST * frequency[-1])
@@ -154,13 +157,6 @@ def _knee_and_floor(
     share = np.log(smooth[left] / (2.0 * floor)) / np.log(smooth[left] / smooth[right])
     cutoff = float(np.exp(np.log(centers[left]) * (1.0 - share) + np.log(centers[right]) * share))
     return float(knee), floor, cutoff if cutoff <= HIGHEST * frequency[-1] else np.nan
-
-
-def _bands(frequency: np.ndarray, density: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centres and mean densities of bands of a sixth of an octave, or of single frequencies where those are wider."""
-    number = np.unique(np.round(BANDS_PER_OCTAVE * np.log2(frequency / frequency[0])), return_inverse=True)[1]
-    count = np.bincount(number)
-    return np.exp(np.bincount(number, np.log(frequency)) / count), np.bincount(number, density) / count
 
 
 FACTORS = 0.5, 0.7, 1.0, 1.4, 2.0  # of the cut-off that the spectrum shows

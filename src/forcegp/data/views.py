@@ -1,6 +1,6 @@
 """Views of a log: rows that follow each other, windows, motions of equal length, and which rows to take."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -141,6 +141,30 @@ def _within(dataset: Dataset) -> Float[np.ndarray, " nq"]:
 def runs(marked: Bool[np.ndarray, " rows"]) -> Int[np.ndarray, "runs 2"]:
     """First rows of all runs of True, and the rows after them."""
     return np.flatnonzero(np.diff(marked, prepend=False, append=False)).reshape(-1, 2)
+
+
+CLIPPED_RATIO = 8.0  # rows at the extreme value over rows in the next thousandth of the range: a smooth peak has 2.4
+CLIPPED_ROWS = 10
+
+
+def resolution(values: Float[np.ndarray, " rows"]) -> float:
+    """The least step between two values of a channel that is not constant."""
+    return float(np.diff(np.unique(np.round(values / np.ptp(values), 9))).min() * np.ptp(values))
+
+
+def ends_of_range(
+    values: Float[np.ndarray, " rows"], moves: Bool[np.ndarray, " rows"]
+) -> Iterator[tuple[float, Bool[np.ndarray, " rows"]]]:
+    """Extremes at which a channel stays while something `moves`, and where: far more rows there than just below."""
+    if moves.sum() < CLIPPED_ROWS or not np.ptp(values[moves]) > 0.0:
+        return
+    same, width = 1e-9 * np.ptp(values[moves]), max(np.ptp(values[moves]) / 1000.0, 1.5 * resolution(values))
+    for extreme in (float(values.max()), float(values.min())):
+        below = abs(extreme - values)
+        at, near = (int((there & moves).sum()) for there in (below <= same, (below > same) & (below <= same + width)))
+        longest = np.diff(runs(below <= same)).max(initial=0)
+        if at >= CLIPPED_ROWS and at > CLIPPED_RATIO * max(near, 1) and longest >= 3:
+            yield extreme, below <= same
 
 
 def whole_windows(dataset: Dataset, width: int) -> Int[np.ndarray, " windows"]:
@@ -334,7 +358,10 @@ def farthest_point_sampling(
     """
     rows = len(points)
     count = whole_number("count", count, 1, rows, "the number of rows")
-    columns = _standardized_columns(points)
+    columns = np.ascontiguousarray(points.T, dtype=np.float64)
+    columns = columns / np.maximum(np.abs(columns).max(axis=1, keepdims=True), 1e-300)  # so that std cannot overflow
+    centred, spread = columns - columns.mean(axis=1, keepdims=True), columns.std(axis=1, keepdims=True)
+    columns = np.where(spread >= ROUNDING, centred / np.maximum(spread, ROUNDING), 0.0)
     distance = np.full(rows, np.inf)
     chosen = np.empty(count, dtype=np.int64)
     chosen[0] = whole_number("start", start, 0, rows - 1, "the last row")
@@ -356,11 +383,3 @@ def farthest_rows(dataset: Dataset, count: int, *, start: int = 0) -> Dataset:
     """The rows that cover the inputs (q, v, u) best, in order: for fewer points, take the first of them."""
     inputs = np.hstack([dataset.q, dataset.v, dataset.u])
     return dataset.rows(farthest_point_sampling(inputs, count, start=start))
-
-
-def _standardized_columns(table: np.ndarray) -> np.ndarray:
-    """(features, rows): contiguous columns with zero mean and unit standard deviation; constant ones become zero."""
-    columns = np.ascontiguousarray(table.T, dtype=np.float64)
-    columns = columns / np.maximum(np.abs(columns).max(axis=1, keepdims=True), 1e-300)  # so that std cannot overflow
-    centred, spread = columns - columns.mean(axis=1, keepdims=True), columns.std(axis=1, keepdims=True)
-    return np.where(spread >= ROUNDING, centred / np.maximum(spread, ROUNDING), 0.0)

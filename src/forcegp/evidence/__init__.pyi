@@ -1,6 +1,7 @@
 from .evidence import (
     Accelerations as Accelerations, ContactForces as ContactForces, Evidence as Evidence,
-    FrameAcceleration as FrameAcceleration, Motions as Motions, Sensor as Sensor, Torques as Torques,
+    FrameAcceleration as FrameAcceleration, JointTorques as JointTorques, Motions as Motions, Sensor as Sensor,
+    Torques as Torques,
 )
 from .evidence import EVIDENCE as EVIDENCE, parse_evidence as parse_evidence
 from .bodies import (

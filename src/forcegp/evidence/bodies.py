@@ -276,7 +276,8 @@ def with_bodies(robot: Robot, wanted: Mapping[int, Float[np.ndarray, "4 4"]]) ->
     Raises NonPhysicalInertia, naming the bodies, where no body has them.
     """
     own, names = carrying(robot), body_names(robot)
-    impossible = [names[own.index(body)] for body, pseudo in wanted.items() if not _definite(pseudo)]
+    indefinite = [body for body, pseudo in wanted.items() if torch.linalg.cholesky_ex(torch.as_tensor(pseudo)).info]
+    impossible = [names[own.index(body)] for body in indefinite]
     if impossible:
         raise NonPhysicalInertia(
             f"no body has the inertia that was found for {', '.join(impossible)}, so there is no such robot; give the "
@@ -302,11 +303,3 @@ def with_bodies(robot: Robot, wanted: Mapping[int, Float[np.ndarray, "4 4"]]) ->
         inertia = np.trace(second) * np.eye(3) - second
         text = replace_inertial(text, name, link.mass * scale**2, center, inertia, source=robot.source)
     return robot.with_text(text)
-
-
-def _definite(pseudo: np.ndarray) -> bool:
-    try:
-        np.linalg.cholesky(pseudo)
-    except np.linalg.LinAlgError:
-        return False
-    return True

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import ClassVar, Literal
 
-from forcegp.data.dataset import FORCE, IMU, Dataset
+from forcegp.data.dataset import FORCE, IMU, TORQUE, Dataset
 from forcegp.errors import InvalidInput, require_known, require_number, usable_arguments
 from forcegp.forces.registry import called
 
@@ -95,7 +95,10 @@ class Motions(Evidence):
 
 @dataclass(frozen=True)
 class Sensor(Evidence):
-    """A sensor at `frame` ("": all), whose names in `Dataset.measured` begin with `kind`; `noise` is in their units."""
+    """A sensor at `frame` ("": all), whose names in `Dataset.measured` begin with `kind`; `noise` is in their units.
+
+    The frame of a torque sensor is the name of its joint.
+    """
 
     kind: ClassVar[str]
     frame: str = ""
@@ -145,12 +148,26 @@ class FrameAcceleration(Sensor):
     turned: bool = False
 
 
+@dataclass(frozen=True)
+class JointTorques(Sensor):
+    """What torque sensors between gears and links measured ("": in all joints), beside torques of the motors.
+
+    A sensor there sees bodies, payloads, contacts and springs, but no friction, rotor or gain of its gear, so both
+    together tell these apart. The noise is found as that of torques is; beside `Torques(noisy="both")` it is `noise`
+    [Nm or N]; None: 2 % of what it measured.
+    """
+
+    name: ClassVar[str] = "joint-torques"
+    kind: ClassVar[str] = TORQUE
+
+
 EVIDENCE: dict[str, type[Evidence]] = {
     "accelerations": Accelerations,
     "torques": Torques,
     "motions": Motions,
     "contact-forces": ContactForces,
     "frame-acceleration": FrameAcceleration,
+    "joint-torques": JointTorques,
 }
 """Kinds by the name that commands and files have for them. Add yours: EVIDENCE["mine"] = Mine."""
 

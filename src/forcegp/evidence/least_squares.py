@@ -309,7 +309,7 @@ def _minimized(
     here, damping, idle, first = point(x), 1e-4, 0, None
     for evaluation in range(1, most + 1):
         damped = here.curvature + damping * np.diag(here.curvature.diagonal() + 1e-12)
-        step = _step(here.gradient, damped, low - here.x, high - here.x)
+        step = step_within(here.gradient, damped, low - here.x, high - here.x)
         step /= float((abs(step) / longest).max(initial=1.0))
         expected = -float(here.gradient @ step + 0.5 * step @ here.curvature @ step)
         first = expected if first is None else first
@@ -327,7 +327,7 @@ def _minimized(
     return here.x, most, False, first or 0.0
 
 
-def _step(gradient: np.ndarray, curvature: np.ndarray, least: np.ndarray, most: np.ndarray) -> np.ndarray:
+def step_within(gradient: np.ndarray, curvature: np.ndarray, least: np.ndarray, most: np.ndarray) -> np.ndarray:
     """The step to the minimum: what goes too far ends at its bound, and the others go on beside that."""
     step, free = np.zeros_like(gradient), ((least < 0.0) | (gradient < 0.0)) & ((most > 0.0) | (gradient > 0.0))
     while free.any():

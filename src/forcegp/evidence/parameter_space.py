@@ -204,7 +204,10 @@ class ParameterSpace:
         out: dict[int, dict[str, Tensor]] = {}
         for own, term in zip(self.split(x)[1], self.terms, strict=True):
             law = self.model.laws[term.law]
-            named = out.setdefault(term.law, {name: self._whole(law, name) for name in law.coefficients})
+            named = {name: law.values[name].to(self.model.robot.device) for name in law.coefficients}
+            if isinstance(law, PerJointLaw):  # numbers that are not estimated stay
+                named = {name: value.expand(self.model.robot.nv).clone() for name, value in named.items()}
+            named = out.setdefault(term.law, named)
             value = torch.as_tensor(term.values(own), device=self.model.robot.device)
             if term.joints is None:
                 named[term.name] = value[0]
@@ -214,11 +217,6 @@ class ParameterSpace:
 
     def _places(self, term: Term) -> Tensor:
         return torch.tensor(term.joints, device=self.model.robot.device)
-
-    def _whole(self, law: Law, name: str) -> Tensor:
-        """A coefficient with one value per joint, those that are not estimated as they are."""
-        value = law.values[name].to(self.model.robot.device)
-        return value.expand(self.model.robot.nv).clone() if isinstance(law, PerJointLaw) else value
 
     def model_at(self, x: Float[np.ndarray, " k"]) -> Model:
         """The model with the numbers of these coordinates, all of them known. Raises NonPhysicalInertia."""

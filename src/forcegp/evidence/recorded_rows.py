@@ -3,6 +3,7 @@
     torque           r = Y(q, v, a) pi + M_0 a + t(x; v, a) - Q
     acceleration     r = a - a^,    dr/dpi = H Y(q, v, a^),    dr/dx = H dt/dx (v, a^)
 
+Torque sensors at links see the same without gears: r = Y pi + t - Q at some joints, of laws and forces outside gears.
 Friction g |u| under load makes u = z / (1 - g sign z). Where a and u are both noisy, the accelerations that were there
 are those of errors in variables (Fuller, "Measurement Error Models", 1987, section 3.2), given the contacts.
 """
@@ -18,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset, with_memory
-from forcegp.data.dataset import FORCE, IMU
+from forcegp.data.dataset import FORCE, IMU, TORQUE
 from forcegp.data.imu import specific_force
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence.bodies import standard_parameters
@@ -109,14 +110,14 @@ Inputs = Float[np.ndarray, "rows nu"]
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Accelerations of the rows, and the torque that they need, but for what is estimated.
+    """Accelerations of the rows, and the torque that they need, but for what is estimated; then that at links.
 
     `regressor`: derivatives in standard parameters of estimated bodies; `fixed`: torque of others less given forces.
     """
 
     a: Rows
-    regressor: Float[np.ndarray, "rows nv n 10"]
-    fixed: Rows
+    regressor: Float[np.ndarray, "rows equations n 10"]
+    fixed: Float[np.ndarray, "rows equations"]
 
 
 class RecordedRows:
@@ -156,19 +157,26 @@ class RecordedRows:
         """What IMUs measure of accelerations (rows, k, nv); of that their values are `felt_right`, with this noise."""
         left = [np.array(x) - offset for x, (_, offset) in zip(imus.values(), parts, strict=True)]
         self.felt_right = np.concatenate([np.zeros((len(self.v), 0)), *left], axis=1)
-        stated = None if model.noise is None else model.noise.sensor  # of force sensors, then of IMUs
-        level = np.repeat([share_of(x) for x in imus.values()], 3) if stated is None else np.atleast_1d(stated)
-        self.felt_noise = np.resize(level[-3 * len(imus) :], 3 * len(imus))
-        self.sensed = sensed = {n.removeprefix(FORCE): x for n, x in (sensed or {}).items() if n not in imus}
+        stated = None if model.noise is None else model.noise.sensor  # of force sensors, then of IMUs and torques
+        at_links = {name: x for name, x in (sensed or {}).items() if name.startswith(TORQUE)}
+        own = [share_of(x) for x in imus.values() for _ in "xyz"] + [share_of(x) for x in at_links.values()]
+        level = np.resize(np.atleast_1d(own if stated is None else stated)[-len(own) :], len(own))
+        self.felt_noise, self.link_noise = np.split(level, [3 * len(imus)])
+        self.links = [robot.joint_names.index(name.removeprefix(TORQUE)) for name in at_links]
+        """Joints with a torque sensor at the link, which measured `at_links` (rows, k)."""
+        self.equations = [*range(robot.nv), *self.links]
+        self.at_links = np.concatenate([np.zeros((len(self.v), 0)), *at_links.values()], axis=1)
+        self.sensed = sensed = {n.removeprefix(FORCE): x for n, x in (sensed or {}).items() if n.startswith(FORCE)}
         arms = {frame: arm(self.kinematics, model, frame).cpu().numpy() for frame in sensed}
         forces = (each @ sensed[frame][..., None] for frame, each in arms.items())
         self.at_contacts = sum(forces, np.zeros((*self.v.shape, 1)))[..., 0]
         """Joint forces of what sensors measured."""
         self.open = self._unseen(A.cpu().numpy(), pushed) if sensed or pushed else self.held
         """Orthonormal rows (rows, m, nv): directions of joint forces that nothing measured, of contacts and pushes."""
-        self.force, self.inertia = np.zeros_like(self.v), np.zeros((robot.nv, robot.nv))
+        self.force, self.in_gears, self.inertia = 0.0 * self.v, 0.0 * self.v, np.zeros((robot.nv, robot.nv))
         for force in kept_laws(space, any_contact, sensed):
-            self.force = self.force + force.force(self.state).detach().cpu().numpy()
+            own = force.force(self.state).detach().cpu().numpy()
+            self.force, self.in_gears = self.force + own, self.in_gears + force.in_gear * own
             added = force.added_inertia(robot)
             self.inertia = self.inertia + (0.0 if added is None else added.detach().cpu().numpy())
         self._armature = np.diag(robot.armature.cpu().numpy())
@@ -181,6 +189,8 @@ class RecordedRows:
         self._stated[own] -= (
             standard_parameters(model.robot).reshape(-1, 10).cpu().numpy()[[space.own.index(body) for body in own]]
         )
+        self._beyond = np.array([not space.model.laws[term.law].in_gear for term in space.terms for _ in term.size])
+        """Of the coordinates of laws: which of them are at the links' side of gears."""
         self._caches: dict[float | None, dict[Any, Any]] = {None: {}, 0.0: {}, 1.0: {}}
 
     def _unseen(self, A: Float[np.ndarray, "rows m nv"], pushed: Sequence[int]) -> Float[np.ndarray, "rows m nv"]:
@@ -208,7 +218,9 @@ class RecordedRows:
         Y = self.kinematics.torque_regressor(torch.as_tensor(a, device=self.kinematics.robot.device)).cpu().numpy()
         fixed = Y.reshape(*a.shape, -1) @ self._stated.ravel() + a @ (self.inertia + self._armature) - self.force
         fixed = fixed - self.at_contacts if given else fixed
-        return Motion(a, np.ascontiguousarray(Y[:, :, self._carriers] * self._there[:, None]), fixed)
+        regressor = Y[:, :, self._carriers] * self._there[:, None]
+        beside = (fixed - a @ (self.inertia + self._armature) + self.in_gears)[:, self.links] - self.at_links
+        return Motion(a, regressor[:, self.equations], np.concatenate([fixed, beside], axis=1))
 
     def by_body(self, a: Rows) -> Float[np.ndarray, "rows nv bodies"]:
         """What each body needs, without what is estimated of it."""
@@ -224,27 +236,41 @@ class RecordedRows:
         return self.space.torque(x, state, a, self._caches[load])
 
     def in_torque(self, x: np.ndarray, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray, Response]:
-        """Residual (rows, nv), derivatives in standard parameters and in x of the laws, and du/dz of forces."""
-        parameters = self.space.standard_parameters(x)
-        rigid = motion.fixed + motion.regressor.reshape(*motion.a.shape, -1) @ parameters.ravel()
-        law = self.space.under_load
+        """Residual (rows, equations), derivatives in standard parameters and in x of the laws, and du/dz of forces.
+
+        Equations are those of joints, then those at links with a torque sensor.
+        """
+        nv, parameters = motion.a.shape[1], self.space.standard_parameters(x)
+        rigid = motion.fixed + motion.regressor.reshape(*motion.fixed.shape, -1) @ parameters.ravel()
+        joints, regressor, law = rigid[:, :nv], motion.regressor, self.space.under_load
+        torque, in_x = self._terms(x, motion.a, 0.0)
+        beyond = in_x[:, self.links] * self._beyond
         if law is None:
-            torque, in_x = self._terms(x, motion.a, 0.0)
-            return rigid + torque, motion.regressor, in_x, lambda values: values
-        (torque, in_x), (loaded, loaded_in_x) = (self._terms(x, motion.a, load) for load in (0.0, 1.0))
-        T = None if law.transmission is None else np.asarray(torch.as_tensor(law.transmission).cpu())
-        motor, joint = (partial(_turned, each) for each in (None if T is None else np.linalg.inv(T), T))
-        delivered, delivered_in_x = self.space.delivered(x, self.state, self.delivered, in_x)
-        z, g = motor(rigid + torque + delivered), motor(loaded - torque)
-        sign = np.sign(z)
-        left = 1.0 - g * sign
-        u = z / left
+            r, response = joints + torque, lambda values: values
+        else:
+            loaded, loaded_in_x = self._terms(x, motion.a, 1.0)
+            T = None if law.transmission is None else np.asarray(torch.as_tensor(law.transmission).cpu())
+            motor, joint = (partial(_turned, each) for each in (None if T is None else np.linalg.inv(T), T))
+            delivered, delivered_in_x = self.space.delivered(x, self.state, self.delivered, in_x)
+            z, g = motor(joints + torque + delivered), motor(loaded - torque)
+            sign = np.sign(z)
+            left = 1.0 - g * sign
+            u = z / left
 
-        def response(values: np.ndarray) -> np.ndarray:
-            return joint(motor(values) / left.reshape(*left.shape, *(1,) * (values.ndim - 2)))
+            def response(values: np.ndarray) -> np.ndarray:
+                return joint(motor(values) / left.reshape(*left.shape, *(1,) * (values.ndim - 2)))
 
-        in_x = response(in_x + delivered_in_x + joint((u * sign)[..., None] * motor(loaded_in_x - in_x)))
-        return joint(u) - delivered, response(motion.regressor), in_x - delivered_in_x, response
+            in_x = response(in_x + delivered_in_x + joint((u * sign)[..., None] * motor(loaded_in_x - in_x)))
+            r, in_x = joint(u) - delivered, in_x - delivered_in_x
+            regressor = np.concatenate([response(regressor[:, :nv]), regressor[:, nv:]], axis=1)
+        if self.links:
+            beside, laws = rigid[:, nv:], self.space.model.laws
+            for k, values in self.space.values(x).items():
+                if not laws[k].in_gear:
+                    beside = beside - laws[k].force_at(self.state, values).cpu().numpy()[:, self.links]
+            r = np.concatenate([r, beside], axis=1)
+            in_x = np.concatenate([in_x, beyond], axis=1)
+        return r, regressor, in_x, response
 
     def acceleration(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """a^ (rows, nv), the mass matrices and H (rows, nv, nv). Raises NumericalError where a matrix is singular."""
@@ -266,11 +292,11 @@ class RecordedRows:
         dr / dpi = -D (1 - M H) Y. What IMUs measure is affine in a^.
         """
         predicted, M, H = self.acceleration(x)
-        Y = self.moving(predicted).regressor
         torque, in_x = self._terms(x, predicted)
         r, by, shape = [a - predicted], [H], predicted.shape
+        Y = self.moving(predicted).regressor[:, : shape[1]]
         if self.sensed:
-            fixed, (D, seen) = self.moving(predicted, given=False).fixed, self._sensing
+            fixed, (D, seen) = self.moving(predicted, given=False).fixed[:, : shape[1]], self._sensing
             rigid = fixed + Y.reshape(*shape, -1) @ self.space.standard_parameters(x).ravel()
             by.append(-D @ (np.eye(shape[1]) - M @ H))
             r.append(seen - (D @ (rigid + torque)[..., None])[..., 0])
@@ -295,7 +321,9 @@ class RecordedRows:
         """
         _, M, H = self.acceleration(x)
         needed, _, _, response = self.in_torque(x, measured)
-        M, a, robot = response(M), measured.a, self.space.model.robot
+        of_bodies = M - self.inertia - self._armature - self.space.added_inertia(x)
+        M, a = np.concatenate([response(M), of_bodies[:, self.links]], axis=1), measured.a
+        robot = self.space.model.robot
         of_joints = np.isin(robot.joint_names, robot.single_joint_names)
         e_a = np.diag(noise.acceleration**2) + (H * np.where(of_joints, 0.0, noise.force**2)) @ H
         A, right = np.concatenate([self.held, self.felt], 1), np.concatenate([self.right, self.felt_right], 1)
@@ -306,9 +334,11 @@ class RecordedRows:
         gain = np.linalg.solve(among, at_contacts).swapaxes(1, 2)
         moved = (gain @ (right[..., None] - A @ a[..., None]))[..., 0]
         e_a = e_a - gain @ at_contacts
-        S = M @ e_a @ M.swapaxes(1, 2) + np.diag(np.where(of_joints, noise.force**2, 0.0))
+        levels = np.append(np.where(of_joints, noise.force, 0.0), self.link_noise)
+        S = M @ e_a @ M.swapaxes(1, 2) + np.diag(levels**2)
         # directions of contact forces; without them S is singular where contacts hold
-        pushed = response(self.open.swapaxes(1, 2)).swapaxes(1, 2)
+        open_ = self.open.swapaxes(1, 2)
+        pushed = np.concatenate([response(open_), open_[:, self.links]], axis=1).swapaxes(1, 2)
         S = S + np.trace(S, axis1=1, axis2=2)[:, None, None] * pushed.swapaxes(1, 2) @ pushed
         whitening = np.linalg.inv(np.linalg.cholesky(S))
         whitening = without(whitening, orthonormal_columns(pushed @ whitening.swapaxes(1, 2)))
@@ -323,22 +353,22 @@ class RecordedRows:
 class LikelyAccelerations:
     """Motions with the accelerations a* where a and u are noisy.
 
-    `offset` (rows, nv): forces that the measured a needs less those of a*; `whitening` (rows, nv, nv): L^-1 of S = L
-    L^T.
+    `offset` (rows, n): forces that the measured a needs less those of a*; `whitening` (rows, n, n): L^-1 of S = L L^T,
+    of the n equations of `in_torque`.
     """
 
     motion: Motion
-    offset: Rows
-    whitening: Float[np.ndarray, "rows nv nv"]
+    offset: Float[np.ndarray, "rows equations"]
+    whitening: Float[np.ndarray, "rows equations equations"]
 
     @cached_property
-    def white_regressor(self) -> Float[np.ndarray, "rows nv n 10"]:
+    def white_regressor(self) -> Float[np.ndarray, "rows equations n 10"]:
         """`white` of the regressor; the same wherever a search is."""
         return self.white(self.motion.regressor)
 
-    def white(self, values: Float[np.ndarray, "rows nv *k"]) -> Float[np.ndarray, "rows nv *k"]:
+    def white(self, values: Float[np.ndarray, "rows equations *k"]) -> np.ndarray:
         """Derivatives of forces as those of whitened residuals."""
-        return (self.whitening @ values.reshape(*self.motion.a.shape, -1)).reshape(values.shape)
+        return (self.whitening @ values.reshape(*self.whitening.shape[:2], -1)).reshape(values.shape)
 
 
 def kept_laws(space: ParameterSpace, any_contact: bool = False, sensed: Iterable[str] = ()) -> tuple[Law, ...]:

@@ -61,26 +61,21 @@ def _hidden(names: Sequence[str], terms: Sequence[int], free: Tensor, effect: Te
     for term in set(terms):
         own = [index for index, number in enumerate(terms) if number == term]
         if all(absent[index] for index in own):
-            raise InvalidInput(
-                f"{_few([names[index] for index in own])} exerts no force at any training row; check frame, point and "
-                "contact of the prior, or leave it out"
-            )
+            idle = listed(repr(names[index]) for index in own)
+            remedy = "check frame, point and contact of the prior, or leave it out"
+            raise InvalidInput(f"{idle} exerts no force at any training row; {remedy}")
     hidden = [not nothing and flat for nothing, flat in zip(absent, (shown <= INVISIBLE * size).tolist(), strict=True)]
-    blind = [name for name, flat in zip(names, hidden, strict=True) if flat]
+    blind = listed(repr(name) for name, flat in zip(names, hidden, strict=True) if flat)
     remedy = "learn a force along the surface, such as gp:tool-friction, or leave that prior out"
     if all(nothing or flat for nothing, flat in zip(absent, hidden, strict=True)):
         raise InvalidInput(
-            f"no data can identify {_few(blind)}: the contacts take the whole force, and the acceleration shows none "
+            f"no data can identify {blind}: the contacts take the whole force, and the acceleration shows none "
             f"of it; {remedy}"
         )
-    if blind:
-        what = f"no data can identify {_few(blind)}: the contacts take that force, the acceleration shows none of it, "
+    if any(hidden):
+        what = f"no data can identify {blind}: the contacts take that force, the acceleration shows none of it, "
         what += "and its posterior and that of the normal force are the prior;"
         yield look(about="effects", what=what, do=remedy)
-
-
-def _few(names: Sequence[str]) -> str:
-    return listed(map(repr, names))
 
 
 def warn_of_contacts(model: Model, dataset: Dataset) -> None:

@@ -42,11 +42,6 @@ def calibrated(
     Raises InvalidInput for models without physics, and where fewer than two stretches last for the longest horizon.
     """
     require_type("posterior", posterior, Posterior, ", as in calibrated(posterior, log)")
-    intervals = _intervals(posterior, dataset, horizons, integrator)
-    return posterior.with_settings(motion_intervals=intervals.to_dict())
-
-
-def _intervals(posterior: Posterior, dataset: Dataset, horizons: Sequence[float], integrator: str) -> MotionIntervals:
     require_type("dataset", dataset, Dataset)
     require_unobserved(posterior, "intervals of motions")
     dataset = with_memory(dataset, posterior.model)
@@ -88,7 +83,8 @@ def _intervals(posterior: Posterior, dataset: Dataset, horizons: Sequence[float]
     factors = np.stack([np.quantile(each, level, axis=0) / DEVIATIONS for each in scores])
     pairs = [np.concatenate(shifts[kind::2]) for kind in (0, 1)] if shifts else []
     shift = np.sqrt(np.nanmean(np.square(pairs), axis=1)) if shifts else ()
-    return MotionIntervals(np.array(kept), rms, factors, inputs, shift)
+    intervals = MotionIntervals(np.array(kept), rms, factors, inputs, shift)
+    return posterior.with_settings(motion_intervals=intervals.to_dict())
 
 
 def _records(dataset: Dataset, seconds: float) -> int:

@@ -19,7 +19,7 @@ from forcegp.data import Dataset
 from forcegp.data.views import RecordedMotions, all_motions
 from forcegp.errors import NonPhysicalInertia, NumericalError
 from forcegp.evidence.bodies import thickened
-from forcegp.evidence.least_squares import correlation_time
+from forcegp.evidence.least_squares import correlation_time, step_within
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.fit.physical import typical_sizes
 from forcegp.forces import JointLaw, RigidBodies
@@ -69,13 +69,6 @@ class Unknowns:
         ]  # fmt: skip
         opened = replace(model, forces=tuple(forces))
         return cls(replace(posterior, target=model), ParameterSpace(opened, typical_sizes(opened, [dataset])))
-
-    @cached_property
-    def limits(self) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"], Float[Tensor, " P"]]:
-        """Least and largest values, and the most that one step should change."""
-        low, high = self.space.bounds
-        least, most, step = (torch.as_tensor(x) for x in (low, high, self.space.longest_steps))
-        return least, most, step
 
     def prior(self, x: Tensor) -> tuple[Float[Tensor, " P"], Float[Tensor, "P P"]]:
         """Standardised distance from the prior, and its Jacobian."""
@@ -148,10 +141,6 @@ class MotionFit:
         """Recorded initial states."""
         return torch.as_tensor(np.concatenate([self.recorded.q[:, 0], self.recorded.v[:, 0]], axis=-1))
 
-    def residual(self, motions: WindowMotions) -> Float[Tensor, "K rows nv"]:
-        """From the recorded positions to those of the motions."""
-        return motions.q - self.q
-
     def spread(self, sigma: Tensor) -> Float[Tensor, " state"]:
         """Standard deviations of initial states about the recorded ones."""
         speed = torch.as_tensor(self.recorded.v.copy()).square().mean((0, 1)).sqrt()
@@ -172,7 +161,7 @@ class MotionFit:
         except (NumericalError, NonPhysicalInertia):  # a step that went too far
             nowhere = torch.full_like(q, math.nan)
             motions = WindowMotions(nowhere, nowhere, *guess, torch.zeros(len(q), dtype=torch.bool))
-        residual = self.residual(motions) / noise
+        residual = (motions.q - self.q) / noise
         away = (states - self.start) / self.spread(sigma)
         from_prior, _ = self.unknowns.prior(x)
         cost = 0.5 * float(residual.square().sum() + away.square().sum() + from_prior.square().sum())
@@ -182,7 +171,7 @@ class MotionFit:
     def whitened(self, here: _Point, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Residuals of the windows (K, n) and their Jacobians in states (K, n, 2 nv) and unknowns (K, n, P)."""
         motions = here.motions
-        parts = self.residual(motions)[..., None], motions.in_start, motions.in_parameters
+        parts = (motions.q - self.q)[..., None], motions.in_start, motions.in_parameters
         r, A, B = ((part / noise[:, None]).flatten(1, 2) for part in parts if part is not None)
         return r[..., 0], A, B
 
@@ -214,28 +203,13 @@ class MotionFit:
         values, jacobian = self.unknowns.prior(here.x)
         return 0.5 * float(r.square().sum() + away.square().sum() + (values + jacobian @ dx).square().sum())
 
-    def step(self, x: Tensor, N: Tensor, right: Tensor) -> Float[Tensor, " P"]:
-        """The change that solves N dx = right. Coordinates that it would take beyond their limits end there.
-
-        All others are solved for again, given those, for they depend on each other.
-        """
-        low, high, longest = self.unknowns.limits
-        free, dx = torch.ones_like(x, dtype=torch.bool), torch.zeros_like(x)
-        while bool(free.any()):
-            dx[free] = torch.linalg.solve(N[free][:, free], right[free] - N[free][:, ~free] @ dx[~free])
-            beyond = free & ((x + dx < low) | (x + dx > high))
-            if not bool(beyond.any()):
-                break
-            dx[beyond] = (x + dx).clamp(low, high)[beyond] - x[beyond]
-            free &= ~beyond
-        return dx / max(1.0, float((dx.abs() / longest).max())) if len(dx) else dx
-
     def minimized(self, here: _Point, noise: Tensor, sigma: Tensor, damping: float) -> tuple[_Point, float]:
         """Levenberg-Marquardt for given noise, from that damping; the last damping as well."""
-        here = self.at(here.x, here.states, noise, sigma, here.motions)
+        here, space = self.at(here.x, here.states, noise, sigma, here.motions), self.unknowns.space
         for _ in range(ITERATIONS):
             N, right, G, g = self.curvature(here, noise, sigma, damping)
-            dx = self.step(here.x, N, right)
+            step = step_within(-right.numpy(), N.numpy(), *(end - here.x.numpy() for end in space.bounds))
+            dx = torch.as_tensor(step / (abs(step) / space.longest_steps).max(initial=1.0))
             change = g - G @ dx
             foreseen = here.cost - self.expected(here, noise, sigma, dx, change)
             if not foreseen > CONTENT or damping > MOST_DAMPING:
@@ -271,7 +245,7 @@ class MotionFit:
 
     def noise(self, motions: WindowMotions) -> tuple[Tensor, Tensor]:
         """sigma_j, and sigma_j sqrt(tau_j) with tau_j the rows that an independent residual is worth."""
-        residual = self.residual(motions)
+        residual = motions.q - self.q
         sigma = residual.square().mean((0, 1)).sqrt().clamp_min(1e-12)
         window = np.repeat(np.arange(len(residual)), residual.shape[1])
         time = torch.as_tensor(correlation_time((residual / sigma).flatten(0, 1).cpu().numpy(), window))

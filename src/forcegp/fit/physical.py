@@ -23,6 +23,7 @@ from forcegp.evidence.least_squares import (
     Jacobian,
     NoiseLevels,
     Regressor,
+    orthonormal_columns,
     weighted_least_squares,
     without,
 )
@@ -58,11 +59,19 @@ class Equations:
         self.a = np.concatenate([log.a for log in logs])
         self.ends = np.cumsum([len(log) for log in logs])[:-1]
         self.measured = [part.moving(a) for part, a in zip(self.parts, self.each(self.a), strict=True)]
-        self.held = _stacked([part.open if evidence.of_torque else part.held for part in self.parts])
+        held = [part.open if evidence.of_torque else part.held for part in self.parts]
+        most = max(each.shape[1] for each in held)  # zeros where a log has fewer directions of contact forces
+        self.held = np.concatenate([np.pad(each, ((0, 0), (0, most - each.shape[1]), (0, 0))) for each in held])
+        self.links, each = self.parts[0].links, self.parts[0].equations
+        if any(part.links != self.links for part in self.parts):
+            raise InvalidInput("a baseline needs torque sensors at the same links as the log; leave others out.")
+        self.sizes, self.hidden = space.typical["force"][each], self.held[:, :, each]
+        """Of the equations of joints and of sensors at links: typical torques, and directions that contacts hide."""
         gains = any(isinstance(space.model.laws[term.law], Actuation) for term in space.terms)
         self.in_units_of_log = gains and not self.held.shape[1]
         seconds = evidence.mean if isinstance(evidence, Torques) else None
-        self.tell_bodies = seconds is not None and not all(map(at_rest, logs))  # any numbers explain a few postures
+        # any numbers explain a few postures
+        self.tell_bodies = seconds is not None and not self.links and not all(map(at_rest, logs))
         self.windows = None if seconds is None else WindowMeans(logs, seconds)
         self._stays: tuple[np.ndarray, ...] = ()
         """Regressors of the last search, which no coordinate changes."""
@@ -86,7 +95,7 @@ class Equations:
         found = [part.in_torque(x, motion)[:3] for part, motion in zip(self.parts, motions, strict=True)]
         r, jacobian = self.equations(x, found)
         if self.windows is not None:
-            free = partial(without, span=self.held.swapaxes(1, 2) if self.held.shape[1] else None)
+            free = partial(without, span=orthonormal_columns(self.hidden) if self.held.shape[1] else None)
             r, jacobian = self.windows.mean(free(r)), self.windows.mean(free(np.asarray(jacobian)))
         return self._as_logged(x, r, np.asarray(jacobian)) if self.in_units_of_log else (r, jacobian)
 
@@ -126,8 +135,7 @@ class Equations:
 
     def accelerations(self, x: np.ndarray) -> list[np.ndarray]:
         """Predicted accelerations, M and H."""
-        found = [part.acceleration(x) for part in self.parts]
-        return [np.concatenate(each) for each in zip(*found, strict=True)]
+        return [np.concatenate(each) for each in zip(*(part.acceleration(x) for part in self.parts), strict=True)]
 
     def whitening(self, noise: NoiseLevels, H: np.ndarray) -> np.ndarray:
         """Of the residuals of `in_acceleration`."""
@@ -165,9 +173,7 @@ class Equations:
         starts = np.concatenate([[0], np.cumsum(lengths)])
         numbers = []
         for log, start, length in zip(self.logs, starts, lengths, strict=False):
-            order = np.arange(length)
-            if self.windows is None:
-                order = np.lexsort((log.time, log.episode))
+            order = np.lexsort((log.time, log.episode)) if self.windows is None else np.arange(length)
             numbers.append(np.array_split(start + order, min(STRETCHES, sum(lengths))))
         rows = [np.concatenate(each) for each in zip(*numbers, strict=True)]
         return [each for each in rows if len(each)]
@@ -189,12 +195,6 @@ class WindowMeans:
         """(rows, ...) as (windows, ...)."""
         sums = np.add.reduceat(values, self.starts, axis=0)
         return sums / self.roots.reshape(-1, *(1,) * (values.ndim - 1))
-
-
-def _stacked(held: Sequence[np.ndarray]) -> np.ndarray:
-    """Directions of contact forces of all logs, as many in every row: zeros where a log has fewer."""
-    most = max(each.shape[1] for each in held)
-    return np.concatenate([np.pad(each, ((0, 0), (0, most - each.shape[1]), (0, 0))) for each in held])
 
 
 ROWS = 5_000
@@ -252,7 +252,7 @@ def fit_physical(
     space = ParameterSpace(model, typical)
     unseen = Unseen.of(model, logs[0], typical["force"])
     equations = Equations(space, logs, evidence, unseen.pushed)
-    held = equations.held if evidence.of_torque and equations.held.shape[1] and equations.windows is None else None
+    held = equations.hidden if evidence.of_torque and equations.held.shape[1] and equations.windows is None else None
     if held is not None and not unseen.pushed and held.any(-1).sum(1).min() == robot.nv:
         raise InvalidInput("contacts hold every degree of freedom in every row, so no equation is left to learn from.")
     history: list[float] = []
@@ -262,7 +262,7 @@ def fit_physical(
         tell(min(done, ROUNDS), ROUNDS, f"all rows, step {done}: {rms:.3g}")
 
     options: dict[str, Any] = {"longest": space.longest_steps, "moved": space.moved, "roughly": roughly}
-    options["sizes"] = typical["force"] if all(len(log) == len(log.episodes) > 2 for log in logs) else None
+    options["sizes"] = equations.sizes if all(len(log) == len(log.episodes) > 2 for log in logs) else None
     search = partial(weighted_least_squares, prior=space.prior, bounds=space.bounds, **options)
     noise, x, changes = None, space.start if near is None else near.x, None
     torque = partial(equations.in_torque, motions=equations.measured)
@@ -295,7 +295,7 @@ def fit_physical(
     told = tuple(doubt.to_dict() for doubt in doubts)
     level = model.noise
     if evidence.of_torque and model.contacts and noise is None:
-        noise = unseen.levels(equations.a, equations.accelerations(fit.x), equations.held, fit.noise)
+        noise = unseen.levels(equations.a, equations.accelerations(fit.x), equations.held, fit.noise[: robot.nv])
     if level is None or level.learn or level.acceleration is None:
         found_levels = Noise(tuple(np.sqrt((residual**2).mean(0)).clip(1e-12)))
         level = found_levels if noise is None else Noise(tuple(noise.acceleration), tuple(noise.force))
@@ -333,7 +333,7 @@ def _with_noise_in_both(
         if not rough:
             noise, least = levels, levels.scaled(LEAST) if least is None else least
         # its whitening holds levels of noise and weights, without forces of contacts
-        known = np.ones(equations.a.shape[1])
+        known = np.ones_like(equations.sizes)
         fit = search(partial(equations.whitened, likely=likely), start=x, known=known, evaluations=steps)
         evaluations += fit.evaluations
         steps, x = STEPS if (fit.x != x).any() else 2 * steps, fit.x
@@ -355,18 +355,24 @@ def _estimates(
 ) -> Estimates:
     """The numbers at the end of the search."""
     white = np.concatenate([fit.white_jacobian, fit.white[..., None]], axis=-1)
-    each = np.arange(white.shape[1])  # equations of a row: of joints, and of sensors
+    columns = np.arange(white.shape[1])  # equations of a row: of joints, and of sensors
     prior = space.prior(fit.x)[1]
     by_body = None
     everything = len(space.carried) == len(space.own) and all(each.payload is None for each in space.carried)
     if everything and space.carried:
-        by_body = _weak_directions(space, fit.information, prior.T @ prior)
+        # of ten directions of each body, those of which the data hold less than the prior, as if others were known
+        G, weak = prior.T @ prior, {}
+        for body, each in enumerate(space.carried):
+            own = slice(10 * body, 10 * body + 10), slice(10 * body, 10 * body + 10)
+            few = np.linalg.eigvalsh(fit.information[own]) < np.linalg.eigvalsh(G[own]).mean()
+            weak[each.name] = int(few.sum())
+        by_body = {name: count for name, count in sorted(weak.items(), key=lambda entry: -entry[1]) if count}
     return Estimates.of_search(
         space.parameters,
         space.numbers(fit.x),
         space.number_slopes(fit.x),
         white.reshape(-1, white.shape[-1]),
-        [(len(each) * rows[:, None] + each).ravel() for rows in equations.stretches()],
+        [(len(columns) * rows[:, None] + columns).ravel() for rows in equations.stretches()],
         prior,
         changes,
         move,
@@ -377,16 +383,6 @@ def _estimates(
         settled=fit.settled,
         thickened=thick,
     )
-
-
-def _weak_directions(space: ParameterSpace, information: np.ndarray, prior: np.ndarray) -> dict[str, int]:
-    """Of ten directions of each body, those of which the data hold less than the prior, as if others were known."""
-    out = {}
-    for body, each in enumerate(space.carried):
-        own = slice(10 * body, 10 * body + 10)
-        weak = np.linalg.eigvalsh(information[own, own]) < np.linalg.eigvalsh(prior[own, own]).mean()
-        out[each.name] = int(weak.sum())
-    return {name: count for name, count in sorted(out.items(), key=lambda entry: -entry[1]) if count}
 
 
 def typical_sizes(model: Model, logs: Sequence[Dataset]) -> dict[str, Float[np.ndarray, " nv"]]:

@@ -152,7 +152,9 @@ def fit_with_refined_loads(
             prior = refined_loads(given, last.trained.robot, lambda name, p=last: _table(p, name))
             if prior is None:
                 return first
-            change = _change(last, prior)
+            with torch.no_grad():  # of mixing vectors at the training points
+                old, new = (x.direction(last.likelihood.dynamics) for x in (last.trained.unknown, prior))
+            change = float((new - old).square().mean().sqrt() / old.square().mean().sqrt())
             if change < SETTLED:
                 # the last is consistent with its own curves; an earlier one must be clearly likelier to be kept
                 if last.negative_log_likelihood < best.negative_log_likelihood + NOTICEABLE:
@@ -185,11 +187,3 @@ def _table(posterior: Posterior, latent: str) -> TabulatedCurve:
     places = [*reversed(below), *at.tolist(), *above]
     mean = posterior.curve(latent, torch.tensor(places, dtype=torch.float64)).mean
     return TabulatedCurve(tuple(places), tuple(mean.tolist()))
-
-
-def _change(posterior: Posterior, prior: UnknownForces) -> float:
-    """How much the other prior's mixing vectors differ at the training points."""
-    with torch.no_grad():
-        dynamics = posterior.likelihood.dynamics
-        old, new = posterior.trained.unknown.direction(dynamics), prior.direction(dynamics)
-    return float((new - old).square().mean().sqrt() / old.square().mean().sqrt())

@@ -61,9 +61,9 @@ class Unseen:
         if not model.contacts or model.carries_known_forces:
             return nothing
         log = log.rows(evenly(log, ROWS))
-        rows = _rows_of_known_physics(model, log)
+        rows = rows_of_known_physics(model, log)
         robot, a = model.robot, np.array(log.a)
-        residual = rows.in_torque(np.zeros(0), rows.moving(a))[0]
+        residual = rows.in_torque(np.zeros(0), rows.moving(a))[0][:, : robot.nv]
         needed = rows.kinematics.inverse_dynamics(torch.as_tensor(a, device=robot.device)).cpu().numpy()
         single, pushing = np.isin(robot.joint_names, robot.single_joint_names), np.zeros_like(typical)
         for j in np.flatnonzero(single & ~rows.delivered.any(0)).tolist():
@@ -125,7 +125,7 @@ class Unseen:
         ]
 
 
-def _rows_of_known_physics(model: Model, log: Dataset) -> RecordedRows:
+def rows_of_known_physics(model: Model, log: Dataset) -> RecordedRows:
     """Rows of the model without what is to be learned."""
     stated = (law for law in model.laws if not law.learned and not (isinstance(law, Payload) and not law.known))
     closed = tuple(replace(law, learn=()) if isinstance(law, RigidBodies) else law for law in stated)

@@ -38,6 +38,7 @@ class Actuation(PerJointLaw):
         "gain": Coefficient("1", 1.0, factor=1.0, lowest=1e-6, highest=1e6, logarithm=True)
     }
     called: ClassVar[str] = "gain"
+    in_gear: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         require_type("Actuation known", self.known, bool)

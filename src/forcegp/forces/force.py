@@ -183,6 +183,8 @@ class Law(Force):
     """What its numbers are called; "" where that is the name of the law."""
     part: ClassVar[str] = ""
     """What of the robot it is a law of: those of one part take the place of each other, "" is that of its class."""
+    in_gear: ClassVar[bool] = False
+    """Whether it acts at the motor's side of a torque sensor at the link."""
     transmission: Any = None
     """Of motors in which it acts; None: it acts at the joints."""
 

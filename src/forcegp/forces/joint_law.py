@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from math import nan
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
@@ -80,6 +80,7 @@ class JointLaw(PerJointLaw):
     "joint_6+joint_5" for a motor of joint 6 that turns with both, "joint_6-0.5*joint_5/joint_3+joint_2".
     """
 
+    in_gear: ClassVar[bool] = True
     transmission: Transmission = field(default=None, kw_only=True)
 
     @override

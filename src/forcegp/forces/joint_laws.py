@@ -77,14 +77,13 @@ class DryFriction(JointLaw):
     @override
     def features(self, state: State) -> tuple[Tensor, ...]:
         own = (state.v, state.delivered.abs()) if self.under_load else (state.v,)
-        return (*own, self._past(state)) if self.memory else own
-
-    def _past(self, state: State) -> Tensor:
-        """Strokes (..., nv, strokes) where the state has them, else the memory (..., nv)."""
-        if state.strokes is not None:
-            return state.strokes
+        if not self.memory:
+            return own
+        if state.strokes is not None:  # (..., nv, strokes), else the memory (..., nv)
+            return (*own, state.strokes)
         z = iter(self.remembered(state).unbind(-1))
-        return torch.stack([next(z) if own else 0.0 * state.v[..., j] for j, own in enumerate(self._mask)], dim=-1)
+        past = [next(z) if remembers else 0.0 * state.v[..., j] for j, remembers in enumerate(self._mask)]
+        return (*own, torch.stack(past, dim=-1))
 
     @override
     def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
@@ -249,8 +248,9 @@ class Offset(JointLaw):
 
 @dataclass(frozen=True, eq=False)
 class Spring(JointLaw):
-    """-k (q - q0): a spring of `stiffness` k (Nm/rad or N/m) in each joint, at rest at the position `rest` q0."""
+    """-k (q - q0): a spring of `stiffness` k (Nm/rad or N/m) between links, at rest at the position `rest` q0."""
 
+    in_gear: ClassVar[bool] = False
     stiffness: Number = None
     rest: Number = None
     coefficients: ClassVar[Mapping[str, Coefficient]] = {

@@ -12,7 +12,7 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput, require_number, usable_arguments
 from forcegp.forces.actuation import ObservedWind
 from forcegp.forces.unknown import SharedInputs
-from forcegp.mechanics import ConstrainedDynamics, Contact, State, surface_axes
+from forcegp.mechanics import ConstrainedDynamics, Contact, surface_axes
 from forcegp.mechanics.gauss_principle import placed
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector
@@ -69,17 +69,6 @@ def require_contact(force: str, contact: int, contacts: Sequence[Contact]) -> No
         raise InvalidInput(
             f"{force} acts at contact {contact}, but the model has {have}; give the contact (`contacts`), or use a "
             "force that needs none, such as JointFriction or AerodynamicForce(frame=...)."
-        )
-
-
-def require_moving(prior: str, frame: str, robot: Robot) -> None:
-    """Raise UnknownName for a frame that does not exist, InvalidInput for one that is fixed in the world."""
-    body, _ = robot.frame(frame)
-    if body < 0:
-        moving = [name for name in robot.link_names if robot.frame(name)[0] >= 0]
-        raise InvalidInput(
-            f"{prior} acts on frame {frame!r}, which is fixed in the world and never moves, so its forces move "
-            f"nothing; give a frame of a moving link: {', '.join(moving)}."
         )
 
 
@@ -160,15 +149,12 @@ class ToolForces(SharedInputs):
         return ("N", "N")
 
     def _directions(self, dynamics: ConstrainedDynamics, where: ToolPoint) -> Float[Tensor, "*batch 3 2"]:
-        return _containing(contact_axes(dynamics, self.contact), where.velocity(dynamics.state.v)[..., :3])
-
-
-def _containing(axes: Float[Tensor, "*batch 3 3"], velocity: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 2"]:
-    """Tangents t + n (t v_t) v_n / |v|^2, since what resists a point resists its drift off the surface, too."""
-    tangents, normal = axes[..., :2], axes[..., 2:]
-    along, off = _along(tangents, velocity), _along(normal, velocity)
-    tilt = along * off / velocity.square().sum(-1, keepdim=True).clamp_min(SMALLEST_SPEED**2)
-    return tangents + normal * tilt[..., None, :]
+        """Tangents t + n (t v_t) v_n / |v|^2, since what resists a point resists its drift off the surface, too."""
+        axes, velocity = contact_axes(dynamics, self.contact), where.velocity(dynamics.state.v)[..., :3]
+        tangents, normal = axes[..., :2], axes[..., 2:]
+        along, off = _along(tangents, velocity), _along(normal, velocity)
+        tilt = along * off / velocity.square().sum(-1, keepdim=True).clamp_min(SMALLEST_SPEED**2)
+        return tangents + normal * tilt[..., None, :]
 
 
 def _along(axes: Float[Tensor, "*batch 3 k"], vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch k"]:
@@ -216,7 +202,13 @@ class AerodynamicForce(SharedInputs):
 
     @override
     def check(self, robot: Robot, contacts: Sequence[Contact]) -> None:
-        require_moving("AerodynamicForce", self.link(robot), robot)
+        frame = self.link(robot)
+        if robot.frame(frame)[0] < 0:
+            moving = ", ".join(name for name in robot.link_names if robot.frame(name)[0] >= 0)
+            raise InvalidInput(
+                f"AerodynamicForce acts on frame {frame!r}, which is fixed in the world and never moves, so its forces "
+                f"move nothing; give a frame of a moving link: {moving}."
+            )
 
     def link(self, robot: Robot) -> str:
         """The link that the force acts on. Raises InvalidInput where none is named and none moves freely."""
@@ -253,23 +245,27 @@ class AerodynamicForce(SharedInputs):
     def columns(self, dynamics: ConstrainedDynamics) -> dict[str, Callable[[], Tensor]]:
         state, where = dynamics.state, self._point(dynamics)
         moving, turning = where.velocity(state.v).split(3, dim=-1)
-        linear, angular = (
-            (where.orientation.mT @ part[..., None])[..., 0] for part in (moving - self._flow(state), turning)
-        )
+        flow = state.v.new_tensor(self.wind) if (wind := ObservedWind.at(state)) is None else wind
+        linear, angular = ((where.orientation.mT @ part[..., None])[..., 0] for part in (moving - flow, turning))
+        groups = state.robot.layout.groups
+
+        def push() -> Tensor:
+            """Of actuators on a base that flies, without x and y, which none drives; else of all joints."""
+            return state.delivered[..., groups[0].rows][..., 2:] if groups else state.delivered
+
+        def root_of_thrust() -> Tensor:
+            thrust = push()[..., :1] if groups else push()
+            return (thrust.square().sum(-1, keepdim=True) + 1e-4).sqrt().sqrt()  # smooth where rotors stand
+
         return {
             "velocity": lambda: linear,
             "drag": lambda: (linear.square().sum(-1, keepdim=True) + 1e-12).sqrt() * linear,
-            "rotor-drag": lambda: _root_of_thrust(state) * linear,
+            "rotor-drag": lambda: root_of_thrust() * linear,
             "angular-velocity": lambda: angular,
-            "thrust": lambda: state.delivered[..., _base_rows(state.robot)][..., _thrust(state.robot)],
+            "thrust": push,
             "height": lambda: where.position[..., 2:],
             "attitude": lambda: where.orientation.flatten(-2),
         }
-
-    def _flow(self, state: State) -> Tensor:
-        """The velocity of the air, along the axes of the world."""
-        wind = ObservedWind.at(state)
-        return state.v.new_tensor(self.wind) if wind is None else wind
 
     @override
     def labels(self, robot: Robot) -> dict[str, Sequence[str]]:
@@ -282,26 +278,10 @@ class AerodynamicForce(SharedInputs):
             "drag": [f"speed times velocity of {link} along its {axis} [m^2/s^2]" for axis in "xyz"],
             "rotor-drag": [f"root of thrust times velocity of {link} along its {axis} [N^1/2 m/s]" for axis in "xyz"],
             "angular-velocity": [f"angular velocity of {link} about its {axis} [rad/s]" for axis in "xyz"],
-            "thrust": pushes[_thrust(robot)],
+            "thrust": pushes[2:] if groups else pushes,
             "height": [f"height of {link} [m]"],
             "attitude": [f"world {world} along {axis} of {link}" for world in "xyz" for axis in "xyz"],
         }
 
     def _point(self, dynamics: ConstrainedDynamics) -> ToolPoint:
         return ToolPoint.of(dynamics, self.link(dynamics.state.robot), (0.0, 0.0, 0.0))
-
-
-def _base_rows(robot: Robot) -> slice:
-    return robot.layout.groups[0].rows if robot.layout.groups else slice(0, robot.nv)
-
-
-def _root_of_thrust(state: State) -> Float[Tensor, "*batch 1"]:
-    """Of the force along z of a base that flies; of all that actuators deliver where there is none."""
-    groups, push = state.robot.layout.groups, state.delivered[..., _base_rows(state.robot)]
-    push = push[..., 2:3] if groups else push
-    return (push.square().sum(-1, keepdim=True) + 1e-4).sqrt().sqrt()  # smooth where rotors stand
-
-
-def _thrust(robot: Robot) -> slice:
-    """Which of the base rows thrusters that point up can drive; all where the base has no such rows."""
-    return slice(2, None) if robot.layout.groups else slice(None)

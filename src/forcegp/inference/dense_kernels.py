@@ -84,19 +84,14 @@ def of_distance(left: Tensor, right: Tensor, smoothness: float) -> Tensor:
     """The squared exponential (smoothness inf) or a Matern of the distances between points that are scaled already."""
     if smoothness == math.inf:
         return torch.exp(-0.5 * squared_distance(left, right))
-    return _matern(distance(left, right), smoothness)
+    a = math.sqrt(2.0 * smoothness) * distance(left, right)  # Rasmussen & Williams (2006), eq. 4.17
+    polynomial = {0.5: lambda: 1.0, 1.5: lambda: 1.0 + a, 2.5: lambda: 1.0 + a * (1.0 + a / 3.0)}[smoothness]()
+    return polynomial * torch.exp(-a)
 
 
 def distance(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:
     """|x_i - y_j| from the differences themselves: a root would make 1e-8 of what cancels in `squared_distance`."""
     return torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")
-
-
-def _matern(r: Tensor, smoothness: float) -> Tensor:
-    """Rasmussen & Williams (2006), eq. 4.17, with scaled distances r."""
-    a = math.sqrt(2.0 * smoothness) * r
-    polynomial = {0.5: lambda: 1.0, 1.5: lambda: 1.0 + a, 2.5: lambda: 1.0 + a * (1.0 + a / 3.0)}[smoothness]()
-    return polynomial * torch.exp(-a)
 
 
 class DenseKernel(NamedTuple):

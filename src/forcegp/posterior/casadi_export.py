@@ -101,13 +101,15 @@ def export_casadi(
     lost, found = rounding(posterior, q, v, u), {}
     for file, function in functions.items():
         try:
-            made = _evaluated(function, [x.numpy().T for x in (q, v, u)])[:, : expected[file].shape[1]]
+            parts = function.map(len(q))(*(x.numpy().T for x in (q, v, u)))
         except RuntimeError:  # many lines
             raise NumericalError(
                 f"CasADi finds no step of {steps:g} s by {integrator} somewhere near the training data, so nothing is "
                 "written; give shorter steps, or export to C, whose Newton method shortens what overshoots."
             ) from None
-        worst = float(np.abs(made - expected[file].numpy()).max() / expected[file].abs().max())
+        made = np.concatenate([np.array(x) for x in (parts if isinstance(parts, tuple) else (parts,))]).T
+        apart = made[:, : expected[file].shape[1]] - expected[file].numpy()
+        worst = float(np.abs(apart).max() / expected[file].abs().max())
         if not worst <= max(STEP_TOLERANCE if file != called else TOLERANCE, lost):
             raise NumericalError(
                 f"{file}.casadi and forcegp differ by {worst:.2g} of the largest value, so nothing is written; export "
@@ -119,12 +121,6 @@ def export_casadi(
         text.pack(function)
         write_text(Path(folder) / f"{file}.casadi", text.encode())  # `save` is silent where the disk is full
     return found
-
-
-def _evaluated(function: Any, given: Sequence[np.ndarray]) -> np.ndarray:
-    """All outputs (n, size) side by side at columns of states."""
-    found = function.map(given[0].shape[1])(*given)
-    return np.concatenate([np.array(part) for part in (found if isinstance(found, tuple) else (found,))]).T
 
 
 def _of_space(casadi: Any, function: Callable[[Tensor, Tensor], Tensor], sizes: Sequence[int]) -> Any:

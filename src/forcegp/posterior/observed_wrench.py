@@ -5,19 +5,20 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
+from torch import Tensor
 
 from forcegp.data import AirLaw, Dataset, find_wind, with_memory, with_wind
 from forcegp.data.filters import episodes_in_order, sums_before
+from forcegp.data.views import in_blocks
 from forcegp.errors import InvalidInput
 from forcegp.forces import AerodynamicForce, ObservedWind, ObservedWrench
 from forcegp.model import Model
-from forcegp.posterior.prediction import ROWS_PER_BLOCK
 
 Posterior = Any
 """A `Posterior`, whose module imports this one."""
 
+OBSERVERS = ObservedWind | ObservedWrench
 TRIED = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s
 MEMORY, LEAST = 1.0, 0.1  # s, of how much each time missed, and of the past that the first row needs
 
@@ -49,8 +50,15 @@ def observing(
         raise InvalidInput(f"seconds is {seconds!r}; give the time in s that an observer looks back.")
     frame = (own or AerodynamicForce()).link(posterior.model.robot)
     posterior, dataset = _in_observed_wind(posterior, dataset)
-    unexplained, effect = _unexplained(posterior, dataset, frame)
-    wrench = np.einsum("nij,nj->ni", np.linalg.pinv(effect, rcond=1e-9), unexplained)
+
+    def unexplained(q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:
+        """Accelerations less their predicted mean, and how a wrench of the world on the link changes them."""
+        dynamics = posterior.dynamics(q, v, u)
+        effect = dynamics.H @ dynamics.state.kinematics.frame_jacobian(frame).mT
+        return a - posterior.predict(q, v, u, covariance=False).mean, effect
+
+    missed, effect = in_blocks(dataset, unexplained, posterior.model.robot.device)
+    wrench = np.einsum("nij,nj->ni", np.linalg.pinv(effect, rcond=1e-9), missed)
     observed = _observed(wrench, dataset, times)
     model = replace(posterior.model, forces=(*posterior.model.forces, ObservedWrench(frame)))
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
@@ -67,7 +75,8 @@ def in_air(model: Model, dataset: Dataset) -> tuple[Mapping[str, Any], Dataset] 
     None where the model has no `AerodynamicForce` or observes nothing, observes already, or rows show no wind.
     """
     of_air = [term for term in model.unknown_forces if isinstance(term, AerodynamicForce) and term.observe != 0.0]
-    if not of_air or _observes(model) or dataset.u.shape[1] != model.sizes[2]:
+    observes = any(isinstance(force, OBSERVERS) for force in model.forces)
+    if not of_air or observes or dataset.u.shape[1] != model.sizes[2]:
         return None
     rows = replace(dataset, model=model, truth={})
     if (found := find_wind(rows)) is None:
@@ -75,10 +84,6 @@ def in_air(model: Model, dataset: Dataset) -> tuple[Mapping[str, Any], Dataset] 
     law, wind = found
     windy = (replace(x, wind=law.wind) if isinstance(x, AerodynamicForce) else x for x in model.forces)
     return {"air": asdict(law)}, with_wind(replace(rows, model=replace(model, forces=tuple(windy))), wind)
-
-
-def _observes(model: Model) -> bool:
-    return any(isinstance(force, ObservedWind | ObservedWrench) for force in model.forces)
 
 
 def unobserved(model: Model) -> Model:
@@ -130,26 +135,11 @@ def _with_past(dataset: Dataset, seconds: float) -> Int[np.ndarray, " late"]:
 def _in_observed_wind(posterior: Posterior, dataset: Dataset) -> tuple[Posterior, Dataset]:
     """Both with the wind that the rows before each one show, where the fit found a law of air."""
     stored = posterior.settings.get("air")
-    if stored is None or _observes(posterior.model):
+    if stored is None or any(isinstance(force, OBSERVERS) for force in posterior.model.forces):
         return posterior, dataset
     rows = replace(dataset, model=posterior.model)
     seen = with_wind(rows, AirLaw(**stored).wind_before(rows))
     return posterior.with_model(seen.model), seen
-
-
-def _unexplained(
-    posterior: Posterior, dataset: Dataset, frame: str
-) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv 6"]]:
-    """Accelerations less their predicted mean, and how a wrench of the world on the link changes them."""
-    device, parts = posterior.model.robot.device, []
-    rows = (torch.tensor(x, device=device).split(ROWS_PER_BLOCK) for x in (dataset.q, dataset.v, dataset.u, dataset.a))
-    for q, v, u, a in zip(*rows, strict=True):
-        with torch.no_grad():
-            dynamics = posterior.dynamics(q, v, u)
-            effect = dynamics.H @ dynamics.state.kinematics.frame_jacobian(frame).mT
-            parts.append((a - posterior.predict(q, v, u, covariance=False).mean, effect))
-    unexplained, effects = (torch.cat(part).cpu().numpy() for part in zip(*parts, strict=True))
-    return unexplained, effects
 
 
 def _observed(

@@ -14,7 +14,7 @@ from torch import Tensor
 from forcegp.data import Dataset, with_memory
 from forcegp.data.dataset import FORCE as OF_SENSOR
 from forcegp.data.dataset import require_rows
-from forcegp.errors import DataWarning, InvalidInput, NumericalError, require_type, usable_arguments
+from forcegp.errors import DataWarning, InvalidInput, NumericalError, require_known, require_type, usable_arguments
 from forcegp.forces import Force
 from forcegp.inference.memory import blas_threads
 from forcegp.inference.prepared_kernels import CompressedCovariance
@@ -36,8 +36,7 @@ from forcegp.posterior.prediction import (
     Positions,
     Prediction,
     Rows,
-    components_of,
-    curve_of,
+    curve_features,
     join_predictions,
     state_rows,
     state_tensor,
@@ -124,7 +123,8 @@ class Posterior(Fitted):
         def through(affine: AffineMap) -> Gaussian:
             return whole.through(affine.matrix, affine.offset)
 
-        predicted, noise = moving, _noise_covariance(given, dynamics)
+        predicted, noise = moving, Noise.covariance(given, dynamics.H)
+        noise = torch.diag_embed(noise).expand_as(dynamics.H) if noise.dim() == 2 else noise
         if self.is_black_box:  # its functions hold what contacts do, so forces are not those of anything
             return Prediction(predicted.mean, predicted.covariance, None, None, None, noise)
         multiplier = through(dynamics.multiplier_map())
@@ -186,8 +186,20 @@ class Posterior(Fitted):
         require_type("covariance", covariance, bool)
         states, batch = state_rows(self.model, q, v, u)
         dynamics = self.dynamics(*(x.reshape(*batch, x.shape[-1]) for x in states))
-        latents = self.latents(dynamics, covariance)
-        return components_of(self.trained.unknown, dynamics, latents)
+        latents, robot, parts = self.latents(dynamics, covariance), dynamics.state.robot, {}
+        B = self.trained.unknown.direction(dynamics)
+        for name, term, which in self.trained.unknown.named(robot):
+            own, mixing, point = latents.entries(which), B[..., which], term.point_force(dynamics)
+            parts[name] = ForceComponent(
+                name,
+                term.latent_names(robot),
+                term.latent_units(robot),
+                own,
+                joint_force=own.through(mixing),
+                acceleration=own.through(dynamics.H @ mixing),
+                point_force=None if point is None else own.through(point),
+            )
+        return parts
 
     @usable_arguments("curve")
     def curve(self, latent: str, features: Array | None = None, *, points: int = 200) -> Curve:
@@ -196,7 +208,18 @@ class Posterior(Fitted):
         `features` are (n, d) in the units of `prior.feature_names`, (n,) for one feature, or None for `points` values
         over the range of the training data. InvalidInput for another name, wrong shapes, and None for several features.
         """
-        return curve_of(self, latent, features, points)
+        names, prior, robot = self.latent_names, self.trained.unknown, self.trained.robot
+        require_known("latent", latent, "this model", names)
+        index = names.index(latent)
+        with torch.no_grad():
+            given = prior.features(self.likelihood.dynamics)[index]
+            visited = torch.stack([given.amin(0), given.amax(0)]) if given.shape[-1] else given[:2]
+            z, known = curve_features(latent, features, visited, points), self.likelihood.standardization
+            mean, variance = self.latent.one(index, (z - known.shift[index]) / known.scale[index])
+        labels = prior.feature_names(robot)
+        inputs = tuple(f"feature {k}" for k in range(z.shape[-1])) if labels is None else labels[index]
+        std = self.widening * variance.clamp_min(0.0).sqrt()
+        return Curve(latent, prior.latent_units(robot)[index], inputs, z, mean, std, visited)
 
     def predictor(self, *, covariance: str = "auto", compile: bool = True) -> Predictor:
         """The accelerations of `predict` at control rates: one state at a time in fractions of a millisecond.
@@ -358,8 +381,3 @@ def _has_its_place(force: Force, model: Model) -> bool:
     except InvalidInput:
         return False
     return True
-
-
-def _noise_covariance(parameters: Mapping[str, Tensor], dynamics: ConstrainedDynamics) -> Tensor:
-    noise = Noise.covariance(parameters, dynamics.H)
-    return torch.diag_embed(noise).expand_as(dynamics.H) if noise.dim() == 2 else noise

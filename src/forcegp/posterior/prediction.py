@@ -10,9 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import InvalidInput, NumericalError, require_known
+from forcegp.errors import InvalidInput, NumericalError
 from forcegp.evidence.likelihood import FAR_FROM_SURFACE
-from forcegp.forces import Actuation, UnknownForces
+from forcegp.forces import Actuation
 from forcegp.integration.integrators import find_roots, rows_jacobian
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.model import Model
@@ -245,26 +245,6 @@ class ForceComponent:
     point_force: Gaussian | None
 
 
-def components_of(prior: UnknownForces, dynamics: ConstrainedDynamics, latents: Gaussian) -> dict[str, ForceComponent]:
-    """All components of Q_U = B f at the states of `dynamics`."""
-    robot = dynamics.state.robot
-    B = prior.direction(dynamics)
-    parts = {}
-    for name, term, which in prior.named(robot):
-        own, mixing = latents.entries(which), B[..., which]
-        point = term.point_force(dynamics)
-        parts[name] = ForceComponent(
-            name,
-            term.latent_names(robot),
-            term.latent_units(robot),
-            own,
-            joint_force=own.through(mixing),
-            acceleration=own.through(dynamics.H @ mixing),
-            point_force=None if point is None else own.through(point),
-        )
-    return parts
-
-
 @dataclass(frozen=True, eq=False)
 class Curve:
     """One process over some of its features, for example a friction curve: force over velocity.
@@ -289,14 +269,6 @@ def joint_force(posterior: Any, dynamics: ConstrainedDynamics) -> Float[Tensor, 
     """Q_K + Q_U, the mean of what acts on the joints of a Posterior beside the contacts."""
     Q_U = posterior.latents(dynamics, False).through(posterior.trained.unknown.direction(dynamics)).mean
     return dynamics.Q_K + Q_U
-
-
-def forces_around(posterior: Any, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-    """Q_K + Q_U (n, nv) at states (n, nv), and the entries (n, k) of dQ/du, M, A, b and off one after the other."""
-    Q, slope = rows_jacobian(lambda u: joint_force(posterior, posterior.dynamics(q, v, u)), u)
-    at = posterior.dynamics(q, v, u)
-    around = slope.flatten(1), at.M.flatten(1), at.A.flatten(1), at.b, at.off()
-    return Q, torch.cat(around, dim=-1).detach()
 
 
 def require_actuated(posterior: Any) -> None:
@@ -361,26 +333,7 @@ def inverse_dynamics(
         return Gaussian(u, posterior.latents(at, True).through(response).covariance)
 
 
-def curve_of(posterior: Any, latent: str, features: Any, points: int) -> Curve:
-    """What `Posterior.curve` documents."""
-    names = posterior.latent_names
-    require_known("latent", latent, "this model", names)
-    index = names.index(latent)
-    prior, robot = posterior.trained.unknown, posterior.trained.robot
-    with torch.no_grad():
-        given = prior.features(posterior.likelihood.dynamics)[index]
-        visited = torch.stack([given.amin(0), given.amax(0)]) if given.shape[-1] else given[:2]
-        z = _curve_features(latent, features, visited, points)
-        standardization = posterior.likelihood.standardization
-        shift, scale = (part[index] for part in (standardization.shift, standardization.scale))
-        mean, variance = posterior.latent.one(index, (z - shift) / scale)
-    labels = prior.feature_names(robot)
-    inputs = tuple(f"feature {k}" for k in range(z.shape[-1])) if labels is None else labels[index]
-    std = posterior.widening * variance.clamp_min(0.0).sqrt()
-    return Curve(latent, prior.latent_units(robot)[index], inputs, z, mean, std, visited)
-
-
-def _curve_features(latent: str, given: Any, visited: Tensor, points: int) -> Tensor:
+def curve_features(latent: str, given: Any, visited: Tensor, points: int) -> Tensor:
     """Features (n, d) of a curve, checked."""
     count = visited.shape[-1]
     if given is None:

@@ -16,7 +16,7 @@ from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, as_plain
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.integration.integrators import Trajectory, check_time_step, integrator_named, rows_jacobian
-from forcegp.posterior.prediction import Gaussian, JointForces, Linearization, forces_around, inverse_dynamics
+from forcegp.posterior.prediction import Gaussian, JointForces, Linearization, inverse_dynamics, joint_force
 from forcegp.posterior.programs import Programs, steps_of
 from forcegp.posterior.rollout import (
     AccelerationFunction,
@@ -265,7 +265,12 @@ class Predictor(Summary):
             case "covariance":
                 return self._with_covariance(*states)
             case "forces":
-                return forces_around(self.posterior, *states)
+                q, v, u = states
+                Q, slope = rows_jacobian(lambda u: joint_force(self.posterior, self.posterior.dynamics(q, v, u)), u)
+                at = self.posterior.dynamics(q, v, u)
+                return Q, torch.cat(
+                    [slope.flatten(1), at.M.flatten(1), at.A.flatten(1), at.b, at.off()], dim=-1
+                ).detach()
         nq, nv, nu = self.sizes
         a, slopes = rows_jacobian(lambda x: self.by_torch(*x.split(self.sizes, dim=-1)), torch.cat([*states], dim=-1))
         if self.space.is_vector_space:

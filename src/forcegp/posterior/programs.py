@@ -67,7 +67,7 @@ class Physics:
     def mixing(self, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, list[Tensor]]:
         """W (n, nv, C) of a = offset + W f, and the features of every process (n, d)."""
         dynamics = self.model.dynamics(q, v, u)
-        return dynamics.H @ self.forces.direction(dynamics), self._features(dynamics)
+        return dynamics.H @ self.forces.direction(dynamics), [*self.standardization(self.forces.features(dynamics))]
 
     @property
     def passive(self) -> list[Law]:
@@ -96,7 +96,8 @@ class Physics:
         B = self.forces.direction(dynamics)
         Q = (B @ f[..., None])[..., 0] + dynamics.Q_K
         around = self.parts(dynamics, B, f), B, dynamics.M, dynamics.A, dynamics.b, dynamics.off()
-        return [dynamics.acceleration_under(Q), dynamics.H @ B, Q, *around, *self._features(dynamics)]
+        features = self.standardization(self.forces.features(dynamics))
+        return [dynamics.acceleration_under(Q), dynamics.H @ B, Q, *around, *features]
 
     def held(
         self, q: Tensor, v: Tensor, u: Tensor, f: Tensor, a: Tensor, multiplier: Tensor, left: Tensor
@@ -121,9 +122,6 @@ class Physics:
         r = Q - inertial + (A.mT @ multiplier[..., None])[..., 0]
         s, t = dynamics.b - (A @ a[..., None])[..., 0], (A.mT @ left[..., None])[..., 0]
         return [*found, r, s, t, dynamics.H, lower.mT @ inverse]
-
-    def _features(self, dynamics: ConstrainedDynamics) -> list[Tensor]:
-        return list(self.standardization(self.forces.features(dynamics)))
 
 
 class Traced(NamedTuple):
@@ -219,7 +217,9 @@ class Programs:
             case "components" | "deviations":
                 outputs = {"Q": [node for part in at.parts for node in copied(part)]}
                 if kind == "deviations":
-                    outputs["covariance"] = self._terms(graph, copied, features, self._of_terms(at.B))
+                    kept = [range(len(self._latents))[which] for which in self.physics.terms.values()]
+                    rows = [[x if c in own else ZERO for c, x in enumerate(row)] for own in kept for row in at.B]
+                    outputs["covariance"] = self._terms(graph, copied, features, rows)
             case "mean":
                 outputs = {"a": copied(at.a)}
             case "linearize" if at.held:
@@ -243,11 +243,6 @@ class Programs:
         terms = copied([row[c] for row in rows for c in self._latents])
         terms += [node for part, z in zip(self.sums, features, strict=True) for node in part.variance(graph, z)]
         return terms + [node for part, z in zip(self.sums, features, strict=True) for node in part.given(graph, z)]
-
-    def _of_terms(self, B: list[list[int]]) -> list[list[int]]:
-        """A row of mixing for each joint and unknown force."""
-        kept = [range(len(self._latents))[which] for which in self.physics.terms.values()]
-        return [[node if c in own else ZERO for c, node in enumerate(row)] for own in kept for row in B]
 
     def _implicit(self, graph: Graph, copied: Copier, a: list[int]) -> tuple[Graph, dict[str, list[int]]]:
         """The acceleration and its derivatives in a step from q, in v and in u, by `Physics.held`."""

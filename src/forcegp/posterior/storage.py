@@ -15,7 +15,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 
 from forcegp import __version__
-from forcegp.atomic_files import atomic_folder, require_replaceable, require_unchanged, write_digests
+from forcegp.atomic_files import atomic_folder, read_json, require_replaceable, require_unchanged, write_digests
 from forcegp.data import units_for
 from forcegp.data.dataset import FORCE, IMU
 from forcegp.errors import FileFormatError, ForceGPError, require_type, usable_arguments
@@ -168,11 +168,8 @@ def _document(path: Path) -> dict[str, Any]:
     file = path / "model.json"
     if not file.is_file():  # to open a pipe would wait for a writer for ever
         raise FileFormatError(f"{path} holds no model.json; give the folder that `forcegp fit --out` wrote")
-    try:
-        document = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:  # also numbers of 5000 digits
-        raise FileFormatError(f"{file} is damaged: {error}") from None
-    if not isinstance(document, dict) or document.get("kind") != KIND:
+    document = read_json(file, "fit the model again")
+    if document.get("kind") != KIND:
         raise FileFormatError(f"{file} is not a stored forcegp model.")
     version = document.get("format_version")
     if version != FORMAT_VERSION:

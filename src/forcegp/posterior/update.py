@@ -6,8 +6,8 @@ from typing import Any
 import torch
 
 from forcegp.data import Dataset
-from forcegp.evidence.likelihood import MarginalLikelihood, TrainingData, check_distance
-from forcegp.inference import ExactPosterior, exact
+from forcegp.evidence.likelihood import TrainingData, check_distance
+from forcegp.inference import exact
 from forcegp.inference.memory import blas_threads, require_memory
 from forcegp.inference.posterior import with_rows
 
@@ -18,8 +18,19 @@ Structured = Any
 def learn_more_rows(posterior: Structured, rows: Dataset) -> Structured:
     """What `Posterior.update` documents."""
     latent, training = exact(posterior.latent, "learning from more rows"), posterior.training
-    _require_memory(latent, len(rows))
-    more = _on_rows(posterior, rows)
+    count, rank, latents = latent.system.deflation.C.shape
+    size, new = rank * (count + len(rows)), rank * len(rows)
+    needed = 8 * (size**2 + 2 * new * size + latents * len(rows) ** 2)  # the factor, blocks of new rows, their copies
+    what = f"a posterior of {count} + {len(rows)} rows"
+    require_memory(needed, what, "give fewer rows", latent.system.alpha.device)
+    # with the standardization at hand instead of one that is computed again
+    reference = training if training.reference is None else training.reference
+    added = TrainingData.of(rows, training.q.device, training.sensed)
+    added = replace(added, reference=reference, correlated_rows=training.correlated_rows)
+    known = posterior.likelihood
+    known.model.check_states(added.q, added.v, added.u)
+    check_distance(known.model, added)
+    more = replace(known, training=added, fixed_standardization=known.standardization)
     with torch.no_grad(), blas_threads(training.q.numel()):
         terms = more.terms(posterior.hyperparameters)
         variance = terms.noise.expand(len(terms.W), *terms.noise.shape[1:])
@@ -31,26 +42,3 @@ def learn_more_rows(posterior: Structured, rows: Dataset) -> Structured:
     likelihood = replace(more, training=replace(training, **joined, sensed=sensed, reference=more.training.reference))
     changes = {"points": len(latent.system.alpha), "rows_added": posterior.settings.get("rows_added", 0) + len(rows)}
     return replace(posterior, likelihood=likelihood, latent=latent).with_settings(**changes)
-
-
-def _on_rows(posterior: Structured, rows: Dataset) -> MarginalLikelihood:
-    """The likelihood of other rows, checked, with the standardization at hand instead of one that is computed again."""
-    likelihood = posterior.likelihood
-    training = likelihood.training
-    reference = training if training.reference is None else training.reference
-    alike = training.correlated_rows
-    added = replace(
-        TrainingData.of(rows, training.q.device, training.sensed), reference=reference, correlated_rows=alike
-    )
-    likelihood.model.check_states(added.q, added.v, added.u)
-    check_distance(likelihood.model, added)
-    return replace(likelihood, training=added, fixed_standardization=likelihood.standardization)
-
-
-def _require_memory(latent: ExactPosterior, added: int) -> None:
-    """Raise NotEnoughMemory where `added` rows do not fit: before anything is computed."""
-    count, rank, latents = latent.system.deflation.C.shape
-    size, new = rank * (count + added), rank * added
-    needed = 8 * (size**2 + 2 * new * size + latents * added**2)  # the new factor, blocks of new rows and their copies
-    what = f"a posterior of {count} + {added} rows"
-    require_memory(needed, what, "give fewer rows", latent.system.alpha.device)

@@ -15,7 +15,7 @@ from typing_extensions import override
 import forcegp
 from forcegp.atomic_files import file_digest
 from forcegp.data import Dataset, is_dataset
-from forcegp.data.dataset import FORCE, IMU
+from forcegp.data.dataset import FORCE, SENSORS
 from forcegp.data.filters import JITTER
 from forcegp.errors import DatasetError, DataWarning, FileFormatError, InvalidInput, usable_arguments
 from forcegp.progress import tell
@@ -122,7 +122,7 @@ def import_recordings(
     columns: dict[str, Any] = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
     columns.setdefault("u", np.zeros((len(columns["time"]), 0)))
     done["rows"] = len(columns["time"])
-    measured = {name: columns.pop(name) for name in [*columns] if name.startswith((FORCE, IMU))}
+    measured = {name: columns.pop(name) for name in [*columns] if name.startswith(SENSORS)}
     if mapping.axes.get("force", ("world",)) == ("body",):
         at = model.robot.kinematics(torch.tensor(columns["q"]))
         for name, values in ((name, values) for name, values in measured.items() if name.startswith(FORCE)):

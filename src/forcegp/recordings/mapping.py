@@ -54,6 +54,7 @@ UNITS: dict[str, dict[str, LogUnit]] = {
     | _units("rad/s", {"rad/s": 1, "rev/s": _TURNS, "rpm": 60 * _TURNS}),
     "a": _units("rad/s^2", {"rad/s^2": 1, "deg/s^2": _DEGREES}) | _units("m/s^2", {"m/s^2": 1, "mm/s^2": 1e3}),
     "force": _units("N", {"N": 1, "mN": 1e3, "kN": 1e-3}),
+    "torque": _units("Nm", {"Nm": 1, "mNm": 1e3, "kNm": 1e-3, "Ncm": 100}) | _units("N", {"N": 1}),
     "imu": _units("m/s^2", {"m/s^2": 1, "mm/s^2": 1e3, "g": 1 / STANDARD}),
 }
 """By quantity and name: what `ColumnMapping.unit` accepts."""
@@ -86,6 +87,8 @@ class ColumnMapping:
         one constant. None: v and a are differentiated, the others are looked for by the names of the joints.
     force: by frame of the robot, three columns of a force sensor there: the force on the robot, x, y, z in world axes.
         By "imu:FRAME", "imu:FRAME@x,y,z" or "imu:FRAME@x,y,z,roll,pitch,yaw" those of an accelerometer, in its axes.
+        By "torque:JOINT" the column of a torque sensor between gear and link, which accelerates the link; by "torque"
+        one for each joint.
     joints: their names, in the order of the columns; columns of a base that moves stand where its robot has them.
     orientation: of a base that moves: quaternions "xyzw" (default) or "wxyz", or "angles" roll, pitch and yaw.
     axes: of its v and a, of the linear and the angular part: "body" (default), "world", or "imu" for what an
@@ -205,7 +208,7 @@ class ColumnMapping:
 
 
 EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body", "force": "foot=fx,fy,fz"}
-OF_IMU = "imu:"  # before a frame of `force`
+OF_IMU, OF_LINKS = "imu", "torque"  # before the frame of an IMU, and the joint of a torque, in `force`
 
 
 def by_quantity(flag: str, text: str) -> dict[str, tuple[str, ...]]:

@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 
 import forcegp.robots
 from forcegp.data.configurations import following
+from forcegp.data.dataset import SENSORS
+from forcegp.data.views import ends_of_range
 from forcegp.errors import DatasetError, FileFormatError, MistakenUnit
 from forcegp.recordings.ros_bag import Read, read_on_one_clock
 from forcegp.recordings.signal_plan import Layout, SignalPlan, spans
@@ -74,6 +76,8 @@ def read_recording(
     rows = len(columns[plan.columns[0]])
     values = np.stack([item.value(columns, rows) for item in plan.signals], axis=1)
     lost = _lost(label, plan, columns, values, skip=options.bad_rows == "skip")
+    skipped = [f"rows left out because they lack a value: {lost.sum()} of {rows}"] if lost.any() else []
+    skipped += _at_ends(plan, values, lost)
     derived, unlogged = _unlogged(plan, values)
     if lost.any():  # stand-ins that nobody sees: the rows before them
         good = np.where(lost, np.argmin(lost), np.arange(rows))
@@ -91,7 +95,6 @@ def read_recording(
     stretches, step, worst, left_out = _stretches(label, source, time, episodes, replace(read, lost=lost), options)
     seconds = float(sum(np.ptp(time[rows]) for _, rows in stretches))
     about = {"name": label, "rows": rows, "seconds": seconds, "median_step": step, "largest_deviation_of_a_step": worst}
-    skipped = [f"rows left out because they lack a value: {lost.sum()} of {rows}"] if lost.any() else []
     about |= {**left_out, "notes": [*read.notes, *unlogged, *skipped, *told]}
     return Recording(about, source, signals, time, begin, (*jumps, *turned), layout, stretches, step, worst)
 
@@ -129,6 +132,19 @@ def _lost(
             "Map other columns, or repair the log."
         )
     return lost if count <= MOST_LOST * rows else np.zeros(rows, bool)  # then the first value that is missing is named
+
+
+def _at_ends(plan: SignalPlan, values: np.ndarray, lost: Bool[np.ndarray, " rows"]) -> list[str]:
+    """Marks rows in which a sensor stays at an end of its range as lost, and says so."""
+    sensors, notes = np.array([item.signal.startswith(SENSORS) for item in plan.signals]), list[str]()
+    changes = np.r_[False, (np.diff(values[:, ~sensors], axis=0) != 0.0).any(1)] & ~lost
+    for k in np.flatnonzero(sensors):
+        for extreme, there in ends_of_range(values[:, k], changes):
+            if extreme != 0.0:  # there nothing touches it
+                lost |= there
+                end = f"{plan.signals[k].signal} ({plan.signals[k].joint}) stays at {extreme:.5g}, an end of its range"
+                notes.append(f"{end}: {there.sum()} rows left out; `trim` their edges")
+    return notes
 
 
 def _seconds(plan: SignalPlan, source: Source, columns: Columns, rows: int) -> tuple[np.ndarray, float]:

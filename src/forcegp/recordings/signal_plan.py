@@ -13,12 +13,14 @@ from jaxtyping import Float
 import forcegp
 from forcegp.data import differentiate
 from forcegp.data.configurations import in_base
-from forcegp.data.dataset import FORCE, IMU, ROTATION, TRANSLATION, imu_place
+from forcegp.data.dataset import FORCE, IMU, ROTATION, TORQUE, TRANSLATION, imu_place
 from forcegp.errors import FileFormatError, InvalidInput, require_known
 from forcegp.recordings.mapping import (
     OF_IMU,
+    OF_LINKS,
     ORIENTATIONS,
     SIGNALS,
+    UNITS,
     ColumnMapping,
     Expression,
     LogUnit,
@@ -240,16 +242,21 @@ def _joints(mapping: ColumnMapping, robot: Robot) -> tuple[str, ...]:
 
 
 def _sensor(mapping: ColumnMapping, frame: str, source: Source, model: forcegp.Model) -> Iterator[JointSignal]:
-    """The force at a frame, or what an IMU there measures."""
-    kind, own = ("imu", f"{IMU}{frame.removeprefix(OF_IMU)}") if frame.startswith(OF_IMU) else ("force", FORCE + frame)
-    model.robot.frame(imu_place(own)[0] if kind == "imu" else frame)
-    expressions = _expressions(mapping.force[frame], (), source, may_lack=False)
-    if len(expressions) != 3:
-        raise InvalidInput(
-            f"force of {frame} has {len(expressions)} columns; give x, y and z, with 0 for what was not measured."
-        )
-    unit = log_unit(kind, mapping.unit.get(kind, ("N" if kind == "force" else "m/s^2",))[0])
-    yield from (JointSignal(own, axis, x, unit, 1.0) for axis, x in zip("xyz", expressions, strict=True))
+    """The force at a frame, what an IMU there measures, or the torque at the link of a joint or of all."""
+    before, colon, place = frame.partition(":")
+    kind, own = ("imu", f"{IMU}{place}") if before == OF_IMU else ("force", FORCE + frame)
+    joints, names, each = (), [(own, axis) for axis in "xyz"], "x, y and z, with 0 for what was not measured"
+    if before == OF_LINKS:
+        kind, joints = "torque", (place,) if colon else model.robot.single_joint_names
+        require_known("joint", joints[0], model.robot.name, model.robot.single_joint_names)
+        names, each = [(f"{TORQUE}{joint}", "torque") for joint in joints], f"one for each of {', '.join(joints)}"
+    else:
+        model.robot.frame(imu_place(own)[0] if kind == "imu" else frame)
+    expressions = _expressions(mapping.force[frame], joints, source, may_lack=False)
+    if len(expressions) != len(names):
+        raise InvalidInput(f"force of {frame} has {len(expressions)} columns; give {each}.")
+    unit = log_unit(kind, mapping.unit.get(kind, (next(iter(UNITS[kind])),))[0])
+    yield from (JointSignal(*name, x, unit, 1.0) for name, x in zip(names, expressions, strict=True))
 
 
 def _expressions(patterns: Sequence[str], joints: Sequence[str], source: Source, may_lack: bool) -> list[Expression]:

@@ -85,7 +85,15 @@ def followed(
         while at.mimics is not None and at.name not in locked:
             above = by_name.get(at.mimics.joint)
             if above is None or above.name in passed or above.type == "floating":
-                problems.errors.append(_objection(description.source, joint, at, above is not None))
+                last = (at if above is None else joint).mimics
+                seen = f"{description.source}: joint {joint.name!r} mimics {last.joint if last else None!r}"
+                why = (
+                    "and so at last itself, or a joint of several degrees of freedom"
+                    if above
+                    else "which the file lacks"
+                )
+                advice = f", {why}; correct its <mimic>, or lock the joint."
+                problems.errors.append(RobotModelError(seen, advice, {"locked": {joint.name: 0.0}}))
                 multiplier, offset = 0.0, 0.0
                 break
             offset += multiplier * at.mimics.offset
@@ -99,14 +107,6 @@ def followed(
         else:
             drives[joint.name] = (at.name, multiplier, offset)
     return held, drives
-
-
-def _objection(source: str, joint: Joint, at: Joint, found: bool) -> RobotModelError:
-    """Why a joint cannot be followed to one with a coordinate: at the last one passed."""
-    last = (joint if found else at).mimics
-    seen = f"{source}: joint {joint.name!r} mimics {last.joint if last else None!r}"
-    why = ", and so at last itself, or a joint of several degrees of freedom" if found else ", which the file lacks"
-    return RobotModelError(seen, f"{why}; correct its <mimic>, or lock the joint.", {"locked": {joint.name: 0.0}})
 
 
 def with_followers(
@@ -194,7 +194,15 @@ def lay_out(
     description: RobotDescription, locked: Mapping[str, float], base: BaseChoice | None, problems: Problems
 ) -> Layout:
     """Order the joints and merge links that are fixed or locked; raises what makes them no tree, collects the rest."""
-    _check_locked(description, locked)
+    by_name = {joint.name: joint for joint in description.joints}
+    for name, position in locked.items():
+        require_known("joint", name, description.source, by_name, UnknownName)
+        if by_name[name].type == "fixed":
+            raise InvalidInput(f"{description.source}: joint {name!r} is fixed already; remove it from `locked`.")
+        if by_name[name].type == "floating" and position != 0.0:
+            raise InvalidInput(
+                f"{description.source}: joint {name!r} is {by_name[name].type}, so it can be locked at 0 alone."
+            )
     held, drives = followed(description, locked, problems)
     root, children = _tree_of(description)
     bodies: list[Joint] = []
@@ -280,18 +288,6 @@ def check_tree(layout: Layout, loops: Sequence[tuple[str, str, str]], problems: 
                     f"({', '.join(layout.bodies[body].name for body in between)}) by `locked`, or take the "
                     "equality out of the file where nothing holds them together.",
                 )
-            )
-
-
-def _check_locked(description: RobotDescription, locked: Mapping[str, float]) -> None:
-    by_name = {joint.name: joint for joint in description.joints}
-    for name, position in locked.items():
-        require_known("joint", name, description.source, by_name, UnknownName)
-        if by_name[name].type == "fixed":
-            raise InvalidInput(f"{description.source}: joint {name!r} is fixed already; remove it from `locked`.")
-        if by_name[name].type == "floating" and position != 0.0:
-            raise InvalidInput(
-                f"{description.source}: joint {name!r} is {by_name[name].type}, so it can be locked at 0 alone."
             )
 
 

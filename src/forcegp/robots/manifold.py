@@ -219,10 +219,10 @@ def difference(start: Float[Tensor, "*batch 7"], end: Float[Tensor, "*batch 7"])
 
 def chart_velocity(step: Float[Tensor, "*#batch 6"], v: Float[Tensor, "*#batch 6"]) -> Tensor:
     """d step / dt where `q0 integrated by step` moves with velocity v: ad / (1 - exp(-ad)) v, to the tenth power."""
-    own, moved = _parts(step), _parts(v)
+    (along, turn), moved, cross = _parts(step), _parts(v), torch.linalg.cross
     total = torch.cat(moved, -1)
     for coefficient in _BERNOULLI:
-        moved = _bracket(own, moved)
+        moved = cross(turn, moved[0]) + cross(along, moved[1]), cross(turn, moved[1])  # ad of SE(3)
         if coefficient:
             total = total + coefficient * torch.cat(moved, -1)
     return total
@@ -230,12 +230,6 @@ def chart_velocity(step: Float[Tensor, "*#batch 6"], v: Float[Tensor, "*#batch 6
 
 _BERNOULLI = (1 / 2, 1 / 12, 0.0, -1 / 720, 0.0, 1 / 30240, 0.0, -1 / 1209600, 0.0, 1 / 47900160)
 """Of x / (1 - exp(-x)), from the first power on."""
-
-
-def _bracket(left: tuple[Tensor, Tensor], right: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """ad of SE(3), [linear; angular]."""
-    cross = torch.linalg.cross
-    return cross(left[1], right[0]) + cross(left[0], right[1]), cross(left[1], right[1])
 
 
 def quaternion_product(left: Float[Tensor, "*batch 4"], right: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:

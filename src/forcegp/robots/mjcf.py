@@ -167,13 +167,15 @@ class MjcfWriter:
             return
         joints = [(joint, np.eye(4))]
         while not any(self.robot.link(name).mass > 0.0 for name in self._rigid(joint.child)):
-            below = self._next(joint.child)
+            rigid = self._rigid(joint.child)
+            below = [(at @ each.origin, each) for name, at in rigid.items() for each in self.children[name]]
+            below = [(step, each) for step, each in below if each.name in self.moving]
             if len(below) != 1 or joint.type == "floating":
                 raise RobotModelError(
                     f"{self.robot.source}: link {joint.child!r} moves and has no mass, which MuJoCo takes only between "
                     "two joints of one degree of freedom; give it a mass."
                 )
-            self.left_out += self._rigid(joint.child)
+            self.left_out += rigid
             step, joint = below[0]
             joints = [*((each, inverse(step) @ at) for each, at in joints), (joint, np.eye(4))]
             pose = pose @ step
@@ -195,15 +197,6 @@ class MjcfWriter:
                     found[joint.child] = found[name] @ still
                     names.append(joint.child)
         return found
-
-    def _next(self, link: str) -> list[tuple[np.ndarray, Joint]]:
-        """The joints that move against these links, and the frames of their children."""
-        return [
-            (pose @ joint.origin, joint)
-            for name, pose in self._rigid(link).items()
-            for joint in self.children[name]
-            if joint.name in self.moving
-        ]
 
     def _couplings(self) -> list[str]:
         return [

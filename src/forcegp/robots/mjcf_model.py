@@ -163,7 +163,8 @@ class CompiledModel:
         if kind == "floating" and model.dof_armature[dof]:
             self._lose("rotor inertia of a free body", self.joints[joint])
         elif kind != "floating":
-            dynamics["armature"] = self._rotor(joint)
+            geared = (model.actuator_armature[k] * model.actuator_gear[k][0] ** 2 for k in self._actuators_of(joint))
+            dynamics["armature"] = float(model.dof_armature[dof] + sum(geared))
         parts.append(_element("dynamics", dynamics if any(dynamics.values()) else {}))
         if joint in self.couplings:
             driver, multiplier, offset = self.couplings[joint]
@@ -276,12 +277,6 @@ class CompiledModel:
             if (model.body_mocapid[ends] < 0).all():
                 first, second = (self.bodies[end] for end in ends)
                 yield self._equality(k), first, second
-
-    def _rotor(self, joint: int) -> float:
-        """The inertia of the rotor of a joint that turns or slides, with those of its actuators, in kg m^2 or kg."""
-        model = self.model
-        geared = (model.actuator_armature[k] * model.actuator_gear[k][0] ** 2 for k in self._actuators_of(joint))
-        return float(model.dof_armature[model.jnt_dofadr[joint]] + sum(geared))
 
     def _lose(self, what: str, where: str) -> None:
         self.problems.note(f"left out: {what}", where)

@@ -128,7 +128,7 @@ def row_scores(
     """
     rows = predict_rows(posterior, test)
     mass = rows["mass"] if mass is None else mass
-    pairs = _pairs(rows, test, mass) | _of_sensors(rows, test, sensed_frames(posterior, test))
+    pairs = _pairs(rows, test, mass, sensed_frames(posterior, test))
     table = {name: metrics(*each) for name, each in pairs.items() if each[0].shape == each[2].shape and each[2].size}
     table[ALL_JOINTS] = {"nlpd": [float(rows["negative_log_density"].mean())]}
     measured = table[ACCELERATION]
@@ -161,22 +161,11 @@ def sensed_frames(posterior: Posterior, dataset: Dataset) -> list[str]:
     return [] if posterior.is_black_box else [name for name in sensed_of(dataset) if name in own]
 
 
-def _of_sensors(rows: Predicted, test: Dataset, frames: Sequence[str]) -> dict[str, Pair]:
-    """Forces at each frame by axis, which sensors measured."""
-    if "sensed" not in rows:
-        return {}
-    mean, variance = rows["sensed"], rows["sensed_variance"]
-    names = [f"{AT_SENSOR} {frame}, {axis}" for frame in frames for axis in "xyz"]
-    there = np.concatenate([sensed_of(test)[frame] for frame in frames], axis=1)
-    return {
-        name: (mean[:, [k]], variance[:, [k]], there[:, [k]])
-        for k, name in enumerate(names)
-        if variance[:, k].max() > CONSTANT**2 * np.square(there[:, k]).mean()  # no motion pushes along the others
-    }
+def _pairs(rows: Predicted, test: Dataset, mass: Matrices, frames: Sequence[str]) -> dict[str, Pair]:
+    """What is compared: measured accelerations, what their errors are as joint forces, A a with b; and known truth.
 
-
-def _pairs(rows: Predicted, test: Dataset, mass: Matrices) -> dict[str, Pair]:
-    """What is compared: measured accelerations, what their errors are as joint forces, A a with b; and known truth."""
+    And forces at each of the frames by axis, which sensors measured.
+    """
     truth, mean = test.truth, rows["mean"]
     zero, still = np.zeros_like(mean), np.zeros_like(rows["residual"])
     pairs: dict[str, Pair] = {
@@ -192,6 +181,11 @@ def _pairs(rows: Predicted, test: Dataset, mass: Matrices) -> dict[str, Pair]:
         pairs[UNKNOWN_FORCE] = rows["unknown_force"], rows["unknown_force_variance"], there
     if "lambda" in truth and "multiplier" in rows:
         pairs[CONTACT_FORCE] = rows["multiplier"], rows["multiplier_variance"], truth["lambda"]
+    for number, frame in enumerate(frames):
+        for k, axis in enumerate("xyz", 3 * number):
+            own = rows["sensed"][:, [k]], rows["sensed_variance"][:, [k]], sensed_of(test)[frame][:, [k % 3]]
+            if own[1].max() > CONSTANT**2 * np.square(own[2]).mean():  # no motion pushes along the others
+                pairs[f"{AT_SENSOR} {frame}, {axis}"] = own
     return pairs
 
 

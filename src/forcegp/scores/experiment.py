@@ -154,7 +154,10 @@ class Experiment:
         def job(split: int, seed: int, kind: str, name: str, work: Candidate | str, **read: str) -> Job:
             spec = {**common, "kind": kind, "name": name, "split": split, "seed": seed, **read}
             spec |= {"digest": work.digest} if isinstance(work, Candidate) else {}
-            place = job_name(self.splits[split], seed, kind, name)
+            bare = name.replace(" ", "")
+            plain = re.sub(r"[^\w.+@-]+", "_", bare)  # every character is one that all file systems take
+            plain += f"-{hashlib.sha256(name.encode()).hexdigest()[:6]}" if plain != bare else ""
+            place = f"{self.splits[split].name}-seed{seed}-{'' if kind == MODEL else f'{kind}-'}{plain}"
             return Job(place, f"{__name__}:compute", spec, tuple(sorted({*read.values()})), arguments=(self, work))
 
         for split in range(len(self.splits)):
@@ -178,14 +181,6 @@ def fingerprint(dataset: Dataset) -> str:
     return digest.hexdigest()
 
 
-def job_name(split: Split, seed: int, kind: str, name: str) -> str:
-    """Every character is one that all file systems take."""
-    plain = re.sub(r"[^\w.+@-]+", "_", name.replace(" ", ""))
-    if plain != name.replace(" ", ""):  # names that differ in other characters only
-        plain += f"-{hashlib.sha256(name.encode()).hexdigest()[:6]}"
-    return f"{split.name}-seed{seed}-{'' if kind == MODEL else f'{kind}-'}{plain}"
-
-
 def kept(store: JobStore, name: str) -> dict[str, Any]:
     """What a finished job found, or why it failed, with its warnings. Raises as `JobStore.load`."""
     stored = store.load(name)
@@ -202,21 +197,17 @@ def compute(
     with threadpool_limits(1):
         try:
             if isinstance(work, str):
-                found |= _identify(experiment, split.apply(experiment.rows)[0], work)
+                start = time.process_time()
+                model = identified_model(work, experiment.model, split.apply(experiment.rows)[0])
+                assert model.noise is not None, "it was found"
+                found |= {"noise": model.noise.to_dict(), "model": model.known.to_dict()}
+                found |= {"cpu_seconds": time.process_time() - start}
             else:
                 found |= _score(store, experiment, split, spec, work)
         except Exception as problem:  # a model of somebody else may fail in any way; its row names the error
             name = "" if isinstance(problem, ForceGPError) else f"{type(problem).__name__}: "
             found["error"] = " ".join(f"{name}{problem}".split())
     return {"split": split.name, "seed": spec["seed"], **found}
-
-
-def _identify(experiment: Experiment, train: Dataset, name: str) -> dict[str, Any]:
-    start = time.process_time()
-    model = identified_model(name, experiment.model, train)
-    assert model.noise is not None, "it was found"
-    found = {"noise": model.noise.to_dict(), "model": model.known.to_dict()}
-    return {"cpu_seconds": time.process_time() - start, **found}
 
 
 def _score(

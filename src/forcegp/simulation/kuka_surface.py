@@ -1,7 +1,7 @@
 """The `kuka-surface` scenario: an iiwa slides its tool on a surface with friction (after Rath, Geist, Trimpe 2021)."""
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -259,7 +259,11 @@ def simulate_episode(config: KukaSurfaceConfig, robot: Robot, plant: RigidBodyDy
             columns[name][step] = value
         v = v + config.time_step * a
         q = q + config.time_step * v
-        _require_bounded(config, v, episode, step + 1)
+        if not np.abs(v).max() < DIVERGED:  # also NaN
+            raise SimulationError(
+                f"episode {episode} diverged after {(step + 1) * config.time_step:.3g} s (joint velocity "
+                f"{np.abs(v).max():.3g} rad/s). Use the published constants, a shorter time_step or another controller."
+            )
         if (step + 1) % STEPS_PER_REPORT == 0 or step + 1 == steps:
             tell(step + 1, steps)
 
@@ -289,14 +293,6 @@ def joint_friction_of(config: KukaSurfaceConfig, robot: Robot) -> LawsOfJoints:
     return LawsOfJoints.named(config.joint_friction, robot, numbers)
 
 
-def _require_bounded(config: KukaSurfaceConfig, v: Float[np.ndarray, " nv"], episode: int, step: int) -> None:
-    if not np.abs(v).max() < DIVERGED:  # also NaN
-        raise SimulationError(
-            f"episode {episode} diverged after {step * config.time_step:.3g} s (joint velocity {np.abs(v).max():.3g} "
-            "rad/s). Use the published constants, a shorter time_step or a softer controller."
-        )
-
-
 def simulate_kuka_surface(config: KukaSurfaceConfig) -> Dataset:
     """Simulate the scenario and return what was measured, with the ground truth.
 
@@ -310,33 +306,24 @@ def simulate_kuka_surface(config: KukaSurfaceConfig) -> Dataset:
     for episode in range(config.episodes):
         with part(episode, config.episodes):
             motions.append(simulate_episode(config, robot, plant, episode))
-    return _dataset(config, robot, motions)
-
-
-def _model(config: KukaSurfaceConfig, robot: Robot) -> Model:
+    columns = {name: np.concatenate([motion[name] for motion in motions]) for name in motions[0]}
     contacts = ()
     if config.surface != "none":
         contacts = (Contact(TOOL_LINK, config.tool_point, table_of(config)),)
     baumgarte = Baumgarte(config.baumgarte_omega, config.baumgarte_zeta) if contacts else None
-    return Model(robot, contacts, (Actuation(), RigidBodies()), baumgarte=baumgarte)
-
-
-def _truth(config: KukaSurfaceConfig, column: Callable[[str], np.ndarray]) -> dict[str, np.ndarray]:
-    """Every true force of the rows, as far as it exists."""
-    truth, parts = {"a": column("a")}, {}
-    if config.surface != "none":
-        truth["lambda"] = column("multiplier")[:, None]
-        parts["Q_U.tool-friction"] = column("tool_torques")
-        truth["force.tool-friction"] = column("tool_force")
-    if config.joint_friction != "none":
-        parts["Q_U.joint-friction"] = column("joint_torques")
-    return {**truth, **parts, "Q_U": sum(parts.values(), np.zeros_like(truth["a"]))}
-
-
-def _dataset(config: KukaSurfaceConfig, robot: Robot, motions: list[Motion]) -> Dataset:
-    def column(name: str) -> np.ndarray:
-        return np.concatenate([motion[name] for motion in motions])
-
-    signals = {name: column(name) for name in ("q", "v", "u", "a", "time")}
+    model = Model(robot, contacts, (Actuation(), RigidBodies()), baumgarte=baumgarte)
+    signals = {name: columns[name] for name in ("q", "v", "u", "a", "time")}
     more = {"u": "commanded torque minus joint damping"}
-    return recorded("kuka-surface", config, _model(config, robot), signals, _truth(config, column), more)
+    return recorded("kuka-surface", config, model, signals, _truth(config, columns), more)
+
+
+def _truth(config: KukaSurfaceConfig, columns: Motion) -> dict[str, np.ndarray]:
+    """Every true force of the rows, as far as it exists."""
+    truth, parts = {"a": columns["a"]}, {}
+    if config.surface != "none":
+        truth["lambda"] = columns["multiplier"][:, None]
+        parts["Q_U.tool-friction"] = columns["tool_torques"]
+        truth["force.tool-friction"] = columns["tool_force"]
+    if config.joint_friction != "none":
+        parts["Q_U.joint-friction"] = columns["joint_torques"]
+    return {**truth, **parts, "Q_U": sum(parts.values(), np.zeros_like(truth["a"]))}

@@ -42,7 +42,8 @@ def simulate_quadruped(config: QuadrupedConfig) -> Dataset:
     robot = Robot.from_urdf(Path(__file__).parent / "quadruped.urdf", base="floating")
     contacts = tuple(contact for leg in LEGS for contact in fixed_point(f"{leg}_foot", switch=f"{leg}_stands"))
     model = Model(robot, contacts, (Actuation(), RigidBodies()))
-    loaded = _loaded(robot, config.payload)
+    box = config.payload / 12.0 * np.diag([0.1**2 + 0.1**2, 0.2**2 + 0.1**2, 0.2**2 + 0.1**2])  # on its trunk
+    loaded = carrying(robot, [Payload("trunk", config.payload, PLACE, box.tolist())]) if config.payload else robot
     steps = max(2, round(config.seconds * RATE))
     parts = []
     for episode in range(config.episodes):
@@ -57,12 +58,6 @@ def simulate_quadruped(config: QuadrupedConfig) -> Dataset:
         {"lambda": forces, "Q_U": Q_U, "Q_U.joint-friction": Q_U},
         {"payload": {"frame": "trunk", "mass": config.payload, "center": list(PLACE)}},
     )
-
-
-def _loaded(robot: Robot, payload: float) -> Robot:
-    """The robot with a box of this mass on its trunk."""
-    size = payload / 12.0 * np.diag([0.1**2 + 0.1**2, 0.2**2 + 0.1**2, 0.2**2 + 0.1**2])
-    return carrying(robot, [Payload("trunk", payload, PLACE, size.tolist())]) if payload else robot
 
 
 def _episode(robot: Robot, model: Model, config: QuadrupedConfig, episode: int, steps: int) -> tuple[Tensor, ...]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.interpolate import PPoly
 from scipy.spatial.transform import Rotation
 
 from forcegp import __version__
@@ -97,32 +98,18 @@ class SegmentPath:
     def sample(self, time: Float[np.ndarray, " times"]) -> Motions:
         """Position [m], velocity [m/s] and acceleration [m/s^2] at the given times [s]; at rest before and after."""
         starts = np.concatenate([[0.0], np.cumsum(self.durations)])
-        segment = np.clip(np.searchsorted(starts, time, side="right") - 1, 0, len(self.durations) - 1)
-        duration, acceleration = self.durations[segment], self.accelerations[segment]
-        step = np.diff(self.points, axis=0)
+        step, acceleration = np.diff(self.points, axis=0), self.accelerations
         length = np.linalg.norm(step, axis=1)
-        direction = (step / np.where(length > 0, length, 1.0)[:, None])[segment]
-        length = length[segment]
-
-        root = np.sqrt(np.maximum((acceleration * duration) ** 2 - 4.0 * acceleration * length, 0.0))
-        blend = 0.5 * duration - 0.5 * root / acceleration
-        cruise = acceleration * blend
-        inside = (time >= 0) & (time < starts[-1])
-        elapsed = np.clip(time - starts[segment], 0.0, duration)
-        left = duration - elapsed
-        speeding, braking = elapsed < blend, left <= blend
-        travelled = np.where(
-            speeding,
-            0.5 * acceleration * elapsed**2,
-            np.where(braking, length - 0.5 * acceleration * left**2, cruise * (elapsed - 0.5 * blend)),
-        )
-        speed = np.where(speeding, acceleration * elapsed, np.where(braking, acceleration * left, cruise))
-        change = np.where(speeding, acceleration, np.where(braking & (blend > 0), -acceleration, 0.0))
-        return (
-            self.points[segment] + direction * travelled[:, None],
-            direction * np.where(inside, speed, 0.0)[:, None],
-            direction * np.where(inside, change, 0.0)[:, None],
-        )
+        root = np.sqrt(np.maximum((acceleration * self.durations) ** 2 - 4.0 * acceleration * length, 0.0))
+        blend = 0.5 * self.durations - 0.5 * root / acceleration
+        push = step * (acceleration / np.where(length > 0, length, 1.0))[:, None]
+        ends = np.append(np.stack([starts[:-1], starts[:-1] + blend, starts[1:] - blend], axis=1), starts[-1])
+        pushes = np.stack([push, 0.0 * push, -push], axis=1).reshape(1, -1, 3)
+        change = PPoly(pushes, np.maximum.accumulate(ends))  # by rounding two blends may overlap
+        inside = ((time >= 0) & (time < starts[-1]))[:, None]
+        at = np.clip(time, 0.0, starts[-1])
+        travelled, speed = change.antiderivative(2), change.antiderivative()
+        return self.points[0] + travelled(at), speed(at) * inside, change(at) * inside
 
 
 def over_table(config: KukaSurfaceConfig, motions: Motions) -> Motions:

@@ -72,18 +72,13 @@ def heading(figure: FigureBase, text: str, *, size: float = LARGE) -> None:
     figure.suptitle(text, fontsize=size, fontweight="bold", x=0.01, ha="left")
 
 
-def legend_entries(*axes: Axes) -> list[Artist]:
-    """What several axes show, each label once."""
+def legend_below(figure: FigureBase, *axes: Axes, columns: int | None = None, size: float = SMALL, **more: Any) -> None:
+    """What these axes show, each label once, below all panels, by default in one row."""
     entries: dict[str, Artist] = {}
     for source in axes:
         for handle, label in zip(*source.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
-    return list(entries.values())
-
-
-def legend_below(figure: FigureBase, *axes: Axes, columns: int | None = None, size: float = SMALL, **more: Any) -> None:
-    """The entries of these axes below all panels, by default in one row."""
-    more |= {"handles": (handles := legend_entries(*axes)), "ncols": columns or max(1, len(handles))}
+    more |= {"handles": [*entries.values()], "ncols": columns or max(1, len(entries))}
     figure.legend(loc="outside lower center", fontsize=size, frameon=False, **more)
 
 
