@@ -1,0 +1,66 @@
+"""Numbers that do not move in silence: what a test computes is compared with what was stored before.
+
+An oracle says that a number is right, at the few places that it can reach; a golden says that a number is what it was,
+at every place that it passes through. `FORCEGP_WRITE_GOLDENS=1` stores them anew, and what has changed is for the
+reviewer to see. Goldens are of short computations, so that no processor and no number of threads moves them.
+"""
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+WRITE = os.environ.get("FORCEGP_WRITE_GOLDENS") == "1"
+FEW = 6
+"""Longer arrays are stored as their size and sums of them, which every entry moves."""
+
+
+def assert_unchanged(name: str, values: Any, rtol: float = 1e-6) -> None:
+    """`values` are numbers, arrays or None in mappings, sequences and dataclasses; name is "package/what".
+
+    Numbers may differ by `rtol` of the largest that stands beside them.
+    """
+    package, _, name = name.partition("/")
+    file = Path(__file__).with_name(f"{package}.json")
+    stored = json.loads(file.read_text()) if file.exists() else {}
+    found = dict(_condensed(values))
+    if WRITE:
+        rounded = {path: [float(f"{x:.9g}") for x in numbers] for path, numbers in found.items()}
+        lines = [f'"{key}": {json.dumps(each)}' for key, each in sorted((stored | {name: rounded}).items())]
+        file.write_text("{\n" + ",\n".join(lines) + "\n}\n")
+        pytest.skip(f"{file.name} has the numbers of now; look at what has changed")
+    known = stored[name]
+    assert found.keys() == known.keys()
+    for path, numbers in found.items():
+        most = max(map(abs, known[path]), default=0.0)
+        np.testing.assert_allclose(numbers, known[path], rtol=rtol, atol=rtol * most + 1e-12, err_msg=path)
+
+
+def _condensed(values: Any, path: str = "") -> Iterator[tuple[str, list[float]]]:
+    if is_dataclass(values):
+        values = {field.name: getattr(values, field.name) for field in fields(values)}
+    if isinstance(values, Mapping):
+        for key, value in values.items():
+            yield from _condensed(value, f"{path}/{key}")
+        return
+    if values is None or isinstance(values, str):
+        yield f"{path} {values}", []
+        return
+    try:
+        x = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):  # of several lengths, or of several kinds
+        for number, value in enumerate(values):
+            yield from _condensed(value, f"{path}/{number}")
+        return
+    known = x[np.isfinite(x)]
+    path = f"{path} {'x'.join(map(str, x.shape))}" + f" but {x.size - known.size}" * (known.size < x.size)
+    if known.size > FEW:
+        places = np.arange(known.size)
+        waves = [np.cos(rate * places + 1.0) @ known / known.size for rate in (0.3, 2.4)]
+        known = np.array([np.sqrt(np.square(known).mean()), *waves])
+    yield path, known.tolist()
