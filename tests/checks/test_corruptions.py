@@ -13,13 +13,15 @@ from tests.checks.corruptions import (
     clean,
     invented,
     named,
+    numbers,
     recorded_under,
-    said_by_check,
+    said_by,
     said_by_fit,
     scaled,
     two_links,
 )
 from tests.checks.logs import clean as filtered_log
+from tests.goldens.compare import assert_unchanged
 from tests.posterior.arm import arm_model
 from tests.robots.robot_models import with_link
 
@@ -44,7 +46,9 @@ def log_of(place: int):
 def test_a_corruption_is_named_by_check_and_before_a_fit(name):
     corrupt, words = CORRUPTIONS[name]
     data = corrupt(log_of(list(CORRUPTIONS).index(name)))
-    assert named(said_by_check(data), words), said_by_check(data)
+    report = check(data)
+    assert named(said_by(report), words), said_by(report)
+    assert_unchanged(f"checks/{name}", {"joints": report.per_joint(), **numbers(report.doubts)}, rtol=1e-3)
     line = said_by_fit(data)
     assert "\n" not in line
     assert named(line, words), line
@@ -53,7 +57,7 @@ def test_a_corruption_is_named_by_check_and_before_a_fit(name):
 
 def test_an_invented_contact_is_named_by_check_and_before_a_fit():
     data = invented(clean(two_links(), 2))
-    assert named(said_by_check(data), "contact")
+    assert named(said_by(check(data)), "contact")
     assert named(said_by_fit(data), "contact")
 
 

@@ -30,7 +30,7 @@ def assert_unchanged(name: str, values: Any, rtol: float = 1e-6) -> None:
     stored = json.loads(file.read_text()) if file.exists() else {}
     found = dict(_condensed(values))
     if WRITE:
-        rounded = {path: [float(f"{x:.9g}") for x in numbers] for path, numbers in found.items()}
+        rounded = {path: [float(f"{x:.8g}") for x in numbers] for path, numbers in found.items()}
         lines = [f'"{key}": {json.dumps(each)}' for key, each in sorted((stored | {name: rounded}).items())]
         file.write_text("{\n" + ",\n".join(lines) + "\n}\n")
         pytest.skip(f"{file.name} has the numbers of now; look at what has changed")
