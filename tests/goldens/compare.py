@@ -7,6 +7,7 @@ reviewer to see. Goldens are of short computations, so that no processor and no 
 
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ FEW = 6
 def assert_unchanged(name: str, values: Any, rtol: float = 1e-6) -> None:
     """`values` are numbers, arrays or None in mappings, sequences and dataclasses; name is "package/what".
 
-    Numbers may differ by `rtol` of the largest that stands beside them.
+    Numbers may differ by `rtol` of themselves, and those of arrays by that of their largest.
     """
     package, _, name = name.partition("/")
     file = Path(__file__).with_name(f"{package}.json")
@@ -37,7 +38,7 @@ def assert_unchanged(name: str, values: Any, rtol: float = 1e-6) -> None:
     known = stored[name]
     assert found.keys() == known.keys()
     for path, numbers in found.items():
-        most = max(map(abs, known[path]), default=0.0)
+        most = 0.0 if path.endswith("}") else max(map(abs, known[path]), default=0.0)
         np.testing.assert_allclose(numbers, known[path], rtol=rtol, atol=rtol * most + 1e-12, err_msg=path)
 
 
@@ -45,7 +46,12 @@ def _condensed(values: Any, path: str = "") -> Iterator[tuple[str, list[float]]]
     if is_dataclass(values):
         values = {field.name: getattr(values, field.name) for field in fields(values)}
     if isinstance(values, Mapping):
+        plain = {key: value for key, value in values.items() if isinstance(value, int | float)}
+        if plain:
+            yield f"{path}/{{{', '.join(map(str, plain))}}}", [*map(float, plain.values())]
         for key, value in values.items():
+            if key in plain:
+                continue
             yield from _condensed(value, f"{path}/{key}")
         return
     if values is None or isinstance(values, str):
@@ -64,3 +70,21 @@ def _condensed(values: Any, path: str = "") -> Iterator[tuple[str, list[float]]]
         waves = [np.cos(rate * places + 1.0) @ known / known.size for rate in (0.3, 2.4)]
         known = np.array([np.sqrt(np.square(known).mean()), *waves])
     yield path, known.tolist()
+
+
+def drawn(figure: Any) -> dict[str, Any]:
+    """What a matplotlib figure shows: lines, bands, limits and numbers of artists of all axes."""
+    return {
+        f"{number}": {
+            "lines": [line.get_xydata() for line in axes.lines],
+            "bands": [path.vertices for part in axes.collections for path in part.get_paths()],
+            "limits": [*axes.get_xlim(), *axes.get_ylim()],
+            "shown": [axes.get_visible(), len(axes.texts), len(axes.patches)],
+        }
+        for number, axes in enumerate(figure.axes)
+    }
+
+
+def numbers_in(text: str) -> list[float]:
+    """All numbers of what a command prints, in their order."""
+    return [float(number) for number in re.findall(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?", text)]

@@ -7,6 +7,7 @@ import pinocchio
 import pytest
 import torch
 from tests.fit.test_identified_moving_bases import FEET, recorded
+from tests.goldens.compare import assert_unchanged
 from tests.robots.test_moving_bases import LIMBS
 
 from forcegp import Dataset, JointFriction, Model, Robot, fit
@@ -102,3 +103,16 @@ def test_a_foot_that_stands_has_one_arrow():
     for k, arrows in enumerate(feet.values()):
         whole = forces[:, 3 * k : 3 * k + 3].sum(1)
         np.testing.assert_allclose(arrows.mean * arrows.direction[:, 0], whole, atol=1e-8)
+
+
+def test_scenes_are_what_they_were(swinging, friction, on_plane):
+    given = on_plane.training
+    data = Dataset(q=given.q, v=given.v, u=given.u, a=0.0 * given.q, time=0.01 * np.arange(20), model=on_plane.model)
+    scenes = {"pendulum": recorded_scene(swinging, friction, start=0.5, seconds=1.0)}
+    scenes |= {"plane": recorded_scene(data, on_plane), "recorded": recorded_scene(data)}
+    parts = ("time", "q", "poses", "arrows", "size", "arrow_length")
+    found = {name: {part: getattr(scene, part) for part in parts} for name, scene in scenes.items()}
+    for name, scene in scenes.items():
+        found[f"{name} tips"] = [arrows.tips(3, scene.arrow_length) for arrows in scene.arrows]
+        found[f"{name} shapes"] = [(shape.link, shape.vertices, len(shape.faces)) for shape in scene.shapes]
+    assert_unchanged("report/scenes", found, rtol=1e-3)

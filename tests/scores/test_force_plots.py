@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.collections import PolyCollection
+from tests.goldens.compare import assert_unchanged, drawn
 from tests.scores.friction import fitted, friction_data, joint_law
 
 from forcegp.data import Dataset
@@ -11,6 +12,7 @@ from forcegp.errors import InvalidInput
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointFriction, JointPositionForces
 from forcegp.scores import friction_curves_figure, normal_force_figure
+from forcegp.scores.accuracy import poor_scores, predict_rows, row_scores, rows_outside, unfinished_search
 
 
 @pytest.fixture(scope="module")
@@ -107,3 +109,13 @@ def test_models_without_normal_force_are_refused(without_contact, data):
         normal_force_figure(without_contact, data)
     with pytest.raises(InvalidInput, match="no normal force"):
         normal_force_figure(fit(data.model.black_box(), friction_data(10, 0)), data)
+
+
+def test_figures_and_scores_are_what_they_were(friction, data):
+    figures = friction_curves_figure(friction, data), normal_force_figure(friction, data, seconds=0.5)
+    rows = predict_rows(friction, data)
+    table, stretches = row_scores(friction, data)
+    doubts = [*rows_outside(friction, data), *poor_scores(friction, data, table), *unfinished_search(friction)]
+    found = {"figures": list(map(drawn, figures)), "rows": rows, "table": table, "stretches": stretches}
+    found["doubts"] = [(each.about, each.level, each.numbers) for each in doubts]
+    assert_unchanged("scores/friction", found, rtol=1e-3)

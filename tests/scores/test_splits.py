@@ -7,12 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.data.samples import model
+from tests.goldens.compare import assert_unchanged
 from tests.posterior.arm import arm_data
+from tests.scores.moving_arm import given_system, moving_arm
 
 from forcegp.data import Dataset
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.scores import Split, split_named
 from forcegp.scores.experiment import training_subset
+from forcegp.scores.held_out import held_out_motions
+from forcegp.scores.models import all_rows_at_once, candidates, default_models, usual_identification
 
 
 def recording(rows: int = 60, episodes: int = 3, seed: int = 0, **changes) -> Dataset:
@@ -146,3 +150,23 @@ def test_seeds_choose_other_training_rows_that_lie_far_apart():
     for points in (1, 201):
         with pytest.raises(InvalidInput, match="from 2 to 200, two thirds"):
             training_subset(train, points, 0)
+
+
+def test_what_is_held_out_is_what_it_was():
+    found, arm = {}, moving_arm(0.5, 4)
+    for text in ("auto", "folds", "leave-one-out", "episodes:1,3", "blocks:5:2,4"):
+        for split in split_named(arm, text, guard=0.03):
+            rows = split.test_rows(arm), split.training_rows(arm)
+            motions = held_out_motions(arm, rows[0], None, 3)
+            starts = [at for _, at in motions.stretches]
+            found[f"{text} {split.name}"] = {**split.to_dict(), "rows": rows, "h": motions.horizons, "starts": starts}
+    for seed in range(3):
+        found[f"subset {seed}"] = training_subset(arm, 12, seed).time
+    model = given_system()
+    usual = usual_identification(model)
+    for name, each in candidates(
+        [*default_models(model), "viscous+stribeck@torques", "gp:joint"], model, usual
+    ).items():
+        counts = [each.all_rows, len(each.evidence), len(each.motions)]
+        found[name] = each.kind, each.identification, counts, [all_rows_at_once(n, 3) != {} for n in range(200, 600, 9)]
+    assert_unchanged("scores/splits", found)
