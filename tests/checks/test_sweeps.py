@@ -98,7 +98,7 @@ def test_clipped_torques(sign):
 
 
 def test_repeated_rows_and_constant_channels():
-    found = {"rows": [], "slow": [], "joints": []}
+    found = {"rows": [], "slow": []}
     for rows in range(10, 30):
         log, at = swing(), 50 + 30 * np.arange(rows)
         q = log.q.copy()
@@ -190,7 +190,7 @@ def test_joints_that_hardly_move():
     for size in (0.4, 0.8, 1.2, 1.6, 2.4):
         q = 0.01 * size * np.sin(3.0 * both.time)[:, None] + np.zeros(3)
         other = np.where(both.time[:, None] < 5.0, both.q, np.where([True, False, True], both.q, 0.5 * q))
-        for name, values, episode in (("still", q, 0), ("held", other, both.time // 2.5 * 1)):
+        for name, values, episode in (("still", q, 0), ("held", other, both.time // 2.5)):
             log = replace(both, q=values, episode=np.zeros(len(q), int) + np.asarray(episode, int))
             inputs = CheckInput.as_recorded(log, log.model, prepared=log)
             found[f"{name} {size}"] = numbers([*excitation_doubts(inputs), *_held(inputs, ["pan"])])

@@ -53,14 +53,6 @@ def test_all_limits_hold_at_every_time(seed):
     np.testing.assert_allclose(np.gradient(v, 0.001, axis=0)[105:-105], a[105:-105], atol=5e-2)
 
 
-def test_motions_to_choose_from_are_smoother_than_chance(chosen):
-    """Neighbours among their control points are nearer to each other than points anywhere."""
-    rng = np.random.default_rng(0)
-    points = np.stack([chosen.random(rng) for _ in range(1000)])
-    near, far = np.diff(points, axis=1), points - np.roll(points, points.shape[1] // 2, axis=1)
-    assert (near**2).mean() < (far**2).mean()
-
-
 def test_a_bare_robot_moves_so_that_its_parameters_show():
     """The determinant of independent columns of Pinocchio's regressor and friction grows with the motions looked at."""
     model = pinocchio.buildModelFromXML(URDF)

@@ -201,18 +201,9 @@ def test_differences_and_winners_are_what_they_were():
     found["lost"] = paired_difference("motion", "a", "b", lost, np.ones((3, 2, 5)))
     for share in np.linspace(0.3, 0.7, 9):
         for ratio in (0.5, 0.66, 0.69, 0.97, 0.99, 1.2):
-            winner = table(ratio, share).winner
+            stretches = {"ls": rng.gamma(20.0, 0.05, size=9), "gp": ratio**2 * rng.gamma(20.0, 0.05, size=9)}
+            left = {"ls": {"torque": {"share": [0.4]}}, "gp": {"torque": {"share": [share]}}}
+            more = {name: {"motions": None, "stretches": each, "table": left[name]} for name, each in stretches.items()}
+            winner = scores({name: [cell(0, 1.0) | each] for name, each in more.items()}).winner
             found[f"winner {share:.2g} {ratio}"] = winner.model, winner.difference and winner.difference.value
     assert_unchanged("scores/differences", found)
-
-
-def table(ratio: float, share: float) -> Scores:
-    """Two models; the learned one has this ratio of errors, and leaves this share of a torque in one of two joints."""
-    rng, models = np.random.default_rng(1), {"a": {"kind": "identified"}, "b": {"kind": "residual"}}
-    runs = {}
-    for name, size, left in (("a", 1.0, 0.4), ("b", ratio, share)):
-        stretches = (size**2 * rng.gamma(20.0, 0.05, size=9)).tolist()
-        scores = {"torque": {"share": [left, 0.1]}, "acceleration": {"nrmse": [left, 0.1]}}
-        run = {"split": "s", "seed": 0, "error": None, "motions": None}
-        runs[name] = [run | {"table": scores, "stretches": stretches}]
-    return Scores(models=models, runs=runs, joint_names=("x", "y"), units={})

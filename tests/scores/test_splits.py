@@ -80,23 +80,6 @@ def test_whole_episodes_are_held_out_and_left_one_by_one():
     assert len({fold.name for fold in folds}) == 3
 
 
-def test_splits_by_name():
-    data = recording()
-    assert split_named(data, "episodes:0,2")[0].held_out == ((0, -np.inf, np.inf), (2, -np.inf, np.inf))
-    assert len(split_named(data, "leave-one-out")) == 3
-    assert len(split_named(data, "auto")[0].held_out) == 1
-    many = recording(70, 7)
-    groups = [split.apply(many)[1].episodes for split in split_named(many, "folds")]
-    assert len(groups) == 4
-    assert sorted(number for group in groups for number in group) == list(range(7))
-    one = recording(60, 1)
-    assert split_named(one, "folds") == split_named(one, "auto")
-    (split,) = split_named(one, "auto", guard=0.1)
-    assert (len(split.held_out), split.guard) == (2, 0.1)
-    assert "5 consecutive blocks of equal duration, blocks 3 and 5 held out" in split.words
-    assert "0.1 s" in split.words
-
-
 WRONG = [
     ("episodes:7", r"held-out episodes are \[7\]; name some of \[0, 1, 2\]"),
     ("episodes:0,1,2", "leave one to learn from"),
