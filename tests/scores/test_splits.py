@@ -69,17 +69,6 @@ def test_a_decimated_recording_is_divided_at_the_same_moments():
     assert split.test_rows(full)[-1], "rows after the last of the few belong to the last block"
 
 
-def test_whole_episodes_are_held_out_and_left_one_by_one():
-    data = recording()
-    split = split_named(data, "episodes:2,0")[0]
-    train, test = split.apply(data)
-    assert (train.episodes, test.episodes) == ((1,), (0, 2))
-    assert len(train) + len(test) == len(data)
-    folds = split_named(data, "leave-one-out")
-    assert [fold.apply(data)[1].episodes for fold in folds] == [(0,), (1,), (2,)]
-    assert len({fold.name for fold in folds}) == 3
-
-
 WRONG = [
     ("episodes:7", r"held-out episodes are \[7\]; name some of \[0, 1, 2\]"),
     ("episodes:0,1,2", "leave one to learn from"),
