@@ -212,13 +212,12 @@ def test_what_every_cause_explains(name):
     log = LOGS[name]()
     inputs = CheckInput.quick(log, log.model)
     root, found = _root(inputs), {}
-    parts = ("shares", "unexplained", "factors", "floor", "rough", "exact", "free", "value", "unscaled", "plain")
+    parts = ("shares", "unexplained", "factors", "floor", "rough", "exact", "value", "unscaled", "plain")
     found["root"] = {part: getattr(root, part) for part in parts}
     for k, (cause, compared) in enumerate(candidates(root.log, inputs, root.shares > DOUBTFUL, root.factors, True)):
         made = Explanation(compared, root.floor, (cause,)).with_signs()
         label = f"{k} {cause.about} {cause.joints}"
         found[label] = [made.value, made.unscaled, cause.cost, *made.shares, *made.turned]
-        found[f"{label}:"] = cause.numbers, cause.correction
     explained, doubts = search(inputs)
     more = [*torque_doubts(inputs, explained), *elastic_doubts(inputs, explained.log), *held_points(inputs)]
     assert_unchanged(f"checks/causes {name}", found | numbers([*doubts, *more]), rtol=1e-4)

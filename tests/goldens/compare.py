@@ -37,9 +37,12 @@ def assert_unchanged(name: str, values: Any, rtol: float = 1e-6) -> None:
         pytest.skip(f"{file.name} has the numbers of now; look at what has changed")
     known = stored[name]
     assert found.keys() == known.keys()
+    moved = {}
     for path, numbers in found.items():
         most = 0.0 if path.endswith("}") else max(map(abs, known[path]), default=0.0)
-        np.testing.assert_allclose(numbers, known[path], rtol=rtol, atol=rtol * most + 1e-12, err_msg=path)
+        if not np.allclose(numbers, known[path], rtol=rtol, atol=rtol * most + 1e-12):
+            moved[path] = numbers, known[path]
+    assert not moved, moved
 
 
 def _condensed(values: Any, path: str = "") -> Iterator[tuple[str, list[float]]]:
