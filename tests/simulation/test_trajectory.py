@@ -42,14 +42,6 @@ def test_it_rests_before_after_and_on_a_segment_without_length():
     assert not acceleration.any()
 
 
-def test_accelerations_are_the_published_rule():
-    path = random_path(KukaSurfaceConfig(), START, 30.0, np.random.default_rng(1))
-    for start, end, duration, acceleration in zip(
-        path.points, path.points[1:], path.durations, path.accelerations, strict=False
-    ):
-        assert acceleration == pytest.approx(max(0.5, 4 * np.linalg.norm(end - start) / duration**2))
-
-
 KINDS = ("plane", "tilted")
 MIDDLE = np.array([0.0, 0.5, 0.055])
 
