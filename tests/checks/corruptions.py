@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
 import torch
 from tests.checks.logs import column, exchanged
 
-from forcegp.checks import check, quick_check
+from forcegp.checks import CheckReport, quick_check
 from forcegp.data import Dataset
+from forcegp.doubts import Doubt
 from forcegp.errors import ForceGPError
 from forcegp.mechanics import Contact, Plane
 from forcegp.model import Model
@@ -275,9 +276,16 @@ def named(said: str, words: str) -> bool:
     return any(word in said.lower() for word in words.split("|"))
 
 
-def said_by_check(data: Dataset) -> str:
-    found = check(data).doubts
-    return "\n".join(f"[{each.level}] {each.about}: {each.what}" for each in found if each.level != "ok")
+def said_by(report: CheckReport) -> str:
+    return "\n".join(f"[{each.level}] {each.about}: {each.what}" for each in report.doubts if each.level != "ok")
+
+
+def numbers(doubts: Iterable[Doubt]) -> dict[str, object]:
+    """What goldens keep of doubts: all but the sentences."""
+    return {
+        f"{k} {each.level} {each.about} {' '.join(each.joints)}": {**each.numbers, **each.correction}
+        for k, each in enumerate(doubts)
+    }
 
 
 def said_by_fit(data: Dataset) -> str:

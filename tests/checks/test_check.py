@@ -37,13 +37,6 @@ def test_a_clean_log_raises_no_alarm(model, seed, noise):
     assert {item.about for item in report.doubts} >= {"sampling", "velocity"}
 
 
-def test_a_joint_that_stays_does_not_show_its_friction():
-    data = clean(4)
-    small = {name: getattr(data, name) * np.array([1e-3, 1, 1]) for name in "qva"}
-    (found,) = [each for each in check(replace(data, **small)).doubts.of("excitation") if each.joints]
-    assert (found.level, found.joints) == ("look", ("pan",))
-
-
 @pytest.mark.parametrize(("share", "level"), [(0.005, "ok"), (0.012, "wrong")])
 def test_velocities_are_compared_of_joints_that_move(share, level):
     data = clean(4, noise=0.0)
@@ -77,12 +70,6 @@ def test_a_rest_on_brakes_is_left_out(lacking):
         assert len(kept.episodes) == 2
         assert np.abs(kept.v).max(axis=1).min() > 0.0
         assert len(without_stops(data.rows(slice(680, None)))[0].episodes) == 1  # 20 rows before it teach nothing
-
-
-def test_a_gap_is_not_differentiated_across():
-    report = check(clean(6).rows(np.r_[0:700, 780:1400]))
-    assert len(report.inputs.even.episodes) == 2
-    assert not report.doubts.of("torque sign")
 
 
 def test_a_prepared_log_is_not_filtered_twice():
@@ -130,28 +117,12 @@ def test_a_dead_torque_is_wrong_where_the_motion_needs_a_share_of_the_others(sha
     assert (found.level, found.joints) == (level, ("elbow",))
 
 
-def test_repeated_rows_are_told():
-    data = clean(7)
-    kept = np.arange(len(data)) // 4 * 4
-    repeated = replace(data, q=data.q[kept], v=data.v[kept], u=data.u[kept])
-    (found,) = check(repeated).doubts.of("repeated rows")
-    assert found.numbers["share"] == pytest.approx(0.75, abs=0.02)
-
-
 def test_an_angle_that_wraps_is_told():
     data = clean(3, pendulum())
     wrapped = column(data, "q", 0, lambda x: (x + 2 * np.pi * data.time / 3 + np.pi) % (2 * np.pi) - np.pi)
     (found,) = check(replace(wrapped, v=data.v + np.array([2 * np.pi / 3, 0.0]))).doubts.of("jumps")
     assert found.level == "wrong"
     assert "np.unwrap" in found.do
-
-
-def test_positions_that_jump_otherwise_end_the_check_of_motion():
-    report = check(column(clean(3), "q", 1, lambda x: x + 5.0 * (np.arange(len(x)) > 700)))
-    (found,) = report.doubts.of("jumps")
-    assert found.numbers["row"] == 700
-    assert report.inputs.prepared is None
-    assert report.comparison is None
 
 
 def test_the_report_is_json_and_sorted_by_severity():
@@ -172,25 +143,12 @@ def test_what_cannot_be_checked_is_refused():
         check(data, pendulum())
 
 
-def test_a_joint_that_is_held_in_one_episode_is_named():
-    one, other = clean(6), clean(7)
-    q, v = other.q.copy(), other.v.copy()
-    q[:, 1], v[:, 1] = 0.2 + 1e-5 * np.sin(9 * other.time), 9e-5 * np.cos(9 * other.time)
-    joined = {name: np.concatenate([getattr(one, name), getattr(other, name)]) for name in ("u", "a", "time")}
-    both = replace(
-        one, q=np.concatenate([one.q, q]), v=np.concatenate([one.v, v]), episode=np.repeat([0, 1], len(one)), **joined
-    )
-    (found,) = check(replace(both, u=both.u * 0 + np.sin(both.time[:, None]))).doubts.of("held joint")
-    assert found.joints == ("lift",)
-    assert found.numbers["stretches"] == [1]
-
-
 def test_a_model_whose_friction_remembers_is_compared_as_if_its_joints_had_slid_on():
     log = clean(4)
     steady, remembering = (Coulomb(0.4, 0.05, sigma=1e3, memory=memory) for memory in (False, True))
     forces = log.model.forces
-    reports = [check(log, log.model.with_forces(*forces, law)) for law in (steady, remembering)]
-    assert reports[0].to_dict() == reports[1].to_dict()
+    reports = [quick_check(log, log.model.with_forces(*forces, law)) for law in (steady, remembering)]
+    assert reports[0] == reports[1]
 
 
 @pytest.mark.parametrize("stiffness", [300.0, 4e4])

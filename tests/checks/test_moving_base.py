@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from tests.checks.corruptions import numbers
+from tests.goldens.compare import assert_unchanged
 
 from forcegp import Dataset, Model, Robot, check, import_recordings
 from forcegp.checks import quick_check
+from forcegp.checks.moving_base import base_doubts, carried_doubts, stance_doubts
 from forcegp.data.configurations import rates
 from forcegp.forces import Actuation, RigidBodies, Thrusters
 from forcegp.recordings import ColumnMapping
@@ -228,3 +231,25 @@ def test_rows_that_were_left_out_are_no_jumps():
     log, _ = flight(noise=False)
     (doubt, *_) = check(log.rows(np.flatnonzero(np.arange(len(log)) % 800 < 50))).doubts.of("base")
     assert doubt.numbers["as recorded"] < 1e-4 * doubt.numbers["speed"]  # across gaps a quarter
+
+
+def test_what_is_said_of_growing_mistakes(log):
+    found = {}
+    drone, world = (x[:800] if isinstance(x, np.ndarray) else x.rows(slice(0, 800)) for x in flight(seed=1))
+    wrong_v, wrong_a = np.zeros((2, 800, 6))
+    wrong_v[:, :3] = world - drone.v[:, :3]
+    wrong_a[:, :3] = Rotation.from_quat(drone.q[:, 3:7]).inv().apply([0.0, 0.0, 9.81])
+    wrong_a[:, :3] += np.cross(drone.v[:, 3:], drone.v[:, :3])
+    for size in (0.3, 0.8, 1.5):
+        found[f"v {size}"] = numbers(base_doubts(replace(drone, v=drone.v + size * wrong_v), drone.model))
+        found[f"a {size}"] = numbers(base_doubts(replace(drone, a=drone.a + size * wrong_a), drone.model))
+        found[f"u {size}"] = numbers(carried_doubts(replace(drone, u=size * drone.u), drone.model))
+    few = log.rows(slice(240, 480))
+    for share in (0.004, 0.03, 0.07):
+        flips = few.u.copy()
+        some = np.random.default_rng(0).random(len(few)) < share
+        flips[some, 12:] = 1.0 - flips[some, 12:]
+        found[f"flags {share}"] = numbers(list(stance_doubts(replace(few, u=flips, truth={}), few.model))[2:])
+    lifted = np.where(np.arange(few.u.shape[1]) < 12, few.u, 0.0)
+    found["no feet"] = numbers(carried_doubts(replace(few, u=lifted, truth={}), few.model))
+    assert_unchanged("checks/bases", found, rtol=1e-5)

@@ -43,14 +43,6 @@ def test_a_foot_that_moves_while_it_stands_is_named(log):
     assert "Set the flag to 0" in doubt.advice
 
 
-def test_a_wrong_foot_point_moves_while_it_bears(log):
-    moved = replace(log.model.contacts[0], point=(0.0, 0.0, 0.3))
-    wrong = [replace(each, point=moved.point) if each.frame == moved.frame else each for each in log.model.contacts]
-    doubts = of(replace(log, model=log.model.with_contacts(wrong), truth={}))
-    assert repr(moved.frame) in doubts[0].what
-    assert doubts[0].level == "wrong"
-
-
 def test_flags_that_are_no_flags_are_named(log):
     (doubt,) = of(flagged(log, log.model.inputs[13], lambda flags: 0.9 * flags))
     assert "neither 0 nor 1" in doubt.what

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.checks.logs import arm, clean, column, late
+from tests.goldens.compare import assert_unchanged, numbers_in
 
 from forcegp import Dataset, Spring, Torques, fit, save_posterior
 from forcegp.data import resample
@@ -33,6 +34,7 @@ def test_a_clean_log_is_told_so(forcegp, folder):
     assert "Torque of every joint; in Nm" in done.stdout
     line = next(line for line in done.stdout.splitlines() if line.strip().startswith("lift"))
     assert line.split()[2] == "%"
+    assert_unchanged("cli/check", numbers_in(done.stdout), rtol=1e-2)
 
 
 def test_defects_are_told_but_are_no_error(forcegp, folder):
@@ -43,6 +45,8 @@ def test_defects_are_told_but_are_no_error(forcegp, folder):
     assert strict.stderr.startswith("forcegp: defects.h5: ")
     told = json.loads(done.stdout)
     assert told["level"] == "wrong"
+    found = {"joints": told["joints"], "doubts": [{**each, "what": None, "do": None} for each in told["doubts"]]}
+    assert_unchanged("cli/defects", found, rtol=1e-2)
     subjects = {item["about"]: item for item in told["doubts"] if item["level"] != "ok"}
     assert subjects["torque sign"]["joints"] == ["lift"]
     assert subjects["delay"]["numbers"]["delay"] == pytest.approx(0.02, abs=0.005)
@@ -58,6 +62,7 @@ def test_prepare_writes_what_it_says(forcegp, folder):
     told = json.loads(done.stdout)["preparation"]
     data, raw = Dataset.load(folder / "data.h5"), Dataset.load(folder / "noisy.h5")
     assert told["rows"] == [len(raw), len(data)]
+    assert_unchanged("cli/preparation", {**told, "why": None}, rtol=1e-2)
     assert json.loads(json.dumps(data.metadata["preparation"])) == told
     np.testing.assert_allclose(np.diff(data.time), 4 * (raw.time[1] - raw.time[0]))
     assert 1.0 < told["cutoff"] < 20.0

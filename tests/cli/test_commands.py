@@ -11,6 +11,7 @@ import subprocess
 
 import numpy as np
 import pytest
+from tests.goldens.compare import assert_unchanged, numbers_in
 
 from forcegp import Dataset, load_posterior, score
 
@@ -54,6 +55,9 @@ def test_score_prints_exactly_one_json_object(workshop, forcegp):
     content = json.loads(done.stdout)
     scores = content["models"]["run"]["scores"]
     assert scores["constraint"]["mae"]["all"]["median"] < 1e-10
+    medians = {name: {score: (each["all"] or {}).get("median") for score, each in own.items()}
+               for name, own in scores.items()}  # fmt: skip
+    assert_unchanged("cli/scores", {"scores": medians, "told": numbers_in(done.stderr)}, rtol=1e-2)
     rows = Dataset.load(workshop / "train.h5").rows(slice(None, None, 4))
     expected = score(load_posterior(workshop / "run"), rows)
     np.testing.assert_allclose(scores["acceleration"]["mae"]["each"], expected.columns("mae"), rtol=1e-6)

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from tests.goldens.compare import assert_unchanged
 from tests.posterior.arm import URDF, arm_data, arm_model
 
 from forcegp import Dataset
@@ -30,6 +31,8 @@ def test_the_next_motion_of_a_model_can_be_imported(forcegp, folder):
     found = json.loads(done.stdout)
     assert max(max(each) for each in found["usage"].values()) <= 1.0
     assert (np.array(found["spread"][1]) < found["spread"][0]).all()
+    table = np.genfromtxt(folder / "next.csv", delimiter=",", skip_header=1)
+    assert_unchanged("cli/excite", {**found, "table": table}, rtol=1e-2)
     names = ("--time", "t", *(x for what in "qvu" for x in (f"--{what}", f"{what}_{{joints}}")))
     words_of_import = ("import", "next.csv", *names, "--joints", "pan,lift,bend", "--robot", "arm.urdf")
     done = forcegp(*words_of_import, "--out", "next.h5", folder=folder)

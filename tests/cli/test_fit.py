@@ -9,6 +9,7 @@ import pytest
 import torch
 from tests.cli.one_line import assert_refused
 from tests.fit.test_motion_fit import line, recording
+from tests.goldens.compare import assert_unchanged, numbers_in
 from tests.posterior.arm import arm_data
 from tests.simulation.pendulum import double_pendulum
 
@@ -47,6 +48,11 @@ def test_laws_and_bodies_are_estimated(identified, folder):
         assert kept["parameters"][f"coulomb.level.{joint}"]["value"] == pytest.approx(0.4, rel=0.2)
         assert kept["parameters"][f"viscous.{joint}"]["value"] == pytest.approx(0.2, abs=0.1)
     assert kept["evidence"] == "torques"
+    assert_unchanged(
+        "cli/fit",
+        {"kept": [each["value"] for each in kept["parameters"].values()], "shown": numbers_in(identified.stdout)},
+        rtol=1e-2,
+    )
     assert kept["settled"]
     posterior = load_posterior(folder / "found")
     assert posterior.parameters["viscous.upper_hinge"].value == kept["parameters"]["viscous.upper_hinge"]["value"]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 from tests.fit.test_payload import CENTER, MASS, TEXT, loaded, log
+from tests.goldens.compare import assert_unchanged
 
 from forcegp import Dataset, Robot
 
@@ -38,6 +39,7 @@ def require_mass(content):
 def test_the_payload_is_printed_and_written(folder, forcegp, held):
     content = json.loads(held.stdout)
     require_mass(content)
+    assert_unchanged("cli/payload", {name: each["value"] for name, each in content["parameters"].items()}, rtol=1e-2)
     assert "mean nothing" not in " ".join(held.stderr.split())
     written = folder / "held"
     assert json.loads((written / "payload.json").read_text())["link"] == "tool0"

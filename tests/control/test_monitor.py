@@ -10,6 +10,7 @@ import pytest
 import torch
 from scipy.stats import norm
 from tests.control.test_tracking import ROBOT, TRUE, URDF, URDF_ALONE, VISCOUS
+from tests.goldens.compare import assert_unchanged
 from tests.posterior.arm import arm_model
 
 from forcegp import ContactMonitor, Dataset, JointFriction, Model, Robot, Rotor, fit, save_posterior
@@ -283,3 +284,15 @@ def test_refusals_are_one_line(workshop, monkeypatch, tmp_path, capsys, words, m
     assert message in told
     assert len(told.strip().splitlines()) == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_alarms_and_places_are_what_they_were(monitor):
+    push = np.zeros((400, 2))
+    push[200:] = 3.0, -1.0
+    q, v, u = motion(4.0, 6, push)
+    state = monitor.run(q, v, u)
+    place = monitor.place(q[300], state.torque[300])
+    ends = {name: end.numpy() for name, end in link_ends(ROBOT).items()}
+    found = {"numbers": monitor.numbers, "state": state, "place": place, "ends": ends}
+    found["levers"] = [each.numpy() for each in monitor.levers(torch.from_numpy(q[300].copy()))]
+    assert_unchanged("control/monitor", found, rtol=1e-3)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import torch
+from tests.goldens.compare import assert_unchanged
 
 from forcegp import Dataset, JointFriction, Model, Noise, Robot, fit
 from forcegp.control import MPPI
@@ -128,3 +129,10 @@ def test_states_and_costs_of_another_shape(predictor):
         controller(predictor, cost=lambda q, v, u: q)([0.0], [0.0])
     with pytest.raises(InvalidInput, match="give a Predictor"):
         MPPI(None, cost, dt=DT, steps=2, torque_limits=1.0)
+
+
+def test_plans_are_what_they_were(predictor):
+    control = controller(predictor, torque_limits=[1.5])
+    torques = played(control, 12)[1]
+    found = {f"{dt}": usual_integrator(predictor, dt) for dt in (1e-3, 0.05, 0.5)}
+    assert_unchanged("control/plans", {"torques": torques, "plan": control.plan, **found})

@@ -4,6 +4,7 @@ import numpy as np
 import pinocchio
 import pytest
 import torch
+from tests.goldens.compare import assert_unchanged
 from tests.posterior.arm import arm_data, arm_model, quick_fit
 
 from forcegp import ComputedTorque, HybridForce, Model, Robot, Viscous, fit
@@ -205,3 +206,16 @@ def test_it_raises_and_keeps_the_last_torques():
     with pytest.raises(InvalidInput, match="give 2 finite numbers"):
         control([np.nan, 0.0], still, *STILL, still)
     assert torch.equal(control.last, safe)
+
+
+def test_commanded_torques_are_what_they_were(touching):
+    free, (q, v) = touching.with_contacts([]), state(touching)
+    exact, limits = free.predictor(covariance="exact"), [9.0, 50.0, 5.0]
+    computed = ComputedTorque(exact, **GAINS, position_noise=1e-3, torque_limits=limits)
+    hybrid = HybridForce(touching.predictor(covariance="exact"), **GAINS, torque_limits=1e6)
+    found = {"limits": computed.torque_limits, "damping": computed.damping, "stiffness": computed.stiffness}
+    for size in (0.0, 0.01, 0.3):
+        aim = q + size, v - size, np.array([1.0, 2.0, -1.0])
+        found[f"computed {size}"] = computed(q, v, *aim), computed.saturated
+        found[f"hybrid {size}"] = hybrid(q, v, *aim, [5.0]), hybrid(q, v, *aim, 0.0)
+    assert_unchanged("control/torques", found, rtol=1e-3)

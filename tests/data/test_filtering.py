@@ -1,4 +1,3 @@
-import dataclasses
 import inspect
 
 import numpy as np
@@ -147,19 +146,6 @@ def test_a_parabola_is_differentiated_exactly_whatever_the_steps(steps, coeffici
     np.testing.assert_allclose(differentiate(values, time)[:, 0], 2 * a * time + b, atol=1e-8)
 
 
-def test_derivatives_of_a_dataset():
-    exact = motion(noise_std=np.ones(2))
-    raw = dataclasses.replace(exact, v=np.ones((2000, 2)), a=np.ones((2000, 2)))
-    from_q = differentiated(raw, "q")
-    np.testing.assert_allclose(from_q.v, exact.v, atol=1e-3)
-    np.testing.assert_allclose(from_q.a[2:-2], exact.a[2:-2], atol=1e-2)
-    np.testing.assert_array_equal(from_q.q, exact.q)
-    assert from_q.noise_std is None
-    from_v = differentiated(dataclasses.replace(exact, a=np.ones((2000, 2))))
-    np.testing.assert_allclose(from_v.a, exact.a, atol=1e-2)
-    np.testing.assert_array_equal(from_v.v, exact.v)
-
-
 # ---------------------------------------------------------------- sampling
 
 
@@ -175,14 +161,3 @@ def test_uniform_step():
     assert uniform_step(np.array([0.0, 0.5])) == 0.5
     with pytest.raises(DatasetError, match="at least 2"):
         uniform_step(np.zeros(1))
-
-
-def test_resampling_of_uneven_rows():
-    rng = np.random.default_rng(0)
-    uneven = np.sort(rng.choice(TIME, 1000, replace=False))
-    even = resample(motion(uneven), 0.002)
-    exact = motion(even.time)
-    assert uniform_step(even.time) == pytest.approx(0.002)
-    np.testing.assert_allclose(even.q, exact.q, atol=1e-6)
-    np.testing.assert_allclose(even.v, exact.v, atol=1e-5)
-    low_pass(even, 50.0)  # what the error message promises

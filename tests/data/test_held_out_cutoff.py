@@ -48,11 +48,6 @@ def test_a_spectrum_that_shows_too_low_a_cutoff_is_overruled():
     assert error(best) < 0.6 * error(low)
 
 
-def test_preparations_take_it_and_report_why():
-    report = Preparation(cutoff="auto").apply(raw(3, 1e-4)).metadata["preparation"]
-    assert "of held-out torques stay unexplained" in report["why"]["cutoff"]
-
-
 def test_a_passive_robot_keeps_the_cutoff_of_its_spectrum():
     """Where no torque acts, every cut-off explains all of it."""
     rows = raw(3, 1e-4)

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from tests.robots.test_moving_bases import LIMBS
 
-from forcegp.data import Dataset, Preparation, differentiated, low_pass, motion_spectrum, resample
+from forcegp.data import Dataset, Preparation, differentiated, low_pass, motion_spectrum
 from forcegp.errors import DatasetError
 from forcegp.mechanics import fixed_point
 from forcegp.model import Model
@@ -97,24 +97,6 @@ def test_neither_signs_nor_the_frame_of_the_world_matter(how):
     turned = world.apply(a.q[:, :3].copy()) + np.array([1.0, -2.0, 0.5])
     np.testing.assert_allclose(turned, b.q[:, :3], atol=1e-12)
     np.testing.assert_allclose(*(motion_spectrum(x).density for x in (one, other)), rtol=1e-6, atol=1e-18)
-
-
-def test_poses_at_other_times():
-    log, fine = tumbling(), tumbling(rate=1000.0)
-    found = resample(jumbled(log), 1e-3)
-    at = slice(0, len(found))
-    away = log.model.robot.difference(torch.tensor(found.q), torch.tensor(fine.q[at]))
-    assert float(away.abs().max()) < 1e-5
-    np.testing.assert_allclose(found.v, fine.v[at], atol=1e-4)
-    assert set(np.unique(found.u[:, 3])) == {0.0, 1.0}
-
-
-def test_the_automatic_cutoff_passes_the_motion_and_its_price_is_reported_per_joint():
-    log = tumbling()
-    noise = torch.tensor(2e-4 * np.random.default_rng(4).normal(size=log.v.shape))
-    noisy = replace(log, q=log.model.robot.integrate(torch.tensor(log.q), noise).numpy())
-    prepared = Preparation(cutoff="auto", trim=0.5).apply(noisy)
-    assert 1.0 < prepared.metadata["preparation"]["cutoff"] < 20.0
 
 
 def test_what_no_filter_can_follow_is_refused():

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.integrate import solve_ivp
 from tests.data.samples import assert_equal, dataset, model
 from tests.posterior.arm import arm_model
 
@@ -16,7 +15,6 @@ from forcegp.data import (
     Preparation,
     differentiated,
     estimate_delay,
-    lagged,
     low_pass,
     motion_spectrum,
 )
@@ -95,20 +93,6 @@ def test_knee_floor_and_cutoff_of_a_power_law_over_white_noise(derivatives, turn
     assert cutoff == pytest.approx(reached, rel=0.02)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_automatic_cutoff_is_nearly_the_best_of_all(seed):
-    data, exact = noisy(seed=seed, sigma=1e-3)
-    inner = slice(500, -500)
-
-    def error(prepared: Dataset) -> float:
-        return float((np.square(prepared.a - exact)[inner].mean(0) / exact[inner].var(0)).max())
-
-    chosen = Preparation(cutoff="auto").apply(data)
-    best = min(error(Preparation(cutoff=float(hertz)).apply(data)) for hertz in (2, 3, 4, 5, 7, 10, 15, 20, 30))
-    assert error(chosen) < 4 * best
-    assert error(chosen) < 1e-4 * error(data)
-
-
 # ---------------------------------------------------------------- delay
 
 
@@ -177,36 +161,6 @@ def test_what_a_delay_needs_is_said():
 # ---------------------------------------------------------------- lag
 
 
-def commanded(*lags: float) -> Dataset:
-    """The log of the arm with commands that actuators of first order follow: u_c = u + T u'."""
-    data = arm_log(noise=0.0)
-    return replace(data, u=data.u + np.array(lags) * np.gradient(data.u, data.time, axis=0))
-
-
-def test_an_actuator_of_first_order_is_that_of_its_differential_equation():
-    time = 0.002 * np.arange(1000)
-    command = np.sin(9.0 * time) + (time > 0.5)
-    exact = solve_ivp(
-        lambda t, x: (np.interp(t, time, command) - x) / 0.07,
-        (0.0, time[-1]),
-        [command[0]],
-        t_eval=time,
-        max_step=0.002,
-    )
-    np.testing.assert_allclose(lagged(command, time, 0.07), exact.y[0], atol=5e-4)
-    assert lagged(command, time, 0.0) is command
-
-
-@pytest.mark.parametrize("lag", [0.01, 0.1])
-def test_a_lag_is_undone(lag):
-    data, given = commanded(lag, lag, lag), arm_log(noise=0.0)
-    prepared = Preparation(lag=lag).apply(data)
-    assert prepared.metadata["preparation"]["lag"] == lag
-    assert prepared.time[0] == pytest.approx(5.0 * lag, abs=0.006)
-    shown = np.abs(prepared.u - _at(prepared, given).u)
-    assert float(np.median(shown)) < 0.15 * float(np.median(np.abs(data.u - given.u)))
-
-
 # ---------------------------------------------------------------- preparation
 
 
@@ -230,15 +184,6 @@ def test_it_is_the_filter_the_differences_and_the_rows_that_it_says():
     assert prepared.metadata["preparation"]["cutoff"] == 12.0
     again = Preparation(every=2).apply(prepared)
     assert again.metadata["preparation"]["earlier"]["cutoff"] == 12.0
-
-
-def test_the_price_is_the_noise_that_is_left():
-    data, exact = noisy(20.0, sigma=1e-3)
-    prepared = Preparation(cutoff=15.0, trim=0.5).apply(data)
-    price = prepared.metadata["preparation"]["acceleration_noise"]
-    left = np.std(prepared.a - exact[250:-250], axis=0)  # at 15 Hz the filter takes nothing of the motion
-    np.testing.assert_allclose(price["after"], left, rtol=0.15)
-    np.testing.assert_allclose(price["before"], np.std(data.a - exact, axis=0), rtol=0.05)
 
 
 @pytest.mark.parametrize(

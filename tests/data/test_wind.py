@@ -57,14 +57,6 @@ def test_the_wind_of_an_exact_law_is_found(wind):
     assert max(law.deviations) < 1e-5
 
 
-def test_every_episode_has_its_wind():
-    winds = [(4.0, 1.0, 0.0), (-2.0, 5.0, 0.0), (0.0, 0.0, 0.0)]
-    dataset = flight(winds, episodes=3, noise=0.05)
-    _, found = find_wind(dataset)
-    for episode, wind in enumerate(winds):
-        np.testing.assert_allclose(found[dataset.episode == episode].mean(0), wind, atol=0.1)
-
-
 def test_another_wind_is_observed_from_the_rows_before():
     law, _ = find_wind(flight([(3.0, -2.0, 0.0)]))
     other = flight([(-5.0, 4.0, 0.0)], seed=1)

@@ -7,11 +7,13 @@ import pinocchio
 import pytest
 import torch
 from tests.fit.test_identified_moving_bases import FEET, recorded
+from tests.goldens.compare import assert_unchanged, drawn
 from tests.robots.test_moving_bases import LIMBS
 
 from forcegp import Dataset, JointFriction, Model, Robot, fit
 from forcegp.report import recorded_scene, scene_notes
 from forcegp.report.motion import LONGEST_ARROW, PALE, _drawn
+from forcegp.scores import model_pictures
 
 
 def test_poses_are_pinocchios(swinging):
@@ -55,23 +57,6 @@ def test_joint_arrows_are_laws_and_learned_part_together(swinging, friction):
     np.testing.assert_allclose(arrows.direction[:, 1], pose[:, :3, :3] @ robot.joints[1].axis, atol=1e-12)
 
 
-def test_contact_arrows_are_the_predicted_force(on_plane):
-    q, v, u = (on_plane.training.q[:4], on_plane.training.v[:4], on_plane.training.u[:4])
-    data = Dataset(q=q, v=v, u=u, a=np.zeros((4, 3)), time=0.01 * np.arange(4), model=on_plane.model)
-    scene = recorded_scene(data, on_plane)
-    contact = next(arrows for arrows in scene.arrows if arrows.title.startswith("contact force"))
-    chosen = [int(np.flatnonzero((q.numpy() == row).all(1))[0]) for row in scene.q]
-    predicted = on_plane.predict(q, v, u).contact_force
-    np.testing.assert_allclose(
-        contact.mean[:, :1] * contact.direction[:, 0], predicted.mean.numpy()[chosen], rtol=1e-9, atol=1e-9
-    )
-    d = torch.tensor(contact.direction[:, 0])
-    std = (d[:, None, :] @ predicted.covariance[chosen] @ d[..., None])[:, 0, 0].sqrt()
-    np.testing.assert_allclose(contact.half[:, 0], 1.959963984540054 * std.numpy(), rtol=1e-6)
-    position = on_plane.model.contacts[0].position(on_plane.model.robot.kinematics(q[chosen])).numpy()
-    np.testing.assert_allclose(contact.start[:, 0], position, atol=1e-12)
-
-
 def test_arrows_are_drawn_to_scale(swinging, friction):
     scene = recorded_scene(swinging, friction, seconds=1.0)
     (arrows,) = scene.arrows
@@ -102,3 +87,18 @@ def test_a_foot_that_stands_has_one_arrow():
     for k, arrows in enumerate(feet.values()):
         whole = forces[:, 3 * k : 3 * k + 3].sum(1)
         np.testing.assert_allclose(arrows.mean * arrows.direction[:, 0], whole, atol=1e-8)
+
+
+def test_scenes_are_what_they_were(swinging, friction, on_plane):
+    given = on_plane.training
+    data = Dataset(q=given.q, v=given.v, u=given.u, a=0.0 * given.q, time=0.01 * np.arange(20), model=on_plane.model)
+    scenes = {"pendulum": recorded_scene(swinging, friction, start=0.5, seconds=1.0)}
+    scenes |= {"plane": recorded_scene(data, on_plane), "recorded": recorded_scene(data)}
+    parts = ("time", "q", "poses", "arrows", "size", "arrow_length")
+    found = {name: {part: getattr(scene, part) for part in parts} for name, scene in scenes.items()}
+    for name, scene in scenes.items():
+        found[f"{name} tips"] = [arrows.tips(3, scene.arrow_length) for arrows in scene.arrows]
+        found[f"{name} shapes"] = [(shape.link, shape.vertices, len(shape.faces)) for shape in scene.shapes]
+    (picture,), missing = model_pictures(friction, swinging)
+    assert (picture.name, missing) == ("forces", [])
+    assert_unchanged("report/scenes", found | {"picture": drawn(picture.figure)}, rtol=1e-3)

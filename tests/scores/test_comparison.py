@@ -7,6 +7,7 @@ from dataclasses import fields
 
 import pytest
 from tests.fit.test_motion_fit import line, recording
+from tests.goldens.compare import assert_unchanged
 from tests.scores.moving_arm import given_system, moving_arm
 
 from forcegp import JointForces, JointFriction, score
@@ -68,6 +69,10 @@ def test_every_kind_of_model_is_a_row_and_identified_is_always_among_them(found)
     assert scores.value("nrmse", model="identified") < 0.5 * scores.value("nrmse", model="given")
     for name, model in scores.models.items():
         assert {run["seed"] for run in scores.runs[name]} == {0, 1}, model
+    parts = ("table", "stretches", "motions", "training_rows", "test_rows")
+    runs = {name: [{p: run[p] for p in parts} for run in scores.finished(name)[:1]] for name in scores.models}
+    winner = scores.winner.model, scores.winner.difference
+    assert_unchanged("scores/comparison", {"runs": runs, "winner": winner}, rtol=1e-3)
     # identified, functions of few inputs, and what was fitted before use all rows, so one seed stands for all
     assert len(changed(folder)) == 1 + 3 + 2 * 2
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 from scipy.stats import ttest_rel
+from tests.goldens.compare import assert_unchanged
 
 from forcegp.errors import FitError, InvalidInput
 from forcegp.scores import Scores
@@ -187,3 +188,22 @@ def test_a_model_that_is_not_there_is_named():
         scores({"urdf": [cell(0, 1.0)], "gp": [cell(0, 0.5)]}).value("mae")
     with pytest.raises(InvalidInput, match=r"no model 'gpp'.*did you mean 'gp'"):
         scores({"urdf": [cell(0, 1.0)], "gp": [cell(0, 0.5)]}).value("mae", model="gpp")
+
+
+def test_differences_and_winners_are_what_they_were():
+    found, rng = {}, np.random.default_rng(5)
+    for seeds, horizons, stretches in ((1, 1, 1), (1, 1, 6), (3, 1, 1), (3, 2, 5)):
+        one, other = rng.gamma(8.0, 0.1, size=(2, seeds, horizons, stretches))
+        for ratio in (0.3, 0.6, 0.95, 1.0, 1.03, 1.6):
+            each = paired_difference("force", "a", "b", ratio * one, other)
+            found[f"{one.shape} {ratio}"] = {**vars(each), "outcome": each.outcome, "to take": each.favours_challenger}
+    lost = np.where(np.arange(5) < 2, np.inf, 1.0) * np.ones((3, 2, 5))
+    found["lost"] = paired_difference("motion", "a", "b", lost, np.ones((3, 2, 5)))
+    for share in np.linspace(0.3, 0.7, 9):
+        for ratio in (0.5, 0.66, 0.69, 0.97, 0.99, 1.2):
+            stretches = {"ls": rng.gamma(20.0, 0.05, size=9), "gp": ratio**2 * rng.gamma(20.0, 0.05, size=9)}
+            left = {"ls": {"torque": {"share": [0.4]}}, "gp": {"torque": {"share": [share]}}}
+            more = {name: {"motions": None, "stretches": each, "table": left[name]} for name, each in stretches.items()}
+            winner = scores({name: [cell(0, 1.0) | each] for name, each in more.items()}).winner
+            found[f"winner {share:.2g} {ratio}"] = winner.model, winner.difference and winner.difference.value
+    assert_unchanged("scores/differences", found)

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-import torch
 from matplotlib.collections import PolyCollection
+from tests.goldens.compare import assert_unchanged, drawn
 from tests.scores.friction import fitted, friction_data, joint_law
 
 from forcegp.data import Dataset
@@ -11,6 +11,7 @@ from forcegp.errors import InvalidInput
 from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointFriction, JointPositionForces
 from forcegp.scores import friction_curves_figure, normal_force_figure
+from forcegp.scores.accuracy import poor_scores, predict_rows, row_scores, rows_outside, unfinished_search
 
 
 @pytest.fixture(scope="module")
@@ -86,24 +87,18 @@ def test_large_models_say_how_many_curves_are_shown(monkeypatch):
     assert "2 of 6 curves" in figure.get_suptitle()
 
 
-def test_the_normal_force_is_drawn_with_its_truth(friction, data):
-    figure = normal_force_figure(friction, data, seconds=0.5)
-    (force,) = figure.axes
-    rows = data.rows(data.time <= 0.5)
-    prediction = friction.predict(rows.q, rows.v, rows.u)
-    dynamics = data.model.dynamics(*(torch.tensor(x) for x in (rows.q, rows.v, rows.u)))
-    size = torch.linalg.vector_norm(dynamics.normals, dim=-1)[:, 0].numpy()
-    time, mean = line(force, "predicted")
-    np.testing.assert_allclose(time, rows.time)
-    np.testing.assert_allclose(mean, size * prediction.multiplier.mean[:, 0].numpy(), rtol=1e-9)
-    np.testing.assert_allclose(line(force, "true")[1], size * rows.truth["lambda"][:, 0], rtol=1e-9)
-    known = dynamics.multiplier(torch.zeros(len(rows), 3, dtype=torch.float64))[:, 0].numpy()
-    np.testing.assert_allclose(line(force, "known physics alone")[1], size * known, rtol=1e-9)
-    assert force.get_ylabel() == "normal force [N]"
-
-
 def test_models_without_normal_force_are_refused(without_contact, data):
     with pytest.raises(InvalidInput, match="no normal force"):
         normal_force_figure(without_contact, data)
     with pytest.raises(InvalidInput, match="no normal force"):
         normal_force_figure(fit(data.model.black_box(), friction_data(10, 0)), data)
+
+
+def test_figures_and_scores_are_what_they_were(friction, data):
+    figures = friction_curves_figure(friction, data), normal_force_figure(friction, data, seconds=0.5)
+    rows = predict_rows(friction, data)
+    table, stretches = row_scores(friction, data)
+    doubts = [*rows_outside(friction, data), *poor_scores(friction, data, table), *unfinished_search(friction)]
+    found = {"figures": list(map(drawn, figures)), "rows": rows, "table": table, "stretches": stretches}
+    found["doubts"] = [(each.about, each.level, each.numbers) for each in doubts]
+    assert_unchanged("scores/friction", found, rtol=1e-3)

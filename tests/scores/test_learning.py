@@ -22,7 +22,6 @@ from forcegp.progress import watched
 from forcegp.robots import Robot
 from forcegp.scores import named_model, summands, usual_forces
 from forcegp.scores.models import (
-    all_rows_at_once,
     allowing_for_correlation,
     candidates,
     default_models,
@@ -105,15 +104,6 @@ def test_noise_of_forces_is_learned_where_rows_show_it():
     q, v, a = (torch.tensor(x) for x in (data.q, data.v, data.a))
     lacking = model.robot.inverse_dynamics(q, v, a).numpy() - data.u
     np.testing.assert_allclose(model.noise.force, lacking.std(axis=0, ddof=1), rtol=1e-8)
-
-
-def test_many_equations_are_learned_through_inducing_points():
-    """So many rows that a search takes its 1,400 equations, and no more than its restarts afford."""
-    assert all_rows_at_once(200, 7) == {}
-    found = all_rows_at_once(201, 7)
-    assert found["learning_points"] == 200
-    assert found["engine"].tolerance == 1.0 / 201
-    assert all_rows_at_once(1000, 2)["learning_points"] < 1000
 
 
 def test_laws_are_refined_on_motions_and_a_short_log_says_why_intervals_are_not_calibrated():

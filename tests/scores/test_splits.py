@@ -7,12 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.data.samples import model
+from tests.goldens.compare import assert_unchanged
 from tests.posterior.arm import arm_data
+from tests.scores.moving_arm import given_system, moving_arm
 
 from forcegp.data import Dataset
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.scores import Split, split_named
 from forcegp.scores.experiment import training_subset
+from forcegp.scores.held_out import held_out_motions
+from forcegp.scores.models import all_rows_at_once, candidates, default_models, usual_identification
 
 
 def recording(rows: int = 60, episodes: int = 3, seed: int = 0, **changes) -> Dataset:
@@ -63,34 +67,6 @@ def test_a_decimated_recording_is_divided_at_the_same_moments():
     assert (split.test_rows(full)[::7] == split.test_rows(few)).all()
     assert (split.training_rows(full)[::7] == split.training_rows(few)).all()
     assert split.test_rows(full)[-1], "rows after the last of the few belong to the last block"
-
-
-def test_whole_episodes_are_held_out_and_left_one_by_one():
-    data = recording()
-    split = split_named(data, "episodes:2,0")[0]
-    train, test = split.apply(data)
-    assert (train.episodes, test.episodes) == ((1,), (0, 2))
-    assert len(train) + len(test) == len(data)
-    folds = split_named(data, "leave-one-out")
-    assert [fold.apply(data)[1].episodes for fold in folds] == [(0,), (1,), (2,)]
-    assert len({fold.name for fold in folds}) == 3
-
-
-def test_splits_by_name():
-    data = recording()
-    assert split_named(data, "episodes:0,2")[0].held_out == ((0, -np.inf, np.inf), (2, -np.inf, np.inf))
-    assert len(split_named(data, "leave-one-out")) == 3
-    assert len(split_named(data, "auto")[0].held_out) == 1
-    many = recording(70, 7)
-    groups = [split.apply(many)[1].episodes for split in split_named(many, "folds")]
-    assert len(groups) == 4
-    assert sorted(number for group in groups for number in group) == list(range(7))
-    one = recording(60, 1)
-    assert split_named(one, "folds") == split_named(one, "auto")
-    (split,) = split_named(one, "auto", guard=0.1)
-    assert (len(split.held_out), split.guard) == (2, 0.1)
-    assert "5 consecutive blocks of equal duration, blocks 3 and 5 held out" in split.words
-    assert "0.1 s" in split.words
 
 
 WRONG = [
@@ -146,3 +122,22 @@ def test_seeds_choose_other_training_rows_that_lie_far_apart():
     for points in (1, 201):
         with pytest.raises(InvalidInput, match="from 2 to 200, two thirds"):
             training_subset(train, points, 0)
+
+
+def test_what_is_held_out_is_what_it_was():
+    found, arm = {}, moving_arm(0.5, 4)
+    for text in ("auto", "folds", "leave-one-out", "episodes:1,3", "blocks:5:2,4"):
+        for split in split_named(arm, text, guard=0.03):
+            rows = split.test_rows(arm), split.training_rows(arm)
+            motions = held_out_motions(arm, rows[0], None, 3)
+            starts = [at for _, at in motions.stretches]
+            found[f"{text} {split.name}"] = {**split.to_dict(), "rows": rows, "h": motions.horizons, "starts": starts}
+    for seed in range(3):
+        found[f"subset {seed}"] = training_subset(arm, 12, seed).time
+    model = given_system()
+    usual = usual_identification(model)
+    names = *default_models(model), "viscous+stribeck@torques", "gp:joint"
+    for name, each in candidates(names, model, usual).items():
+        found[name] = each.kind, each.identification, [each.all_rows, len(each.evidence), len(each.motions)]
+    found["at once"] = [all_rows_at_once(count, 3) != {} for count in range(200, 600, 9)]
+    assert_unchanged("scores/splits", found)

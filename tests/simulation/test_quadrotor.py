@@ -152,15 +152,3 @@ def test_a_predictor_takes_what_observers_report(posterior, test, tmp_path):
         expected = seeing.predict(q, v, u, covariance=False).mean
         np.testing.assert_allclose(predictor.mean(q, v, u), expected, rtol=1e-9, atol=1e-9)
     assert export_c(seeing, tmp_path / "c").differences
-
-
-def test_without_columns_the_air_moves_as_in_the_training(posterior, train):
-    """So rows of the same wind are predicted without an observer, and the model can be fitted again."""
-    rows = acting(train).rows(np.arange(0, 2760, 15))
-    a = posterior.predict(rows.q, rows.v, rows.u, covariance=False).mean.numpy()
-    assert np.sqrt(np.square(a - rows.a).mean()) < 0.5 * np.sqrt(np.square(rows.a).mean())
-    assert posterior.model.unknown_forces[0].wind == posterior.settings["air"]["wind"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        again = fit(posterior.model, rows, points=40, restarts=1)  # too few rows to show their wind
-    assert again.model.inputs == train.model.inputs

@@ -42,30 +42,6 @@ def test_it_rests_before_after_and_on_a_segment_without_length():
     assert not acceleration.any()
 
 
-def test_way_points_are_reached_at_rest_below_the_surface_within_their_ranges():
-    config = KukaSurfaceConfig()
-    path = random_path(config, START, 60.0, np.random.default_rng(0))
-    corners = path.points[1:]
-    position, velocity, _ = path.sample(np.cumsum(path.durations))
-    np.testing.assert_allclose(position, corners, atol=1e-12)
-    np.testing.assert_allclose(velocity, 0.0, atol=1e-12)
-    assert path.durations.sum() >= 60.0
-    assert (path.durations >= 0.5).all()
-    assert (path.durations <= 1.0).all()
-    for column, (lower, upper) in enumerate([config.waypoint_x, config.waypoint_y]):
-        assert lower <= corners[:, column].min() < lower + 0.1 * (upper - lower)
-        assert upper >= corners[:, column].max() > upper - 0.1 * (upper - lower)
-    np.testing.assert_allclose(corners[:, 2], 0.055 - 1e-4)
-
-
-def test_accelerations_are_the_published_rule():
-    path = random_path(KukaSurfaceConfig(), START, 30.0, np.random.default_rng(1))
-    for start, end, duration, acceleration in zip(
-        path.points, path.points[1:], path.durations, path.accelerations, strict=False
-    ):
-        assert acceleration == pytest.approx(max(0.5, 4 * np.linalg.norm(end - start) / duration**2))
-
-
 KINDS = ("plane", "tilted")
 MIDDLE = np.array([0.0, 0.5, 0.055])
 
