@@ -12,11 +12,12 @@ from tests.checks.logs import PENDULUM, RATE, arm, clean, column, pendulum
 from tests.robots.robot_models import with_link
 
 from forcegp.checks import CheckReport, check, quick_check, without_stops
+from forcegp.checks.residuals import pushed_where_they_are
 from forcegp.checks.search import moving
 from forcegp.checks.torques import with_gravity
 from forcegp.data import Dataset, Preparation
 from forcegp.errors import InvalidInput
-from forcegp.forces import Coulomb
+from forcegp.forces import Coulomb, Viscous
 from forcegp.mechanics import fixed_point
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -205,3 +206,17 @@ def test_rows_at_rest_show_no_torque():
     speed[::2], speed[1::4, 0], speed[3::4, 0] = 1.0, 0.08, 0.06  # of .71
     rows = replace(clean(0, pendulum()).rows(slice(0, 100)), v=speed)
     assert [len(moving(each)) for each in (rows, replace(rows, v=0.0 * speed))] == [75, 100]
+
+
+def test_springs_are_asked_for_where_torques_are_missed_by_position():
+    log, rng = clean(0, noise=0.0), np.random.default_rng(0)
+    model = log.model.with_forces(Viscous(0.1), Coulomb(0.2, 0.05))
+
+    def asked(spring: float, share: float = 0.0) -> tuple[str, ...]:
+        """With a spring at the second joint of this power of its torque, and noise of this share of what is missed."""
+        pull = spring**0.5 * log.u[:, 1].std() / log.q[:, 1].std() * (log.q[:, 1] - log.q[:, 1].mean())
+        noise = rng.standard_normal(len(log)) * pull.std() * (share / (1.0 - share)) ** 0.5
+        return pushed_where_they_are(column(log, "u", 1, lambda u: u + pull + noise), model)
+
+    assert asked(0.0) == asked(7e-4) == asked(0.1, 0.75) == ()
+    assert asked(1.6e-3) == asked(0.1) == asked(0.1, 0.5) == ("lift",)

@@ -177,7 +177,7 @@ def _stopped(*_):
 
 @pytest.mark.usefixtures("unchecked")  # its dataset is none
 def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
-    dataset = SimpleNamespace(units={"q": "rad"})
+    dataset, numbers = SimpleNamespace(units={"q": "rad"}), list[list[str]]()
 
     def told(errors, moved=0.01, shares=None, covered=0.94, still=()):
         table = {"acceleration": {"nrmse": errors, "coverage_95": [covered] * 3}}
@@ -187,7 +187,9 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
         run = {"split": "s", "seed": 0, "error": None, "table": table, "motions": motions, "stretches": []}
         names = ("hip", "knee", "wrist")
         about = {"given": {"kind": "given", "summary": ""}}
-        return verdict(Scores(models=about, runs={"given": [run]}, joint_names=names, units={}), dataset, still)
+        scores = Scores(models=about, runs={"given": [run]}, joint_names=names, units={})
+        numbers.append(scores.not_known("given", still))
+        return verdict(scores, dataset, still)
 
     lost = told([328.2, 0.9, None], None)
     assert lost.startswith("Do not use any of these models: on unseen time the best one, “the URDF”, leaves of the acc")
@@ -205,6 +207,7 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
     whole = told([0.1, 0.16, 2.6], shares=[0.02, 0.03, 0.05])
     assert whole.endswith("of each torque, and positions 1 s ahead are wrong by 0.01 rad.")
     assert "wrist 51 %" in told([0.1] * 3, shares=[0.02, 0.03, 0.51])
+    assert numbers[-3:] == [["wrist"], [], ["wrist"]]
     assert told([0.1] * 3, None).endswith("but its motions diverge: do not simulate with it.")
     assert told([0.1] * 3, covered=0.57).endswith("Do not trust its intervals: those of 95 % hold 57 %.")
     assert "intervals" not in told([0.1] * 3, covered=0.81)

@@ -341,6 +341,7 @@ def answer_lines(
         for two in (("rad", "m"), ("Nm", "N"), ("kg m²", "kg"))
     )
 
+    still = scores.not_known("identified", still)
     open_ones = f"; of {', '.join(still)} not known from this log" if still else ""
 
     def each(field: str) -> str:

@@ -6,7 +6,7 @@ would change are jackknife variances (Efron & Stein 1981), added as Welch & Satt
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -243,6 +243,11 @@ class Scores(Summary):
     def unusable(self, model: str, beside: Iterable[str] = ()) -> int:
         """In how many joints a model leaves more than `USABLE`, or it is not known what it leaves."""
         return sum(share is None or share > USABLE for share in self.left(model, beside)[1].values())
+
+    def not_known(self, model: str, still: Collection[str] = ()) -> list[str]:
+        """Joints that stand still, or of which it leaves more than `USABLE`: what it has of them is no number."""
+        left = self.left(model)[1]
+        return [name for name in self.joint_names if name in still or (left.get(name) or 0.0) > USABLE]
 
     def errors(self, criterion: str, model: str) -> dict[tuple[str, int], Float[np.ndarray, "horizons stretches"]]:
         """Squared errors by split and seed; one horizon but for motions."""
