@@ -107,7 +107,7 @@ def test_a_bag_that_is_played_live(tmp_path, monkeypatch):
     assert 0.0 < found[0][0] - 1.7e9 - 200 * dt < 0.1
     assert {place.link for _, place, _ in found} == {"fore"}
     assert 0.4 < found[-1][1].force[2] < 1.1
-    assert all(0.0 <= at - (stamp - 1.7e9) / speed < 1.0 for stamp, _, at in found)
+    assert all(at >= (stamp - 1.7e9) / speed for stamp, _, at in found)
     pose = NOMINAL.robot.frame_pose(torch.tensor(log["q"][-1]), "fore")
     np.testing.assert_allclose(view.arrow.points[0, 1], (pose @ torch.tensor([0.1, 0, 0, 1]).double())[:3], atol=0.02)
     np.testing.assert_allclose(np.diff(view.arrow.points[0, :, 2]), 0.01, atol=0.0015)

@@ -23,18 +23,7 @@ from forcegp.data import Preparation
 from forcegp.evidence import motion_residuals
 from forcegp.scores import Scores
 
-COLUMNS = [
-    "--time",
-    "Zeit",
-    "--q",
-    "Winkel_{1..2}",
-    "--v",
-    "Tempo_{1..2}",
-    "--u",
-    "Moment_{1..2}",
-    "--robot",
-    "arm.urdf",
-]
+COLUMNS = shlex.split("--time Zeit --q Winkel_{1..2} --v Tempo_{1..2} --u Moment_{1..2} --robot arm.urdf")
 
 
 @pytest.fixture(scope="module")

@@ -210,13 +210,13 @@ def test_what_a_log_does_not_tell_of_memory_is_said(kind, lugre_log):  # the fix
     log, few = lugre_log.rows(slice(0, 3000)), 1000
     if kind == "short":
         log = replace(log, episode=np.arange(3000) // 10)
-        said = r"counts as 0 before the first row .* in \d\d% of the rows"
+        said = r"until a joint has moved .* \d\d% of the rows come before that"
     elif kind == "coarse":
         log, said = replace(log, q=np.round(log.q / 2e-3) * 2e-3), r"larger than the ways .*: pan \(2\), lift \(2\)"
     else:
         u = arm_model(0).robot.inverse_dynamics(*map(torch.tensor, (log.q, log.v, log.a))).numpy()
         log = replace(log, u=u + 0.5 * np.sign(log.v))
-        said = "sigma of pan, lift, bend is at its bound: it turns sooner"
+        said = "friction of pan, lift, bend turns sooner after a reversal than the log can tell"
     with pytest.warns(DataWarning, match=said):
         fit(arm_model(0).with_forces(Viscous(), Coulomb(memory=True)), log, Torques(), rows=few)
 

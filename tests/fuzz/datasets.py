@@ -142,7 +142,7 @@ def _apply(file: h5py.File, change: Change) -> None:
         case "edit":
             file[name] = edited_json({} if len(text) > 100_000 or "9" * 99 in text else json.loads(text), value)
         case how:
-            file[name] = ARRAYS[how](np.ones(3) if content is None else content)
+            file[name] = ARRAYS[how](np.ones(3) if content is None else np.atleast_1d(content))
     for key, unit in units.items():
         if isinstance(file.get(name, getlink=True), h5py.HardLink):
             file[name].attrs[key] = unit

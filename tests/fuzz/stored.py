@@ -29,7 +29,7 @@ CHANGES = {
     "infinite": lambda x: x + float("inf"),
     "huge": lambda x: x * 1e300,
     "zero": lambda x: x * 0.0,
-    "negative": lambda x: -x - 1.0,
+    "negative": lambda x: -1.0 * x - 1.0,
     "flat": lambda x: x.reshape(-1),
     "one": lambda x: x.reshape(-1)[:1],
     "empty": lambda x: x.reshape(-1)[:0],

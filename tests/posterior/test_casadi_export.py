@@ -32,12 +32,6 @@ def friction() -> Posterior:
     return quick_fit(arm_model().with_forces(JointFriction()), arm_data(12, 0), 1)
 
 
-@pytest.fixture(scope="module")
-def states() -> list[torch.Tensor]:
-    data = arm_data(6, 1)
-    return [torch.tensor(x) for x in (data.q, data.v, data.u)]
-
-
 def test_it_is_predict_with_the_derivatives_of_a_predictor(posterior, states):
     function = casadi_function(posterior)
     slopes = function.jacobian()

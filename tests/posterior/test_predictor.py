@@ -4,7 +4,7 @@ import pickle
 
 import pytest
 import torch
-from tests.posterior.arm import arm_data, arm_model, quick_fit
+from tests.posterior.arm import arm_model, quick_fit
 from torch.autograd import forward_ad
 
 from forcegp.errors import InvalidInput, NumericalError, NumericalWarning
@@ -38,12 +38,6 @@ def means(posterior) -> Predictor:
 @pytest.fixture(scope="module")
 def compressed(posterior) -> Predictor:
     return posterior.predictor()
-
-
-@pytest.fixture(scope="module")
-def states() -> tuple[torch.Tensor, ...]:
-    data = arm_data(5, 1)
-    return tuple(torch.tensor(x) for x in (data.q, data.v, data.u))
 
 
 def assert_close(found: torch.Tensor, expected: torch.Tensor, tolerance: float = 1e-10):

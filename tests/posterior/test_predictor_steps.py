@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from tests.posterior.arm import arm_data, arm_model, quick_fit
+from tests.posterior.arm import arm_model, quick_fit
 
 from forcegp.errors import InvalidInput
 from forcegp.forces import ContactFriction, JointForces, JointFriction, RigidBodies, ToolForces
@@ -27,12 +27,6 @@ def posterior(request) -> Posterior:
 @pytest.fixture(scope="module")
 def smooth() -> Posterior:
     return quick_fit(arm_model().with_forces(JointForces()))
-
-
-@pytest.fixture(scope="module")
-def states() -> list[torch.Tensor]:
-    data = arm_data(4, 1)
-    return [torch.tensor(x) for x in (data.q, data.v, data.u)]
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
@@ -85,7 +79,7 @@ def test_a_step_is_differentiable(smooth, states):
         ({"dt": 0.0}, r"dt is 0\.0; give the time step as a positive number"),
         ({"dt": True}, "dt is True; give the time step"),
         ({"integrator": "rk5"}, "no integrator 'rk5'.*did you mean 'rk4'"),
-        ({"u": torch.zeros(2, 3)}, r"q \(4, 3\), v \(4, 3\), u \(2, 3\)"),
+        ({"u": torch.zeros(2, 3)}, r"q \(5, 3\), v \(5, 3\), u \(2, 3\)"),
     ],
 )
 def test_wrong_arguments_of_a_step_are_named(smooth, states, changed, message):
@@ -105,7 +99,7 @@ def test_inverse_dynamics_is_predict_read_backwards(posterior, states):
     for wanted in ([12.0], torch.tensor([[3.0], [-2.0], [7.0], [40.0]]).double(), None):
         found = predictor.inverse_dynamics(q, v, expected.mean, wanted)
         forward = posterior.predict(q, v, found.mean)
-        multiplier = torch.zeros(4, 1).double() if wanted is None else torch.as_tensor(wanted).double().expand(4, 1)
+        multiplier = torch.zeros(5, 1).double() if wanted is None else torch.as_tensor(wanted).double().expand(5, 1)
         torch.testing.assert_close(forward.mean, expected.mean, rtol=1e-9, atol=1e-9)
         torch.testing.assert_close(forward.multiplier.mean, multiplier, rtol=1e-9, atol=1e-9)
         assert (torch.linalg.eigvalsh(found.covariance) >= -1e-12).all()
@@ -116,9 +110,9 @@ def test_inverse_dynamics_is_predict_read_backwards(posterior, states):
 
 def test_inverse_dynamics_refuses_what_it_cannot_solve(smooth, states):
     predictor = smooth.predictor(covariance="none", compile=False)
-    with pytest.raises(InvalidInput, match=r"normal_force has shape \(2,\); give \(1,\) or \(4, 1\)"):
+    with pytest.raises(InvalidInput, match=r"normal_force has shape \(2,\); give \(1,\) or \(5, 1\)"):
         predictor.inverse_dynamics(*states, [1.0, 2.0])
-    with pytest.raises(InvalidInput, match=r"q \(4, 3\), v \(4, 3\), a \(3,\)"):
+    with pytest.raises(InvalidInput, match=r"q \(5, 3\), v \(5, 3\), a \(3,\)"):
         predictor.inverse_dynamics(*states[:2], torch.zeros(3))
     carried = quick_fit(arm_model().with_forces(JointForces()).without_mean())
     with pytest.raises(InvalidInput, match="no RigidBodies"):

@@ -18,12 +18,6 @@ def posterior() -> Posterior:
     return quick_fit(arm_model().with_forces(JointFriction(), JointForces()), arm_data(20, 0))
 
 
-@pytest.fixture
-def states() -> list[torch.Tensor]:
-    data = arm_data(4, 1)
-    return [torch.tensor(x) for x in (data.q, data.v, data.u)]
-
-
 @pytest.fixture(autouse=True)
 def empty_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))

@@ -119,8 +119,8 @@ def doubts_of_past(model: Model, log: Dataset, known: Bool[np.ndarray, " rows"])
     if estimated and share > MISLEADING:
         yield look(
             about="friction that remembers",
-            what=f"it counts as 0 before the first row of each episode, which shows in {share:.0%} of the rows: its "
-            "levels are too small.",
+            what="until a joint has moved a little, a log does not tell which way its gear was turned last: "
+            f"{share:.0%} of the rows come before that, and levels of dry friction are too small.",
             do="Give longer episodes, or leave memory out.",
         )
 
@@ -148,6 +148,7 @@ def doubts_of_memory(space: ParameterSpace, x: np.ndarray) -> Iterator[Doubt]:
             if (own == ends).any():
                 yield look(
                     about="friction that remembers",
-                    what=f"sigma of {listed(joints[own == ends])} is at its bound: it turns {when} than the log tells.",
-                    do="Leave it out of memory, or give a log of slower reversals.",
+                    what=f"friction of {listed(joints[own == ends])} turns {when} after a reversal than the log can "
+                    "tell (its sigma is at a bound).",
+                    do="Give a log of slower reversals; predictions between reversals do not depend on it.",
                 )

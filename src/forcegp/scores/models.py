@@ -323,7 +323,8 @@ def candidate(name: str, given: Given, model: Model, identification: str) -> Can
     unknown, key = described.unknown_forces, None
     if described.is_open and not model.is_open and not unknown:  # laws alone: an identification of its own
         if on_identified:
-            raise InvalidInput(f"model {name!r}: `identified` has its laws already; name all laws, or leave these out.")
+            every = "+".join((identification.partition(EVIDENCE)[0], *words))
+            raise InvalidInput(f"model {name!r}: `identified` has its laws already; name all laws, as in {every}.")
         key, words = f"{forces}{EVIDENCE}{text}" if text else forces, ()
     elif on_identified:
         own, _, usual = identification.partition(EVIDENCE)
