@@ -96,7 +96,7 @@ def test_inverse_dynamics_is_predict_read_backwards(posterior, states):
     expected = posterior.predict(q, v, u)
     back = predictor.inverse_dynamics(q, v, expected.mean, expected.multiplier.mean)
     torch.testing.assert_close(back.mean, u, rtol=1e-9, atol=1e-9)
-    for wanted in ([12.0], torch.tensor([[3.0], [-2.0], [7.0], [40.0]]).double(), None):
+    for wanted in ([12.0], torch.tensor([[3.0], [-2.0], [7.0], [40.0], [1.0]]).double(), None):
         found = predictor.inverse_dynamics(q, v, expected.mean, wanted)
         forward = posterior.predict(q, v, found.mean)
         multiplier = torch.zeros(5, 1).double() if wanted is None else torch.as_tensor(wanted).double().expand(5, 1)

@@ -1,5 +1,7 @@
 """Floating joints against Pinocchio, and the manifold of their positions."""
 
+from pathlib import Path
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -11,39 +13,8 @@ from forcegp.errors import InvalidInput
 from forcegp.robots import Robot, manifold
 from forcegp.robots.manifold import ConfigurationSpace
 
-LIMBS = """<robot name="crab">
-  <link name="trunk"><inertial><origin xyz="0.02 -0.03 0.05" rpy="0.2 0.1 -0.3"/><mass value="6"/>
-    <inertia ixx="0.06" ixy="0.002" ixz="-0.004" iyy="0.09" iyz="0.003" izz="0.1"/></inertial></link>
-  <joint name="a_hip" type="revolute"><origin xyz="0.2 0.1 0" rpy="0.3 0 0.1"/><parent link="trunk"/>
-    <child link="a_thigh"/><axis xyz="1 2 -0.5"/><limit lower="-1" upper="2" velocity="3" effort="40"/></joint>
-  <link name="a_thigh"><inertial><origin xyz="0.15 0 0.05" rpy="0 0 0.4"/><mass value="1.2"/>
-    <inertia ixx="0.005" ixy="0.001" ixz="0" iyy="0.028" iyz="0" izz="0.027"/></inertial></link>
-  <joint name="a_knee" type="revolute"><origin xyz="0.3 0 0"/><parent link="a_thigh"/><child link="a_foot"/>
-    <axis xyz="0 1 0"/><limit lower="-2" upper="2" velocity="3" effort="40"/></joint>
-  <link name="a_foot"><inertial><origin xyz="0.01 0.02 0.03"/><mass value="0.6"/>
-    <inertia ixx="0.001" ixy="0" ixz="0.0001" iyy="0.0012" iyz="0" izz="0.0008"/></inertial></link>
-  <joint name="b_slide" type="prismatic"><origin xyz="-0.2 0.1 0" rpy="0 0.7 0.2"/><parent link="trunk"/>
-    <child link="b_foot"/><axis xyz="0 1 1"/><limit lower="0" upper="0.5" velocity="1" effort="20"/></joint>
-  <link name="b_foot"><inertial><origin xyz="0 0.01 0.02" rpy="0 1 0"/><mass value="0.4"/>
-    <inertia ixx="0.001" ixy="0.0001" ixz="0" iyy="0.0012" iyz="0" izz="0.0005"/></inertial></link>
-</robot>
-"""
-CARRIER = """<robot name="carrier">
-  <link name="ground"/>
-  <joint name="rail" type="prismatic"><origin xyz="0.1 0.2 0.3" rpy="0.1 0.5 -0.2"/><parent link="ground"/>
-    <child link="sled"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="1" effort="20"/></joint>
-  <link name="sled"><inertial><origin xyz="0 0.01 0.02"/><mass value="2"/>
-    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.012" iyz="0" izz="0.008"/></inertial></link>
-  <joint name="loose" type="floating"><origin xyz="-0.1 0.1 0.2" rpy="0.4 0 0.3"/><parent link="sled"/>
-    <child link="body"/></joint>
-  <link name="body"><inertial><origin xyz="0.02 -0.03 0.05" rpy="0.2 0.1 -0.3"/><mass value="6"/>
-    <inertia ixx="0.06" ixy="0.002" ixz="-0.004" iyy="0.09" iyz="0.003" izz="0.1"/></inertial></link>
-  <joint name="arm" type="revolute"><origin xyz="0.3 0 0"/><parent link="body"/><child link="hand"/>
-    <axis xyz="0 0 1"/><limit lower="-2" upper="2" velocity="1" effort="20"/></joint>
-  <link name="hand"><inertial><origin xyz="0.1 0.02 0.03"/><mass value="0.6"/>
-    <inertia ixx="0.001" ixy="0" ixz="0.0001" iyy="0.0012" iyz="0" izz="0.0008"/></inertial></link>
-</robot>
-"""
+LIMBS = Path(__file__).with_name("limbs.urdf").read_text()
+CARRIER = Path(__file__).with_name("carrier.urdf").read_text()
 ROOTS = {"floating": pin.JointModelFreeFlyer, "fixed": None}
 ROWS = 4
 
