@@ -55,7 +55,7 @@ def test_slopes_are_those_of_the_columns():
 )
 def test_what_is_no_combination_is_refused(text):
     with pytest.raises(InvalidInput):
-        parse_expression(text, COLUMNS, "log.csv")
+        parse_expression(text, (*COLUMNS, ""), "log.csv")
 
 
 @given(st.text(alphabet=string.printable, max_size=30))

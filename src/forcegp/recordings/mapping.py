@@ -392,7 +392,7 @@ def parse_expression(text: str, columns: Collection[str], owner: str) -> Express
         words.append(found[found.lastgroup or 0])
         return f" _{len(words) - 1} "
 
-    names = [] if text in columns else sorted(columns, key=len, reverse=True)
+    names = [] if text in columns else sorted(filter(None, columns), key=len, reverse=True)
     known = "|".join(re.escape(name) + (r"(?!\w)" if re.match(r"\w", name[-1]) else "") for name in names or [text])
     try:
         tree = ast.parse(re.sub(TOKEN % (known or "(?!)"), placed, text).strip(), mode="eval").body
