@@ -43,7 +43,10 @@ def test_combinations(text, value):
 
 
 def test_slopes_are_those_of_the_columns():
-    assert parse_expression("2*theta1 - theta2/4 + 3", COLUMNS, "log").weights == {"theta1": 2.0, "theta2": -0.25}
+    assert parse_expression("2*theta1 - theta2/4 + 3", (*COLUMNS, ""), "log").weights == {
+        "theta1": 2.0,
+        "theta2": -0.25,
+    }
 
 
 @pytest.mark.parametrize(
@@ -55,7 +58,7 @@ def test_slopes_are_those_of_the_columns():
 )
 def test_what_is_no_combination_is_refused(text):
     with pytest.raises(InvalidInput):
-        parse_expression(text, (*COLUMNS, ""), "log.csv")
+        parse_expression(text, COLUMNS, "log.csv")
 
 
 @given(st.text(alphabet=string.printable, max_size=30))
