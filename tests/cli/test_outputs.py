@@ -219,5 +219,5 @@ def test_a_changed_model_of_an_identification_is_refused(folder, capfd):
 def test_names_that_are_no_text_are_refused(folder, capfd):
     name = os.fsdecode(b"arm\xff.h5")
     os.link("arm.h5", name)
-    for words in (["check", name], ["fit", "arm.h5", "--out", name], ["score", name, "--out", "out"]):
-        assert "is not UTF-8, so it could not be reported; rename it" in refused(words, capfd)
+    for words in (["check", name], ["fit", "arm.h5", "--out", name], ["fit", "arm.h5", "--out", "x\0y"]):
+        assert "holds NUL or is not UTF-8; give another, or rename it" in refused(words, capfd)

@@ -190,8 +190,8 @@ class Command(ABC):
                     inputs.append(path)
         path = self.output
         for given in (*inputs, *([] if path is None else [path])):
-            if any("\ud800" <= letter <= "\udfff" for letter in str(given)):  # bytes that Python could not decode
-                raise InvalidInput(f"the name {str(given)!r} is not UTF-8, so it could not be reported; rename it.")
+            if any(letter == "\0" or "\ud800" <= letter <= "\udfff" for letter in str(given)):
+                raise InvalidInput(f"the name {str(given)!r} holds NUL or is not UTF-8; give another, or rename it.")
         for other in inputs:
             if path is None:
                 break
