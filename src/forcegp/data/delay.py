@@ -76,7 +76,7 @@ class Delay:
         if high - low > 1e3 * APART:
             return f"{low:.0f} to {high:.0f} ms cannot be told apart here from friction: none is assumed"
         if self.remains >= WORTH:
-            return f"{size}, which explains hardly anything: none is assumed"
+            return "u is taken to be on time: a delay explains hardly anything"
         return f"{size}, but not more than three standard deviations in most joints: none is assumed"
 
 
