@@ -188,6 +188,8 @@ WRONG = {
     "ImportOptions": {"gap": "x"},
     "KukaSurfaceConfig": {"tool_mass": None},
     "JointFriction": {"joints": torch.tensor(5.0)},
+    "rollout": {"dt": ""},
+    "MPPI": {"integrator": torch.zeros(4)},
 }
 
 

@@ -388,7 +388,7 @@ class MPPI(Controller):
         apart = torch.arange(self.steps, dtype=torch.float64)
         self._colour = torch.linalg.cholesky(CORRELATION ** (apart[:, None] - apart).abs())
         self._scales = torch.logspace(math.log10(SMALLEST_SCALE), 0.0, self.samples, dtype=torch.float64)
-        self.integrator = integrator or usual_integrator(predictor, self.dt)
+        self.integrator = usual_integrator(predictor, self.dt) if integrator is None else integrator
 
     @override
     def restart(self) -> None:

@@ -270,8 +270,8 @@ class Posterior(Fitted):
         if baumgarte is not None and not self.model.contacts:
             raise InvalidInput("baumgarte was given, but the model has no contacts; give baumgarte=None.")
         model = replace(self.model, baumgarte=baumgarte)
+        check_time_step(dt)
         if self.model.held_inputs:
-            check_time_step(dt)
             u = self.model.foreseen(state_tensor("u", u, self.model.sizes[2], self.model.robot.device))
         samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
         method = integrator_named(integrator, model)
