@@ -188,7 +188,7 @@ WRONG = {
     "ImportOptions": {"gap": "x"},
     "KukaSurfaceConfig": {"tool_mass": None},
     "JointFriction": {"joints": torch.tensor(5.0)},
-    "rollout": {"dt": ""},
+    "rollout ": {"dt": ""},
     "MPPI": {"integrator": torch.zeros(4)},
 }
 
