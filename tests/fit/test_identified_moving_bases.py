@@ -12,7 +12,7 @@ from tests.robots.random_positions import random_positions
 from tests.robots.test_moving_bases import LIMBS, ROOTS, Pair
 
 from forcegp.data import Dataset
-from forcegp.errors import InvalidInput
+from forcegp.errors import DataWarning, InvalidInput
 from forcegp.evidence import (
     Accelerations,
     NoiseLevels,
@@ -261,6 +261,17 @@ def test_a_drone_without_joints(walker):
     assert carried.value == pytest.approx(0.3 * locked.mass, rel=0.05)
     np.testing.assert_allclose(parameters_of(found), standard_parameters(heavier.robot), atol=1e-3)
     assert [type(force) for force in found.model.forces] == [type(force) for force in model.forces]
+    weak = replace(rotors, thrust=(1.0, 1.0, 0.8, 1.0), torque=(0.02, -0.02, 0.016, -0.02))
+    weak = replace(model, forces=(Actuation(), weak, RigidBodies()))
+    q, v, u = rows_of(model, 2000, switches=0)
+    q[:, 3:] = torch.nn.functional.normalize(0.1 * q[:, 3:] + torch.eye(4)[3], dim=-1)
+    u = 2.5 * locked.mass * (1.0 + 0.1 * u)  # hovering, roughly
+    a = weak.dynamics(q, v, u).acceleration_map().offset
+    values = {name: x.numpy() for name, x in zip("qvua", (q, v, u, a + 0.1 * torch.randn_like(a)), strict=True)}
+    log = Dataset(**values, time=0.01 * np.arange(2000), model=model)
+    with pytest.warns(DataWarning, match=r"without a payload: rotor_3 0\.8\."):
+        carried = fit(model.with_forces(Payload()), log, Torques("both", mean=0.4)).parameters["payload.mass"]
+    assert carried.interval[0] < 0.0
 
 
 def test_a_payload_on_the_trunk_of_a_walker(walker):

@@ -175,16 +175,20 @@ def with_longer_forearm(text):
     return text.replace(joint, longer)
 
 
-@pytest.mark.parametrize("cause", ["gains", "lengths"])
+@pytest.mark.parametrize("cause", ["gain", "gains", "lengths"])
 def test_causes_that_explain_more_are_named_and_in_the_interval(cause):
-    """All torques 5 % off, and a forearm that the URDF has too short."""
-    data = log(loaded() if cause == "gains" else with_longer_forearm(loaded()), 1, noise=0.05)
-    data = replace(data, u=data.u * 1.05) if cause == "gains" else data
-    with pytest.warns(DataWarning, match={"gains": "torques of the log times", "lengths": "lengths before"}[cause]):
+    """One torque a fifth too small, all torques 5 % off, and a forearm that the URDF has too short."""
+    data = log(with_longer_forearm(loaded()) if cause == "lengths" else loaded(), 1, noise=0.05)
+    off = {"gain": [1.0, 1.0, 0.8, 1.0, 1.0, 1.0], "gains": 1.05, "lengths": 1.0}[cause]
+    data = replace(data, u=data.u * off)
+    with pytest.warns(DataWarning, match="lengths before" if cause == "lengths" else "torques of the log times"):
         estimate = Found(data, rows=800)
     [doubt] = [each for each in estimate.posterior.settings["doubts"] if each["numbers"]]
     factors = doubt["numbers"][cause]
-    if cause == "gains":
+    if cause == "gain":
+        assert doubt["joints"] == ["elbow_joint"]
+        assert factors["elbow_joint"] == pytest.approx(1.25, abs=0.03)
+    elif cause == "gains":
         assert list(factors.values()) == pytest.approx([1.0 / 1.05] * 6, abs=0.015)
     else:
         assert factors["wrist_1_joint"] == pytest.approx(1.1, abs=0.02)
@@ -206,7 +210,7 @@ def test_a_cause_is_what_ridge_regression_finds(times):
     best = -np.linalg.lstsq(np.vstack([J, one]), np.append((r / noise).ravel(), np.zeros(space.size)))[0]
     left = r + (J @ best).reshape(r.shape) * noise
     found = Fit(space.start, left, jacobian, noise, one, 1, True)
-    cause = misfit(space.model_at(space.start), [rows], [data.a], lambda x: x, found)
+    cause = misfit(space.model_at(space.start), [rows], [data.a], [left], lambda each: each[0] / noise[:, None], found)
     C = (-(rows.delivered + left)[:, :, None] * np.eye(6) / noise[:, None]).reshape(r.size, -1)
     both = np.block([[C, J], [np.eye(6) / 0.2, np.zeros((6, space.size))], [np.zeros((space.size, 6)), one]])
     right = np.concatenate([(r / noise).ravel(), np.zeros(6 + space.size)])

@@ -24,7 +24,7 @@ from forcegp.atomic_files import atomic_file, atomic_folder, write_json
 from forcegp.cli.command import CONFIG, LOG, Command, options_of, unless_given
 from forcegp.cli.fit import write_estimates
 from forcegp.cli.logs import ColumnOptions, FilterOptions, prepared_rows, resolved, stance_text
-from forcegp.cli.payload import LAWS, payload_dict, payload_text, with_payload
+from forcegp.cli.payload import LAWS, drives_of, payload_dict, payload_text, with_payload
 from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal, doubts_table, facts, shown
 from forcegp.doubts import Doubt, Doubts, wrong
@@ -352,8 +352,10 @@ def answer_lines(
         ("viscous", f"{each('viscous')} {force} per {q}/s{open_ones}"),
         ("rotors", f"{each('rotor')} {inertia}{open_ones}"),
     ] if joints else []  # fmt: skip
-    by = ", if thrust coefficients are right" if forcegp.data.thruster_columns(identified.model) else ""
-    mass, error = values.total_mass
+    (mass, error), loaded = values.total_mass, content["payload"] or {"doubts": ()}
+    if any("gain" in doubt["numbers"] for doubt in loaded["doubts"]):  # what it changes of a payload, it changes of all
+        error = math.hypot(error, loaded["parameters"]["payload.mass"]["std"])
+    weight = f"{mass:.4g} ± {1.96 * error:.1g} kg, if {drives_of(identified.model)} are right"
     errors = "; ".join(
         f"{short_name(name)} {number(_motion(scores, name))} / {number(_known(scores, 'nrmse', ACCELERATION, name))}"
         for name in scores.models
@@ -371,8 +373,8 @@ def answer_lines(
         ("timing", f"{shifted}; {filtered}"),
         *([("stance", stance_text(prepared))] if "stance" in prepared else []),
         *of_joints,
-        *([("whole mass", f"{mass:.4g} ± {1.96 * error:.1g} kg{by}")] if moving else []),
-        ("payload", held + by),
+        *([("whole mass", weight)] if moving else []),
+        ("payload", held),
         ("models", f"error of q{ahead} / nRMSE of the acceleration, on unseen time: {errors}"),
         *left_of_torques(scores, best),
         ("best", f"{short_name(best)}{intervals}"),

@@ -14,7 +14,7 @@ from forcegp.errors import DatasetError, InvalidInput
 from forcegp.evidence.least_squares import Fit, Residual
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
-from forcegp.forces import Actuation, Payload
+from forcegp.forces import Actuation, Payload, Thrusters
 from forcegp.model import Model
 from forcegp.posterior.fitted import STRETCHES
 from forcegp.robots import Robot
@@ -120,17 +120,21 @@ def changes_without_rests(
     return np.stack(changes)
 
 
+GAINS = (
+    0.2,
+    "torques of the log times",
+    "Check these drives; `gain` among the forces estimates them.",
+)
 CAUSES = {
-    "gains": (
-        0.2,
-        "torques of the log times",
-        "Estimate gains (`gain` among the forces), or calibrate them by a load of known mass.",
-    ),
+    "gain": GAINS,
+    "gains": GAINS,
     "lengths": (0.1, "lengths before the joints times", "Correct the URDF's lengths."),
     "masses": (0.2, "masses of the links times", "Give a baseline (a log without the payload), or identify all links."),
 }
-"""Usual deviations of the logarithms of factors, what they are of, and what to do. Of two causes the first is named,
-unless the other explains a tenth more."""
+"""Usual deviations of the logarithms of factors, what they are of, and what to do; `gain` is that of one joint. Of two
+causes the first is named, unless the other explains a tenth more, or half as much again where the first is one number.
+"""
+ALONE = 1.5
 STEP = 1e-4
 """Of a length, for its derivative."""
 WRONG = 0.03
@@ -143,57 +147,105 @@ def misfit(
     model: Model,
     rows: Sequence[RecordedRows],
     a: Sequence[Float[np.ndarray, "rows nv"]],
-    mean: Callable[[np.ndarray], np.ndarray],
+    left: Sequence[Float[np.ndarray, "rows nv"]],
+    white: Callable[[Sequence[np.ndarray]], np.ndarray],
     fit: Fit,
 ) -> tuple[Doubt, Float[np.ndarray, " k"]] | None:
     """The cause that explains most, if far more than `model`, and how far the coordinates move with it.
 
-    `model` has the numbers of the fit, `a` are accelerations of the rows, `mean` makes equations of what rows have. At
-    the best x, causes c with columns C lower the whitened residual r (Frisch & Waugh 1933): c = -(C' C - C' J F^-1 J' C
-    + S^-2)^-1 C' r with F = J' J + prior, and x moves by -F^-1 J' C c.
+    `model` has the numbers of the fit, of torques of rows with accelerations `a` it leaves `left`, and `white` makes
+    residuals of the fit of such torques. At the best x, causes c with columns C lower the whitened residual r (Frisch &
+    Waugh 1933): c = -(C' C - C' J F^-1 J' C + S^-2)^-1 C' r with F = J' J + prior, and x moves by -F^-1 J' C c.
     """
     [actuation] = [law for law in model.laws if isinstance(law, Actuation)]
-    gains = 1.0 if actuation.is_exact else actuation.values["gain"].cpu().numpy()[:, None]
-    white, J = fit.white.ravel(), fit.white_jacobian.reshape(fit.white.size, -1)
-    inverse, cost = np.linalg.inv(fit.information + fit.prior_information), 0.5 * float((fit.white**2).sum())
+    r, J = fit.white.ravel(), fit.white_jacobian.reshape(fit.white.size, -1)
+    inverse, cost = np.linalg.inv(fit.information + fit.prior_information), 0.5 * float(r @ r)
     best, found = max(CLEARLY_MORE, LEAST * cost), None
     scales = [10 * k for k, each in enumerate(rows[0].space.carried) if each.payload is not None]
     if np.linalg.norm(fit.residual) <= RIGHT * np.linalg.norm(0.5 * fit.jacobian[..., scales]):
         return None  # of the torques of payloads, next to nothing is left
     for cause, (usual, said, do) in CAUSES.items():
-        if cause != "lengths" and not actuation.is_exact:
-            continue  # a factor of all masses is one of the gains that are estimated
-        parts = [_columns(cause, model, part, each) for part, each in zip(rows, a, strict=True)]
-        names, C = parts[0][0], np.concatenate([each for _, each in parts])
-        C = mean(C) / gains
-        if cause == "gains":  # as the log has them: with the torques, what is needed would vanish, too
-            C = C - fit.residual[:, :, None] * np.eye(C.shape[1])
-        C = (C / fit.noise[:, None]).reshape(white.size, -1)
-        across = J.T @ C
-        own = C.T @ C - across.T @ inverse @ across
-        change = -np.linalg.solve(own + np.eye(C.shape[1]) / usual**2, C.T @ white)
-        more, off, factors = -0.5 * float(white @ C @ change), abs(change) > WRONG, np.exp(change)
-        if more > best and off.any() and abs(change).max() < NO_STEP:
-            told = ", ".join(f"{names[k]} {factors[k]:.3g}" for k in np.flatnonzero(off))
+        if (cause != "lengths" and not actuation.is_exact) or (cause[:4] != "gain" and model.contacts):
+            continue  # a factor of all masses is one of the gains that are estimated; lengths move contacts
+        names, columns = zip(*(_columns(cause, model, *each) for each in zip(rows, a, left, strict=True)), strict=True)
+        C = white(columns).reshape(r.size, -1)
+        across, instead = J.T @ C, False
+        if cause == "gain":
+            more, instead, change, move = _of_one(rows[0].space, fit, C, usual, best)
+        else:
+            own = C.T @ C - across.T @ inverse @ across
+            change = -np.linalg.solve(own + np.eye(C.shape[1]) / usual**2, C.T @ r)
+            more, move = -0.5 * float(r @ C @ change), -inverse @ (across @ change)
+        off, factors = abs(change) > WRONG, np.exp(change)
+        if cause == "gain":  # what is needed is g u, and without the payload another torque than `left` has
+            factors = 1.0 + change if instead else 1.0 / (1.0 - change)
+        if (instead or more > best) and off.any() and abs(change).max() < NO_STEP:
+            told = ", ".join(f"{names[0][k]} {factors[k]:.3g}" for k in np.flatnonzero(off))
+            less = (
+                "explain the log as well, without a payload" if instead else f"leave {more / cost:.0%} less of the log"
+            )
             doubt = look(
                 about="payload",
-                what=f"{said} these factors would leave {more / cost:.0%} less of the log: {told}. "
-                "The intervals hold what that would change.",
+                what=f"{said} these factors would {less}: {told}. The intervals hold what that would change.",
                 do=do,
-                joints=tuple(np.array(names)[off].tolist()),
-                numbers={cause: dict(zip(names, factors.tolist(), strict=True))},
+                joints=tuple(np.array(names[0])[off].tolist()),
+                numbers={cause: dict(zip(names[0], factors.tolist(), strict=True))},
             )
-            best, found = 1.1 * more, (doubt, -inverse @ (across @ change))
+            best, found = (ALONE if cause == "gain" else 1.1) * more, (doubt, move)
+            if instead:
+                break
     return found
 
 
+def _of_one(
+    space: ParameterSpace, fit: Fit, C: Float[np.ndarray, "equations causes"], usual: float, least: float
+) -> tuple[float, bool, Float[np.ndarray, " causes"], Float[np.ndarray, " k"]]:
+    """Nats that the best of the causes explains alone, whether instead of the payload, its change, and the move of x.
+
+    Without the payload they are nats beyond what that explains: where they are hardly fewer, so many numbers are no
+    better than one.
+    """
+    r, J = fit.white.ravel(), fit.white_jacobian.reshape(fit.white.size, -1)
+    curvature, found = fit.information + fit.prior_information, []
+    none, slopes = np.zeros_like(fit.x), space.bodies.slopes(fit.x[: space.bodies.size])
+    for body in (k for k, each in enumerate(space.carried) if each.payload is not None):
+        own, rows = np.r_[space.bodies.slices[body]], slice(10 * body, 10 * body + 10)
+        none[own] = -np.linalg.solve(slopes[rows, own], space.standard_parameters(fit.x)[body])
+    for out in (False, True)[: 1 + bool(none.any())]:
+        free = np.flatnonzero(none == 0.0) if out else np.arange(len(none))
+        beyond = J @ none * out
+        left, slope, across = r + beyond, J[:, free].T @ beyond, J[:, free].T @ C
+        inner = np.linalg.solve(curvature[np.ix_(free, free)], np.c_[slope, across])
+        size = np.square(C).sum(0) - (across * inner[:, 1:]).sum(0) + usual**-2
+        change = -(C.T @ left - across.T @ inner[:, 0]) / size
+        own = 0.5 * change**2 * size
+        more = own + 0.5 * (r @ r - left @ left + slope @ inner[:, 0])
+        k, move = int(np.argmax(more)), none * out
+        move[free] -= inner[:, 0] + inner[:, 1 + k] * change[k]
+        found.append((float(more[k]), out and own[k] > least, np.where(np.arange(len(change)) == k, change, 0.0), move))
+    (beside, *_), (without, clear, *_) = found[0], found[-1]
+    return found[-1] if clear and without > max(-CLEARLY_MORE, beside - least) else found[0]
+
+
 def _columns(
-    cause: str, model: Model, rows: RecordedRows, a: Float[np.ndarray, "rows nv"]
+    cause: str, model: Model, rows: RecordedRows, a: Float[np.ndarray, "rows nv"], left: Float[np.ndarray, "rows nv"]
 ) -> tuple[list[str], Float[np.ndarray, "rows nv causes"]]:
-    """Names of joints or links, and derivatives of torques needed less those measured in logarithms of factors."""
+    """Names of joints or links, and derivatives of torques needed less those measured in logarithms of factors.
+
+    Of gains they are as the log has them: with the torques, what is needed would vanish, too.
+    """
     robot = model.loaded_robot if rows.loaded else model.robot
-    if cause == "gains":
-        return list(robot.joint_names), -rows.delivered[:, :, None] * np.eye(robot.nv)
+    if cause[:4] == "gain":
+        names, columns = list[str](), list[np.ndarray]()
+        for law in model.laws:
+            for name in law.names if isinstance(law, Actuation | Thrusters) and law.known else ():
+                here = torch.zeros_like(rows.state.u)
+                here[:, model.inputs.index(name)] = rows.state.u[:, model.inputs.index(name)]
+                torque = law.delivered(replace(rows.state, u=here)).cpu().numpy()
+                along = torque / np.linalg.norm(torque, axis=1, keepdims=True).clip(1e-300)
+                columns.append(torque + along * (along * left).sum(axis=1, keepdims=True))
+                names.append(name)
+        return names, -np.stack(columns, axis=-1) if columns else np.zeros((*a.shape, 0))
     if cause == "masses":
         return [body.child for body in robot.layout.bodies], rows.by_body(a)
     q, v, at = (torch.as_tensor(np.array(x), device=robot.device) for x in (rows.q, rows.v, a))

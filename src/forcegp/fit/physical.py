@@ -133,6 +133,28 @@ class Equations:
             return r, jacobian
         return self.windows.mean(r), self.windows.mean(np.asarray(jacobian))
 
+    def left(
+        self, x: np.ndarray, noise: NoiseLevels | Float[np.ndarray, " nv"]
+    ) -> tuple[list[np.ndarray], Callable[[Sequence[np.ndarray]], np.ndarray]]:
+        """What is left of the torques of every log, and what makes whitened residuals of derivatives of torques.
+
+        `noise` is that of both kinds, or of what the log has as torque. Neither holds forces of contacts.
+        """
+        one, motions = np.eye(self.a.shape[1]), self.measured
+        free = [without(np.tile(one, (len(part.v), 1, 1)), orthonormal_columns(part.open)) for part in self.parts]
+        if isinstance(noise, NoiseLevels):
+            likely = [part.likely(x, own, noise) for part, own in zip(self.parts, motions, strict=True)]
+            motions, white = [each.motion for each in likely], [each.whitening for each in likely]
+        else:
+            white = [each / noise[:, None] for each in free]
+
+        def whitened(columns: Sequence[np.ndarray]) -> np.ndarray:
+            each = np.concatenate([W @ own for W, own in zip(white, columns, strict=True)])
+            return each if self.windows is None else self.windows.mean(each)
+
+        torques = (part.in_torque(x, own)[0] for part, own in zip(self.parts, motions, strict=True))
+        return [(P @ r[..., None])[..., 0] for P, r in zip(free, torques, strict=True)], whitened
+
     def accelerations(self, x: np.ndarray) -> list[np.ndarray]:
         """Predicted accelerations, M and H."""
         return [np.concatenate(each) for each in zip(*(part.acceleration(x) for part in self.parts), strict=True)]
@@ -282,13 +304,12 @@ def fit_physical(
     found = space.model_at(fit.x)
     residual = equations.a - equations.accelerations(fit.x)[0]
     doubts = list(doubts_of_memory(space, fit.x))
-    if equations.tell_bodies:  # noise of single rows hides what is left
-        doubts += doubts_of_payloads(space, fit)
-    cause = None
-    means = equations.windows if equations.tell_bodies and not evidence.noisy_in_both else None
-    if means is not None and not model.contacts and any(each.payload is not None for each in space.carried):
-        cause = misfit(found, equations.parts, equations.each(equations.a), means.mean, fit)
-    doubts += [] if cause is None else [cause[0]]
+    cause = None  # noise of single rows hides what is left
+    if equations.tell_bodies and any(each.payload is not None for each in space.carried):
+        gains = found.actuation.values["gain"].cpu().numpy() if equations.in_units_of_log else 1.0
+        left = equations.left(fit.x, fit.noise * gains if noise is None else noise)
+        cause = misfit(found, equations.parts, equations.each(equations.a), *left, fit)
+        doubts += doubts_of_payloads(space, fit) if cause is None else [cause[0]]
     estimates = _estimates(space, fit, equations, evidence, thick, changes, None if cause is None else cause[1])
     doubts += unseen.doubts(model)
     Doubts(doubts).warn(stacklevel=4)
