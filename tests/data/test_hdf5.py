@@ -61,7 +61,10 @@ def change(file: Path, name: str, values: object = None) -> None:
             opened[name] = values
 
 
-OTHERS = {"format": ["another", 1.0, np.zeros(0), h5py.Empty("f8")], "format_version": [2, 1000, 0, -1, "one", 1.5]}
+OTHERS = {
+    "format": [np.bytes_("another"), "forcegp-dataset", 1.0, np.zeros(0), h5py.Empty("f8")],
+    "format_version": [2, 1000, 0, -1, np.bytes_("one"), 1.5],
+}
 
 
 @pytest.mark.parametrize(
@@ -71,6 +74,7 @@ def test_files_of_another_kind_or_version_are_refused(file, name, value):
     with h5py.File(file, "a") as opened:
         opened.attrs[name] = value
     assert is_dataset(file) == (name == "format_version")
+    value = value.decode() if isinstance(value, bytes) else value
     said = rf"format version .*{value}.*; this forcegp .* reads 1\. Use what wrote"
     with pytest.raises(FileFormatError, match=said if name == "format_version" else "not a forcegp dataset"):
         Dataset.load(file)
@@ -91,9 +95,10 @@ def test_a_missing_field_is_named(file, name):
         ("q", np.full((40, 2), b"x"), "'q' must hold numbers"),
         ("episode", np.zeros(40), "episode must be an array of integers"),
         ("model", np.zeros(2), "'model' must hold text"),
-        ("metadata", "{", "is damaged"),
-        ("metadata", "[1]", "must be a JSON object"),
-        ("metadata", ["{}", "{}"], "must hold one text"),
+        ("metadata", "{}", "must hold text of fixed length"),
+        ("metadata", np.bytes_("{"), "is damaged"),
+        ("metadata", np.bytes_("[1]"), "must be a JSON object"),
+        ("metadata", np.full(2, b"{}"), "must hold one text"),
         ("truth/a", np.zeros((40, 9)), r"truth\['a'\] has shape"),
         ("truth", np.zeros(3), "'truth' must be a group"),
         ("strokes", np.zeros((40, 3)), "strokes have shape"),

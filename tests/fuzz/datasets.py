@@ -17,6 +17,7 @@ from tests.fuzz.oracle import Target, allowed, require_ended_well, require_no_co
 from tests.fuzz.values import DAMAGE, JSON, JSON_EDITS, SCALARS, WORDS, Damage, damaged, edited_json, words
 
 from forcegp import Dataset
+from forcegp.data.hdf5 import fixed_text
 
 NAMES = words("q v u a time episode noise_std strokes truth/a truth/lambda joint_names metadata model")
 ATTRIBUTES = ("format", "format_version", "written_by", "time_ordered", "units")
@@ -107,7 +108,7 @@ def _apply(file: h5py.File, change: Change) -> None:
     if change.how == "attribute":
         own = isinstance(file.get("q", getlink=True), h5py.HardLink)
         holder = file["q"] if name == "units" and own else file
-        text = value.encode("utf-8", "replace").replace(b"\0", b"?") if isinstance(value, str) else value
+        text = np.bytes_(value.encode("utf-8", "replace").replace(b"\0", b"?")) if isinstance(value, str) else value
         try:
             holder.attrs[name] = [] if text is None else text
         except (TypeError, OverflowError):  # a number that HDF5 does not have
@@ -134,13 +135,20 @@ def _apply(file: h5py.File, change: Change) -> None:
             if isinstance(file.get("v", getlink=True), h5py.HardLink):
                 file[name] = file["v"]
         case "text":
-            file[name] = json.dumps(value).replace("@deep", "")
+            file[name] = fixed_text(json.dumps(value).replace("@deep", ""))
         case "motion":
-            file[name] = json.dumps({"preparation": value, "source": value, "import": value, "windows": value})
+            file[name] = fixed_text(
+                json.dumps({"preparation": value, "source": value, "import": value, "windows": value})
+            )
         case "names":
-            file[name] = [item.replace("\0", "") for item in value] or np.zeros(0)
+            file[name] = (
+                fixed_text([x.replace("\0", "").encode("utf-8", "replace").decode() for x in value])
+                if value
+                else np.zeros(0)
+            )
         case "edit":
-            file[name] = edited_json({} if len(text) > 100_000 or "9" * 99 in text else json.loads(text), value)
+            edited = edited_json({} if len(text) > 100_000 or "9" * 99 in text else json.loads(text), value)
+            file[name] = fixed_text(edited)
         case how:
             file[name] = ARRAYS[how](np.ones(3) if content is None else np.atleast_1d(content))
     for key, unit in units.items():

@@ -70,7 +70,7 @@ def test_metadata_of_another_kind_do_not_matter(place, stated, command):
     data.save(place / "data.h5")
     with h5py.File(place / "data.h5", "r+") as file:
         del file["metadata"]
-        file["metadata"] = json.dumps(stated)
+        file["metadata"] = np.bytes_(json.dumps(stated))
     more = {"check": "", "import": "--cutoff 20 --out o.h5", "fit": f"{FEW} --no-checks --out o"}
     assert require_ended_well([command, "data.h5", *more[command].split()], place) == 0
 

@@ -352,7 +352,7 @@ def answer_lines(
         ("viscous", f"{each('viscous')} {force} per {q}/s{open_ones}"),
         ("rotors", f"{each('rotor')} {inertia}{open_ones}"),
     ] if joints else []  # fmt: skip
-    (mass, error), loaded = values.total_mass, content["payload"] or {"doubts": ()}
+    (mass, error), loaded = values.total_mass, dict[str, Any](content["payload"] or {"doubts": ()})
     if any("gain" in doubt["numbers"] for doubt in loaded["doubts"]):  # what it changes of a payload, it changes of all
         error = math.hypot(error, loaded["parameters"]["payload.mass"]["std"])
     weight = f"{mass:.4g} ± {1.96 * error:.1g} kg, if {drives_of(identified.model)} are right"

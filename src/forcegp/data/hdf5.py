@@ -20,7 +20,6 @@ VERSION = 1
 COLUMNS = ("q", "v", "u", "a", "time", "episode")
 
 COMPRESSION = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
-_TEXT = h5py.string_dtype("utf-8")
 _LARGEST_COMPRESSION = 1100  # deflate reaches at most 1032:1; anything that claims more holds no such data
 
 
@@ -36,24 +35,38 @@ def write_fields(path: Path, fields: Mapping[str, Any], units: Mapping[str, Any]
     with atomic_file(path) as temporary, new_file(temporary) as file:
         for name, values in arrays.items():
             file.create_dataset(name, data=values, **(COMPRESSION if values.size else {}))
-        file.attrs["format"] = FORMAT
+        file.attrs["format"] = fixed_text(FORMAT)
         file.attrs["format_version"] = VERSION
-        file.attrs["written_by"] = f"forcegp {__version__}"
+        file.attrs["written_by"] = fixed_text(f"forcegp {__version__}")
         file.attrs["time_ordered"] = fields["time_ordered"]
         for name, unit in units.items():
-            file[name].attrs.create("units", unit, dtype=_TEXT)
+            file[name].attrs["units"] = fixed_text(unit)
         if names:
-            file.create_dataset("measured_names", data=names, dtype=_TEXT)
-        file.create_dataset("joint_names", data=list(fields["model"].robot.joint_names), dtype=_TEXT)
-        file.create_dataset("metadata", data=json.dumps(fields["metadata"]), dtype=_TEXT)
-        file.create_dataset("model", data=fields["model"].to_json(), dtype=_TEXT)
+            file["measured_names"] = fixed_text(names)
+        file["joint_names"] = fixed_text(fields["model"].robot.joint_names)
+        file["metadata"] = fixed_text(json.dumps(fields["metadata"]))
+        file["model"] = fixed_text(fields["model"].to_json())
+
+
+def fixed_text(text: Any) -> np.ndarray:
+    """Texts of a fixed length: HDF5 keeps others in a heap, and reads a damaged one for ever, beyond any interrupt."""
+    raw = np.strings.encode(np.asarray(text, dtype=str), "utf-8")
+    return raw.astype(h5py.string_dtype("utf-8", max(raw.dtype.itemsize, 1)))
+
+
+def _attribute(file: h5py.File, name: str) -> Any:
+    """Number or text; None for texts that no file of ours holds."""
+    if name not in file.attrs or (stored := file.attrs.get_id(name).dtype).hasobject:
+        return None
+    value = file.attrs[name]
+    return value.decode("utf-8", "replace") if stored.kind == "S" else value
 
 
 def is_dataset(path: Path) -> bool:
     """Whether a file is a dataset of this or another version."""
     try:
         with h5py.File(path, "r") as file:
-            return isinstance(kind := file.attrs.get("format"), str) and kind == FORMAT
+            return isinstance(kind := _attribute(file, "format"), str) and kind == FORMAT
     except (OSError, RuntimeError, KeyError, ValueError, TypeError):  # whatever h5py meets in a damaged file
         return False
 
@@ -97,13 +110,13 @@ class _Reader:
 
     def fields(self) -> dict[str, Any]:
         file, required = self.file, (*COLUMNS, "metadata", "model")
-        kind, version = file.attrs.get("format"), file.attrs.get("format_version")
+        kind, version = _attribute(file, "format"), _attribute(file, "format_version")
         ours = f"is an HDF5 file, but not a forcegp dataset (its 'format' is {kind!r}, not {FORMAT!r})."
         self.require(isinstance(kind, str) and kind == FORMAT, f" {ours}")
         self.require(
             isinstance(version, int | np.integer) and version == VERSION,
             f" has format version {version!r}; this forcegp ({__version__}) reads {VERSION}. Use what wrote it "
-            f"({file.attrs.get('written_by')!r}), or convert the log again.",
+            f"({_attribute(file, 'written_by')!r}), or convert the log again.",
         )
         missing = [name for name in required if name not in file]
         self.require(not missing, f" has no {', '.join(missing)}; a dataset needs {', '.join(required)}.")
@@ -121,7 +134,7 @@ class _Reader:
         self.require(len(arrays) == len(measured), ": 'measured' needs one table for each of 'measured_names'.")
         pairs = zip(measured, arrays, strict=True)
         values["measured"] = {name: x[:, :1] if name.startswith("torque.") else x for name, x in pairs}
-        values["time_ordered"] = bool(file.attrs.get("time_ordered", True))
+        values["time_ordered"] = "time_ordered" not in file.attrs or bool(_attribute(file, "time_ordered"))
         try:
             values["model"] = forcegp.Model.from_json(self.text("model"))
         except ForceGPError as error:
@@ -146,8 +159,7 @@ class _Reader:
 
     def texts(self, name: str) -> list[str]:
         stored = self.stored(name)
-        text = h5py.check_string_dtype(stored.dtype) is not None
-        self.require(text, f": {name!r} must hold text; it holds {stored.dtype}.")
+        self.require(stored.dtype.kind == "S", f": {name!r} must hold text of fixed length; it holds {stored.dtype}.")
         return np.atleast_1d(stored.asstr()[()]).ravel().tolist()
 
     def text(self, name: str) -> str:

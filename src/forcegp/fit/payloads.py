@@ -237,8 +237,8 @@ def _columns(
     robot = model.loaded_robot if rows.loaded else model.robot
     if cause[:4] == "gain":
         names, columns = list[str](), list[np.ndarray]()
-        for law in model.laws:
-            for name in law.names if isinstance(law, Actuation | Thrusters) and law.known else ():
+        for law in (each for each in model.laws if isinstance(each, Actuation | Thrusters) and each.known):
+            for name in law.names:
                 here = torch.zeros_like(rows.state.u)
                 here[:, model.inputs.index(name)] = rows.state.u[:, model.inputs.index(name)]
                 torque = law.delivered(replace(rows.state, u=here)).cpu().numpy()
