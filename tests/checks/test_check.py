@@ -220,3 +220,4 @@ def test_springs_are_asked_for_where_torques_are_missed_by_position():
 
     assert asked(0.0) == asked(7e-4) == asked(0.1, 0.75) == ()
     assert asked(1.6e-3) == asked(0.1) == asked(0.1, 0.5) == ("lift",)
+    assert "lift" not in pushed_where_they_are(column(log, "u", 1, lambda u: 0.0 * u), model)  # passive

@@ -165,8 +165,8 @@ def misfit(
     if np.linalg.norm(fit.residual) <= RIGHT * np.linalg.norm(0.5 * fit.jacobian[..., scales]):
         return None  # of the torques of payloads, next to nothing is left
     for cause, (usual, said, do) in CAUSES.items():
-        if (cause != "lengths" and not actuation.is_exact) or (cause[:4] != "gain" and model.contacts):
-            continue  # a factor of all masses is one of the gains that are estimated; lengths move contacts
+        if (cause != "lengths" and not actuation.is_exact) or (cause != "gain" and model.robot.base != "fixed"):
+            continue  # a factor of all masses is one of the gains that are estimated, or of all those of a base
         names, columns = zip(*(_columns(cause, model, *each) for each in zip(rows, a, left, strict=True)), strict=True)
         C = white(columns).reshape(r.size, -1)
         across, instead = J.T @ C, False
