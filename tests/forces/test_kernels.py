@@ -180,3 +180,15 @@ def test_the_width_of_friction_has_a_hyperprior():
         assert float(start[name].exp()) == pytest.approx(0.1)
         moved = latent.log_prior(start | {name: start[name] + 1.5})
         assert float(latent.log_prior(start) - moved) == pytest.approx(1.125)
+
+
+def test_the_hyperprior_is_normal_in_the_logarithm_of_the_length_scales():
+    latent = LatentKernels(JointForces().kernels(arm_model().robot, (4,), torch.ones(1).double()))
+    parameters = latent.initial_parameters()
+    raw = torch.tensor([[0.0, 1.0, 2.0, 5.0]]).double()
+    parameters["kernels.0.base_kernel.raw_lengthscale"] = raw.requires_grad_()
+    expected = torch.distributions.Normal(torch.tensor(0.5).double() * torch.tensor(4.0).double().log() + 3.0, 2.0)
+    value = latent.log_prior(parameters)
+    assert float(value.detach()) == pytest.approx(float(expected.log_prob(raw.detach()).sum()), rel=1e-12)
+    (gradient,) = torch.autograd.grad(value, raw)
+    assert torch.allclose(gradient, (expected.loc - raw) / 4.0)

@@ -1,0 +1,68 @@
+"""Fits as they were: numbers with their intervals and who decides them, noise, settings, predictions, warnings."""
+
+import warnings
+
+import pytest
+import torch
+from tests.evidence.test_contact_forces import held, measured
+from tests.fit.test_friction_choice import LEVEL, log_with, sign
+from tests.fit.test_motion_fit import line, recording
+from tests.fit.test_payload import Found, loaded, log
+from tests.goldens.compare import assert_unchanged
+from tests.posterior.arm import arm_data, arm_model
+
+from forcegp import Accelerations, ContactForces, JointForces, JointFriction, Motions, Torques, fit
+from forcegp.forces import Actuation, GearFriction, LoadFriction, Offset, RigidBodies, Rotor, Spring, Stribeck, Viscous
+from forcegp.inference import OptimizerOptions
+
+FREE = arm_model(0)
+FEW = {"restarts": 3, "options": OptimizerOptions(iterations=4)}
+
+
+def in_air(*forces, evidence=None, **more):
+    return fit(FREE.with_forces(*forces), arm_data(80, 0, FREE), evidence or Torques(), **more)
+
+
+FITS = {
+    "laws": lambda: in_air(Viscous(), Stribeck(), Rotor(), Offset(), Spring()),
+    "bodies": lambda: in_air(RigidBodies(("fore", "hand")), LoadFriction(), Actuation(gain=None)),
+    "accelerations": lambda: in_air(RigidBodies("all"), Viscous(), evidence=Accelerations()),
+    "both": lambda: in_air(Viscous(), Rotor(), evidence=Torques("both")),
+    "sensor": lambda: fit(
+        held(Viscous()), measured(held(Viscous(0.7)), held(), rows=60, noise=0.2), [Torques(), ContactForces()]
+    ),
+    "payload": lambda: Found(log(loaded(), 1, seconds=6.0, noise=0.05), laws=(Viscous(),)).posterior,
+    "gears": lambda: fit(
+        FREE.with_forces(Viscous(), GearFriction()),
+        log_with(lambda v, rigid: (LEVEL + 0.1 * abs(rigid)) * sign(v), rows=900),
+        Torques(),
+        rows=600,
+    ),
+    "motions": lambda: fit(log_of_cart().model.with_forces(Viscous()), log_of_cart(), [Accelerations(), Motions()]),
+    "friction": lambda: in_air(JointFriction(), evidence=Accelerations(), points=40, **FEW),
+    "beside": lambda: in_air(Viscous(), JointForces(("q",)), evidence=Accelerations(), points=30, **FEW),
+    "plane": lambda: fit(arm_model().with_forces(JointForces()), arm_data(40, 1), points=25, **FEW),
+}
+
+
+def log_of_cart():
+    return recording(line, 0, 3.0)
+
+
+@pytest.mark.parametrize("case", FITS)
+def test_what_is_found_is_what_it_was(case):
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        posterior = FITS[case]()
+    entries, rows = posterior.parameters.entries, posterior.training
+    predicted = posterior.predict(rows.q[:5], rows.v[:5], rows.u[:5])
+    found = {
+        "numbers": {each.name: [each.value, each.std, each.start, each.prior_std] for each in entries},
+        "decided": [f"{each.name} [{each.unit}] {each.decided_by}: {each.why}" for each in entries],
+        "noise": posterior.model.noise,
+        "settings": {name: x for name, x in posterior.settings.items() if name != "optimizer"},
+        "searched": {name: x.tolist() for name, x in posterior.hyperparameters.items()},
+        "predicted": [predicted.mean.tolist(), predicted.covariance.tolist(), torch.tensor(len(rows)).item()],
+        "said": [str(each.message) for each in said],
+    }
+    assert_unchanged(f"fit/{case}", found, rtol=1e-3)
