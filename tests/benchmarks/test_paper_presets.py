@@ -31,13 +31,6 @@ def test_other_points_and_seeds():
         fig2b.with_points((401,)).require_possible()
 
 
-def test_unknown_names_list_the_known():
-    with pytest.raises(InvalidInput, match=r"did you mean .*all, .*fig2b"):
-        experiments_of("smoke", "fig2")
-    with pytest.raises(InvalidInput, match="paper"):
-        experiments_of("papers", "all")
-
-
 def test_the_committed_page_is_made_of_the_committed_numbers():
     folder = DOCS / NAME
     experiments = [each for each in PRESETS["paper"] if (folder / f"{each.name}.json").exists()]

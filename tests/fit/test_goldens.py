@@ -1,7 +1,9 @@
 """Fits as they were: numbers with their intervals and who decides them, noise, settings, predictions, warnings."""
 
 import warnings
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from tests.evidence.test_contact_forces import held, measured
@@ -12,6 +14,8 @@ from tests.goldens.compare import assert_unchanged
 from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import Accelerations, ContactForces, JointForces, JointFriction, Motions, Torques, fit
+from forcegp.data.dataset import TORQUE
+from forcegp.fit.sensors import torque_sensor_doubts
 from forcegp.forces import Actuation, GearFriction, LoadFriction, Offset, RigidBodies, Rotor, Spring, Stribeck, Viscous
 from forcegp.inference import OptimizerOptions
 
@@ -66,3 +70,18 @@ def test_what_is_found_is_what_it_was(case):
         "said": [str(each.message) for each in said],
     }
     assert_unchanged(f"fit/{case}", found, rtol=1e-3)
+
+
+def test_torque_sensors_beside_what_bodies_need():
+    log, found = log_with(lambda v, rigid: LEVEL * sign(v), rows=1500), {}
+    bodies = FREE.robot.inverse_dynamics(*(torch.tensor(getattr(log, name)) for name in "qva")).numpy()
+    noise = np.random.default_rng(0).standard_normal(bodies.shape)
+    changes = {f"times {factor:g}": factor * bodies for factor in (-1.0, 0.02, 0.08, 0.93, 0.97, 1.04, 1.06, 9.0, 20.0)}
+    changes |= {f"drift {x:g}": bodies + x * np.linspace(-1, 1, len(log))[:, None] for x in (0.05, 0.2, 0.8)}
+    changes |= {f"noise {x:g}": bodies + x * noise * bodies.std(0) for x in (0.5, 2.0, 4.0, 9.0)}
+    for name, values in (changes | {"swapped": bodies[:, [1, 0, 2]], "offset": bodies + 0.3}).items():
+        columns = zip(log.joint_names, values.T[:, :, None], strict=True)
+        measured_there = {f"{TORQUE}{joint}": column for joint, column in columns}
+        doubts = torque_sensor_doubts(replace(log, measured=measured_there), FREE)
+        found[name] = [[f"{each.level} {each.do}", *each.joints, each.numbers] for each in doubts]
+    assert_unchanged("fit/torque sensors", found, rtol=1e-3)

@@ -1,5 +1,6 @@
 """Every force as it was: numbers and words, at states of an arm on a plane whose last joint slides."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -7,14 +8,22 @@ import pytest
 import torch
 from tests.forces.force_conformance import bent_arm, some_states
 from tests.forces.test_parse_forces import EXPRESSIONS, NAMES
+from tests.forces.test_thrusters import DRONE, PLACES
 from tests.goldens.compare import assert_unchanged
+from tests.robots.mjcf_models import ARM, CHAIN, QUADROTOR
+from tests.robots.random_positions import random_positions
 
-from forcegp.forces import Coulomb, Law, Payload, RigidBodies, Viscous
+from forcegp import Model, Robot
+from forcegp.errors import RobotFileWarning
+from forcegp.forces import Actuation, Coulomb, Law, Payload, RigidBodies, Thrusters, Viscous, force_to_dict
 from forcegp.forces.contact_friction import ExpectedFriction, TabulatedCurve
 from forcegp.forces.force import Memory
 from forcegp.forces.joint_laws import law_columns, usual_columns
 from forcegp.forces.kernels import KERNELS, kernel_of
 from forcegp.forces.unknown import has_few_inputs
+
+SPRUNG = """<body name="pod"><joint name="tilt" stiffness="3" springref="20" damping=".2"/><geom size=".1"/>
+<site name="up"/></body></body></worldbody>"""
 
 
 def numbers(tensors) -> list:
@@ -89,3 +98,23 @@ def test_expected_friction_and_memory():
         "usual": usual_columns(model.robot, *(x.numpy() for x in (z, v, seen, v)), (0.1, 1.0)),
     }
     assert_unchanged("forces/expected", found)
+
+
+def test_forces_that_files_state_and_thrusters(tmp_path):
+    robot, found, generator = Robot.from_urdf_text(DRONE, base="floating"), {}, torch.Generator().manual_seed(0)
+    q = random_positions(robot, generator, 3)
+    v, u = (torch.randn(3, n, dtype=torch.float64, generator=generator) for n in (robot.nv, 4))
+    wrenches = [(0, 0, 1, 0, 0, 0.02), (1, 2, -3, 0.4, 0.5, 0.6), (0, 0, 0, 0.1, 0.2, -0.3), (0,) * 6]
+    made = {str(wrench): Thrusters.of_wrench("pod", wrench, "one") for wrench in wrenches}
+    for name, force in (made | {"plain": Thrusters("pod", PLACES, power=2)}).items():
+        model = Model(robot, (), (force, Actuation(np.eye(robot.nv)[:, -2:], ("a", "b"))))
+        dynamics = model.dynamics(q, v, u[:, : len(model.inputs)])
+        found[name] = of_law(model.laws[0], dynamics) | {"u": model.inputs, "Q": dynamics.Q_K.tolist()}
+    sprung = QUADROTOR.replace("</body></worldbody>", SPRUNG)
+    for name, text in (("arm", ARM), ("chain", CHAIN), ("rotors", QUADROTOR), ("sprung", sprung)):
+        (tmp_path / "robot.xml").write_text(text)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RobotFileWarning)
+            model = Model.from_mjcf(tmp_path / "robot.xml")
+        found[name] = {"u": model.inputs, "forces": [force_to_dict(force) for force in model.laws]}
+    assert_unchanged("forces/files", found)

@@ -190,6 +190,3 @@ def test_every_law_of_joints_is_tested_here():
     tested = {type(make()) for make, _ in FORMULAS.values()}
     own = {kind for kind in map(force_class, FORCES) if kind.__module__.startswith("forcegp.")}
     assert {kind for kind in own if issubclass(kind, JointLaw)} <= tested
-
-
-# ---------------------------------------------------------------- a law of the user

@@ -140,9 +140,6 @@ def test_data_of_no_use_are_not_returned(changes, message):
         simulate_kuka_surface(type("Odd", (KukaSurfaceConfig,), changes)(**dataclasses.asdict(SHORT)))
 
 
-# ---------------------------------------------------------------- the registry
-
-
 def test_scenarios_are_found_by_name(short):
     assert_equal(simulate("kuka-surface", **dataclasses.asdict(SHORT)), short)
     with pytest.raises(InvalidInput, match="no scenario 'mars'"):
