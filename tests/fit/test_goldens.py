@@ -15,6 +15,7 @@ from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import Accelerations, ContactForces, JointForces, JointFriction, Motions, Torques, fit
 from forcegp.data.dataset import TORQUE
+from forcegp.fit import calibrated
 from forcegp.fit.sensors import torque_sensor_doubts
 from forcegp.forces import Actuation, GearFriction, LoadFriction, Offset, RigidBodies, Rotor, Spring, Stribeck, Viscous
 from forcegp.inference import OptimizerOptions
@@ -32,9 +33,7 @@ FITS = {
     "bodies": lambda: in_air(RigidBodies(("fore", "hand")), LoadFriction(), Actuation(gain=None)),
     "accelerations": lambda: in_air(RigidBodies("all"), Viscous(), evidence=Accelerations()),
     "both": lambda: in_air(Viscous(), Rotor(), evidence=Torques("both")),
-    "sensor": lambda: fit(
-        held(Viscous()), measured(held(Viscous(0.7)), held(), rows=60, noise=0.2), [Torques(), ContactForces()]
-    ),
+    "sensor": lambda: fit(held(Viscous()), pushed(), [Torques(), ContactForces()]),
     "payload": lambda: Found(log(loaded(), 1, seconds=6.0, noise=0.05), laws=(Viscous(),)).posterior,
     "gears": lambda: fit(
         FREE.with_forces(Viscous(), GearFriction()),
@@ -43,10 +42,17 @@ FITS = {
         rows=600,
     ),
     "motions": lambda: fit(log_of_cart().model.with_forces(Viscous()), log_of_cart(), [Accelerations(), Motions()]),
+    "hidden": lambda: fit(held(Viscous()), replace(pushed(), measured={}), Torques()),
+    "calibrated": lambda: calibrated(FITS["cart"](), log_of_cart(), (0.1, 0.25)),
+    "cart": lambda: fit(log_of_cart().model.with_forces(Viscous()), log_of_cart(), Accelerations()),
     "friction": lambda: in_air(JointFriction(), evidence=Accelerations(), points=40, **FEW),
     "beside": lambda: in_air(Viscous(), JointForces(("q",)), evidence=Accelerations(), points=30, **FEW),
     "plane": lambda: fit(arm_model().with_forces(JointForces()), arm_data(40, 1), points=25, **FEW),
 }
+
+
+def pushed():
+    return measured(held(Viscous(0.7)), held(), rows=60, noise=0.2)
 
 
 def log_of_cart():

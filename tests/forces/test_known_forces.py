@@ -141,9 +141,6 @@ def test_bodies_that_are_learned_are_of_links_that_move():
         RigidBodies((first,)).bound_to(chain())
 
 
-# ---------------------------------------------------------------- armature
-
-
 def test_armature_adds_to_the_diagonal_and_to_that_of_the_robot():
     q, v, u = states(4, 5)
     geared = Model(chain().with_armature([0.1, 0.2, 0.3, 0.4]), forces=(Actuation(), RigidBodies(), Rotor(NUMBERS)))
@@ -181,9 +178,6 @@ def test_armature_adds_to_the_diagonal_and_to_that_of_the_robot():
 def test_wrong_numbers_are_named(kind, arguments, error, message):
     with pytest.raises(error, match=message):
         known(kind(*arguments))
-
-
-# ---------------------------------------------------------------- files
 
 
 def test_every_law_of_joints_is_tested_here():
