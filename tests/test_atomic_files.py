@@ -15,7 +15,10 @@ from forcegp.atomic_files import (
     atomic_folder,
     read_json,
     remove_leftovers,
+    require_replaceable,
+    require_unchanged,
     require_writable,
+    write_digests,
     write_json,
     write_text,
 )
@@ -273,3 +276,29 @@ def test_git_ignores_what_is_being_written(repository, name):
     if not (repository / ".git").exists():
         pytest.skip("no checkout")
     subprocess.run(["git", "check-ignore", "--quiet", name], cwd=repository, check=True)
+
+
+def test_folders_that_others_made_or_wrote_into_are_not_replaced(tmp_path):
+    folder = tmp_path / "run"
+
+    def asked(overwrite: bool = True, ours: bool = True) -> None:
+        require_replaceable(folder, "forcegp", lambda _: ours, overwrite=overwrite, own=["own.txt"])
+
+    asked(overwrite=False)
+    folder.mkdir()
+    asked(overwrite=False, ours=False)
+    (folder / "model.txt").write_text("one")
+    write_digests(folder)
+    (folder / "own.txt").write_text("two")
+    asked()
+    for more, words in (({"ours": False}, "was not written by forcegp"), ({"overwrite": False}, "exists already")):
+        with pytest.raises(FileFormatError, match=words):
+            asked(**more)
+    (folder / "notes").mkdir()
+    (folder / "notes" / "monday.txt").write_text("mine")
+    (folder / "elsewhere").symlink_to("/nowhere")
+    with pytest.raises(FileFormatError, match=r"did not write \(elsewhere, notes/monday\.txt\)"):
+        asked()
+    (folder / "model.txt").write_text("other")
+    with pytest.raises(FileFormatError, match=r"damaged: model\.txt is not as it was written; fit again"):
+        require_unchanged(folder, "fit again")

@@ -7,7 +7,6 @@ from tests.posterior.arm import arm_data, arm_model
 from tests.posterior.raw_log import motion
 
 from forcegp import Viscous, check, fit, score
-from forcegp.errors import ForceGPError
 from forcegp.forces import Actuation, JointForces, RigidBodies
 from forcegp.inference import OptimizerOptions
 from forcegp.summary import Summary
@@ -75,11 +74,3 @@ def test_notebooks_show_the_same_facts_as_a_table(shown, name):
 def test_html_of_a_name_is_escaped():
     odd = type("Odd", (Summary,), {"facts": lambda self: {"x": "<b>"}})
     assert "<td>&lt;b&gt;</td>" in odd()._repr_html_()
-
-
-def test_a_prediction_of_means_shows_itself(shown, data):
-    prediction = shown["Posterior"].predict(data.q, data.v, data.u, covariance=False)
-    assert "only the mean was predicted" in repr(prediction)
-    for name in ("std", "variance"):
-        with pytest.raises(ForceGPError, match="call predict"):
-            getattr(prediction, name)

@@ -28,11 +28,3 @@ def test_the_wrong_tool_is_too_heavy_and_off_centre_and_nothing_else(motion):
         np.testing.assert_allclose(after[name].inertia, before[name].inertia, rtol=1e-7, atol=1e-10)
     assert MASS_OFFSET == 0.5
     assert CENTER_OFFSET == (0.05, 0.05, -0.03)
-
-
-def test_the_contact_point_of_the_wrong_tool_stays_where_it_was(motion):
-    wrong = wrong_model(motion.model)
-    assert wrong.contacts == motion.model.contacts
-    before, after = Tool(motion.model), Tool(wrong)
-    for q in motion.q[::120]:
-        np.testing.assert_allclose(after.position(q), before.position(q), rtol=0, atol=1e-14)

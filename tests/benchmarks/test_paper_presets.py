@@ -22,12 +22,6 @@ def test_jobs_that_experiments_share_are_the_same(preset):
     assert all(name in known for job in known.values() for name in job.inputs)
 
 
-def test_figure_2b_has_the_seeds_and_points_that_it_promises():
-    (fig2b,) = experiments_of("paper", "fig2b")
-    assert fig2b.points == (100, 200, 400, 600, 800, 1000)
-    assert all(len(fig2b.seeds_of(count)) >= (5 if count <= 400 else 2) for count in fig2b.points)
-
-
 def test_other_points_and_seeds():
     (fig2b,) = experiments_of("smoke", "fig2b")
     changed = fig2b.with_points((50, 10, 50)).with_seeds((7, 8))
@@ -35,13 +29,6 @@ def test_other_points_and_seeds():
     assert changed.seeds_of(10) == changed.seeds_of(50) == (7, 8)
     with pytest.raises(InvalidInput, match="asked for 401"):
         fig2b.with_points((401,)).require_possible()
-
-
-def test_unknown_names_list_the_known():
-    with pytest.raises(InvalidInput, match=r"did you mean .*all, .*fig2b"):
-        experiments_of("smoke", "fig2")
-    with pytest.raises(InvalidInput, match="paper"):
-        experiments_of("papers", "all")
 
 
 def test_the_committed_page_is_made_of_the_committed_numbers():

@@ -19,12 +19,9 @@ def test_the_page_equals_its_numbers(results):
     assert PAGE.read_text(encoding="utf-8") == performance_page(results)
 
 
-def test_every_number_has_a_meaning(results):
+def test_every_number_has_a_meaning_and_every_question_a_module(results):
     known = {key for asked in QUESTIONS.values() for key in asked if key != "title"}
     assert set(results) - known == ABOUT_ALL
-
-
-def test_every_question_is_a_module():
     assert all(find_spec(f"benchmarks.{question}") for question in QUESTIONS)
 
 

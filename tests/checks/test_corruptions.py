@@ -47,7 +47,8 @@ def test_a_corruption_is_named_by_check_and_before_a_fit(name):
     data = corrupt(log_of(list(CORRUPTIONS).index(name)))
     report = check(data)
     assert named(said_by(report), words), said_by(report)
-    assert_unchanged(f"checks/{name}", {"joints": report.per_joint(), **numbers(report.doubts)}, rtol=1e-3)
+    found = {"joints": report.per_joint(), "quick": numbers(quick_check(data)), **numbers(report.doubts)}
+    assert_unchanged(f"checks/{name}", found, rtol=1e-3)
     line = said_by_fit(data)
     assert "\n" not in line
     assert named(line, words), line

@@ -5,14 +5,10 @@ import re
 from pathlib import Path
 
 import pytest
-from tests.posterior.arm import arm_data
 
 from forcegp.cli.arguments import COMMANDS, command_class
 from forcegp.cli.command import options_of
 from forcegp.cli.terminal import OTHERWISE, with_option_names
-from forcegp.errors import ForceGPError
-from forcegp.fit import fit
-from forcegp.forces import JointForces
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 OF_A_PROGRAM = re.compile(r"(forcegp [a-z]+|xcode-select|start one with)[^;)`]* --[a-z]")
@@ -37,12 +33,6 @@ def test_arguments_become_the_options_of_the_command(message, words):
 def test_every_other_name_is_an_option_of_some_command():
     everywhere = {name for command in COMMANDS for name in options_of(command_class(command))}
     assert set(OTHERWISE.values()) <= everywhere
-
-
-def test_the_library_names_its_arguments():
-    data = arm_data(20, 0)
-    with pytest.raises(ForceGPError, match=r"^`points=99` must be an integer from 2 to 20"):
-        fit(data.model.with_forces(JointForces()), data, points=99)
 
 
 def flags_without_a_command(path):

@@ -15,6 +15,7 @@ from forcegp.codegen.library import (
     PACKAGES,
     code_digest,
     compile_library,
+    default_folder,
     load_library,
     opened_library,
     own_file,
@@ -160,3 +161,10 @@ def test_what_belongs_to_another_user_is_refused(tmp_path, monkeypatch, owner, r
             own_file(tmp_path)
     else:
         own_file(tmp_path)
+
+
+def test_default_folder(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert default_folder() == tmp_path / "forcegp" / "compiled"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert default_folder() == Path.home() / ".cache" / "forcegp" / "compiled"

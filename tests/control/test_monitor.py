@@ -1,6 +1,5 @@
 """The monitor of contacts: against the momentum observer, a dense formula, and forces that are known."""
 
-import json
 import math
 from importlib.resources import files
 
@@ -13,8 +12,7 @@ from tests.control.test_tracking import ROBOT, TRUE, URDF, URDF_ALONE, VISCOUS
 from tests.goldens.compare import assert_unchanged
 from tests.posterior.arm import arm_model
 
-from forcegp import ContactMonitor, Dataset, JointFriction, Model, Robot, Rotor, fit, save_posterior
-from forcegp.cli.main import main
+from forcegp import ContactMonitor, Dataset, JointFriction, Model, Robot, Rotor, fit
 from forcegp.control.monitor import errors_near_rest, link_ends
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.evidence.least_squares import NoiseLevels
@@ -231,59 +229,6 @@ def test_what_makes_no_monitor(make, message):
         return
     with pytest.raises((InvalidInput, DatasetError), match=message):
         make()
-
-
-def saved(path, given):
-    q, v, u = given
-    a = np.gradient(v, DT, axis=0)
-    Dataset(q=q, v=v, u=u, a=a, time=DT * np.arange(len(q)), model=URDF_ALONE).save(path)
-
-
-@pytest.fixture(scope="module")
-def workshop(posterior, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("monitor")
-    save_posterior(posterior, folder / "run")
-    push = np.zeros((800, 2))
-    push[300:400], push[600:700] = (1.0, 0.5), (-1.0, 0.5)
-    saved(folder / "free.h5", motion(120.0, 1))
-    q, v, u = motion(8.0, 7, push)
-    saved(folder / "log.h5", (q, v, u))
-    (folder / "log.csv").write_text("time,q1\n0,0\n")
-    return folder
-
-
-def test_a_log_becomes_a_table_of_contacts(workshop, monkeypatch, tmp_path, capsys):
-    monkeypatch.chdir(workshop)
-    out = tmp_path / "contacts"
-    assert main(["monitor", "run", "log.h5", "--free", "free.h5", "--out", str(out)]) == 0
-    assert "2 contacts in 8 s" in capsys.readouterr().out
-    found = json.loads((out / "contacts.json").read_text())
-    rows = found["contacts"]
-    assert len(rows) == 2
-    assert [row["start"] for row in rows] == pytest.approx([3.0, 6.0], abs=0.1)
-    assert [row["end"] for row in rows] == pytest.approx([4.0, 7.0], abs=0.3)  # it fades
-    assert {"contacts.json", "config.json", "SHA256SUMS"} == {f.name for f in out.iterdir()}
-    assert json.loads((out / "config.json").read_text())["bandwidth"] == 2.0
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ((), "--free S|FREE.h5"),
-        (("--free", "nowhere.h5"), "give seconds above 0, or a dataset that is there"),
-        (("--free", "5"), "too short for a threshold"),
-        (("--free", "-1"), "give seconds above 0"),
-        (("--free", "log.csv"), "log.csv is not an HDF5 file"),
-        (("--free", "free.h5", "--bandwidth", "500"), "below 50"),
-    ],
-)
-def test_refusals_are_one_line(workshop, monkeypatch, tmp_path, capsys, words, message):
-    monkeypatch.chdir(workshop)
-    assert main(["monitor", "run", "log.h5", *words, "--out", str(tmp_path / "out")]) == 2
-    told = capsys.readouterr().err
-    assert message in told
-    assert len(told.strip().splitlines()) == 1
-    assert not (tmp_path / "out").exists()
 
 
 def test_alarms_and_places_are_what_they_were(monitor):

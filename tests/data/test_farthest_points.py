@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from tests.data.samples import dataset
 
-from forcegp.data import farthest_point_sampling, farthest_rows
+from forcegp.data import farthest_point_sampling
 from forcegp.errors import InvalidInput
 
 TABLES = hnp.arrays(
@@ -69,11 +68,3 @@ def test_repeated_rows_come_last(points):
 def test_wrong_arguments(arguments, message):
     with pytest.raises(InvalidInput, match=message):
         inspect.unwrap(farthest_point_sampling)(np.zeros((5, 2)), **arguments)
-
-
-def test_rows_of_a_dataset_in_sampling_order():
-    data = dataset()
-    sample = farthest_rows(data, 10, start=1)
-    points = np.hstack([data.q, data.v, data.u])
-    np.testing.assert_array_equal(sample.a, data.a[farthest_point_sampling(points, 10, start=1)])
-    np.testing.assert_array_equal(sample.rows(slice(4)).q, farthest_rows(data, 4, start=1).q)

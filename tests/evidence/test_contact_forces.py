@@ -18,8 +18,6 @@ from forcegp.evidence.likelihood import MarginalLikelihood, TrainingData
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
 from forcegp.fit.physical import typical_sizes
-from forcegp.fit.sensors import with_sensors
-from forcegp.fit.unseen import OF_TORQUE, PUSHED, Unseen
 from forcegp.forces import (
     FORCES,
     Actuation,
@@ -158,59 +156,6 @@ def test_friction_under_load_counts_the_gain():
     assert [found[f"gain.{j}"].value for j in ("pan", "lift", "bend")] == pytest.approx([0.8, 0.9, 1.2], rel=1e-3)
 
 
-def test_predictions_given_accelerations_are_those_of_one_large_gaussian():
-    model = replace(on_plane(JointForces(("q",))), noise=Noise(0.05, 0.02, learn=False, sensor=0.3))
-    log = measured(on_plane(Viscous(0.7)), on_plane(), rows=20, noise=0.05)
-    posterior = fit(model, log, [Accelerations(), ContactForces()], **QUICK)
-    states, at = tensors(log, "q", "v", "u"), model.dynamics(*tensors(log, "q", "v", "u"))
-    a = torch.tensor(log.a) + 0.1
-    plain = posterior.predict(*states)
-    H, C = at.H, at.contact_force_map().matrix
-    force = posterior.hyperparameters["noise.log_force"].exp()  # learned beside a sensor
-    S = plain.unknown_force.covariance + torch.diag(force.square())
-    G = torch.cat([H, C], 1)
-    mean = torch.cat([plain.mean, plain.contact_force.mean], 1)
-    whole = G @ S @ G.mT
-    seen = whole[:, :3, :3] + 0.05**2 * torch.eye(3)
-    gain = whole[:, 3:, :3] @ torch.linalg.inv(seen)
-    expected = mean[:, 3:] + (gain @ (a - mean[:, :3])[..., None])[..., 0]
-    spread = whole[:, 3:, 3:] - gain @ whole[:, :3, 3:]
-    found = posterior.predict(*states, a=a).force_at("hand")
-    torch.testing.assert_close(found.mean, expected, rtol=0.0, atol=1e-8)
-    torch.testing.assert_close(found.covariance, spread, rtol=0.0, atol=1e-8)
-    with pytest.raises(InvalidInput, match=r"no contact at 'fore'.*; there is hand"):
-        posterior.predict(*states).force_at("fore")
-    several = posterior.with_contacts(fixed_point("hand")).predict(*states)
-    torch.testing.assert_close(several.force_at("hand").mean, several.contact_force.mean.unflatten(-1, (3, 3)).sum(-2))
-    with pytest.raises(InvalidInput, match="a has shape"):
-        posterior.predict(*states, a=a[:, :2])
-
-
-def test_what_contacts_hide_is_in_the_interval_of_their_force():
-    log = measured(held(Viscous(0.7)), held(), rows=60)
-    posterior = fit(held(Viscous()), replace(log, measured={}, noise_std=[0.05] * 3), Accelerations())
-    h = torch.tensor(posterior.settings["hidden_force"])
-    typical = typical_sizes(held(), [replace(log, measured={})])["force"]
-    assert h.numpy() == pytest.approx(0.2 * typical)  # a leg, a UR10e: gains off by 10 to 16 % and friction
-    assert OF_TORQUE == 0.2
-    at = posterior.dynamics(*tensors(log, "q", "v", "u"))
-    expected = torch.linalg.inv((at.A / h.square()) @ at.A.mT).diagonal(dim1=-2, dim2=-1)  # (A h^-2 A^T)^-1
-    found = posterior.predict(*tensors(log, "q", "v", "u"))
-    torch.testing.assert_close(found.multiplier.variance, expected, rtol=1e-5, atol=0.0)
-    assert float(found.unseen.min()) > 0.999  # of a model without functions all is the prior
-    assert float(found.variance.max()) < 1e-6 * float(expected.min())
-    sensed = fit(
-        held(JointForces(("v",))), replace(log, noise_std=[0.05] * 3), [Accelerations(), ContactForces()], **QUICK
-    )
-    assert "hidden_force" not in sensed.settings
-    assert not bool(sensed.predict(*tensors(log, "q", "v", "u")).unseen.any())
-    learned = fit(held(JointForces(("v",))), replace(log, measured={}, noise_std=[0.05] * 3), **QUICK)
-    found = learned.predict(*tensors(log, "q", "v", "u"))
-    seen = learned.with_settings(hidden_force=None).predict(*tensors(log, "q", "v", "u"))
-    torch.testing.assert_close(found.unseen, 1.0 - seen.multiplier.variance / found.multiplier.variance)
-    assert "not seen by the log" in str(found)
-
-
 def test_a_sensor_shows_forces_along_the_normal(tmp_path, monkeypatch):
     """Something pulls the tool onto the plane, the more the faster it moves: no acceleration shows it."""
     monkeypatch.setitem(FORCES, "world-forces", WorldForces)  # so that files carry it
@@ -237,34 +182,6 @@ def test_a_sensor_shows_forces_along_the_normal(tmp_path, monkeypatch):
     assert len(updated.training.sensed[SENSOR]) == 160
     with pytest.raises(InvalidInput, match=r"the sensor 'force.hand', which these rows do not have"):
         again.update(replace(test, measured={}))
-
-
-@pytest.mark.parametrize(("force", "found"), [(1.3, ("lift",)), (0.7, ())])
-def test_a_joint_that_something_pushes_teaches_nothing(force, found):
-    truth = held(Actuation(gain=[0.8, 1.0, 1.0]))
-    log = measured(held(), held(), rows=100)
-    log = replace(log, u=log.u * [1.0, 0.0, 1.0], measured={})
-    needed = held().robot.kinematics(*tensors(log, "q", "v")).inverse_dynamics(torch.tensor(log.a)).numpy()
-    push = np.zeros((100, 3))
-    push[:, 1] = force * PUSHED * np.sqrt((needed[:, 1] ** 2).mean())
-    at = truth.dynamics(*tensors(log, "q", "v", "u"))
-    log = replace(log, a=at.acceleration(torch.tensor(push)).numpy())
-    typical = typical_sizes(held(), [log])["force"]
-    unseen = Unseen.of(held(), log, typical)
-    assert tuple(log.joint_names[j] for j in unseen.pushed) == found
-    if found:
-        with pytest.warns(DataWarning, match="nothing drives lift, u is 0 there"):
-            posterior = fit(held(Viscous()), log, Torques())
-        assert posterior.model.noise.pushes[1] == pytest.approx(10.0 * push[0, 1], rel=0.3)
-
-
-def test_noise_that_nobody_states_begins_at_two_per_cent():
-    log = measured(on_plane(), on_plane(), rows=20)
-    noise = with_sensors(log, log.model, Torques(), [ContactForces()])[1].noise
-    assert noise.sensor == pytest.approx((0.02 * np.sqrt((log.measured[SENSOR] ** 2).mean()),))
-    assert with_sensors(log, held(), Torques(), [ContactForces(noise=0.7)])[1].noise.sensor == (0.7,) * 3
-    typical = np.array([1.0, 2.0, 3.0])
-    assert Unseen(typical, (), 0.0 * typical, None).with_pushes(noise).force == pytest.approx(0.02 * typical)
 
 
 class TestLogsOfSensors:

@@ -106,12 +106,6 @@ def test_intervals_hold_what_gears_bear_in_postures():
     assert held_of_postures(4, range(6)).min() >= 5
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("count", [4, 6, 12])
-def test_intervals_hold_in_many_logs_of_postures(count):
-    assert held_of_postures(count, range(100, 118)).min() >= 16
-
-
 def test_rests_in_one_piece_are_read_as_episodes_are():
     """Rows of rests one after the other, without the moves, and few of them."""
     data = postures(0, 6, rows=30)

@@ -1,17 +1,23 @@
 """What no data can teach is said before the fit, with the names of what is concerned and what to do about it."""
 
-import dataclasses
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from tests.evidence.test_contact_forces import SENSOR, held, measured, on_plane, tensors
 from tests.forces.world_forces import WorldForces
 from tests.posterior.arm import arm_data, arm_model
 
+from forcegp import ContactForces, Torques, Viscous
 from forcegp.errors import DataWarning, InvalidInput, UnknownName
 from forcegp.fit import fit as fit_model
+from forcegp.fit.physical import typical_sizes
+from forcegp.fit.sensors import with_sensors
+from forcegp.fit.unseen import PUSHED, Unseen
 from forcegp.forces import (
+    Actuation,
     AerodynamicForce,
     ContactFriction,
     JointForces,
@@ -44,7 +50,7 @@ def fit(data, *forces, mean=True, noise=None):
 
 
 def with_columns(data, **columns):
-    return dataclasses.replace(data, truth={}, **columns)
+    return replace(data, truth={}, **columns)
 
 
 @pytest.mark.parametrize("prefix", ["", "tool-friction "], ids=["alone", "in-a-sum"])
@@ -175,3 +181,31 @@ def test_no_residual_at_all_is_refused(data):
     exact = with_columns(data, a=data.model.dynamics(*states).acceleration_map().offset.numpy())
     with pytest.raises(InvalidInput, match="accelerations equal the mean"):
         fit(exact, JointFriction(), noise=Noise(0.1))
+
+
+@pytest.mark.parametrize(("force", "found"), [(1.3, ("lift",)), (0.7, ())])
+def test_a_joint_that_something_pushes_teaches_nothing(force, found):
+    truth = held(Actuation(gain=[0.8, 1.0, 1.0]))
+    log = measured(held(), held(), rows=100)
+    log = replace(log, u=log.u * [1.0, 0.0, 1.0], measured={})
+    needed = held().robot.kinematics(*tensors(log, "q", "v")).inverse_dynamics(torch.tensor(log.a)).numpy()
+    push = np.zeros((100, 3))
+    push[:, 1] = force * PUSHED * np.sqrt((needed[:, 1] ** 2).mean())
+    at = truth.dynamics(*tensors(log, "q", "v", "u"))
+    log = replace(log, a=at.acceleration(torch.tensor(push)).numpy())
+    typical = typical_sizes(held(), [log])["force"]
+    unseen = Unseen.of(held(), log, typical)
+    assert tuple(log.joint_names[j] for j in unseen.pushed) == found
+    if found:
+        with pytest.warns(DataWarning, match="nothing drives lift, u is 0 there"):
+            posterior = fit_model(held(Viscous()), log, Torques())
+        assert posterior.model.noise.pushes[1] == pytest.approx(10.0 * push[0, 1], rel=0.3)
+
+
+def test_noise_that_nobody_states_begins_at_two_per_cent():
+    log = measured(on_plane(), on_plane(), rows=20)
+    noise = with_sensors(log, log.model, Torques(), [ContactForces()])[1].noise
+    assert noise.sensor == pytest.approx((0.02 * np.sqrt((log.measured[SENSOR] ** 2).mean()),))
+    assert with_sensors(log, held(), Torques(), [ContactForces(noise=0.7)])[1].noise.sensor == (0.7,) * 3
+    typical = np.array([1.0, 2.0, 3.0])
+    assert Unseen(typical, (), 0.0 * typical, None).with_pushes(noise).force == pytest.approx(0.02 * typical)

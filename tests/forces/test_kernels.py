@@ -8,8 +8,10 @@ import torch
 from tests.forces.kernel_conformance import KernelConformance
 from tests.inference.kernel_functions import kernel_cross, kernel_matrix
 from tests.inference.problems import normal
+from tests.posterior.arm import arm_model
 
 from forcegp.errors import InvalidInput
+from forcegp.forces import JointForces
 from forcegp.forces.kernels import KERNELS, checked_kernel, kernel_of
 from forcegp.inference import LatentKernels
 
@@ -61,17 +63,6 @@ def test_friction_against_its_formula():
     phi, x = torch.tanh(s / 0.2), torch.asinh(s / 0.3)
     expected = phi @ phi.mT * (0.7 + 0.4 * torch.exp(-(x - x.mT).abs() / 0.6)) + 0.9 * s @ s.mT
     torch.testing.assert_close(matrix(kernel, s), expected, rtol=1e-13, atol=1e-14)
-
-
-def test_friction_is_zero_at_rest_and_starts_with_equal_shares():
-    kernel = kernel_of("friction", 1, 3.0)
-    rest, fast = torch.zeros(1, 1).double(), torch.ones(1, 1).double()
-    assert float(matrix(kernel, rest)) == 0.0
-    assert float(kernel_cross(kernel, rest, normal(5, 1)).detach().abs().max()) == 0.0
-    assert float(matrix(kernel, fast)) == pytest.approx(3.0, rel=1e-6)
-    (coulomb, stribeck), viscous = kernel.kernels[0].kernels[1].kernels, kernel.kernels[1]
-    shares = [float(x.detach()) for x in (coulomb.constant, stribeck.outputscale, viscous.variance)]
-    assert shares == pytest.approx([1.0, 1.0, 1.0])
 
 
 def test_friction_is_a_function_of_one_velocity():
@@ -180,3 +171,15 @@ def test_the_width_of_friction_has_a_hyperprior():
         assert float(start[name].exp()) == pytest.approx(0.1)
         moved = latent.log_prior(start | {name: start[name] + 1.5})
         assert float(latent.log_prior(start) - moved) == pytest.approx(1.125)
+
+
+def test_the_hyperprior_is_normal_in_the_logarithm_of_the_length_scales():
+    latent = LatentKernels(JointForces().kernels(arm_model().robot, (4,), torch.ones(1).double()))
+    parameters = latent.initial_parameters()
+    raw = torch.tensor([[0.0, 1.0, 2.0, 5.0]]).double()
+    parameters["kernels.0.base_kernel.raw_lengthscale"] = raw.requires_grad_()
+    expected = torch.distributions.Normal(torch.tensor(0.5).double() * torch.tensor(4.0).double().log() + 3.0, 2.0)
+    value = latent.log_prior(parameters)
+    assert float(value.detach()) == pytest.approx(float(expected.log_prob(raw.detach()).sum()), rel=1e-12)
+    (gradient,) = torch.autograd.grad(value, raw)
+    assert torch.allclose(gradient, (expected.loc - raw) / 4.0)

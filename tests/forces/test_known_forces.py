@@ -141,9 +141,6 @@ def test_bodies_that_are_learned_are_of_links_that_move():
         RigidBodies((first,)).bound_to(chain())
 
 
-# ---------------------------------------------------------------- armature
-
-
 def test_armature_adds_to_the_diagonal_and_to_that_of_the_robot():
     q, v, u = states(4, 5)
     geared = Model(chain().with_armature([0.1, 0.2, 0.3, 0.4]), forces=(Actuation(), RigidBodies(), Rotor(NUMBERS)))
@@ -183,13 +180,7 @@ def test_wrong_numbers_are_named(kind, arguments, error, message):
         known(kind(*arguments))
 
 
-# ---------------------------------------------------------------- files
-
-
 def test_every_law_of_joints_is_tested_here():
     tested = {type(make()) for make, _ in FORMULAS.values()}
     own = {kind for kind in map(force_class, FORCES) if kind.__module__.startswith("forcegp.")}
     assert {kind for kind in own if issubclass(kind, JointLaw)} <= tested
-
-
-# ---------------------------------------------------------------- a law of the user

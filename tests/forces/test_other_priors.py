@@ -37,17 +37,6 @@ def test_accelerations_are_mixed_by_the_projection_onto_the_constraint(train):
     assert np.allclose(projector @ projector, projector, atol=1e-10)
 
 
-def test_a_fit_with_accelerations_obeys_the_constraint_and_can_be_stored(train, test, tmp_path):
-    from forcegp.posterior import load_posterior, save_posterior
-
-    posterior = fit(train.model.with_forces(JointAccelerations()).without_mean(), train, restarts=1, options=QUICK)
-    mean = posterior.predict(test.q, test.v, test.u).mean
-    dynamics = train.model.dynamics(*(torch.tensor(x) for x in (test.q, test.v, test.u)))
-    assert torch.allclose((dynamics.A @ mean[..., None])[..., 0], dynamics.b, atol=1e-9)
-    save_posterior(posterior, tmp_path / "run")
-    assert torch.equal(load_posterior(tmp_path / "run").predict(test.q, test.v, test.u).mean, mean)
-
-
 def test_without_forces_the_prediction_is_the_analytical_model(train, test):
     posterior = fit(train.model, train)
     prediction = posterior.predict(test.q, test.v, test.u)

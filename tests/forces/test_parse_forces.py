@@ -28,7 +28,6 @@ from forcegp.forces import (
     Spring,
     Stribeck,
     ToolForces,
-    UnknownForces,
     Viscous,
     force_from_dict,
     parse_forces,
@@ -99,6 +98,8 @@ MISTAKES = {
     "gp:joint:inputs=q/torque": "give one or more of 'q', 'v', 'u', each once",
     "gp:joint-friction:kernel=frictoin": "did you mean 'friction'",
     "gp:joint-friction:joints=pan/pan": "each once, or None for all",
+    "gp:tool-friction:kernel=(linear": "'(linear'",
+    "gp:tool-friction:kernel=linear)": "'linear)'",
     "gp:matern-3/2": "'matern-3/2' in 'gp:matern-3/2' is a kernel, not a force; write it as an option",
 }
 
@@ -198,23 +199,3 @@ def test_wrong_arguments_of_constructors(make, message):
 def test_damaged_files_are_refused(stored):
     with pytest.raises((FileFormatError, InvalidInput)):
         force_from_dict(stored)
-
-
-def test_units_are_those_of_the_joints():
-    from tests.forces.force_conformance import bent_arm
-
-    robot = bent_arm().robot  # its last joint slides
-    assert JointForces().latent_units(robot) == ("Nm", "Nm", "N")
-    assert JointFriction(("bend",)).latent_units(robot) == ("N",)
-    assert JointPositionForces().latent_units(robot) == ("Nm", "Nm", "N")
-    assert JointAccelerations().latent_units(robot) == ("rad/s^2", "rad/s^2", "m/s^2")
-    assert ContactFriction().latent_units(robot) == ("N",)
-    assert ContactFriction(load=True).latent_units(robot) == ("",)
-    assert ToolForces().latent_units(robot) == ("N", "N")
-    assert JointFriction().feature_names(robot)[1:] == (("velocity of lift [rad/s]",), ("velocity of bend [m/s]",))
-    assert JointPositionForces().feature_names(robot)[2] == ("position of bend [m]",)
-    names = JointForces().feature_names(robot)[0]
-    assert names[2:8:2] == ("q of bend [m]", "v of lift [rad/s]", "u of pan [Nm]")
-    alone = UnknownForces((JointFriction(),))
-    assert alone.feature_names(robot) == JointFriction().feature_names(robot)
-    assert alone.slices(robot) == (slice(0, 3),)

@@ -5,10 +5,9 @@ import re
 import pytest
 import torch
 from tests.forces.third_party_unknown import AirDrag
-from tests.posterior.arm import arm_data, arm_model
+from tests.posterior.arm import arm_data
 
 from forcegp.data import Dataset
-from forcegp.errors import UnknownName
 from forcegp.fit import fit
 from forcegp.forces import force_to_dict, parse_forces
 from forcegp.inference import OptimizerOptions
@@ -20,11 +19,8 @@ def text(repository):
     return (repository / "tests/forces/third_party_unknown.py").read_text(encoding="utf-8")
 
 
-def test_it_is_short(text):
+def test_the_page_on_forces_shows_the_same_short_file(repository, text):
     assert len(text.splitlines()) < 60
-
-
-def test_the_page_on_forces_shows_the_same_file(repository, text):
     page = (repository / "docs" / "how-to" / "forces.md").read_text(encoding="utf-8")
     blocks = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     assert [block for block in blocks if "class AirDrag" in block] == [text]
@@ -49,9 +45,3 @@ def test_it_finds_the_drag_that_acts():
     part = fit(model, rows, restarts=1, options=OptimizerOptions(iterations=20)).components(*states)["air-drag"]
     torch.testing.assert_close(part.latents.mean, torch.full((40, 1), 1.7).double(), rtol=1e-3, atol=0.0)
     torch.testing.assert_close(part.point_force.mean, force, rtol=1e-3, atol=1e-4)
-
-
-def test_a_wrong_link_is_named():
-    model = arm_model().with_forces(AirDrag("hnad"), noise=Noise(0.1))
-    with pytest.raises(UnknownName, match="did you mean 'hand'"):
-        fit(model, arm_data(10, 1), restarts=1)

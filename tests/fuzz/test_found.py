@@ -20,7 +20,7 @@ from tests.posterior.arm import URDF
 import forcegp
 import forcegp.inference
 from forcegp.atomic_files import write_digests
-from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, RobotModelError
+from forcegp.errors import FileFormatError, ForceGPError, RobotModelError
 from forcegp.model import Model
 
 pytestmark = pytest.mark.usefixtures("unchecked")
@@ -199,8 +199,3 @@ def test_values_of_another_kind_are_refused_in_one_sentence(call):
     with pytest.raises(ForceGPError) as refused:
         function(**{**arguments(), **WRONG[call]})
     assert str(refused.value).strip()
-
-
-def test_the_sentence_names_what_was_called():
-    with pytest.raises(InvalidInput, match=r"OptimizerOptions was given a value of another kind: .*; see help"):
-        forcegp.inference.OptimizerOptions(iterations=None)

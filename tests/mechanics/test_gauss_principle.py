@@ -78,8 +78,23 @@ class TestAgainstDenseEquations:
         forces = dynamics.Q_K + Q_U + (A.mT @ dynamics.multiplier(Q_U)[..., None])[..., 0]
         assert_close((M @ a[..., None])[..., 0], forces, TOLERANCE)
 
-
-# ---------------------------------------------------------------- batches
+    def test_forces_of_contacts_are_gradients_times_multipliers(self, solved):
+        dynamics, Q_U = solved
+        assert_close(dynamics.acceleration_under(dynamics.Q_K + Q_U), dynamics.acceleration(Q_U), TOLERANCE)
+        if not dynamics.contacts:
+            assert dynamics.off().shape == (20, 0)
+            return
+        at, multiplier = dynamics.state.kinematics, dynamics.multiplier(Q_U)
+        places = [each.position(at).detach().requires_grad_() for each in dynamics.contacts]
+        values = [each.surface.value(p) for each, p in zip(dynamics.contacts, places, strict=True)]
+        gradients = torch.stack([torch.autograd.grad(x.sum(), p)[0] for x, p in zip(values, places, strict=True)], 1)
+        sizes = gradients.norm(dim=-1)
+        assert_close(dynamics.off(), torch.stack(values, -1).detach() / sizes, TOLERANCE)
+        assert_close(dynamics.contact_force_map()(Q_U), (gradients * multiplier[..., None]).flatten(1), TOLERANCE)
+        frame, measured = dynamics.contacts[0].frame, normal(20, 3)
+        assert_close(dynamics.force_at(frame)(Q_U), (sizes * multiplier).sum(-1, keepdim=True), TOLERANCE)
+        along = torch.nn.functional.normalize(gradients.sum(1), dim=-1)
+        assert_close(dynamics.as_measured(frame, measured), (along * measured).sum(-1, keepdim=True), TOLERANCE)
 
 
 # ---------------------------------------------------------------- derivatives

@@ -11,7 +11,7 @@ from tests.robots.test_moving_bases import LIMBS
 
 from forcegp.errors import ContactError, InvalidInput
 from forcegp.forces import Actuation
-from forcegp.mechanics import Contact, Plane, Sphere, fixed_frame, fixed_point
+from forcegp.mechanics import Contact, ImplicitSurface, Plane, Sphere, fixed_frame, fixed_point
 from forcegp.model import Model
 from forcegp.robots import Robot
 
@@ -66,6 +66,15 @@ def test_accelerations_and_foot_forces_are_those_of_the_equations_of_motion(walk
         acting = torch.repeat_interleave(u[k, 3:] > 0, 3)
         torch.testing.assert_close(forces[k][acting], solution[robot.nv :], rtol=1e-7, atol=1e-7)
         assert (forces[k][~acting].abs() < 1e-12).all()
+    torch.testing.assert_close(found.force_at("b_foot")(torch.zeros_like(v)), forces[:, 3:])
+    assert torch.equal(found.as_measured("a_foot", forces[:, :3]), forces[:, :3])
+    assert torch.equal(found.state.positions, torch.nn.functional.pad(q[:, -3:], (6, 0)))
+    torch.testing.assert_close(found.state.delivered, torch.nn.functional.pad(u[:, :3], (6, 0)))
+    swinging = Contact("b_foot", POINT, ImplicitSurface(lambda p: 2.0 * p[2] - 0.6), switch="b_stands")
+    off = Model(robot, (swinging,)).dynamics(q, v, u[:, [0, 1, 2, 4]]).off()[:, 0]
+    torch.testing.assert_close(
+        off, torch.where(u[:, 4] > 0, swinging.position(found.state.kinematics)[:, 2] - 0.3, 0.0)
+    )
 
 
 def test_a_frame_that_is_held_neither_moves_nor_turns(robot):

@@ -1,16 +1,22 @@
 """Fitting and predicting with the structured model."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from tests.evidence.test_contact_forces import QUICK, held, measured, on_plane, tensors
 from tests.posterior.arm import NOISE, URDF, arm_data, arm_model, quick_fit
 
+from forcegp import Accelerations, ContactForces, Viscous
 from forcegp.data import Dataset
 from forcegp.errors import ContactError, DataWarning, InvalidInput
 from forcegp.fit import fit
+from forcegp.fit.physical import typical_sizes
+from forcegp.fit.unseen import OF_TORQUE
 from forcegp.forces import JointForces
 from forcegp.inference import OptimizerOptions
-from forcegp.mechanics import Contact, Plane
+from forcegp.mechanics import Contact, Plane, fixed_point
 from forcegp.noise import Noise
 from forcegp.robots import Robot
 
@@ -150,3 +156,56 @@ def test_states_that_make_no_sense_are_refused(posterior, test):
         posterior.predict(test.q[:2], test.v[:3], test.u[:3])
     with pytest.raises(InvalidInput, match=r"is not an array of real numbers|must be an array of real numbers"):
         posterior.predict(["a", "b", "c"], test.v, test.u)
+
+
+def test_predictions_given_accelerations_are_those_of_one_large_gaussian():
+    model = replace(on_plane(JointForces(("q",))), noise=Noise(0.05, 0.02, learn=False, sensor=0.3))
+    log = measured(on_plane(Viscous(0.7)), on_plane(), rows=20, noise=0.05)
+    posterior = fit(model, log, [Accelerations(), ContactForces()], **QUICK)
+    states, at = tensors(log, "q", "v", "u"), model.dynamics(*tensors(log, "q", "v", "u"))
+    a = torch.tensor(log.a) + 0.1
+    plain = posterior.predict(*states)
+    H, C = at.H, at.contact_force_map().matrix
+    force = posterior.hyperparameters["noise.log_force"].exp()  # learned beside a sensor
+    S = plain.unknown_force.covariance + torch.diag(force.square())
+    G = torch.cat([H, C], 1)
+    mean = torch.cat([plain.mean, plain.contact_force.mean], 1)
+    whole = G @ S @ G.mT
+    seen = whole[:, :3, :3] + 0.05**2 * torch.eye(3)
+    gain = whole[:, 3:, :3] @ torch.linalg.inv(seen)
+    expected = mean[:, 3:] + (gain @ (a - mean[:, :3])[..., None])[..., 0]
+    spread = whole[:, 3:, 3:] - gain @ whole[:, :3, 3:]
+    found = posterior.predict(*states, a=a).force_at("hand")
+    torch.testing.assert_close(found.mean, expected, rtol=0.0, atol=1e-8)
+    torch.testing.assert_close(found.covariance, spread, rtol=0.0, atol=1e-8)
+    with pytest.raises(InvalidInput, match=r"no contact at 'fore'.*; there is hand"):
+        posterior.predict(*states).force_at("fore")
+    several = posterior.with_contacts(fixed_point("hand")).predict(*states)
+    torch.testing.assert_close(several.force_at("hand").mean, several.contact_force.mean.unflatten(-1, (3, 3)).sum(-2))
+    with pytest.raises(InvalidInput, match="a has shape"):
+        posterior.predict(*states, a=a[:, :2])
+
+
+def test_what_contacts_hide_is_in_the_interval_of_their_force():
+    log = measured(held(Viscous(0.7)), held(), rows=60)
+    posterior = fit(held(Viscous()), replace(log, measured={}, noise_std=[0.05] * 3), Accelerations())
+    h = torch.tensor(posterior.settings["hidden_force"])
+    typical = typical_sizes(held(), [replace(log, measured={})])["force"]
+    assert h.numpy() == pytest.approx(0.2 * typical)  # a leg, a UR10e: gains off by 10 to 16 % and friction
+    assert OF_TORQUE == 0.2
+    at = posterior.dynamics(*tensors(log, "q", "v", "u"))
+    expected = torch.linalg.inv((at.A / h.square()) @ at.A.mT).diagonal(dim1=-2, dim2=-1)  # (A h^-2 A^T)^-1
+    found = posterior.predict(*tensors(log, "q", "v", "u"))
+    torch.testing.assert_close(found.multiplier.variance, expected, rtol=1e-5, atol=0.0)
+    assert float(found.unseen.min()) > 0.999  # of a model without functions all is the prior
+    assert float(found.variance.max()) < 1e-6 * float(expected.min())
+    sensed = fit(
+        held(JointForces(("v",))), replace(log, noise_std=[0.05] * 3), [Accelerations(), ContactForces()], **QUICK
+    )
+    assert "hidden_force" not in sensed.settings
+    assert not bool(sensed.predict(*tensors(log, "q", "v", "u")).unseen.any())
+    learned = fit(held(JointForces(("v",))), replace(log, measured={}, noise_std=[0.05] * 3), **QUICK)
+    found = learned.predict(*tensors(log, "q", "v", "u"))
+    seen = learned.with_settings(hidden_force=None).predict(*tensors(log, "q", "v", "u"))
+    torch.testing.assert_close(found.unseen, 1.0 - seen.multiplier.variance / found.multiplier.variance)
+    assert "not seen by the log" in str(found)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.goldens.compare import assert_unchanged
 from tests.recordings.log_files import JOINTS, motion, table, write_text
 
 from forcegp import Model, Robot
@@ -13,7 +14,7 @@ from forcegp.cli.main import parse_arguments
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 from forcegp.recordings import ColumnMapping, by_quantity, listed, open_source
-from forcegp.recordings.mapping import expanded, guessed_columns, guessed_time, log_unit, parse_expression
+from forcegp.recordings.mapping import UNITS, expanded, guessed_columns, guessed_time, log_unit, parse_expression
 from forcegp.recordings.signal_plan import signal_plan
 
 COLUMNS = ("theta1", "theta2", "theta", "a-b", "a", "b", "/js:position.j1", "x[0]", "1e3")
@@ -211,3 +212,7 @@ def test_joints_without_a_column_are_named_with_what_holds_them(tmp_path):
         signal_plan(ColumnMapping(), source, Model(Robot.from_urdf_text(ARM)))
     held = Model(Robot.from_urdf_text(ARM, locked={"finger": 0.0}))
     assert signal_plan(ColumnMapping(), source, held).guessed[1] == "u = eff_shoulder"  # as ROS abbreviates effort
+
+
+def test_units_are_what_they_were():
+    assert_unchanged("recordings/units", {quantity: dict(units) for quantity, units in UNITS.items()})

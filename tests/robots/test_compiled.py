@@ -4,7 +4,6 @@ import os
 import pickle
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -101,16 +100,6 @@ print(compiled.forward_dynamics(q, v, tau).tolist())
     assert eval(done.stdout) == compiled.forward_dynamics(*torch.full((3, 3), 0.3, dtype=torch.float64)).tolist()
     assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == before
     assert all(path.suffix == ".so" for path in before)  # nothing unfinished lies about
-
-
-def test_default_folder(robot, monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert robot.compile().folder == tmp_path / "forcegp" / "compiled"
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    assert robot.compile().folder == Path.home() / ".cache" / "forcegp" / "compiled"
-
-
-# ---------------------------------------------------------------------- what cannot be
 
 
 def test_what_is_not_supported_says_so(robot, compiled):

@@ -1,17 +1,25 @@
 """Plots of friction curves and normal forces: what is drawn is what the model and the truth say."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection
+from tests.evidence.test_contact_forces import held
+from tests.evidence.test_contact_forces import measured as sensed
 from tests.goldens.compare import assert_unchanged, drawn
+from tests.posterior.arm import arm_model, quick_fit
 from tests.scores.friction import fitted, friction_data, joint_law
 
+from forcegp import Noise, Viscous
 from forcegp.data import Dataset
+from forcegp.data.dataset import FORCE
 from forcegp.errors import InvalidInput
 from forcegp.fit import fit
-from forcegp.forces import ContactFriction, JointFriction, JointPositionForces
+from forcegp.forces import ContactFriction, JointForces, JointFriction, JointPositionForces
+from forcegp.mechanics import fixed_point
 from forcegp.scores import friction_curves_figure, normal_force_figure
-from forcegp.scores.accuracy import poor_scores, predict_rows, row_scores, rows_outside, unfinished_search
+from forcegp.scores.accuracy import metrics, poor_scores, predict_rows, row_scores, rows_outside, unfinished_search
 
 
 @pytest.fixture(scope="module")
@@ -102,3 +110,17 @@ def test_figures_and_scores_are_what_they_were(friction, data):
     found = {"figures": list(map(drawn, figures)), "rows": rows, "table": table, "stretches": stretches}
     found["doubts"] = [(each.about, each.level, each.numbers) for each in doubts]
     assert_unchanged("scores/friction", found, rtol=1e-3)
+
+
+def test_scores_beside_sensors_are_what_they_were():
+    """Of forces at two frames, and of intervals without a width."""
+    log = sensed(held(Viscous(0.7)), held(), rows=40, noise=0.1)
+    feet = (held().contacts[0], fixed_point("fore", (0.0, 0.1, 0.0))[1])
+    model = arm_model(0).with_contacts(feet).with_forces(JointForces(("v",)), noise=Noise(0.1))
+    log = replace(log, model=model.known, measured=log.measured | {f"{FORCE}fore": log.a}, truth={"a": 1.01 * log.a})
+    posterior = quick_fit(model, replace(log, measured={})).with_settings(widening=1.0)
+    table, stretches = row_scores(posterior, log, whole=log.rows(slice(20)))
+    size = np.array([[1e-3], [1.0], [1e3]]) * [1.0, -1.0]
+    widths = [metrics(1.1 * x, (k * 1e-9 * x) ** 2 * [1.0, 1e20], x) for x in size[:, None] for k in (0.9, 1.1)]
+    figure = normal_force_figure(posterior, log, seconds=0.2)
+    assert_unchanged("scores/sensors", {"of": table, "in": stretches, "no": widths, "seen": drawn(figure)}, rtol=1e-3)

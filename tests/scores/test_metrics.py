@@ -3,28 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from scipy.stats import multivariate_normal
 
 from forcegp.errors import NumericalError
 from forcegp.scores.accuracy import metrics, negative_log_density, over_columns
-
-ROWS, K = 30, 4
-
-
-def gaussians(seed: int, rows: int = ROWS, k: int = K) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Means, covariances and one target per row that is drawn from them."""
-    generator = np.random.default_rng(seed)
-    factor = generator.normal(size=(rows, k, k))
-    covariance = factor @ factor.swapaxes(-1, -2) + 0.1 * np.eye(k)
-    mean = generator.normal(size=(rows, k))
-    target = mean + (np.linalg.cholesky(covariance) @ generator.normal(size=(rows, k, 1)))[..., 0]
-    return torch.tensor(mean), torch.tensor(covariance), torch.tensor(target)
-
-
-def test_joint_density_is_that_of_scipy():
-    mean, covariance, target = gaussians(0)
-    expected = [-multivariate_normal(m, S).logpdf(y) for m, S, y in zip(mean, covariance, target, strict=True)]
-    np.testing.assert_allclose(negative_log_density(mean, covariance, target), expected, rtol=1e-10)
 
 
 def test_a_constrained_covariance_without_noise_has_no_density():

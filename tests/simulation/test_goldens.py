@@ -9,7 +9,7 @@ SCENES = {
     "plane": ("kuka-surface", {"settle_seconds": 1.0, "seconds": 0.5, "seed": 5}),
     "dry": ("kuka-surface", {"settle_seconds": 1.0, "seconds": 0.5, "surface": "tilted", "friction": "stribeck"}),
     "free": ("kuka-surface", {"settle_seconds": 0.5, "seconds": 0.5, "surface": "none", "joint_friction": "stribeck"}),
-    "quadruped": ("quadruped", {"seconds": 4.5, "seed": 1}),
+    "quadruped": ("quadruped", {"seconds": 4.5, "seed": 1, "payload": 3.0}),
     "quadrotor": ("quadrotor", {"seconds": 0.5, "episodes": 2}),
 }
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from forcegp.errors import InvalidInput, SimulationError
+from forcegp.errors import InvalidInput
 from forcegp.simulation import KukaSurfaceConfig, simulate_kuka_surface
 
 
@@ -34,9 +34,3 @@ def test_the_equations_of_motion_hold_in_every_row(scene):
 def test_parts_that_do_not_fit_are_refused(changes, message):
     with pytest.raises(InvalidInput, match=message):
         KukaSurfaceConfig(**changes)
-
-
-def test_friction_beyond_what_determines_the_normal_force_is_refused():
-    extreme = {"coulomb_coefficient": 20.0, "static_coefficient": 20.0, "friction_smoothing": 1e-3}
-    with pytest.raises(SimulationError, match="not determined"):
-        simulate_kuka_surface(KukaSurfaceConfig(seconds=1.0, friction="stribeck", **extreme))

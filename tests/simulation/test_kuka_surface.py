@@ -33,16 +33,6 @@ def tensors(data: Dataset, *names: str) -> list[torch.Tensor]:
     return [torch.tensor(data.truth[name] if name in data.truth else getattr(data, name)) for name in names]
 
 
-# ---------------------------------------------------------------- the physics, by forcegp's own robot
-
-
-def test_gauss_principle_gives_acceleration_and_multiplier_from_the_true_force(data):
-    q, v, u, a, unknown, multiplier = tensors(data, "q", "v", "u", "a", "Q_U", "lambda")
-    dynamics = data.model.dynamics(q, v, u)
-    np.testing.assert_allclose(dynamics.acceleration(unknown), a, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(dynamics.multiplier(unknown), multiplier, rtol=0, atol=1e-8)
-
-
 def test_the_unknown_force_is_viscous_friction_at_the_tool_point(data):
     q, v, unknown = tensors(data, "q", "v", "Q_U")
     point = torch.tensor([0.0, 0.0, 0.1], dtype=torch.float64)
@@ -148,9 +138,6 @@ def test_numbers_are_taken_from_their_range_only(config, field, least, most):
 def test_data_of_no_use_are_not_returned(changes, message):
     with pytest.raises(SimulationError, match=message):
         simulate_kuka_surface(type("Odd", (KukaSurfaceConfig,), changes)(**dataclasses.asdict(SHORT)))
-
-
-# ---------------------------------------------------------------- the registry
 
 
 def test_scenarios_are_found_by_name(short):
