@@ -23,22 +23,8 @@ FEWEST = 10 * STRETCHES
 """Rows that a payload needs, but in a log of postures alone."""
 
 
-def _usual_link(robot: Robot) -> str:
-    """A base that moves, else of the last joint the last link of the file.
-
-    Joints of several bodies, as of fingers, count as none, if there are others: what fingers hold moves with the hand.
-    """
-    if robot.base != "fixed":
-        return robot.layout.moving[0]
-    drives = [drive.joint for drive in robot.layout.drives]
-    solid = {place.body for place in robot.layout.links.values()}
-    alone = [body for body, joint in enumerate(drives) if drives.count(joint) == 1 and body in solid]
-    last = max(alone, default=len(robot.layout.bodies) - 1)
-    return [name for name, place in robot.layout.links.items() if place.body == last][-1]
-
-
 def with_payloads_placed(model: Model, logs: Sequence[Dataset]) -> Model:
-    """The model whose payload without a link is on the usual one.
+    """The model whose payload without a link is on a base that moves, else on the last link of the last joint.
 
     Raises DatasetError for logs too short for a payload.
     """
@@ -57,7 +43,14 @@ def with_payloads_placed(model: Model, logs: Sequence[Dataset]) -> Model:
         )
     if not open_ones:
         return model
-    placed = replace(open_ones[0], link=_usual_link(model.robot))
+    # of joints of several bodies, as of fingers, none counts, if there are others: what they hold moves with the hand
+    layout = model.robot.layout
+    drives = [drive.joint for drive in layout.drives]
+    solid = {place.body for place in layout.links.values()}
+    alone = [body for body, joint in enumerate(drives) if drives.count(joint) == 1 and body in solid]
+    last = max(alone, default=len(layout.bodies) - 1)
+    usual = [name for name, place in layout.links.items() if place.body == last][-1]
+    placed = replace(open_ones[0], link=usual if model.robot.base == "fixed" else layout.moving[0])
     return replace(model, forces=tuple(placed if force is open_ones[0] else force for force in model.forces))
 
 
@@ -129,8 +122,9 @@ CAUSES = {
     "lengths": (0.1, "lengths before the joints times", "Correct the URDF's lengths."),
     "masses": (0.2, "masses of the links times", "Give a baseline (a log without the payload), or identify all links."),
 }
-"""Usual deviations of the logarithms of factors, what they are of, and what to do. Of two causes the first is named,
-unless the other explains a tenth more."""
+"""Usual deviations of the logarithms of factors, what they are of, and what to do. All factors of a cause are tried,
+and each alone. Of two the first is named, unless the other explains a tenth more: what it explains less the half of
+the logarithm of the rows for each factor (Schwarz 1978)."""
 STEP = 1e-4
 """Of a length, for its derivative."""
 WRONG = 0.03
@@ -156,7 +150,7 @@ def misfit(
     gains = 1.0 if actuation.is_exact else actuation.values["gain"].cpu().numpy()[:, None]
     white, J = fit.white.ravel(), fit.white_jacobian.reshape(fit.white.size, -1)
     inverse, cost = np.linalg.inv(fit.information + fit.prior_information), 0.5 * float((fit.white**2).sum())
-    best, found = max(CLEARLY_MORE, LEAST * cost), None
+    best, least, found = 0.0, max(CLEARLY_MORE, LEAST * cost), None
     scales = [10 * k for k, each in enumerate(rows[0].space.carried) if each.payload is not None]
     if np.linalg.norm(fit.residual) <= RIGHT * np.linalg.norm(0.5 * fit.jacobian[..., scales]):
         return None  # of the torques of payloads, next to nothing is left
@@ -170,21 +164,34 @@ def misfit(
             C = C - fit.residual[:, :, None] * np.eye(C.shape[1])
         C = (C / fit.noise[:, None]).reshape(white.size, -1)
         across = J.T @ C
-        own = C.T @ C - across.T @ inverse @ across
-        change = -np.linalg.solve(own + np.eye(C.shape[1]) / usual**2, C.T @ white)
-        more, off, factors = -0.5 * float(white @ C @ change), abs(change) > WRONG, np.exp(change)
-        if more > best and off.any() and abs(change).max() < NO_STEP:
-            told = ", ".join(f"{names[k]} {factors[k]:.3g}" for k in np.flatnonzero(off))
+        own, slope = C.T @ C - across.T @ inverse @ across + np.eye(C.shape[1]) / usual**2, C.T @ white
+        tried = list[tuple[float, float, np.ndarray]]()
+        for some in (np.arange(len(slope)), *np.arange(len(slope))[:, None]):
+            change = np.zeros(len(slope))
+            change[some] = -np.linalg.solve(own[np.ix_(some, some)], slope[some])
+            more = -0.5 * float(slope @ change)
+            tried.append((more - 0.5 * len(some) * np.log(white.size), more, change))
+        worth, more, change = max(tried, key=lambda each: each[0])
+        off, factors = abs(change) > WRONG, np.exp(change)
+        if worth > best and more > least and off.any() and abs(change).max() < NO_STEP:
+            told = ", ".join(f"{factors[k]:.3g} ({names[k]})" for k in np.flatnonzero(off))
             doubt = look(
                 about="payload",
-                what=f"{said} these factors would leave {more / cost:.0%} less of the log: {told}. "
+                what=f"{said} {told} would leave {more / cost:.0%} less unexplained. "
                 "The intervals hold what that would change.",
                 do=do,
                 joints=tuple(np.array(names)[off].tolist()),
-                numbers={cause: dict(zip(names, factors.tolist(), strict=True))},
+                numbers={cause: {names[k]: float(factors[k]) for k in np.flatnonzero(change)}},
             )
-            best, found = 1.1 * more, (doubt, -inverse @ (across @ change))
+            best, found = 1.1 * worth, (doubt, -inverse @ (across @ change))
     return found
+
+
+def with_length(robot: Robot, body: int, factor: float) -> Robot:
+    """The robot with this factor of what leads to the joint of a body."""
+    rest = robot.tree.rest.clone()
+    rest[body, :3, 3] *= factor
+    return replace(robot, tree=replace(robot.tree, rest=rest))
 
 
 def _columns(
@@ -200,9 +207,7 @@ def _columns(
     names, columns = [], []
     for body, drive in enumerate(robot.layout.drives):
         if robot.layout.parents[body] >= 0 and bool(robot.tree.rest[body, :3, 3].any()):
-            rest = robot.tree.rest.clone()
-            rest[body, :3, 3] *= 1.0 + STEP
-            longer = replace(robot, tree=replace(robot.tree, rest=rest))
+            longer = with_length(robot, body, 1.0 + STEP)
             change = longer.inverse_dynamics(q, v, at) - robot.inverse_dynamics(q, v, at)
             names.append(robot.joint_names[drive.joint])
             columns.append(change.cpu().numpy() / STEP)

@@ -282,13 +282,14 @@ def fit_physical(
     found = space.model_at(fit.x)
     residual = equations.a - equations.accelerations(fit.x)[0]
     doubts = list(doubts_of_memory(space, fit.x))
-    if equations.tell_bodies:  # noise of single rows hides what is left
-        doubts += doubts_of_payloads(space, fit)
     cause = None
     means = equations.windows if equations.tell_bodies and not evidence.noisy_in_both else None
     if means is not None and not model.contacts and any(each.payload is not None for each in space.carried):
         cause = misfit(found, equations.parts, equations.each(equations.a), means.mean, fit)
-    doubts += [] if cause is None else [cause[0]]
+    if cause is not None:
+        doubts.append(cause[0])
+    elif equations.tell_bodies:  # noise of single rows hides what is left
+        doubts += doubts_of_payloads(space, fit)
     estimates = _estimates(space, fit, equations, evidence, thick, changes, None if cause is None else cause[1])
     doubts += unseen.doubts(model)
     Doubts(doubts).warn(stacklevel=4)
