@@ -40,7 +40,15 @@ class Noise:
         require_type("learn", self.learn, bool)
         for name in ("acceleration", "force", "sensor", "pushes"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, _positive(name, getattr(self, name)))
+                given = getattr(self, name)
+                message = f"Noise {name} is {given!r}; give a positive, finite standard deviation, or one per joint."
+                try:
+                    values = torch.as_tensor(given, dtype=torch.float64)
+                except (TypeError, ValueError, RuntimeError):
+                    raise InvalidInput(message) from None
+                if values.dim() > 1 or not values.numel() or not bool(((values > 0) & torch.isfinite(values)).all()):
+                    raise InvalidInput(message)
+                object.__setattr__(self, name, tuple(values.tolist()) if values.dim() else float(values))
 
     def parameters(self, nv: int, device: torch.device | None = None) -> dict[str, Float[Tensor, "nv"]]:
         """Logarithms of the standard deviations, one per joint.
@@ -103,14 +111,3 @@ class Noise:
         """The noise that `to_dict` stored."""
         given: dict[str, Any] = {name: tuple(x) if isinstance(x, list) else x for name, x in stored.items()}
         return cls(**given)
-
-
-def _positive(name: str, given: object) -> float | tuple[float, ...]:
-    message = f"Noise {name} is {given!r}; give a positive, finite standard deviation, or one per joint."
-    try:
-        values = torch.as_tensor(given, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError):
-        raise InvalidInput(message) from None
-    if values.dim() > 1 or not values.numel() or not bool(((values > 0) & torch.isfinite(values)).all()):
-        raise InvalidInput(message)
-    return tuple(values.tolist()) if values.dim() else float(values)

@@ -47,7 +47,7 @@ def answered(folder, forcegp):
         "auto", "log.csv", *COLUMNS, "--forces", "given", "--forces", "identified", "--out", "answer", folder=folder
     )
     assert refused.returncode == 2
-    assert refused.stderr.strip().splitlines()[-1].startswith("forcegp: 4 mistakes in the log")
+    assert "forcegp: unit of q, unit of time, velocity, torque sign: wrong." in refused.stderr
     assert not (folder / "answer").exists()
     command = refused.stdout[refused.stdout.index("forcegp auto") :].strip()
     assert "\n" not in command
@@ -116,7 +116,9 @@ def test_a_base_on_a_wall_is_corrected(tmp_path, forcegp, monkeypatch):
 
 def test_the_printed_command_keeps_every_option():
     columns = "--headerless 1,2 --side-by-side --time a:c1 --q b --u 0 --sign u=1,-1 --robot arm.urdf"
-    others = "--accept --overwrite --cutoff 9 --every 3 --lock finger=0.1 --gravity=-9.81,0,0 --link tool"
+    others = (
+        "--accept --overwrite --cutoff 9 --every 3 --lock finger=0.1 --gravity=-9.81,0,0 --link tool --without 1,2.5"
+    )
     others += " --forces given --forces gp:joint,viscous --out here"
     words = ["auto", "a.txt", "b.txt", *columns.split(), *others.split()]
     command = parse_arguments(words)

@@ -1,6 +1,7 @@
 """Rows of filtered logs repeat their neighbours: noise is learned from those that do not."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from forcegp.inference import OptimizerOptions
 from forcegp.noise import Noise
 
 QUICK = OptimizerOptions(iterations=2)
+SAID = pytest.mark.filterwarnings("ignore::forcegp.errors.DataWarning")
 CUTOFF = 4.0  # Hz, so that rows within .081 s are alike
 
 
@@ -32,22 +34,15 @@ def filtered(rows: int = 480, seed: int = 0, cutoff: float | None = CUTOFF) -> D
     return Dataset(q=q, v=v, u=u, a=a + 0.5 * errors / errors.std(axis=0), time=time, model=model, metadata=metadata)
 
 
+@SAID
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 3))
 def test_kept_rows_lie_apart_and_every_other_row_is_near_an_earlier_one(seed, episodes):
     draw = np.random.default_rng(seed)
     whole = filtered(200)
-    order = draw.permutation(200)
-    log = Dataset(
-        **{name: getattr(whole, name)[order] for name in ("q", "v", "u", "a", "time")},
-        episode=draw.integers(0, episodes, 200),
-        model=whole.model,
-        metadata=whole.metadata,
-        time_ordered=False,
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        kept = independent_rows(log)
+    some = replace(whole, time_ordered=False).rows(draw.permutation(200))
+    log = replace(some, episode=draw.integers(0, episodes, 200))
+    kept = independent_rows(log)
     apart = LowPass(CUTOFF).memory - 1e-9
     rows = [int(np.flatnonzero(log.time == time)[0]) for time in kept.time]
     near = (np.abs(log.time[:, None] - log.time) < apart) & (log.episode[:, None] == log.episode)
@@ -57,14 +52,11 @@ def test_kept_rows_lie_apart_and_every_other_row_is_near_an_earlier_one(seed, ep
     assert independent_rows(filtered(200, cutoff=None)).time.tolist() == whole.time.tolist()
 
 
+@SAID
 def test_learned_noise_is_not_lost_in_smooth_errors():
     """Of the same rows, taken for independent, the functions interpolate the errors."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        found, alike = (
-            fit(arm_model(0).with_forces(JointForces()), filtered(cutoff=cutoff), points=120, restarts=1)
-            for cutoff in (CUTOFF, None)
-        )
+    model = arm_model(0).with_forces(JointForces())
+    found, alike = (fit(model, filtered(cutoff=each), points=120, restarts=1) for each in (CUTOFF, None))
     assert float(found.noise_std.min()) > 0.2
     assert float(alike.noise_std.max()) < 0.1
     assert len(found.training) == found.settings["points"] < 80
@@ -72,25 +64,22 @@ def test_learned_noise_is_not_lost_in_smooth_errors():
 
 
 def test_rows_that_are_left_out_are_warned_of():
-    model, quick = (
-        arm_model(0).with_forces(JointForces(), noise=Noise(None, learn=True)),
-        {"restarts": 1, "options": QUICK},
-    )
-    with pytest.warns(
-        DataWarning,
-        match=r"within 0\.081 s of .* of 200 rows lie further .*these alone teach the noise",
-    ):
+    model = arm_model(0).with_forces(JointForces(), noise=Noise(None, learn=True))
+    quick = {"restarts": 1, "options": QUICK}
+    with pytest.warns(DataWarning, match=r"0\.081 s away: .* of 200 rows are .*noise is learned from these"):
         fit(model, filtered(), points=200, **quick)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(independent_rows(filtered(1000))) > 100
     with pytest.warns(DataWarning, match="too few, so all are taken, and learned noise may be none"):
         few = fit(model, filtered(60), points=50, **quick)
     assert few.settings["points"] == 50
 
 
+@SAID
 def test_all_rows_are_taken_where_no_number_is_given():
     """Hyper-parameters come from rows that lie apart; as many of these as are asked for."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        model = arm_model(0).with_forces(JointForces())
-        posterior = fit(model, filtered(), restarts=1, options=QUICK, learning_points=25)
+    model = arm_model(0).with_forces(JointForces())
+    posterior = fit(model, filtered(), restarts=1, options=QUICK, learning_points=25)
     assert posterior.settings["points"] == 480
     assert posterior.settings["learning_points"] == 25

@@ -199,7 +199,7 @@ BROKEN = {
     "ms given as s": Broken(scaled(1e3, "time"), "add --unit time=ms"),
     "unknown unit": Broken(GOOD, "no unit 'degrees' in the units of q; did you mean", f"{FLAGS} --unit q=degrees"),
     "angle wraps": Broken(csv(wrapping), "jumps by more than half a turn", FLAGS),
-    "degrees": Broken(scaled(57.3, "q_shoulder", "q_elbow"), "Give --unit q=deg if it is in degrees"),
+    "degrees": Broken(scaled(57.3, "q_shoulder", "q_elbow"), "Give --unit q=deg if it is in deg"),
     "beyond limits": Broken(
         with_urdf(scaled(3.0, "q_elbow"), "shoulder", "elbow"), "beyond its limits -1.5 to 1.5 in the URDF"
     ),

@@ -9,7 +9,7 @@ from tests.data.samples import model
 from tests.recordings.log_files import JOINTS, STEP, motion, table, write_text
 
 from forcegp.data import Dataset, differentiate
-from forcegp.errors import DatasetError, DataWarning, InvalidInput
+from forcegp.errors import DatasetError, DataWarning, InvalidInput, MistakenUnit
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings
 
 NAMES = ColumnMapping(time="time", q=("q_{joints}",), v=("v_{joints}",), u=("u_{joints}",), joints=JOINTS)
@@ -99,10 +99,11 @@ def test_start_and_end_count_from_the_first_row_of_each_episode(tmp_path):
     data = motion()
     columns = table(data) | {"run": np.repeat([4.0, 7.0], 100)}
     mapping = dataclasses.replace(NAMES, episode="run")
-    found = imported(write_text(tmp_path / "log.csv", columns), mapping, start=10 * STEP, end=20 * STEP)
-    kept = np.r_[10:21, 110:121]
+    span = {"start": 10 * STEP, "end": 40 * STEP, "without": (15.5 * STEP, 27.5 * STEP)}
+    found = imported(write_text(tmp_path / "log.csv", columns), mapping, **span)
+    kept = np.r_[10:16, 28:41, 110:116, 128:141]
     np.testing.assert_array_equal(found.q, data["q"][kept])
-    assert [episode["number"] for episode in found.metadata["import"]["episodes"]] == [4, 7]
+    assert [episode["number"] for episode in found.metadata["import"]["episodes"]] == [4, 4, 7, 7]
 
 
 def test_wrapped_angles_are_continued_if_told_so(tmp_path):
@@ -146,6 +147,17 @@ def test_joints_that_slide_are_in_metres(tmp_path):
     found = import_recordings([path], mapping, model=rail)
     assert found.units["q"] == ("rad", "m")
     np.testing.assert_array_equal(found.q[:, 1], data["q"][:, 1] / 1000)
+    called = {"t_ms": 1e3 * data["time"], "p [°]": np.rad2deg(data["q"][:, 0]), "p (mm)": 1e3 * data["q"][:, 1]}
+    path = write_text(tmp_path / "called.csv", called)
+    mapping = ColumnMapping(q=("p [°]", "p (mm)"), u=("0",), time="t_ms")
+    found = import_recordings([path], mapping, model=rail)
+    np.testing.assert_allclose(found.q, data["q"], atol=1e-14)
+    np.testing.assert_allclose(found.time, data["time"], atol=1e-14)
+    assert found.metadata["import"]["guessed"] == ["unit q=deg,mm, as the columns are called"]
+    mapping = dataclasses.replace(mapping, unit={"q": ("deg", "m")})
+    with pytest.raises(MistakenUnit, match="Then add `unit` q=deg,mm"):
+        import_recordings([path], mapping, model=rail)
+    mapping = dataclasses.replace(mapping, unit={"q": ("rad", "mm")})
     with pytest.raises(InvalidInput, match="q of joint 'elbow' is mm, but the joint turns"):
         imported(path, mapping)
 

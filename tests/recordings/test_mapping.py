@@ -14,7 +14,15 @@ from forcegp.cli.main import parse_arguments
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 from forcegp.recordings import ColumnMapping, by_quantity, listed, open_source
-from forcegp.recordings.mapping import UNITS, expanded, guessed_columns, guessed_time, log_unit, parse_expression
+from forcegp.recordings.mapping import (
+    UNITS,
+    expanded,
+    guessed_columns,
+    guessed_time,
+    log_unit,
+    named_unit,
+    parse_expression,
+)
 from forcegp.recordings.signal_plan import signal_plan
 
 COLUMNS = ("theta1", "theta2", "theta", "a-b", "a", "b", "/js:position.j1", "x[0]", "1e3")
@@ -136,6 +144,8 @@ def test_lists_are_split_at_the_commas_that_separate():
 )
 def test_units(quantity, name, given, si):
     np.testing.assert_allclose(log_unit(quantity, name).in_si(np.array([given])), si, rtol=1e-15)
+    assert named_unit(quantity, f"q1 [{name}]") == named_unit(quantity, f"q1 ({name})") == log_unit(quantity, name).name
+    assert [named_unit("q", each) for each in ("q_deg", "q[1]", "q_m", "q_hand", "mm")] == ["deg", *[None] * 4]
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from forcegp.checks.check_input import DEGREE, CheckInput
 from forcegp.checks.torques import Change, Comparison, needed_torques, with_gravity
 from forcegp.data import Dataset
 from forcegp.doubts import Level
+from forcegp.fit.payloads import with_length
 from forcegp.model import Model
 from forcegp.robots import Robot
 
@@ -263,22 +264,16 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         length = float(torch.linalg.vector_norm(robot.tree.rest[body, :3, 3, 0]))
         if length == 0.0 or robot.layout.parents[body] < 0:
             continue  # where the whole robot stands changes nothing
-        left, x = best([needed_torques(_with_length(robot, body, y), rows) for y in parts], parabolas, FACTORS)
+        left, x = best([needed_torques(with_length(robot, body, y), rows) for y in parts], parabolas, FACTORS)
         what = (
             f"the torques fit {x:.3g} times the length from {names[drive.joint]} to the joint before "
             f"({x * length:.3g} instead of {length:.3g} m)"
         )
         cause = number("lengths", what, drive.joint, x, NUMBER + 0.2)
         if abs(np.log(max(x, 1e-9))) > 0.05:
-            found.append((left, cause, lambda x=x, b=body: now.after(changed(), _with_length(robot, b, x))))
+            found.append((left, cause, lambda x=x, b=body: now.after(changed(), with_length(robot, b, x))))
     for _, cause, made in sorted(found, key=lambda each: each[0])[:SCANNED]:
         yield cause, made()
-
-
-def _with_length(robot: Robot, body: int, factor: float) -> Robot:
-    rest = robot.tree.rest.clone()
-    rest[body, :3, 3] *= factor
-    return replace(robot, tree=replace(robot.tree, rest=rest))
 
 
 def _left_of(now: Comparison, signals: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, " values"]:
@@ -312,7 +307,10 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         size = float(J[3, 3])
         if body not in layout.parents:
             unit = size or 1.0
-            columns = np.stack([of_part(body, unit * part) for part in _first_moments(J)], axis=-1)
+            parts = torch.zeros_like(J).expand(4, 4, 4).clone()  # of 1 kg at the origin, and 1 kg m along each axis
+            for part, k in zip(parts, (3, 0, 1, 2), strict=True):
+                part[k, 3] = part[3, k] = unit
+            columns = np.stack([of_part(body, part) for part in parts], axis=-1)
             held = solved(now, columns)
             if held is not None and held[0] > 0.0:
                 offset = np.linalg.inv(layout.child_frames[body])
@@ -341,14 +339,6 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
             do = "Describe it as `spring` (forcegp fit --forces spring estimates it)."
             cause = number("spring", text, joint, float(found[0]), NUMBER + 0.2, do=do)
             yield cause, replace(now, more=now.more + found[0] * only)
-
-
-def _first_moments(J: torch.Tensor) -> Iterator[torch.Tensor]:
-    """Pseudo-inertias of 1 kg at the origin, and of 1 kg m along each axis."""
-    for k in (3, 0, 1, 2):
-        part = torch.zeros_like(J)
-        part[k, 3] = part[3, k] = 1.0
-        yield part
 
 
 def solved(now: Comparison, columns: Float[np.ndarray, "rows nv k"]) -> Float[np.ndarray, " k"] | None:

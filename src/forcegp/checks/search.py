@@ -34,6 +34,7 @@ GOOD = 0.03  # share that a good log may leave
 DOUBTFUL = 2e-3  # share above which causes are tried
 EXPLAINED = 0.1  # share that a robot with rough masses leaves
 RESTS = 0.5  # share of what friction leaves that a torque must explain, for a factor of it to mean something
+MOSTLY, EDGES = 0.75, 25  # share of what is left that sits somewhere; rows between which that is sought first
 ROUGH = 2.5  # factor either way that wrong masses make of a torque
 CHOICES = np.array([0.0, SIGN, NUMBER, SIGN + NUMBER])
 """Cost of a torque as it is, turned, times a factor, and both."""
@@ -116,12 +117,15 @@ class Explanation:
         left = (self._logarithms() + CHOICES)[:, :2]
         return float(np.nansum(left.min(axis=1))) + sum(cause.cost for cause in self.causes) + SIGN * len(self.turned)
 
-    @property
+    @cached_property
     def factors(self) -> Float[np.ndarray, " nv"]:
-        """Of u over what is needed, NaN where nothing is."""
+        """Of u over what is needed, NaN where friction alone leaves little more."""
         shares, factors = self._fits
         turn = np.nanargmin(np.where(np.isnan(shares[:, 2:]), np.inf, shares[:, 2:]), axis=1)
-        return np.where(shares.min(axis=1) < 0.5, factors[np.arange(len(turn)), turn], np.nan)
+        u = self.log.rows.u - self.log.rows.u.mean(axis=0)
+        alone = [positive_fit(each, x)[1] for each, x in zip(self.log.friction.swapaxes(0, 1), u.T, strict=True)]
+        told = shares.min(axis=1) * np.square(u).sum(axis=0) < RESTS * np.array(alone)
+        return np.where(told, factors[np.arange(len(turn)), turn], np.nan)
 
     @property
     def plain(self) -> float:
@@ -354,31 +358,59 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     if not len(bad):
         return
     rows, shares = root.log.rows, ", ".join(f"{inputs.names[k]} {100.0 * root.rough[k]:.0f} %" for k in bad)
+    do = "Look at these joints there: contacts, brakes, cables, another robot, or a channel that is not a torque."
+    where, seconds, others = _where(root, int(bad[np.argmax(root.rough[bad])]), inputs)
+    if others is not None and (left := replace(root, log=replace(root.log, rows=others)).rough.max()) <= EXPLAINED:
+        where += f", and elsewhere at most {100.0 * left:.2g} % stays: a contact, or a load, in these seconds"
+        do = f"Leave them out by forcegp import --without {seconds}, or forcegp auto with the same."
     yield look(
         about=UNKNOWN,
         what="something is wrong that is none of the causes that were tried (signs, units, orders, zeros, gravity, "
-        f"masses, payload, springs, delay): unexplained stay of the torque of {shares}{_where(root, bad, inputs)}.",
-        do="Look at these joints there: contacts, brakes, cables, another robot, or a channel that is not a torque.",
+        f"masses, payload, springs, delay): unexplained stay of the torque of {shares}{where}.",
+        do=do,
         joints=inputs.named(bad),
         numbers={"unexplained": root.rough[bad].tolist(), "rows": len(rows)},
     )
 
 
-def _where(root: Explanation, bad: np.ndarray, inputs: CheckInput) -> str:
-    """Where in q, v or time more than half of what is left sits, in a quarter of the rows."""
-    worst = int(bad[np.argmax(root.rough[bad])])
-    rows, target = root.log.rows, root.log.rows.u[:, worst] - root.log.tau[:, worst]
-    target = target - target.mean()
-    number, _ = positive_fit(root.log.friction[:, worst], target)
-    left = np.square(target - root.log.friction[:, worst] @ number)
-    best, text = 0.5, ""
-    for name, values, unit in (("q", rows.q[:, worst], inputs.unit_of_each("q")[worst]), ("time", rows.time, "s"),
-                               ("v", rows.v[:, worst], inputs.unit_of_each("v")[worst])):  # fmt: skip
+def _where(root: Explanation, joint: int, inputs: CheckInput) -> tuple[str, str, Dataset | None]:
+    """Where in q, v or time most of what is left of a torque sits; of time the ends, and the rows elsewhere."""
+    rows, best, found = root.log.rows, 0.0, ("", "", None)
+    level = np.ones(len(rows))
+    signals = np.c_[root.log.friction[:, joint], level, -level, rows.u[:, joint] - root.log.tau[:, joint]]
+    for name, values, unit in (("q", rows.q[:, joint], inputs.unit_of_each("q")[joint]), ("time", rows.time, "s"),
+                               ("v", rows.v[:, joint], inputs.unit_of_each("v")[joint])):  # fmt: skip
         order = np.argsort(values, kind="stable")
-        for part in np.array_split(order, 8)[:-1]:
-            first = int(np.searchsorted(values[order], values[part[0]]))
-            own = order[first : first + len(order) // 4]
-            if (share := float(left[own].sum() / left.sum())) > best:
-                ends = f"{values[own[0]]:.3g} and {values[own[-1]]:.3g} {unit}"
-                best, text = share, f"; {100.0 * share:.0f} % of it at {inputs.names[worst]} for {name} between {ends}"
-    return text
+        gain, share, first, last = _stretch(signals[order])
+        if gain > best and share > MOSTLY:
+            ends = values[order[[max(first - 1, 0), min(last, len(rows) - 1)]]]
+            text = f"; {100.0 * share:.0f} % of it at {inputs.names[joint]} for {name} between {ends[0]:.3g} and "
+            others = rows.rows(np.sort(np.r_[order[:first], order[last:]])) if name == "time" else None
+            best, found = gain, (f"{text}{ends[1]:.3g} {unit}", f"{ends[0]:.4g},{ends[1]:.4g}", others)
+    return found
+
+
+def _stretch(signals: Float[np.ndarray, "rows k"]) -> tuple[float, float, int, int]:
+    """Successive rows, half of all at most, of whose last signal the others on the other rows tell less than there.
+
+    What two levels of what is left explain [nats], the share in these rows, the first of them and the end.
+    """
+    count = len(signals)
+    sums = np.cumsum(np.einsum("ri,rj->rij", signals, signals), axis=0)
+    sums = np.concatenate([np.zeros_like(sums[:1]), sums])
+    whole = positive_solution(sums[-1])[1]
+
+    def told(first: int, last: int) -> tuple[float, float, int, int]:
+        own, inside = last - first, sums[last] - sums[first]
+        number, left = positive_solution(sums[-1] - inside)
+        number = np.append(-number, 1.0)
+        each = np.array([left / (count - own), number @ inside @ number / own]) / (whole / count + 1e-300)
+        gain = float(-np.log(np.maximum(each, LEAST)) @ (count - own, own))
+        return (gain if each[1] > each[0] else 0.0), each[1] * own / (each @ (count - own, own)), first, last
+
+    edges = np.linspace(0, count, EDGES, dtype=int)
+    best = max(told(a, b) for a in edges for b in edges if 0 < b - a <= count // 2)
+    for _ in range(2):  # to the row
+        best = max(told(a, best[3]) for a in range(max(best[3] - count // 2, 0), best[3]))
+        best = max(told(best[2], b) for b in range(best[2] + 1, min(best[2] + count // 2, count) + 1))
+    return best

@@ -94,18 +94,14 @@ class Auto(Command):
         if mistakes and not self.correct:
             terminal.show(doubts_table(Doubts(mistakes), terminal.worded), "Run:")
             terminal.command(corrected)
-            raise DatasetError(
-                f"{len(mistakes)} mistakes in the log; run the command above, or add --correct to this one."
-            )
+            raise DatasetError(f"{Doubts(mistakes).subjects}: wrong. Run the command above, or add --correct.")
         terminal.names_stages = True  # of minutes, most of which have nothing to count
         with terminal.progress("checking"):
             report = forcegp.check(dataset)
         bad, still = report.doubts.at("wrong"), [x for doubt in report.doubts for x in doubt.numbers.get("still", ())]
         if bad and not self.accept:
             terminal.show(doubts_table(bad, terminal.worded))
-            raise DatasetError(
-                f"something is wrong with the log ({bad.subjects}); correct it, or add --accept to continue."
-            )
+            raise DatasetError(f"something is wrong with the log ({bad.subjects}); correct it, or add --accept.")
         self.out.mkdir(parents=True, exist_ok=True)
         with atomic_file(self.out / "log.h5", overwrite=True) as temporary:
             dataset.save(temporary)
@@ -159,10 +155,10 @@ class Auto(Command):
                     options, undecided = self.columns.options(), None
                     dataset = forcegp.import_recordings(self.logs, mapping, model=model, options=options)
             except MistakenUnit as error:
-                correction = {"unit": {error.quantity: (error.unit,)}}
+                unit = {error.quantity: tuple(error.unit.split(","))}
                 what = str(error).partition(" Is ")[0]
-                mistakes.append(wrong(about=f"unit of {error.quantity}", what=what, correction=correction))
-                mapping = replace(mapping, unit={**mapping.unit, error.quantity: (error.unit,)})
+                mistakes.append(wrong(about=f"unit of {error.quantity}", what=what, correction={"unit": unit}))
+                mapping = replace(mapping, unit={**mapping.unit, **unit})
                 continue
             done = dict(dataset.metadata["import"])
             if done["open_switches"]:
@@ -321,8 +317,8 @@ def answer_lines(
     done, prepared, seconds, out = content["import"], content["preparation"], content["seconds"], content["out"]
     deviation = max(each["largest_deviation_of_a_step"] for each in done["recordings"])
     jitter = f", steps up to {deviation:.0%} off (evened out)" if done["resampled_to_step"] is not None else ""
-    told = {"stop", "spring", "drift", "unknown cause"}
-    seen = [(x["about"], x["what"]) for x in (*done["stops"], *content["check"]["doubts"]) if x["about"] in told]
+    told, doubts = {"stop", "spring", "drift", "unknown cause"}, (*done["stops"], *content["check"]["doubts"])
+    seen = [(x["about"], f"{x['what']} {x['do']}") for x in doubts if x["about"] in told]
     flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
     mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
     late, lag, rate = prepared["delay"], prepared["lag"], (len(dataset) - len(dataset.episodes)) / seconds
@@ -342,19 +338,24 @@ def answer_lines(
     )
 
     still = scores.not_known("identified", still)
-    open_ones = f"; of {', '.join(still)} not known from this log" if still else ""
 
-    def each(field: str) -> str:
-        return ", ".join("–" if name in still else f"{values[f'{field}.{name}'].value:.3g}" for name in joints)
+    def but_for(names: Sequence[str]) -> str:
+        return f"; of {', '.join(names)} not known from this log" if names else ""
+
+    def each(field: str, unit: str) -> str:
+        own = {name: values[f"{field}.{name}"] for name in joints}
+        lost = [name for name, value in own.items() if name in still or value.interval[0] <= 0.0]
+        return ", ".join("–" if x in lost else f"{own[x].value:.3g}" for x in own) + f" {unit}{but_for(lost)}"
 
     of_joints = [
-        ("dry friction", friction_in_words(identified.model, recording, force, still) + open_ones),
-        ("viscous", f"{each('viscous')} {force} per {q}/s{open_ones}"),
-        ("rotors", f"{each('rotor')} {inertia}{open_ones}"),
+        ("dry friction", friction_in_words(identified.model, recording, force, still) + but_for(still)),
+        ("viscous", each("viscous", f"{force} per {q}/s")),
+        ("rotors", each("rotor", inertia)),
     ] if joints else []  # fmt: skip
-    (mass, error), loaded = values.total_mass, dict[str, Any](content["payload"] or {"doubts": ()})
-    if any("gain" in doubt["numbers"] for doubt in loaded["doubts"]):  # what it changes of a payload, it changes of all
-        error = math.hypot(error, loaded["parameters"]["payload.mass"]["std"])
+    beside = [each for each in (content["payload"] or {}).get("doubts", ()) if each["numbers"]]
+    mass, error = values.total_mass
+    if any("gains" in each["numbers"] for each in beside):  # what it changes of a payload, it changes of all
+        error = math.hypot(error, content["payload"]["parameters"]["payload.mass"]["std"])
     weight = f"{mass:.4g} ± {1.96 * error:.1g} kg, if {drives_of(identified.model)} are right"
     errors = "; ".join(
         f"{short_name(name)} {number(_motion(scores, name))} / {number(_known(scores, 'nrmse', ACCELERATION, name))}"
@@ -368,6 +369,7 @@ def answer_lines(
     command = "faster and larger motions, also of what hardly moved" if moving else command
     return [
         ("log", f"{len(dataset)} rows, {seconds:.3g} s at {rate:.4g} Hz, {freedoms}{jitter}"),
+        *(("by name", each) for each in ["; ".join(done["guessed"])] if each),
         ("corrected", mistakes),
         *seen,
         ("timing", f"{shifted}; {filtered}"),
@@ -375,6 +377,7 @@ def answer_lines(
         *of_joints,
         *([("whole mass", weight)] if moving else []),
         ("payload", held),
+        *((next(iter(x["numbers"])), f"{x['what']} {x['do']}") for x in beside if x["about"] == "payload"),
         ("models", f"error of q{ahead} / nRMSE of the acceleration, on unseen time: {errors}"),
         *left_of_torques(scores, best),
         ("best", f"{short_name(best)}{intervals}"),

@@ -136,6 +136,8 @@ class ColumnOptions:
     """Leave out what comes earlier, in seconds from the first row of each episode."""
     end: Seconds = None
     """Leave out what comes later."""
+    without: Annotated[tuple[float, ...], listed(float), unless_given("S,S,...", "none")] = ()
+    """Leave out from one to the other, as of contacts; several pairs one after the other."""
     unwrap: bool = False
     """Continue angles of joints that jump by a turn."""
     bad_rows: Literal["refuse", "skip"] = "refuse"

@@ -164,13 +164,12 @@ def payload_text(found: Any) -> str:
     parts = {name: found.estimates[f"payload.{name}"] for name in ("mass", *(f"center_of_mass.{x}" for x in "xyz"))}
     mass, *center = parts.values()
     error = 0.5 * (mass.interval[1] - mass.interval[0])
-    doubts = [doubt["what"].partition(". The")[0] for doubt in found.settings["doubts"] if "gain" in doubt["numbers"]]
     if mass.value < max(SURE * mass.std, LEAST_PAYLOAD):
-        return "; ".join([f"none ({mass.value:.2g} ± {error:.1g} kg)", *doubts])
+        return f"none ({mass.value:.2g} ± {error:.1g} kg)"
     place = ", ".join(f"{1e3 * each.value:.0f}" for each in center)
     [held] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
     links = f"if the URDF's links{' and ' * bool(drives := drives_of(found.model))}{drives} are right"
-    return "; ".join([f"{mass.value:.3g} ± {error:.1g} kg at ({place}) mm of {held.link}, {links}", *doubts])
+    return f"{mass.value:.3g} ± {error:.1g} kg at ({place}) mm of {held.link}, {links}"
 
 
 def drives_of(model: forcegp.Model) -> str:

@@ -94,7 +94,10 @@ class Graph:
                 return operands[1] if known[0] else operands[2]
             return operands[1] if operands[1] == operands[2] else self._record((operation, *operands))
         if None not in known:
-            return self.constant(_folded(operation, known))
+            try:
+                return self.constant(float({**UNARY, **BINARY}[operation](*known)))  # type: ignore[arg-type]  # none is None
+            except (ValueError, ZeroDivisionError, OverflowError):  # outside its domain NaN, as a processor has it
+                return self.constant(math.nan)
         simpler = self._simplified(operation, operands, known)
         if simpler is not None:
             return simpler
@@ -195,14 +198,6 @@ class Copier:
             else:
                 known[node] = graph.apply(operation, *(known[operand] for operand in rest))
         return [known[node] for node in nodes]
-
-
-def _folded(operation: str, operands: Sequence[float | None]) -> float:
-    """An operation on known numbers; outside its domain NaN, as a processor has it."""
-    try:
-        return float({**UNARY, **BINARY}[operation](*operands))  # type: ignore[arg-type]  # the caller has checked that none is None
-    except (ValueError, ZeroDivisionError, OverflowError):
-        return math.nan
 
 
 FUNCTIONS: dict[str, Any] = {

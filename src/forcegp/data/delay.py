@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -210,20 +209,12 @@ def torque_columns(
         past, spread = torch.tensor(dataset.strokes), torch.tensor(joint_positions(dataset).std(0)).clamp_min(1e-9)
         states = [after_strokes(past, sigma / spread).numpy() for sigma in STIFFNESSES]
         own += [part for z in states for part in (z, z * np.sqrt(np.abs(dataset.v)))]
-    forces = np.stack([each[chosen] for each in (own if cutoff is None else _behind(cutoff, own, dataset))], axis=-1)
-    return np.concatenate([torque.cpu().numpy(), forces], axis=-1).transpose(1, 0, 2)
-
-
-def _behind(
-    cutoff: float, forces: Sequence[Float[np.ndarray, "rows nv"]], dataset: Dataset
-) -> Iterator[Float[np.ndarray, "rows nv"]]:
-    """The forces behind a low-pass, episode by episode."""
-    smooth, episodes = LowPass(cutoff), [dataset.episode == number for number in dataset.episodes]
-    for force in forces:
-        passed = np.empty_like(force)
-        for own in episodes:
-            passed[own] = smooth(force[own], dataset.time[own])
-        yield passed
+    forces = np.stack(own, axis=-1)
+    if cutoff is not None:
+        for there in (dataset.episode == number for number in dataset.episodes):
+            for k, force in enumerate(own):
+                forces[there, :, k] = LowPass(cutoff)(force[there], dataset.time[there])
+    return np.concatenate([torque.cpu().numpy(), forces[chosen]], axis=-1).transpose(1, 0, 2)
 
 
 def _unexplained(normal: np.ndarray, right: np.ndarray, square: np.ndarray) -> Float[np.ndarray, " shifts"]:

@@ -221,26 +221,20 @@ class ParameterSpace:
     def model_at(self, x: Float[np.ndarray, " k"]) -> Model:
         """The model with the numbers of these coordinates, all of them known. Raises NonPhysicalInertia."""
         values, robot = self.values(x), self.model.robot
-        pseudo, laws = self.bodies.pseudo_inertias(x[: self.bodies.size]), list(self.model.laws)
+        pseudo, laws = self.bodies.pseudo_inertias(x[: self.bodies.size]), list[Any](self.model.laws)
         for index, named in values.items():
             laws[index] = laws[index].with_values(named)
         wanted = {each.body: pseudo[k] for k, each in enumerate(self.carried) if each.payload is None}
         if wanted:
             robot = with_bodies(robot, wanted)
-        for k, each in enumerate(self.carried):
-            if each.payload is not None:
-                laws[each.payload] = self._payload(each, pseudo[k])
+        for each, J in zip(self.carried, pseudo, strict=True):
+            if each.payload is not None and each.offset is not None:
+                there, law = np.linalg.inv(each.offset), laws[each.payload]
+                mass, center, inertia = physical_of_pseudo_inertia(there @ J @ there.T)
+                given = {"mass": float(mass), "center_of_mass": tuple(center), "inertia": tuple(map(tuple, inertia))}
+                laws[each.payload] = replace(law, **given)
         closed = (replace(law, learn=()) if isinstance(law, RigidBodies) else law for law in laws)
         return replace(self.model, robot=robot, forces=(*closed, *self.model.unknown_forces))
-
-    def _payload(self, each: Carried, pseudo: Float[np.ndarray, "4 4"]) -> Payload:
-        assert each.offset is not None, "it is a payload"
-        assert each.payload is not None, "it is a payload"
-        there = np.linalg.inv(each.offset)
-        mass, center, inertia = physical_of_pseudo_inertia(there @ pseudo @ there.T)
-        given = self.model.laws[each.payload]
-        assert isinstance(given, Payload), "its number is that of a payload"
-        return replace(given, mass=float(mass), center_of_mass=tuple(center), inertia=tuple(map(tuple, inertia)))
 
     # --- what they do
 
@@ -362,25 +356,21 @@ def _derivatives(
     return force.cpu().numpy(), out
 
 
-def _at_motors(law: Law, typical: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
-    """Typical sizes at the motors of a law."""
-    if law.transmission is None:
-        return typical
-    T = np.asarray(torch.as_tensor(law.transmission).cpu())
-    sizes = {name: abs(T) @ typical[name] for name in ("position", "velocity")}
-    force, inertia = abs(np.linalg.inv(T)).T @ typical["force"], typical["inertia"] / (T**2).sum(1)
-    return {**sizes, "force": force, "inertia": inertia}
-
-
 def _terms(model: Model, typical: Mapping[str, np.ndarray]) -> list[Term]:
     robot, out = model.robot, []
     singles = np.flatnonzero(np.isin(robot.joint_names, robot.single_joint_names))
     for index, law in enumerate(model.laws):
+        sizes = typical
+        if law.transmission is not None:  # those at its motors
+            T = np.asarray(torch.as_tensor(law.transmission).cpu())
+            force, inertia = abs(np.linalg.inv(T)).T @ typical["force"], typical["inertia"] / (T**2).sum(1)
+            sizes = {name: abs(T) @ typical[name] for name in ("position", "velocity")}
+            sizes |= {"force": force, "inertia": inertia}
         for name in law.learned:
             coefficient, given = law.coefficients[name], getattr(law, name)
             per_joint = isinstance(law, PerJointLaw)
             joints = singles if per_joint else np.zeros(1, dtype=int)
-            size = coefficient.size(_at_motors(law, typical))[joints]
+            size = coefficient.size(sizes)[joints]
 
             def of(value: Any, joints: np.ndarray = joints, per_joint: bool = per_joint) -> np.ndarray:
                 array = np.asarray(torch.as_tensor(value).detach().cpu(), dtype=np.float64)

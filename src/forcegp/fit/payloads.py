@@ -23,22 +23,8 @@ FEWEST = 10 * STRETCHES
 """Rows that a payload needs, but in a log of postures alone."""
 
 
-def _usual_link(robot: Robot) -> str:
-    """A base that moves, else of the last joint the last link of the file.
-
-    Joints of several bodies, as of fingers, count as none, if there are others: what fingers hold moves with the hand.
-    """
-    if robot.base != "fixed":
-        return robot.layout.moving[0]
-    drives = [drive.joint for drive in robot.layout.drives]
-    solid = {place.body for place in robot.layout.links.values()}
-    alone = [body for body, joint in enumerate(drives) if drives.count(joint) == 1 and body in solid]
-    last = max(alone, default=len(robot.layout.bodies) - 1)
-    return [name for name, place in robot.layout.links.items() if place.body == last][-1]
-
-
 def with_payloads_placed(model: Model, logs: Sequence[Dataset]) -> Model:
-    """The model whose payload without a link is on the usual one.
+    """The model whose payload without a link is on a base that moves, else on the last link of the last joint.
 
     Raises DatasetError for logs too short for a payload.
     """
@@ -57,7 +43,14 @@ def with_payloads_placed(model: Model, logs: Sequence[Dataset]) -> Model:
         )
     if not open_ones:
         return model
-    placed = replace(open_ones[0], link=_usual_link(model.robot))
+    # of joints of several bodies, as of fingers, none counts, if there are others: what they hold moves with the hand
+    layout = model.robot.layout
+    drives = [drive.joint for drive in layout.drives]
+    solid = {place.body for place in layout.links.values()}
+    alone = [body for body, joint in enumerate(drives) if drives.count(joint) == 1 and body in solid]
+    last = max(alone, default=len(layout.bodies) - 1)
+    usual = [name for name, place in layout.links.items() if place.body == last][-1]
+    placed = replace(open_ones[0], link=usual if model.robot.base == "fixed" else layout.moving[0])
     return replace(model, forces=tuple(placed if force is open_ones[0] else force for force in model.forces))
 
 
@@ -120,21 +113,14 @@ def changes_without_rests(
     return np.stack(changes)
 
 
-GAINS = (
-    0.2,
-    "torques of the log times",
-    "Check these drives; `gain` among the forces estimates them.",
-)
 CAUSES = {
-    "gain": GAINS,
-    "gains": GAINS,
+    "gains": (0.2, "torques of the log times", "Check these drives; `gain` among the forces estimates them."),
     "lengths": (0.1, "lengths before the joints times", "Correct the URDF's lengths."),
     "masses": (0.2, "masses of the links times", "Give a baseline (a log without the payload), or identify all links."),
 }
-"""Usual deviations of the logarithms of factors, what they are of, and what to do; `gain` is that of one joint. Of two
-causes the first is named, unless the other explains a tenth more, or half as much again where the first is one number.
-"""
-ALONE = 1.5
+"""Usual deviations of the logarithms of factors, what they are of, and what to do. All factors of a cause are tried,
+and each alone. Of two the first is named, unless the other explains a tenth more: what it explains less the half of
+the logarithm of the rows for each factor (Schwarz 1978)."""
 STEP = 1e-4
 """Of a length, for its derivative."""
 WRONG = 0.03
@@ -160,71 +146,75 @@ def misfit(
     [actuation] = [law for law in model.laws if isinstance(law, Actuation)]
     r, J = fit.white.ravel(), fit.white_jacobian.reshape(fit.white.size, -1)
     inverse, cost = np.linalg.inv(fit.information + fit.prior_information), 0.5 * float(r @ r)
-    best, found = max(CLEARLY_MORE, LEAST * cost), None
+    best, least, found, moving = 0.0, max(CLEARLY_MORE, LEAST * cost), None, model.robot.base != "fixed"
     scales = [10 * k for k, each in enumerate(rows[0].space.carried) if each.payload is not None]
     if np.linalg.norm(fit.residual) <= RIGHT * np.linalg.norm(0.5 * fit.jacobian[..., scales]):
         return None  # of the torques of payloads, next to nothing is left
     for cause, (usual, said, do) in CAUSES.items():
-        if (cause != "lengths" and not actuation.is_exact) or (cause != "gain" and model.robot.base != "fixed"):
+        if (cause != "lengths" and not actuation.is_exact) or (cause != "gains" and moving):
             continue  # a factor of all masses is one of the gains that are estimated, or of all those of a base
         names, columns = zip(*(_columns(cause, model, *each) for each in zip(rows, a, left, strict=True)), strict=True)
         C = white(columns).reshape(r.size, -1)
-        across, instead = J.T @ C, False
-        if cause == "gain":
-            more, instead, change, move = _of_one(rows[0].space, fit, C, usual, best)
-        else:
-            own = C.T @ C - across.T @ inverse @ across
-            change = -np.linalg.solve(own + np.eye(C.shape[1]) / usual**2, C.T @ r)
-            more, move = -0.5 * float(r @ C @ change), -inverse @ (across @ change)
-        off, factors = abs(change) > WRONG, np.exp(change)
-        if cause == "gain":  # what is needed is g u, and without the payload another torque than `left` has
-            factors = 1.0 + change if instead else 1.0 / (1.0 - change)
-        if (instead or more > best) and off.any() and abs(change).max() < NO_STEP:
-            told = ", ".join(f"{names[0][k]} {factors[k]:.3g}" for k in np.flatnonzero(off))
-            less = (
-                "explain the log as well, without a payload" if instead else f"leave {more / cost:.0%} less of the log"
-            )
+        across, every = J.T @ C, np.arange(C.shape[1])
+        own, slope = C.T @ C - across.T @ inverse @ across + np.eye(len(every)) / usual**2, C.T @ r
+        tried = list[tuple[float, float, np.ndarray, np.ndarray]]()
+        for some in (*([] if moving else [every]), *every[:, None]):
+            change = np.zeros(len(every))
+            change[some] = -np.linalg.solve(own[np.ix_(some, some)], slope[some])
+            more = -0.5 * float(slope @ change)
+            tried.append((more - 0.5 * len(some) * np.log(r.size), more, change, -inverse @ (across @ change)))
+        worth, more, change, move = max(tried, key=lambda each: each[0])
+        instead = _instead(rows[0].space, fit, C, usual, least, more) if cause == "gains" else None
+        change, move = instead or (change, move)
+        off, factors = abs(change) > WRONG, np.exp(change) if instead is None else 1.0 + change
+        clearly = instead is not None or (worth > best and more > least)
+        if clearly and off.any() and abs(change).max() < NO_STEP:
+            told = ", ".join(f"{factors[k]:.3g} ({names[0][k]})" for k in np.flatnonzero(off))
+            less = f"leave {more / cost:.0%} less unexplained" if instead is None else "do as well as any payload"
             doubt = look(
                 about="payload",
-                what=f"{said} these factors would {less}: {told}. The intervals hold what that would change.",
+                what=f"{said} {told} would {less}. The intervals hold what that would change.",
                 do=do,
                 joints=tuple(np.array(names[0])[off].tolist()),
-                numbers={cause: dict(zip(names[0], factors.tolist(), strict=True))},
+                numbers={cause: {names[0][k]: float(factors[k]) for k in np.flatnonzero(change)}},
             )
-            best, found = (ALONE if cause == "gain" else 1.1) * more, (doubt, move)
-            if instead:
+            best, found = 1.1 * worth, (doubt, move)
+            if instead is not None:
                 break
     return found
 
 
-def _of_one(
-    space: ParameterSpace, fit: Fit, C: Float[np.ndarray, "equations causes"], usual: float, least: float
-) -> tuple[float, bool, Float[np.ndarray, " causes"], Float[np.ndarray, " k"]]:
-    """Nats that the best of the causes explains alone, whether instead of the payload, its change, and the move of x.
+def _instead(
+    space: ParameterSpace, fit: Fit, C: Float[np.ndarray, "equations causes"], usual: float, least: float, most: float
+) -> tuple[Float[np.ndarray, " causes"], Float[np.ndarray, " k"]] | None:
+    """The change of one cause, and the move of x with it, that explain the log as well as a payload, and without it.
 
-    Without the payload they are nats beyond what that explains: where they are hardly fewer, so many numbers are no
-    better than one.
+    So many numbers are no better than one that explains hardly less: `most` nats less than the best cause beside it.
     """
     r, J = fit.white.ravel(), fit.white_jacobian.reshape(fit.white.size, -1)
-    curvature, found = fit.information + fit.prior_information, []
     none, slopes = np.zeros_like(fit.x), space.bodies.slopes(fit.x[: space.bodies.size])
     for body in (k for k, each in enumerate(space.carried) if each.payload is not None):
         own, rows = np.r_[space.bodies.slices[body]], slice(10 * body, 10 * body + 10)
         none[own] = -np.linalg.solve(slopes[rows, own], space.standard_parameters(fit.x)[body])
-    for out in (False, True)[: 1 + bool(none.any())]:
-        free = np.flatnonzero(none == 0.0) if out else np.arange(len(none))
-        beyond = J @ none * out
-        left, slope, across = r + beyond, J[:, free].T @ beyond, J[:, free].T @ C
-        inner = np.linalg.solve(curvature[np.ix_(free, free)], np.c_[slope, across])
-        size = np.square(C).sum(0) - (across * inner[:, 1:]).sum(0) + usual**-2
-        change = -(C.T @ left - across.T @ inner[:, 0]) / size
-        own = 0.5 * change**2 * size
-        more = own + 0.5 * (r @ r - left @ left + slope @ inner[:, 0])
-        k, move = int(np.argmax(more)), none * out
-        move[free] -= inner[:, 0] + inner[:, 1 + k] * change[k]
-        found.append((float(more[k]), out and own[k] > least, np.where(np.arange(len(change)) == k, change, 0.0), move))
-    (beside, *_), (without, clear, *_) = found[0], found[-1]
-    return found[-1] if clear and without > max(-CLEARLY_MORE, beside - least) else found[0]
+    free, left = np.flatnonzero(none == 0.0), r + J @ none
+    curvature = (fit.information + fit.prior_information)[np.ix_(free, free)]
+    slope, across = J[:, free].T @ (left - r), J[:, free].T @ C
+    inner = np.linalg.solve(curvature, np.c_[slope, across])
+    size = np.square(C).sum(0) - (across * inner[:, 1:]).sum(0) + usual**-2
+    change = -(C.T @ left - across.T @ inner[:, 0]) / size
+    own = 0.5 * change**2 * size  # nats
+    k = int(np.argmax(own))
+    if own[k] < least or own[k] + 0.5 * (r @ r - left @ left + slope @ inner[:, 0]) < max(-CLEARLY_MORE, most - least):
+        return None
+    none[free] -= inner[:, 0] + inner[:, 1 + k] * change[k]
+    return np.where(np.arange(len(change)) == k, change, 0.0), none
+
+
+def with_length(robot: Robot, body: int, factor: float) -> Robot:
+    """The robot with this factor of what leads to the joint of a body."""
+    rest = robot.tree.rest.clone()
+    rest[body, :3, 3] *= factor
+    return replace(robot, tree=replace(robot.tree, rest=rest))
 
 
 def _columns(
@@ -235,7 +225,7 @@ def _columns(
     Of gains they are as the log has them: with the torques, what is needed would vanish, too.
     """
     robot = model.loaded_robot if rows.loaded else model.robot
-    if cause[:4] == "gain":
+    if cause == "gains":
         names, columns = list[str](), list[np.ndarray]()
         for law in (each for each in model.laws if isinstance(each, Actuation | Thrusters) and each.known):
             for name in law.names:
@@ -252,9 +242,7 @@ def _columns(
     names, columns = [], []
     for body, drive in enumerate(robot.layout.drives):
         if robot.layout.parents[body] >= 0 and bool(robot.tree.rest[body, :3, 3].any()):
-            rest = robot.tree.rest.clone()
-            rest[body, :3, 3] *= 1.0 + STEP
-            longer = replace(robot, tree=replace(robot.tree, rest=rest))
+            longer = with_length(robot, body, 1.0 + STEP)
             change = longer.inverse_dynamics(q, v, at) - robot.inverse_dynamics(q, v, at)
             names.append(robot.joint_names[drive.joint])
             columns.append(change.cpu().numpy() / STEP)

@@ -21,7 +21,7 @@ from forcegp.noise import ACCELERATION, SENSOR
 from forcegp.posterior import Posterior
 from forcegp.robots.arguments import whole_number
 
-FEWEST_INDEPENDENT, WARNED_OF = 10, 0.9  # rows that noise is learned from, and the share of them that needs no word
+FEWEST_INDEPENDENT, TELLING = 10, 100  # rows that noise is learned from, and those that tell it within a tenth
 LEARNING_ROWS = 600
 """Rows that hyper-parameters are found on where there are more than `MOST_EXACT_ROWS`."""
 
@@ -44,7 +44,7 @@ def learning_rows(rows: Dataset, learning_points: int | None, *, ordered: bool) 
 def independent_rows(rows: Dataset) -> Dataset:
     """Those that lie further apart in time than a filter makes them alike, for learned noise is taken for independent.
 
-    Warns where many rows are left out, and where so few are left that all stay.
+    Warns where few are left, and where so few that all stay.
     """
     seconds = memory(rows.metadata) * (1.0 - 1e-9)
     if seconds == 0.0:
@@ -55,13 +55,13 @@ def independent_rows(rows: Dataset) -> Dataset:
         if all(abs(found.get((episode, place + k), np.inf) - time) >= seconds for k in (-1, 0, 1)):
             found[episode, place] = time
             kept.append(row)
-    if len(kept) > WARNED_OF * len(rows):
+    if len(kept) >= min(TELLING, len(rows)):
         return rows.rows(np.array(kept))
     few = len(kept) < FEWEST_INDEPENDENT
-    what = "too few, so all are taken, and learned noise may be none" if few else "and these alone teach the noise"
+    what = "too few, so all are taken, and learned noise may be none" if few else "and noise is learned from these"
     warnings.warn(
-        f"the filter of the log makes rows alike that lie within {seconds:.2g} s of each other: {len(kept)} of "
-        f"{len(rows)} rows lie further apart, {what}; give a longer log, or `noise` if it is known",
+        f"a filter repeats in each row those up to {seconds:.2g} s away: {len(kept)} of {len(rows)} rows are "
+        f"independent, {what}; give a longer log, or `noise` if it is known",
         DataWarning,
         stacklevel=4,
     )

@@ -112,11 +112,16 @@ class UnknownForces(Unknown):
 
     @override
     def kernels(self, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]) -> tuple[Kernel, ...]:
-        return tuple(
-            kernel
-            for term, part in zip(self.terms, self.slices(robot), strict=True)
-            for kernel in _kernels_of(term, robot, dimensions[part], variances[part])
-        )
+        found = list[Kernel]()
+        for term, part in zip(self.terms, self.slices(robot), strict=True):
+            kernels, own = term.kernels(robot, dimensions[part], variances[part]), type(term).__name__
+            # one kernel alone would be iterated over without an end
+            if not isinstance(kernels, list | tuple) or not all(isinstance(kernel, Kernel) for kernel in kernels):
+                raise InvalidInput(f"{own}.kernels must give a tuple of GPyTorch kernels, one per latent")
+            if len(kernels) != len(dimensions[part]):
+                raise InvalidInput(f"{own}.kernels gives {len(kernels)} kernels for {len(dimensions[part])} latents")
+            found += kernels
+        return tuple(found)
 
     @override
     def scalings(self, robot: Robot) -> tuple[tuple[Scaling, ...] | Scaling, ...]:
@@ -148,18 +153,6 @@ class UnknownForces(Unknown):
 
     def _joined(self, of: Callable[[Unknown], tuple[Any, ...]]) -> tuple[Any, ...]:
         return tuple(entry for term in self.terms for entry in of(term))
-
-
-def _kernels_of(
-    term: Unknown, robot: Robot, dimensions: tuple[int, ...], variances: Float[Tensor, " C"]
-) -> Sequence[Kernel]:
-    """Those that it gives, checked: one kernel alone would be iterated over without an end."""
-    kernels, own = term.kernels(robot, dimensions, variances), type(term).__name__
-    if not isinstance(kernels, list | tuple) or not all(isinstance(kernel, Kernel) for kernel in kernels):
-        raise InvalidInput(f"{own}.kernels must give a tuple of GPyTorch kernels, one per latent")
-    if len(kernels) != len(dimensions):
-        raise InvalidInput(f"{own}.kernels gives {len(kernels)} kernels for {len(dimensions)} latents")
-    return kernels
 
 
 class ExpressedKernels(Unknown):

@@ -201,9 +201,11 @@ def draw_functions(
             tuple(DrawnTerm.draw(term, z, samples, frequencies, generator) for term in kernel_terms(kernel))
             for kernel, z in zip(latent.kernels, latent.features, strict=True)
         )
-        prior = [
-            _at_same_points(drawn, z, samples, frequencies) for drawn, z in zip(terms, latent.features, strict=True)
-        ]
+        prior = list[Tensor]()
+        for drawn, z in zip(terms, latent.features, strict=True):
+            few = max(1, BLOCK_BYTES // (8 * max(1, len(z)) * frequencies))  # as all cosines at all points are many
+            parts = [slice(start, min(samples, start + few)) for start in range(0, samples, few)]
+            prior.append(torch.cat([_sum(drawn, z.repeat(part.stop - part.start, 1), part) for part in parts]))
         drawn = zip(latent.function_weights(prior, generator), latent.weights, strict=True)
         # w f + (1 - w) mean at the centres, of functions f whose prior part is multiplied by w as well
         weights = tuple(widening * own + (1.0 - widening) * mean for own, mean in drawn)
@@ -213,12 +215,3 @@ def draw_functions(
 def _sum(drawn: Sequence[DrawnTerm], z: Float[Tensor, "n d"], samples: slice) -> Float[Tensor, "S m"]:
     first, *others = [term(z, samples) for term in drawn]
     return sum(others, first)
-
-
-def _at_same_points(
-    drawn: Sequence[DrawnTerm], z: Float[Tensor, "N d"], samples: int, frequencies: int
-) -> Float[Tensor, "S N"]:
-    """All functions at z, a few at a time, for all their cosines at all points are many numbers."""
-    few = max(1, BLOCK_BYTES // (8 * max(1, len(z)) * frequencies))
-    parts = [slice(start, min(samples, start + few)) for start in range(0, samples, few)]
-    return torch.cat([_sum(drawn, z.repeat(part.stop - part.start, 1), part) for part in parts])

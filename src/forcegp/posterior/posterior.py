@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -337,7 +338,11 @@ class Posterior(Fitted):
         # the training rows are always conditioned in their own system: nothing is factorised again, no number changes
         # widths of intervals of motions were found in the system before
         kept = {name: value for name, value in self.settings.items() if name != "motion_intervals"}
-        there = (force for force in trained.unknown_forces if _has_its_place(force, model))
+        there = list[Force]()
+        for force in trained.unknown_forces:
+            with suppress(InvalidInput):  # without its contact a force is zero
+                force.check(model.robot, model.contacts)
+                there.append(force)
         model = replace(model, forces=(*model.laws, *there), noise=trained.noise)
         return replace(self, target=model, settings=kept)
 
@@ -372,12 +377,3 @@ class Posterior(Fitted):
 
 def _all_on(tensors: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor]:
     return {name: value.to(device) for name, value in tensors.items()}
-
-
-def _has_its_place(force: Force, model: Model) -> bool:
-    """Whether a model has what a force acts at; without its contact a force is zero."""
-    try:
-        force.check(model.robot, model.contacts)
-    except InvalidInput:
-        return False
-    return True

@@ -198,7 +198,8 @@ def matlab_arrays(path: Path) -> Arrays:
         with reading(path, MATLAB), h5py.File(path, "r") as file:
             if file.visititems(lambda _, item: True if getattr(item, "dtype", None) == REFERENCE else None):
                 return _lists({name: _referred(file, file[name]) for name in map(str, file) if name[0] != INTERNAL})
-        upright = {name: _upright(shape[::-1]) for name, (shape, _) in arrays.items() if name[0] != INTERNAL}
+        turned = {name: shape[::-1] for name, (shape, _) in arrays.items() if name[0] != INTERNAL}
+        upright = {name: shape[::-1] if len(shape) == 2 and shape[0] == 1 else shape for name, shape in turned.items()}
         return {
             name: (shape, lambda name=name, shape=shape: arrays[name][1]().T.reshape(shape))
             for name, shape in upright.items()
@@ -211,10 +212,6 @@ def matlab_arrays(path: Path) -> Arrays:
             require_plausible_size(path, repr(name), 8 * math.prod(shape), size)
         content = loadmat(str(path), simplify_cells=True)
         return _lists({name: value for name, value in content.items() if not name.startswith("__")})
-
-
-def _upright(shape: tuple[int, ...]) -> tuple[int, ...]:
-    return (shape[1], 1) if len(shape) == 2 and shape[0] == 1 and shape[1] > 1 else shape
 
 
 def _referred(file: h5py.File, item: Any) -> Any:

@@ -41,6 +41,7 @@ class ImportOptions:
     rate: "auto" gives uneven rows even times at the median of the recordings' median rates, a number (Hz) all rows at
         that rate; "log" keeps every stamp.
     start, end: seconds from the first row of each episode that are kept.
+    without: begins and ends of stretches in these seconds that are left out, as of contacts.
     unwrap: add whole turns to positions of turning joints where they jump by more than half a turn.
     bad_rows: "skip" leaves out rows in which a value is missing or no finite number, up to 5 % of a log; "refuse" only
         those in which every value is.
@@ -55,6 +56,7 @@ class ImportOptions:
     rate: float | Literal["auto", "log"] = "auto"
     start: float | None = None
     end: float | None = None
+    without: tuple[float, ...] = ()
     unwrap: bool = False
     bad_rows: Literal["refuse", "skip"] = "refuse"
     beyond_limits: bool = False
@@ -68,6 +70,8 @@ class ImportOptions:
             raise InvalidInput(f"rate is {self.rate!r}; give rows per second, 'auto' or 'log'.")
         if self.start is not None and self.end is not None and not self.start < self.end:
             raise InvalidInput(f"start ({self.start} s) must come before end ({self.end} s).")
+        if len(self.without) % 2 or not (np.diff(self.without) > 0.0).all():
+            raise InvalidInput(f"without is {self.without}; give begin and end of each stretch in s, in their order.")
         for name, allowed in (("stance", ("log", "auto")), ("bad_rows", ("refuse", "skip"))):
             if getattr(self, name) not in allowed:
                 raise InvalidInput(f"{name} is {getattr(self, name)!r}; allowed: {allowed[0]!r} or {allowed[1]!r}.")

@@ -69,6 +69,18 @@ def log_unit(quantity: str, name: str) -> LogUnit:
     return units[spelled]
 
 
+UNIT_OF_A_NAME = re.compile(r"[\[(]([^\d\[(]+)[\])]$|_([A-Za-z]{2,})$")
+
+
+def named_unit(quantity: str, column: str) -> str | None:
+    """The unit that the name of a column ends with, as in `pos [mm]` and `pos_mm`; None where it is none."""
+    found = UNIT_OF_A_NAME.search(column.strip())
+    try:
+        return None if found is None else log_unit(quantity, found[1] or found[2]).name
+    except InvalidInput:
+        return None
+
+
 SIGNALS = ("q", "v", "u", "a")
 ORIENTATIONS = ("xyzw", "wxyz", "angles")
 """Quaternions with w last or first; roll, pitch and yaw with R = Rz(yaw) Ry(pitch) Rx(roll), or the yaw of a plane."""

@@ -289,17 +289,23 @@ def _require_plausible_positions(
         low, high = float(column.min()), float(column.max())
         lower, upper = limits.get(item.joint, (-np.inf, np.inf))
         margin = BEYOND * (upper - lower) if np.isfinite(upper - lower) else 0.0
+        least, most = lower - margin, upper + margin
         degrees = item.unit.name == "rad" and max(-low, high) > TURNS
+        other = (
+            "deg" if degrees else "mm" if item.unit.name == "m" and least <= 1e-3 * low and 1e-3 * high <= most else ""
+        )
+        used = {x.unit.si: x.unit.name for x in plan.signals if x.signal == "q" and x.unit.si != "1"}
+        units = ",".join((used | {item.unit.si: other}).values())
         where = f"{label}: q of joint {item.joint!r} runs from {low:.4g} to {high:.4g} {item.unit.si}"
-        if low < lower - margin or high > upper + margin:
+        if low < least or high > most:
             seen = f"{where}, beyond its limits {lower:.4g} to {upper:.4g} in the URDF."
-            if degrees:
-                hint = "Is it in degrees? Then add `unit` q=deg. `beyond_limits` accepts it."
-                raise MistakenUnit(f"{seen} {hint}", "q", "deg")
+            if other:
+                hint = f"Is it in {other}? Then add `unit` q={units}. `beyond_limits` accepts it."
+                raise MistakenUnit(f"{seen} {hint}", "q", units)
             raise DatasetError(f"{seen} Are unit, sign, zero and URDF right? `beyond_limits` accepts it.")
         if degrees and item.joint not in believed and not np.isfinite(upper - lower):
-            hint = "Give `unit` q=deg if it is in degrees, `unit` q=rad if not."
-            raise MistakenUnit(f"{where}, more than two turns. {hint}", "q", "deg")
+            hint = f"Give `unit` q={units} if it is in deg, `unit` q=rad if not."
+            raise MistakenUnit(f"{where}, more than two turns. {hint}", "q", units)
 
 
 REPEATED = 0.05
@@ -345,9 +351,9 @@ def _stretches(
     repeated = int((~read.lost & ~kept).sum())
     since = time - np.repeat(time[begins], np.diff([*begins, len(time)]))
     start, end = -np.inf if options.start is None else options.start, np.inf if options.end is None else options.end
-    kept &= (since >= start) & (since <= end)
+    kept &= (since >= start) & (since <= end) & (np.searchsorted(options.without, since) % 2 == 0)
     if not kept.any():
-        raise DatasetError(f"{label}: no row lies between `start` and `end`; it has {since.max():.6g} s.")
+        raise DatasetError(f"{label}: `start`, `end` and `without` leave no row of its {since.max():.6g} s.")
     paused = read.paused(options.gap, GAP)
     used = np.flatnonzero(kept & ~paused)
     number = np.searchsorted(begins, used, side="right") - 1

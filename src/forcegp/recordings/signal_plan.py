@@ -29,6 +29,7 @@ from forcegp.recordings.mapping import (
     guessed_time,
     log_unit,
     named_after,
+    named_unit,
     parse_expression,
 )
 from forcegp.recordings.source import Columns, Source
@@ -204,13 +205,18 @@ def signal_plan(
         for item in _signals(mapping, name, expressions, log[name], order[name], joints, turned)
     )
     signals += tuple(item for frame in mapping.force for item in _sensor(mapping, frame, source, model))
+    for name in found.keys() - mapping.unit.keys():
+        if any(x.unit.per_si != 1.0 for x in signals if x.signal == name):
+            units = ",".join(x.unit.name for x in signals if x.signal == name)
+            guessed.append(f"unit {name}={units}, as the columns are called")
     lacking = {name: [x.expression is LACKING for x in signals if x.signal == name != "u"] for name in found}
     episode = mapping.episode or (EPISODE if EPISODE in source.columns() else None)
     if episode is not None:
         require_known("column", episode, str(source.path), source.columns(), FileFormatError)
-    # stamps of ROS are whole nanoseconds; everything else is taken for seconds
-    stamps = time is not None and time.is_column and next(iter(time.weights)).endswith((":header.stamp", ":log_time"))
-    [time_unit, *_] = mapping.unit.get("time", ("ns" if stamps else "s",))
+    name = next(iter(time.weights)) if time is not None and time.is_column else ""
+    # stamps of ROS are whole nanoseconds; what is called nothing else is taken for seconds
+    usual = "ns" if name.endswith((":header.stamp", ":log_time")) else named_unit("time", name) or "s"
+    [time_unit, *_] = mapping.unit.get("time", (usual,))
     return SignalPlan(
         joints=tuple(order["v"]),
         signals=signals,
@@ -303,7 +309,9 @@ def _signals(
         raise InvalidInput(
             f"{signal} has {len(expressions)} columns for {len(names)} {what} ({', '.join(names) or 'none'}); {remedy}"
         )
-    given = [log_unit(signal, name) for name in mapping.unit.get(signal, ())]
+    named = [named_unit(signal, next(iter(x.weights))) if x.is_column else None for x in expressions]
+    named = [x or columns[name] or "1" for x, name in zip(named, names, strict=True)]
+    given = [log_unit(signal, name) for name in mapping.unit.get(signal, named)]
     signs, driven = mapping.sign.get(signal, (1.0,)), sum(signal != "u" or columns[name] != "1" for name in names)
     if driven < len(names) and len(signs) in (1, driven):  # they do not change a switch that stands behind actuators
         signs = (*signs * (driven // len(signs)), *[1.0] * (len(names) - driven))

@@ -117,7 +117,14 @@ class DelimitedText(Source):
         if not lines:
             raise FileFormatError(f"{self.path} holds no rows, only comments or empty lines.")
         self._comments = bool(comments)
-        self._delimiter = _detected_delimiter(lines[-LAST_LINES:])
+
+        def numbers(delimiter: str) -> tuple[int, int]:
+            table = [line.split(None if delimiter == BLANKS else delimiter) for line in lines[-LAST_LINES:]]
+            found = [[_is_number(field.strip(' "')) and bool(field) for field in row] for row in table]
+            return sum(map(sum, found)), sum(map(all, found))
+
+        # between which the most numbers stand, of equal ones that with more lines of nothing else
+        self._delimiter = max((",", "\t", ";", "|", BLANKS), key=numbers)
         table = [self._fields(line) for line in lines]
         width = Counter(map(len, table[-LAST_LINES:])).most_common(1)[0][0]
         columns = zip(*(row for row in table[-LAST_LINES:] if len(row) == width), strict=True)
@@ -284,14 +291,3 @@ def seconds_of(texts: Sequence[str | None]) -> np.ndarray:
             seconds[row] = 86400.0 * days + 3600 * int(hour) + 60 * int(minute) + float(second)
     midnights = (seconds < 86400.0) & (np.diff(seconds, prepend=seconds[:1]) < -43200.0)
     return seconds + 86400.0 * np.cumsum(midnights)
-
-
-def _detected_delimiter(lines: Sequence[str]) -> str:
-    """The delimiter between which the most numbers stand, of equal ones that with more lines of nothing else."""
-
-    def numbers(delimiter: str) -> tuple[int, int]:
-        table = [line.split(None if delimiter == BLANKS else delimiter) for line in lines]
-        found = [[_is_number(field.strip(' "')) and bool(field) for field in row] for row in table]
-        return sum(map(sum, found)), sum(map(all, found))
-
-    return max((",", "\t", ";", "|", BLANKS), key=numbers)

@@ -170,21 +170,17 @@ def _capsules(robot: Robot) -> dict[str, Any]:
         center = robot.link(name).center_of_mass
         if not places and robot.link(name).mass > 0.0:
             places = [2.0 * center]
-        parts = [_capsule(radius, place) for place in places if np.linalg.norm(place) > SHORTEST]
+        parts = list[Any]()
+        for place in places:
+            if (height := float(np.linalg.norm(place))) > SHORTEST:
+                parts.append(mesh := trimesh_module().creation.capsule(height=height, radius=radius, count=(12, 12)))
+                mesh.apply_translation((0.0, 0.0, 0.5 * height - 0.5 * (mesh.bounds[0, 2] + mesh.bounds[1, 2])))
+                mesh.apply_transform(trimesh_module().geometry.align_vectors((0.0, 0.0, 1.0), place))
         if not parts and robot.link(name).mass > 0.0:
             parts = [trimesh_module().creation.icosphere(subdivisions=2, radius=radius)]
         if parts:
             out[name] = trimesh_module().util.concatenate(parts)
     return out
-
-
-def _capsule(radius: float, end: np.ndarray) -> Any:
-    """From the origin of a link to `end`."""
-    height = float(np.linalg.norm(end))
-    mesh = trimesh_module().creation.capsule(height=height, radius=radius, count=(12, 12))
-    mesh.apply_translation((0.0, 0.0, 0.5 * height - 0.5 * (mesh.bounds[0, 2] + mesh.bounds[1, 2])))
-    mesh.apply_transform(trimesh_module().geometry.align_vectors((0.0, 0.0, 1.0), end))
-    return mesh
 
 
 def poses_of_links(robot: Robot, q: torch.Tensor, links: list[str]) -> np.ndarray:

@@ -129,11 +129,11 @@ def score(
         runs = {name: [kept(store, job.name) for job in fits if job.spec["name"] == name] for name in chosen}
         for name in (name for name, each in chosen.items() if each.all_rows):  # they use no chance
             runs[name] = [{**run, "seed": seed} for seed in range(seeds) for run in runs[name]]
-        about |= {
-            "splits": [_split_facts(experiment, each) for each in splits],
-            "configuration": experiment.configuration,
-            "seeds": list(range(seeds)),
-        }
+        about |= {"splits": [], "configuration": experiment.configuration, "seeds": list(range(seeds))}
+        for each in splits:
+            (train, test), motions = each.apply(experiment.rows), experiment.motions(each)
+            sides = {"training_rows": len(train), "test_rows": len(test), "motions": len(motions)}
+            about["splits"].append(each.to_dict() | sides | {"notes": list(motions.notes)})
         scores = _scores(log, runs, chosen, about, partial(_on_all_rows, experiment, chosen))
         if folder is not None:
             with store.locked():
@@ -167,12 +167,6 @@ def _runs_of(
         with part(place, len(given), name):
             runs[name] = [run | scored(posterior, log, motions, integrator)]
     return runs
-
-
-def _split_facts(experiment: Experiment, split: Split) -> dict[str, Any]:
-    (train, test), motions = split.apply(experiment.rows), experiment.motions(split)
-    sides = {"training_rows": len(train), "test_rows": len(test), "motions": len(motions), "notes": list(motions.notes)}
-    return split.to_dict() | sides
 
 
 def _scores(

@@ -16,7 +16,7 @@ from forcegp.data import Dataset, evenly
 from forcegp.errors import ForceGPError, InvalidInput
 from forcegp.evidence.recorded_rows import sensed_of
 from forcegp.forces import Actuation, JointFriction, LoadFriction, Offset, RigidBodies, Rotor, Unknown
-from forcegp.mechanics import Contact, Held
+from forcegp.mechanics import Held
 from forcegp.model import Model
 from forcegp.posterior.posterior import Posterior
 from forcegp.progress import part
@@ -208,22 +208,17 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
         style.draw_band(axes, rows.time, mean[:, index], spread[:, index], alpha=0.3, label="95 % band")
         style.draw_line(axes, rows.time, mean[:, index], style.PREDICTION, 1.3, "predicted")
         axes.margins(x=0)
-        name, label = _contact_labels(contact)
+        name, label = f"{type(contact.surface).__name__.lower()} at {contact.frame}", "normal force [N]"
+        if isinstance(contact.surface, Held):
+            axis = " ".join(f"{x:.2g}" for x in contact.surface.normal)
+            axis = {"1 0 0": "x", "0 1 0": "y", "0 0 1": "z"}.get(axis, f"({axis})")
+            name, label = f"{contact.frame} along {axis}", "force [N]"
         title = f"Contact {index}: {name}" if len(contacts) > 1 else name[0].upper() + name[1:]
         style.quiet(axes, title=title, x="time [s]", y=label)
     style.legend_below(figure, *grid, size=style.NORMAL)
     held = any(isinstance(contact.surface, Held) for contact in contacts)
     style.heading(figure, f"{'Contact' if held else 'Normal'} force after {len(posterior.training)} training points")
     return figure
-
-
-def _contact_labels(contact: Contact) -> tuple[str, str]:
-    """What a contact is, and what its multiplier is."""
-    if not isinstance(contact.surface, Held):
-        return f"{type(contact.surface).__name__.lower()} at {contact.frame}", "normal force [N]"
-    axis = " ".join(f"{x:.2g}" for x in contact.surface.normal)
-    axis = {"1 0 0": "x", "0 1 0": "y", "0 0 1": "z"}.get(axis, f"({axis})")
-    return f"{contact.frame} along {axis}", "force [N]"
 
 
 PICTURES: dict[str, tuple[Callable[[Posterior, Dataset], Figure], str]] = {
