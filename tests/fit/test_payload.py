@@ -206,7 +206,7 @@ def test_a_cause_is_what_ridge_regression_finds(times):
         assert 0.8 < abs(expected[:6]).max() < 1.6
         assert cause is None or "gains" not in cause[0].numbers
         return
-    doubt, move = cause
+    doubt, move, _ = cause
     assert np.log(list(doubt.numbers["gains"].values())) == pytest.approx(expected[:6], rel=1e-6)
     assert move == pytest.approx(expected[6:] - best, rel=1e-6)
 

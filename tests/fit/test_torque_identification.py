@@ -14,8 +14,9 @@ from forcegp.data import Dataset
 from forcegp.errors import InvalidInput, RobotFileWarning
 from forcegp.evidence import Accelerations, Torques, motion_residuals
 from forcegp.evidence.least_squares import Fit
+from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.fit import fit
-from forcegp.fit.physical import _with_noise_in_both
+from forcegp.fit.physical import Equations, _with_noise_in_both, typical_sizes
 from forcegp.forces import (
     Actuation,
     Body,
@@ -186,6 +187,26 @@ def test_friction_under_load_does_not_explain_the_torque_by_itself():
     assert found.parameters["load.factor.pan"].value == pytest.approx(0.15, abs=0.01)
     assert found.parameters["load.factor.bend"].value < 0.5
     assert missing(found, log)[:, 2].std() > 4.0  # of 5.8 that no model can know
+
+
+def test_a_passive_joint_does_not_explain_its_torque_by_carrying_nothing():
+    """No torque is no torque of any mass; the hand swings freely, beside noise of accelerations."""
+    log = recorded(400, 3)
+    free = replace(log, u=log.u * [1.0, 1.0, 0.0])
+    states = [torch.tensor(np.array(x)) for x in (free.q, free.v, free.u)]
+    model = replace(log.model, forces=(Actuation(), RigidBodies()))
+    a = model.dynamics(*states).acceleration_map().offset.numpy()
+    free = replace(free, a=a + 0.01 * a.std(axis=0) * np.random.default_rng(0).standard_normal(a.shape), model=model)
+    found = identified(free, given(), strength=1.0).parameters
+    assert found["hand.mass"].value == pytest.approx(model.robot.link("hand").mass, rel=0.1)
+    space = ParameterSpace(model.with_forces(RigidBodies("all"), Viscous()), typical_sizes(model, [free]))
+    equations = Equations(space, [free.rows(slice(0, 20))], Torques())
+    x = space.start + 0.1 * np.random.default_rng(1).standard_normal(space.size)
+    assert list(equations.passive) == [2]
+    J = np.asarray(equations.in_torque(x, equations.measured)[1])
+    numeric = [(equations.in_torque(x + h, equations.measured)[0] - equations.in_torque(x - h, equations.measured)[0])
+               / 2e-6 for h in 1e-6 * np.eye(len(x))]  # fmt: skip
+    np.testing.assert_allclose(J, np.stack(numeric, axis=-1), atol=1e-5 * abs(J).max())
 
 
 def test_springs_and_where_they_rest():

@@ -59,8 +59,8 @@ RIGHT = 0.01  # residuals over a payload's torques below which it is right as it
 LEAST = 0.05  # share of the squares that a payload leaves, which only numbers of no body explain
 
 
-def doubts_of_payloads(space: ParameterSpace, fit: Fit) -> Iterator[Doubt]:
-    """Ten free numbers in place of a payload's explain much more: no body on its link explains the log."""
+def doubts_of_payloads(space: ParameterSpace, fit: Fit, least: float) -> Iterator[Doubt]:
+    """Ten free numbers in place of a payload's explain much more, than a cause of `least` nats, too: it is no body."""
     number, white = len(space.carried), fit.residual / fit.noise
     for body, each in enumerate(space.carried):
         if each.payload is None:
@@ -75,7 +75,9 @@ def doubts_of_payloads(space: ParameterSpace, fit: Fit) -> Iterator[Doubt]:
         cost = 0.5 * float((white**2).sum())
         more = cost - 0.5 * float((left**2).sum())
         moves = payload @ space.standard_parameters(fit.x)[body]
-        if np.linalg.norm(fit.residual) > RIGHT * np.linalg.norm(moves) and more > max(CLEARLY_MORE, LEAST * cost):
+        if np.linalg.norm(fit.residual) > RIGHT * np.linalg.norm(moves) and more > max(
+            CLEARLY_MORE, LEAST * cost, least
+        ):
             yield look(
                 about="payload",
                 what=f"no body on {getattr(space.model.laws[each.payload], 'link', '')} explains the log: free numbers "
@@ -136,8 +138,8 @@ def misfit(
     left: Sequence[Float[np.ndarray, "rows nv"]],
     white: Callable[[Sequence[np.ndarray]], np.ndarray],
     fit: Fit,
-) -> tuple[Doubt, Float[np.ndarray, " k"]] | None:
-    """The cause that explains most, if far more than `model`, and how far the coordinates move with it.
+) -> tuple[Doubt, Float[np.ndarray, " k"], float] | None:
+    """The cause that explains most, if far more than `model`; how far the coordinates move with it; and nats.
 
     `model` has the numbers of the fit, of torques of rows with accelerations `a` it leaves `left`, and `white` makes
     residuals of the fit of such torques. At the best x, causes c with columns C lower the whitened residual r (Frisch &
@@ -178,7 +180,7 @@ def misfit(
                 joints=tuple(np.array(names[0])[off].tolist()),
                 numbers={cause: {names[0][k]: float(factors[k]) for k in np.flatnonzero(change)}},
             )
-            best, found = 1.1 * worth, (doubt, move)
+            best, found = 1.1 * worth, (doubt, move, more)
             if instead is not None:
                 break
     return found

@@ -75,6 +75,12 @@ class Equations:
         self.windows = None if seconds is None else WindowMeans(logs, seconds)
         self._stays: tuple[np.ndarray, ...] = ()
         """Regressors of the last search, which no coordinate changes."""
+        robot, logged = space.model.robot, np.concatenate([part.delivered for part in self.parts])
+        idle = evidence.of_torque and space.bodies.size and robot.base == "fixed" and not self.held.shape[1]
+        alone = {j: row for j, row in enumerate(np.eye(robot.nv)) if idle and not logged[:, j].any()}
+        motions = {j: [self._moving(0.0 * row), self._moving(row)] for j, row in alone.items()}
+        self.passive = {j: (own, self._inertia(space.start, j, own)[0]) for j, own in motions.items()}
+        """Joints without any torque: motions at rest and with 1 rad/s^2 of this joint, and the inertia at the start."""
 
     def each(self, values: np.ndarray) -> list[np.ndarray]:
         """Rows by log."""
@@ -90,10 +96,31 @@ class Equations:
         slopes = self.space.bodies.slopes(x[: self.space.bodies.size])
         return residual, Chained(self._regressor, slopes, np.concatenate(in_terms))
 
+    def _moving(self, a: Float[np.ndarray, " nv"]) -> list[Motion]:
+        """All rows with these accelerations."""
+        return [part.moving(a + 0.0 * part.v) for part in self.parts]
+
+    def _inertia(self, x: np.ndarray, joint: int, motions: Sequence[Sequence[Motion]]) -> np.ndarray:
+        """What a joint needs more in the second of two motions, as mean of the rows; then its derivatives in x."""
+        means = []
+        for motion in motions:
+            r, jacobian = self.equations(
+                x, [part.in_torque(x, own)[:3] for part, own in zip(self.parts, motion, strict=True)]
+            )
+            means.append(np.append(r[:, joint].mean(), np.asarray(jacobian)[:, joint].mean(axis=0)))
+        return means[1] - means[0]
+
     def in_torque(self, x: np.ndarray, motions: Sequence[Motion]) -> tuple[np.ndarray, Jacobian]:
-        """Torques needed less those measured; beside gains, where contacts hide nothing, as they are logged."""
+        """Torques needed less those measured; beside gains, where contacts hide nothing, as they are logged.
+
+        Those of passive joints are over their inertia: else they would vanish with the bodies that they move.
+        """
         found = [part.in_torque(x, motion)[:3] for part, motion in zip(self.parts, motions, strict=True)]
         r, jacobian = self.equations(x, found)
+        for joint, (own, first) in self.passive.items():
+            jacobian, (inertia, *slopes) = np.asarray(jacobian), self._inertia(x, joint, own) / first
+            r[:, joint] /= inertia
+            jacobian[:, joint] = (jacobian[:, joint] - r[:, [joint]] * np.array(slopes)) / inertia
         if self.windows is not None:
             free = partial(without, span=orthonormal_columns(self.hidden) if self.held.shape[1] else None)
             r, jacobian = self.windows.mean(free(r)), self.windows.mean(free(np.asarray(jacobian)))
@@ -146,7 +173,8 @@ class Equations:
             likely = [part.likely(x, own, noise) for part, own in zip(self.parts, motions, strict=True)]
             motions, white = [each.motion for each in likely], [each.whitening for each in likely]
         else:
-            white = [each / noise[:, None] for each in free]
+            passive = {j: self._inertia(x, j, own)[0] / first for j, (own, first) in self.passive.items()}
+            white = [each / (noise * [passive.get(j, 1.0) for j in range(len(one))])[:, None] for each in free]
 
         def whitened(columns: Sequence[np.ndarray]) -> np.ndarray:
             each = np.concatenate([W @ own for W, own in zip(white, columns, strict=True)])
@@ -309,7 +337,8 @@ def fit_physical(
         gains = found.actuation.values["gain"].cpu().numpy() if equations.in_units_of_log else 1.0
         left = equations.left(fit.x, fit.noise * gains if noise is None else noise)
         cause = misfit(found, equations.parts, equations.each(equations.a), *left, fit)
-        doubts += doubts_of_payloads(space, fit) if cause is None else [cause[0]]
+        bodies = list(doubts_of_payloads(space, fit, -np.inf if cause is None else cause[2]))
+        doubts += bodies if bodies or cause is None else [cause[0]]
     estimates = _estimates(space, fit, equations, evidence, thick, changes, None if cause is None else cause[1])
     doubts += unseen.doubts(model)
     Doubts(doubts).warn(stacklevel=4)
