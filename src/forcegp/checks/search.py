@@ -408,7 +408,7 @@ def _stretch(signals: Float[np.ndarray, "rows k"]) -> tuple[float, float, int, i
         gain = float(-np.log(np.maximum(each, LEAST)) @ (count - own, own))
         return (gain if each[1] > each[0] else 0.0), each[1] * own / (each @ (count - own, own)), first, last
 
-    edges = np.linspace(0, count, EDGES, dtype=int)
+    edges = np.linspace(0, count, EDGES, dtype=int).tolist()
     best = max(told(a, b) for a in edges for b in edges if 0 < b - a <= count // 2)
     for _ in range(2):  # to the row
         best = max(told(a, best[3]) for a in range(max(best[3] - count // 2, 0), best[3]))
