@@ -157,6 +157,8 @@ def misfit(
             continue  # a factor of all masses is one of the gains that are estimated, or of all those of a base
         names, columns = zip(*(_columns(cause, model, *each) for each in zip(rows, a, left, strict=True)), strict=True)
         C = white(columns).reshape(r.size, -1)
+        if not C.shape[1]:
+            continue
         across, every = J.T @ C, np.arange(C.shape[1])
         own, slope = C.T @ C - across.T @ inverse @ across + np.eye(len(every)) / usual**2, C.T @ r
         tried = list[tuple[float, float, np.ndarray, np.ndarray]]()
@@ -195,7 +197,8 @@ def _instead(
     """
     r, J = fit.white.ravel(), fit.white_jacobian.reshape(fit.white.size, -1)
     none, slopes = np.zeros_like(fit.x), space.bodies.slopes(fit.x[: space.bodies.size])
-    for body in (k for k, each in enumerate(space.carried) if each.payload is not None):
+    unknown = [k for k, law in enumerate(space.model.laws) if isinstance(law, Payload) and law.mass is None]
+    for body in (k for k, each in enumerate(space.carried) if each.payload in unknown):
         own, rows = np.r_[space.bodies.slices[body]], slice(10 * body, 10 * body + 10)
         none[own] = -np.linalg.solve(slopes[rows, own], space.standard_parameters(fit.x)[body])
     free, left = np.flatnonzero(none == 0.0), r + J @ none
@@ -206,7 +209,11 @@ def _instead(
     change = -(C.T @ left - across.T @ inner[:, 0]) / size
     own = 0.5 * change**2 * size  # nats
     k = int(np.argmax(own))
-    if own[k] < least or own[k] + 0.5 * (r @ r - left @ left + slope @ inner[:, 0]) < max(-CLEARLY_MORE, most - least):
+    if (
+        not none.any()
+        or own[k] < least
+        or own[k] + 0.5 * (r @ r - left @ left + slope @ inner[:, 0]) < max(-CLEARLY_MORE, most - least)
+    ):
         return None
     none[free] -= inner[:, 0] + inner[:, 1 + k] * change[k]
     return np.where(np.arange(len(change)) == k, change, 0.0), none
