@@ -200,6 +200,7 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
     assert "intervals" not in told([0.1] * 3, covered=0.81)
 
 
+@pytest.mark.usefixtures("unchecked")  # a stand-in for a posterior
 def test_accelerations_are_learned_from_where_torques_make_them_predictable():
     data = clean(0, pendulum(), noise=0.0)
     known = fit(data.model.with_forces(Viscous(0.1), Coulomb(0.2), noise=Noise(1.0)), data)

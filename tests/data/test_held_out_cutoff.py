@@ -56,6 +56,8 @@ def test_a_passive_robot_keeps_the_cutoff_of_its_spectrum():
     assert Preparation(cutoff="auto").resolved(still).cutoff == float(f"{np.nanmax(spectrum):.3g}")
     with pytest.raises(DatasetError, match="no torque acts"):
         held_out_cutoff(still, 6.0)
+    one = replace(rows, u=rows.u * (np.arange(6) == 1))  # the others are no part of the mean
+    assert min(held_out_cutoff(one, 6.0)[1].values()) > 1e-4
 
 
 def test_short_logs_are_refused():

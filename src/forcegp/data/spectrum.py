@@ -221,6 +221,6 @@ def _judged(dataset: Dataset, cutoff: float, source: Literal["q", "v"]) -> tuple
                 theta = np.linalg.lstsq(learned[one][::4], u[one][::4], rcond=1e-2)[0] / size
                 left += float(np.square(measured[other, joint] - seen[joint][other] @ theta).sum())
             shares[k, joint] = left / max(float(np.square(measured[:, joint]).sum()), 1e-300)
-    mean = np.exp(np.log(np.maximum(shares, 1e-12)).mean(axis=1))
+    mean = np.exp(np.log(np.maximum(shares[:, log.u.any(axis=0)], 1e-12)).mean(axis=1))
     best = float(f"{tried[int(np.argmin(mean))]:.3g}")
     return best, {float(f"{f:.3g}"): float(share) for f, share in zip(tried, mean, strict=True)}
