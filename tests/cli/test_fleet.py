@@ -108,6 +108,7 @@ def test_words_without_a_list_are_refused(listed):
         fleet(["fit", "a.h5", "--out", "out"])
 
 
+@pytest.mark.usefixtures("unchecked")  # a stand-in for the runs
 def test_processes_are_those_of_the_words_unless_others_are_given(listed, monkeypatch):
     monkeypatch.setattr(Fleet, "run", lambda asked, _: {"rows": [asked.jobs]})
     asked = words("out")

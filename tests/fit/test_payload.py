@@ -157,7 +157,7 @@ def test_few_postures_have_the_interval_of_student():
     values, one = np.array([1.0, 1.5, 3.0]), np.ones((1, 1))
     name = SimpleNamespace(name="mean", unit="1", start=0.0)
     white = np.column_stack([np.ones(3), values.mean() - values])
-    found = Estimates.of_search([name], np.array([values.mean()]), one, white, [[0], [1], [2]], 1e-6 * one)
+    found = Estimates.of_search([name], np.array([values.mean()]), one, white, list(np.arange(3)[:, None]), 1e-6 * one)
     expected = student.interval(0.95, 2, values.mean(), values.std(ddof=1) / 3**0.5)
     assert found["mean"].interval == pytest.approx(expected, rel=1e-6)
 

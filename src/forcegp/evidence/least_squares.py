@@ -27,7 +27,7 @@ of the search that goes further has a covariance that rounding makes singular.""
 class NoiseLevels:
     """Standard deviations per joint: of accelerations [rad/s^2 or m/s^2] and of forces [Nm or N]."""
 
-    acceleration: Float[np.ndarray, " nv"]
+    acceleration: Float[np.ndarray, " equations"]
     force: Float[np.ndarray, " nv"]
 
     @classmethod
@@ -84,7 +84,7 @@ class NoiseLevels:
         """All levels times this."""
         return NoiseLevels(factor * self.acceleration, factor * self.force)
 
-    def whitening(self, H: Float[np.ndarray, "rows nv nv"]) -> Float[np.ndarray, "rows nv nv"]:
+    def whitening(self, H: Float[np.ndarray, "rows equations nv"]) -> Float[np.ndarray, "rows equations equations"]:
         """L_n^-1 with S_n = L_n L_n^T: residuals times this have the identity as covariance. H as in `of`."""
         inverse = torch.as_tensor(H)
         S = _covariance(inverse, torch.as_tensor(self.acceleration), torch.as_tensor(self.force))

@@ -137,7 +137,7 @@ class RecordedRows:
         loaded: bool = True,
         any_contact: bool = False,
         strokes: Float[np.ndarray, "rows nv strokes"] | None = None,
-        sensed: Mapping[str, Float[np.ndarray, "rows 3"]] | None = None,
+        sensed: Mapping[str, Float[np.ndarray, "rows _"]] | None = None,
         pushed: Sequence[int] = (),
     ) -> None:
         model, robot = space.model, space.model.loaded_robot
@@ -193,7 +193,7 @@ class RecordedRows:
         """Of the coordinates of laws: which of them are at the links' side of gears."""
         self._caches: dict[float | None, dict[Any, Any]] = {None: {}, 0.0: {}, 1.0: {}}
 
-    def _unseen(self, A: Float[np.ndarray, "rows m nv"], pushed: Sequence[int]) -> Float[np.ndarray, "rows m nv"]:
+    def _unseen(self, A: Float[np.ndarray, "rows m nv"], pushed: Sequence[int]) -> Float[np.ndarray, "rows r nv"]:
         seen = [contact.frame in self.sensed for contact in self.space.model.contacts]
         axes = np.broadcast_to(np.eye(A.shape[-1])[list(pushed)], (len(A), len(pushed), A.shape[-1]))
         rows = np.concatenate([A[:, np.logical_not(seen)], axes], axis=1)
