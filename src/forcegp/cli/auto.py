@@ -323,10 +323,9 @@ def answer_lines(
     mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
     late, lag, rate = prepared["delay"], prepared["lag"], (len(dataset) - len(dataset.episodes)) / seconds
     early = "early: a controller that holds u is half a time step" if -late * rate < 1.0 else "early, or q and v late"
-    when = "late" if late > 0.0 else early
     why = prepared["why"].get("delay", "u is taken to be on time").partition(";")[0].rstrip(".")
     on_time = why if why.startswith("u is") else f"delay of u: {why}"
-    shifted = f"u was logged {1e3 * abs(late):.1f} ms {when} (shifted)" if late else on_time
+    shifted = f"u was logged {1e3 * abs(late):.1f} ms {'late' if late > 0.0 else early} (shifted)" if late else on_time
     shifted += f", rotors follow within {1e3 * lag:.0f} ms" if lag else ""
     filtered = "no filter" if prepared["cutoff"] is None else f"filter at {prepared['cutoff']:g} Hz"
     joints, moving = robot.single_joint_names, robot.base != "fixed"
