@@ -187,9 +187,7 @@ class ColumnOptions:
             raise InvalidInput(f"{path} and the flags: {error}") from None
 
     def _stated(self) -> forcegp.recordings.ColumnMapping:
-        given: dict[str, Any] = {
-            item.name: getattr(self, item.name) for item in fields(forcegp.recordings.ColumnMapping)
-        }
+        given: Any = {item.name: getattr(self, item.name) for item in fields(forcegp.recordings.ColumnMapping)}
         lists = {name: text for name, text in given.items() if name in (*"qvua", "joints") and text is not None}
         given |= {name: tuple(forcegp.recordings.listed(str(text))) for name, text in lists.items()}
         if self.headerless is not None:

@@ -239,9 +239,8 @@ def jacobian(
     if seeds is None:
         seeds = [[ONE if i == j else ZERO for j in range(len(inputs))] for i in range(len(inputs))]
     directions = range(len(seeds[0]) if seeds else 0)
-    tangents: dict[int, dict[int, int]] = {
-        node: {j: row[j] for j in directions if row[j] != ZERO} for node, row in zip(inputs, seeds, strict=True)
-    }
+    given = zip(inputs, seeds, strict=True)
+    tangents = {node: {j: row[j] for j in directions if row[j] != ZERO} for node, row in given}
     for node in graph.needed(outputs):
         if node in tangents:
             continue

@@ -44,9 +44,8 @@ def choose_transmission(
         motors = np.einsum("nkc,kj->njkc", columns, T * weight).reshape(*v.shape, -1)
         X = np.concatenate([bodies, motors], axis=-1)
         X = X / np.sqrt((X**2).sum((0, 1))).clip(1e-300)
-        normal, right = (
-            np.stack([np.tensordot(X[k], y[k], ((0, 1), (0, 1))) for k in rows]) for y in (X, torque[..., None])
-        )
+        sides = X, torque[..., None]
+        normal, right = (np.stack([np.tensordot(X[k], y[k], ((0, 1), (0, 1))) for k in rows]) for y in sides)
         others = normal.sum(0) - normal + RIDGE * np.eye(X.shape[-1])
         each = np.linalg.solve(others, right.sum(0) - right)[..., 0]
         return np.stack([((torque[k] - X[k] @ x) ** 2).sum(0) for k, x in zip(rows, each, strict=True)])

@@ -299,9 +299,7 @@ class _DeflatedNLL(torch.autograd.Function):
         deflation = deflate(W_white, y_white)
         system = solve_deflated(deflation, kernel_matrices)
         alpha, beta = system.alpha, system.beta
-        value = 0.5 * (
-            (deflation.t * alpha).sum() + system.factor.log_determinant() + deflation.remainder.square().sum()
-        )
+        value = (deflation.t * alpha).sum() + system.factor.log_determinant() + deflation.remainder.square().sum()
         W_needed, y_needed, *K_needed = ctx.needs_input_grad
         gradients: list[Tensor | None] = [None] * (2 + len(kernel_matrices))
         if y_needed:
@@ -315,7 +313,7 @@ class _DeflatedNLL(torch.autograd.Function):
                 C_gradient = C_gradient - alpha[..., None] * latent_mean[:, None, :]
                 gradients[0] = deflation.U @ C_gradient - deflation.remainder[..., None] * latent_mean[:, None, :]
         ctx.gradients = gradients
-        return value
+        return 0.5 * value
 
     @staticmethod
     def backward(ctx, upstream: Tensor):  # type: ignore[override]  # the base takes *args

@@ -103,9 +103,8 @@ def load_posterior(path: str | Path) -> Posterior:
         training = _rows(TRAINING, tensors, model)
         if any(name.startswith(REFERENCE) for name in tensors):
             training = replace(training, reference=_rows(REFERENCE, tensors, model))
-        parameters = {
-            name.removeprefix(PARAMETERS): value for name, value in tensors.items() if name.startswith(PARAMETERS)
-        }
+        own = [name for name in tensors if name.startswith(PARAMETERS)]
+        parameters = {name.removeprefix(PARAMETERS): tensors[name] for name in own}
         found: dict[str, Any] = {name: kind(document["result"][name]) for name, kind in RESULT.items()}
         engine, settings = document["engine"], dict(document["settings"])
         _require_numbers(settings, model.robot.nv)

@@ -61,9 +61,8 @@ def write_page(path: str | Path, page: Page, *, overwrite: bool = True) -> None:
     template = environment.from_string(files("forcegp.report").joinpath("page.html").read_text(encoding="utf-8"))
     details = json.dumps(page.details, indent=1, default=str) if page.details else ""
     with atomic_file(path, overwrite=overwrite) as temporary:
-        temporary.write_text(
-            template.render(page=page, details=details, version=__version__, mark=MARK) + "\n", encoding="utf-8"
-        )
+        text = template.render(page=page, details=details, version=__version__, mark=MARK)
+        temporary.write_text(text + "\n", encoding="utf-8")
 
 
 SECONDS = 10.0

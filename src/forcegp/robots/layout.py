@@ -87,11 +87,9 @@ def followed(
             if above is None or above.name in passed or above.type == "floating":
                 last = (at if above is None else joint).mimics
                 seen = f"{description.source}: joint {joint.name!r} mimics {last.joint if last else None!r}"
-                why = (
-                    "and so at last itself, or a joint of several degrees of freedom"
-                    if above
-                    else "which the file lacks"
-                )
+                why = "which the file lacks"
+                if above:
+                    why = "and so at last itself, or a joint of several degrees of freedom"
                 advice = f", {why}; correct its <mimic>, or lock the joint."
                 problems.errors.append(RobotModelError(seen, advice, {"locked": {joint.name: 0.0}}))
                 multiplier, offset = 0.0, 0.0

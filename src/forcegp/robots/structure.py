@@ -329,9 +329,8 @@ class RobotStructure(Summary):
         """In float64; :class:`~forcegp.errors.InvalidInput` unless it is (..., nv), or a possible q, on its device."""
         if name != "q" or not self.layout.groups:
             return checked_tensor(name, value, self.nv, f"one value per joint of {self.name}", self.device)
-        q = checked_tensor(
-            name, value, self.nq, f"positions of {self.name}: {', '.join(self.position_names)}", self.device
-        )
+        meaning = f"positions of {self.name}: {', '.join(self.position_names)}"
+        q = checked_tensor(name, value, self.nq, meaning, self.device)
         self.space.check(q)
         return q
 
