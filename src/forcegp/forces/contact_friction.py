@@ -18,9 +18,9 @@ from forcegp.forces.link_forces import (
     SMALLEST_SPEED,
     ToolPoint,
     contact_axes,
-    is_contact_number,
     nominal_normal_force,
     require_contact,
+    require_contact_number,
 )
 from forcegp.forces.unknown import ExpressedKernels, Scaling, Unknown, UnknownForces
 from forcegp.mechanics import ConstrainedDynamics, Contact
@@ -154,8 +154,7 @@ class ContactFriction(ExpressedKernels):
     @usable_arguments("ContactFriction")
     def __post_init__(self) -> None:
         require_type("load", self.load, bool)
-        if not is_contact_number(self.contact):
-            raise InvalidInput(f"ContactFriction has contact {self.contact!r}; give a contact's number from 0.")
+        require_contact_number("ContactFriction", self.contact)
         if self.expected is not None and not self.load:
             raise InvalidInput("ContactFriction has an expected friction but no load; give load=True, or leave it out")
         object.__setattr__(self, "expected", ExpectedFriction.of(self.expected))
