@@ -374,10 +374,8 @@ def _shown(terminal: Terminal, data: Path, report: forcegp.checks.CheckReport) -
     heading = Text(f"{data}: {counts['wrong']} wrong, {counts['look']} to look at, {counts['ok']} ok", style="bold")
     told = [heading, doubts_table(report.doubts, terminal.worded)]
     if report.comparison is not None:
-        rows = [
-            [name, shown(left, "{:.2g} %", 100.0), shown(rms), shown(factor)]
-            for name, left, rms, factor in (each.values() for each in content["joints"])
-        ]
+        joints = (each.values() for each in content["joints"])
+        rows = [[name, shown(left, "{:.2g} %", 100.0), shown(rms), shown(factor)] for name, left, rms, factor in joints]
         unit = report.inputs.log.units["u"]
         title = f"Torque of every joint; in {unit if isinstance(unit, str) else 'the unit of each joint'}"
         told.append(columns(title, ["joint", "unexplained", "rms", "factor"], rows))

@@ -22,7 +22,7 @@ from forcegp.forces.link_forces import (
     require_contact,
     require_contact_number,
 )
-from forcegp.forces.unknown import ExpressedKernels, Scaling, Unknown, UnknownForces
+from forcegp.forces.unknown import ExpressedKernels, Scaling, UnknownForces
 from forcegp.mechanics import ConstrainedDynamics, Contact
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, is_sequence
@@ -236,25 +236,15 @@ def refined_loads(forces: UnknownForces, robot: Robot, table: Table) -> UnknownF
 
     That of the sliding, and of the `JointFriction` beside it. None for forces without such a term.
     """
-    names = forces.latent_names(robot)
-    if not any(_wants_load(term) for term in forces.terms):
+    names, terms = forces.latent_names(robot), list(forces.terms)
+    loaded = {k: term for k, term in enumerate(terms) if isinstance(term, ContactFriction) and term.load}
+    wanting = {k: term for k, term in loaded.items() if term.expected is None}
+    if not wanting:
         return None
-    joints = tuple(
-        (joint, table(latent))
-        for _, term, which in forces.named(robot)
-        if isinstance(term, JointFriction)
-        for joint, latent in zip(term.latent_names(robot), names[which], strict=True)
-    )
-    return UnknownForces(
-        tuple(
-            replace(term, expected=ExpectedFriction(table(names[which][0]), joints))
-            if isinstance(term, ContactFriction) and _wants_load(term)
-            else term
-            for _, term, which in forces.named(robot)
-        )
-    )
-
-
-def _wants_load(term: Unknown) -> bool:
-    """Whether its latent is a friction coefficient, and the load is still to be found."""
-    return isinstance(term, ContactFriction) and term.load and term.expected is None
+    latents, joints = [names[which] for which in forces.slices(robot)], list[tuple[str, TabulatedCurve]]()
+    for term, own in zip(terms, latents, strict=True):
+        if isinstance(term, JointFriction):
+            joints += zip(term.latent_names(robot), map(table, own), strict=True)
+    for k, term in wanting.items():
+        terms[k] = replace(term, expected=ExpectedFriction(table(latents[k][0]), tuple(joints)))
+    return UnknownForces(tuple(terms))

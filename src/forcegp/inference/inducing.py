@@ -208,7 +208,5 @@ def inducing_pivots(
     candidates = torch.linspace(0, count - 1, min(count, CANDIDATES), dtype=torch.float64).round().long().to(C.device)
     relevance = C.square().sum(1)[candidates]
     share = tolerance / max(1, C.shape[-1]) * len(candidates)
-    return [
-        candidates[pivoted_cholesky(kernel, z[candidates], relevance[:, c], points, share)]
-        for c, (kernel, z) in enumerate(zip(kernels.dense, features, strict=True))
-    ]
+    each = zip(kernels.dense, features, relevance.mT, strict=True)
+    return [candidates[pivoted_cholesky(kernel, z[candidates], own, points, share)] for kernel, z, own in each]

@@ -232,13 +232,9 @@ def negative_log_likelihood(
     """
     count, outputs, _ = W.shape
     if outputs > 1 and noise.ndim == 2 and _acts_apart(W):
-        one = range(outputs)
-        return torch.stack(
-            [
-                negative_log_likelihood(W[:, d : d + 1, d : d + 1], residual[:, d : d + 1], noise[:, d : d + 1], [K])
-                for d, K in zip(one, kernel_matrices, strict=True)
-            ]
-        ).sum()
+        each = zip((slice(d, d + 1) for d in range(outputs)), kernel_matrices, strict=True)
+        alone = [negative_log_likelihood(W[:, d, d], residual[:, d], noise[:, d], [K]) for d, K in each]
+        return torch.stack(alone).sum()
     W_white, y_white, log_noise = whiten(W.detach(), residual, noise)
     quadratic_and_logdet = _DeflatedNLL.apply(W_white, y_white, *kernel_matrices)
     return quadratic_and_logdet + log_noise + 0.5 * count * outputs * math.log(2.0 * math.pi)

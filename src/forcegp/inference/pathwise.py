@@ -148,10 +148,8 @@ class DrawnTerm:
             return (columns.mT * beyond * between).sum(1)
         if not self.frequencies:
             return (columns @ weights[0][..., None])[..., 0]
-        phase = sum(
-            factor.embedding(z).unflatten(0, (count, -1)) @ frequencies[samples]
-            for factor, frequencies in zip(self.term.factors, self.frequencies, strict=True)
-        )
+        drawn = zip(self.term.factors, self.frequencies, strict=True)
+        phase = sum(factor.embedding(z).unflatten(0, (count, -1)) @ omega[samples] for factor, omega in drawn)
         assert isinstance(phase, Tensor)
         waves = phase.cos() @ weights[0].mT + phase.sin() @ weights[1].mT
         return (columns * waves).sum(-1)

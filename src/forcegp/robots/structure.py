@@ -60,10 +60,9 @@ class Tree:
         if self.coupling.shape != other.coupling.shape or self.groups != other.groups:
             return False
         constants = ("rest", "sine", "cosine", "slide", "descendants", "inertias", "gravity", "armature", "coupling")
-        return all(
-            torch.allclose(getattr(self, name), getattr(other, name).to(self.rest.device), rtol=1e-9, atol=1e-12)
-            for name in (*constants, "shift")
-        )
+        there = other.to(self.rest.device)
+        pairs = ((getattr(self, name), getattr(there, name)) for name in (*constants, "shift"))
+        return all(torch.allclose(mine, others, rtol=1e-9, atol=1e-12) for mine, others in pairs)
 
 
 def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndarray) -> Tree:
