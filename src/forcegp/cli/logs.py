@@ -20,6 +20,7 @@ from forcegp.cli.terminal import Terminal, columns, doubts_table, facts, shown
 from forcegp.errors import DatasetError, InvalidInput
 
 Columns = Annotated[str | None, unless_given("COLUMNS", "by the names", str)]
+MappingFile = Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "log.yaml or forcegp.yaml beside it", Path)]
 Text = Annotated[str | None, unless_given("TEXT", "none", str)]
 Seconds = Annotated[float | None, unless_given("S", "all", float)]
 
@@ -85,9 +86,7 @@ class ColumnOptions:
     """Frames, or points of them, that stand on the ground at times: 1 or 0 in columns of u after those of the
     actuators, in this order. Without these columns motion and forces decide; rows that leave it open are dropped.
     FRAME:flat is a foot that does not turn while it stands, FRAME:ball=RADIUS (m) a ball that rolls on level ground."""
-    mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "log.yaml or forcegp.yaml beside it", Path)] = (
-        None
-    )
+    mapping: MappingFile = None
     """What the columns mean; flags replace its entries."""
     time: Columns = None
     """Time stamps; of a bag with several topics, those of the messages that become rows."""

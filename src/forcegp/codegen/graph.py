@@ -319,8 +319,5 @@ def _slopes_of_call(graph: Graph, node: int) -> list[tuple[int, Callable[[], int
     found = graph.slopes.get(call)
     if found is None:
         raise InvalidInput(f"{graph.nodes[call][1]} gives no derivatives; make the program with slopes.")
-    return [
-        (operand, partial(graph.output, call, found[position, k]))
-        for k, operand in enumerate(graph.operands(call))
-        if (position, k) in found
-    ]
+    operands = ((operand, found.get((position, k))) for k, operand in enumerate(graph.operands(call)))
+    return [(operand, partial(graph.output, call, slope)) for operand, slope in operands if slope is not None]

@@ -62,11 +62,9 @@ def _candidates(model: Model, T: Float[np.ndarray, "nv nv"]) -> Iterator[tuple[n
     robot, nv = model.robot, len(T)
     named = {joint.name: joint.type == "prismatic" for joint in robot.joints}
     slides = [named.get(name) if name in robot.single_joint_names else None for name in robot.joint_names]
-    pairs = {
-        (robot.layout.drives[body].joint, robot.layout.drives[parent].joint)
-        for body, parent in enumerate(robot.layout.parents)
-        if parent >= 0
-    }
+    drives = robot.layout.drives
+    bodies = zip(drives, robot.layout.parents, strict=True)
+    pairs = {(drive.joint, drives[parent].joint) for drive, parent in bodies if parent >= 0}
     for a, b in sorted(pairs | {pair[::-1] for pair in pairs}):
         if a != b and slides[a] is not None and slides[a] == slides[b] and T[a, b] == 0.0:
             for sign in (1.0, -1.0):

@@ -91,11 +91,9 @@ def model_page(
 
 def scene_notes(recorded: RecordedScene) -> list[str]:
     """What the arrows of a scene mean, and what of the robot could not be drawn."""
-    arrows = [
-        f"{group.title}: {group.largest:.3g} {group.unit} would be {recorded.arrow_length:.2g} m long"
-        for group in recorded.arrows
-        if group.largest > 0.0
-    ]
+    long = f"would be {recorded.arrow_length:.2g} m long"
+    drawn = (group for group in recorded.arrows if group.largest > 0.0)
+    arrows = [f"{group.title}: {group.largest:.3g} {group.unit} {long}" for group in drawn]
     meaning = "Arrows are forces that the model found, torques along the axes of joints; pale ends are 95 % intervals"
     return ([f"{meaning}. {'; '.join(arrows)}."] if arrows else []) + recorded.doubts
 
