@@ -138,11 +138,7 @@ def printable(text: str) -> str:
 
     Control characters but line breaks and tabs, and what turns the direction of writing round (Unicode, TR 36, 2.10).
     """
-    return ACTING.sub(_written, text)
-
-
-def _written(found: re.Match[str]) -> str:
-    return ascii(found[0])[1:-1]
+    return ACTING.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
 def spreadsheet_cell(text: str) -> str:

@@ -297,9 +297,8 @@ class Model(Summary):
         if not self.contacts:
             *batch, nv = state.v.shape
             return state.q.new_zeros(*batch, 0, nv), state.q.new_zeros(*batch, 0), state.q.new_zeros(*batch, 0, 3)
-        rows, right, normals = zip(
-            *(contact.constraint(state, self.baumgarte) for contact in self.contacts), strict=True
-        )
+        each = (contact.constraint(state, self.baumgarte) for contact in self.contacts)
+        rows, right, normals = zip(*each, strict=True)
         return torch.stack(rows, dim=-2), torch.stack(right, dim=-1), torch.stack(normals, dim=-2)
 
     def check_states(self, q: Float[Tensor, "N nq"], v: Float[Tensor, "N nv"], u: Float[Tensor, "N nu"]) -> None:

@@ -22,9 +22,8 @@ class Summary:
         return line if len(line) <= WIDTH else f"{type(self).__name__}(\n  " + "\n  ".join(entries) + "\n)"
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><th>{escape(name)}</th><td>{escape(str(value))}</td></tr>" for name, value in self.facts().items()
-        )
+        cells = {escape(name): escape(str(value)) for name, value in self.facts().items()}
+        rows = "".join(f"<tr><th>{name}</th><td>{value}</td></tr>" for name, value in cells.items())
         return f"<table><caption>{escape(type(self).__name__)}</caption>{rows}</table>"
 
 

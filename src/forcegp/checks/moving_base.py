@@ -95,11 +95,8 @@ def base_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         other = errors[axes] < CLEARLY * error
         if error <= 2.0 * size and not other:  # noise of the velocities alone makes both large
             continue
-        kind, remedy, correction = (
-            look,
-            "Differentiate v: a is its derivative in body axes, without gravity and w x v.",
-            {},
-        )
+        kind, correction = look, {}
+        remedy = "Differentiate v: a is its derivative in body axes, without gravity and w x v."
         seen = (
             f"the acceleration of {group.name!r} is off from the change of its velocity by {error:.2g}, which itself "
             f"is {size:.2g}."
@@ -237,11 +234,8 @@ def _of_velocity(
     numbers = {"as recorded": recorded, "speed": speed} | ({reading: other} if reading else {})
     kind, remedy, seen = ok, "", f"positions and velocities of {group.name!r} agree."
     if reading:
-        kind, seen = (
-            wrong,
-            f"positions of {group.name!r} change as if it had {reading}: off by {other:.2g}, as recorded",
-        )
-        seen += f" by {recorded:.2g}, of a speed of {speed:.2g}."
+        kind, seen = wrong, f"positions of {group.name!r} change as if it had {reading}: off by {other:.2g}, as"
+        seen += f" recorded by {recorded:.2g}, of a speed of {speed:.2g}."
     elif recorded > CLEARLY * speed and speed > 0.0:
         remedy = "Check units and time stamps, and that v is linear, then angular velocity in the axes of the base."
         kind, seen = look, f"positions of {group.name!r} do not change as its velocities say: off by {recorded:.2g} of"

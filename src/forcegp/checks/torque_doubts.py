@@ -165,9 +165,8 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
         return log, []
     still = np.unique(np.concatenate(found))
     inputs, at, held = CheckInput.quick(_cut(log, still), model), log.rows(still), np.zeros(len(still), bool)
-    rows = replace(
-        inputs, compared=inputs.mended if inputs.compared is None else inputs.compared, most_rows=1000
-    ).rows()
+    compared = inputs.mended if inputs.compared is None else inputs.compared
+    rows = replace(inputs, compared=compared, most_rows=1000).rows()
     columns, standing = _needs(inputs.robot, rows), _needs(inputs.robot, at)
     for k, (u, v, a) in enumerate(zip(rows.u.T, rows.v.T, rows.a.T, strict=True)):
         slow = np.sqrt(np.square(v).mean()) + 1e-300

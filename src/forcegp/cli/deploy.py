@@ -95,9 +95,8 @@ def _c(options: Export, terminal: Terminal, posterior: Any, folder: Path) -> dic
             predictor = posterior.predictor(covariance="compressed" if options.covariance else "none")
             given["monitor"] = options.alarms.monitor(predictor, free, dt)
     made = forcegp.export_c(posterior, folder, **given)
-    terminal.show(
-        columns(str(options.out), ["file", "bytes"], [[file, f"{size:,}"] for file, size in made.files.items()])
-    )
+    sizes = [[file, f"{size:,}"] for file, size in made.files.items()]
+    terminal.show(columns(str(options.out), ["file", "bytes"], sizes))
     for function, apart in made.differences.items():
         terminal.show(f"{function}: at most {apart:.1e} of the largest value from forcegp's own")
     return {"name": made.name, "files": made.files, "differences": made.differences, "inflation": made.inflation}
@@ -270,8 +269,7 @@ class Excite(Command):
         spread = None if chosen.spread is None else chosen.spread.tolist()
         if spread is not None:
             table |= {"spread of a,\nbefore": spread[0], "\nafter": spread[1]}
-        rows = [
-            [name, *map(number, each)] for name, *each in zip(chosen.robot.joint_names, *table.values(), strict=True)
-        ]
+        of_joints = zip(chosen.robot.joint_names, *table.values(), strict=True)
+        rows = [[name, *map(number, each)] for name, *each in of_joints]
         terminal.show(columns(str(self.out), ["joint", *table], rows))
         return {"out": str(self.out), "usage": usage, "spread": spread, "condition": chosen.condition}

@@ -187,11 +187,8 @@ class Fit(Command):
 
     def _write(self, posterior: forcegp.posterior.Posterior) -> None:
         """The model, how it was made and what was estimated; what is known also as a robot's file."""
-        options = {
-            name: str(value) if isinstance(value, Path) else value
-            for name, value in values_of(self).items()
-            if name not in ("json", "debug", "overwrite")
-        }
+        given = {name: x for name, x in values_of(self).items() if name not in ("json", "debug", "overwrite")}
+        options = {name: str(x) if isinstance(x, Path) else x for name, x in given.items()}
         data = {"path": str(self.log), "sha256": file_digest(self.log)}
         content = {"options": options, "data": data, "resolved": dict(posterior.settings)}
         with self.folder(self.out, content) as folder:

@@ -78,10 +78,9 @@ class Fleet(Command):
             run_jobs(store, work, self.jobs)
         rows = []
         for name in lines:
-            row = store.load(name)
-            rows.append(
-                {"log": name, "folder": str(self.out / name), "cpu_seconds": row["cpu_seconds"]} | row["result"]
-            )
+            kept = store.load(name)
+            about = {"log": name, "folder": str(self.out / name), "cpu_seconds": kept["cpu_seconds"]}
+            rows.append(about | kept["result"])
         write_text(self.out / TABLE, table_of(rows))
         failed = {row["log"]: row["error"] for row in rows if row["error"]}
         done = f"{len(rows) - len(failed)} of {len(rows)} logs are done; numbers of each in {self.out / TABLE}"

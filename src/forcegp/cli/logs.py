@@ -20,6 +20,7 @@ from forcegp.cli.terminal import Terminal, columns, doubts_table, facts, shown
 from forcegp.errors import DatasetError, InvalidInput
 
 Columns = Annotated[str | None, unless_given("COLUMNS", "by the names", str)]
+MappingFile = Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "log.yaml or forcegp.yaml beside it", Path)]
 Text = Annotated[str | None, unless_given("TEXT", "none", str)]
 Seconds = Annotated[float | None, unless_given("S", "all", float)]
 
@@ -85,9 +86,7 @@ class ColumnOptions:
     """Frames, or points of them, that stand on the ground at times: 1 or 0 in columns of u after those of the
     actuators, in this order. Without these columns motion and forces decide; rows that leave it open are dropped.
     FRAME:flat is a foot that does not turn while it stands, FRAME:ball=RADIUS (m) a ball that rolls on level ground."""
-    mapping: Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "log.yaml or forcegp.yaml beside it", Path)] = (
-        None
-    )
+    mapping: MappingFile = None
     """What the columns mean; flags replace its entries."""
     time: Columns = None
     """Time stamps; of a bag with several topics, those of the messages that become rows."""
@@ -187,9 +186,7 @@ class ColumnOptions:
             raise InvalidInput(f"{path} and the flags: {error}") from None
 
     def _stated(self) -> forcegp.recordings.ColumnMapping:
-        given: dict[str, Any] = {
-            item.name: getattr(self, item.name) for item in fields(forcegp.recordings.ColumnMapping)
-        }
+        given: Any = {item.name: getattr(self, item.name) for item in fields(forcegp.recordings.ColumnMapping)}
         lists = {name: text for name, text in given.items() if name in (*"qvua", "joints") and text is not None}
         given |= {name: tuple(forcegp.recordings.listed(str(text))) for name, text in lists.items()}
         if self.headerless is not None:
@@ -376,10 +373,8 @@ def _shown(terminal: Terminal, data: Path, report: forcegp.checks.CheckReport) -
     heading = Text(f"{data}: {counts['wrong']} wrong, {counts['look']} to look at, {counts['ok']} ok", style="bold")
     told = [heading, doubts_table(report.doubts, terminal.worded)]
     if report.comparison is not None:
-        rows = [
-            [name, shown(left, "{:.2g} %", 100.0), shown(rms), shown(factor)]
-            for name, left, rms, factor in (each.values() for each in content["joints"])
-        ]
+        joints = (each.values() for each in content["joints"])
+        rows = [[name, shown(left, "{:.2g} %", 100.0), shown(rms), shown(factor)] for name, left, rms, factor in joints]
         unit = report.inputs.log.units["u"]
         title = f"Torque of every joint; in {unit if isinstance(unit, str) else 'the unit of each joint'}"
         told.append(columns(title, ["joint", "unexplained", "rms", "factor"], rows))

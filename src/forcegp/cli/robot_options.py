@@ -92,9 +92,8 @@ class RobotOptions(RobotFileOptions):
         model = recorded.with_robot(robot)
         if self.robot is not None:  # its damping, dry friction and springs
             there = model.laws
-            model = model.with_forces(
-                *(law for law in own.laws if not any(law.takes_the_place_of(each) for each in there))
-            )
+            new = (law for law in own.laws if not any(law.takes_the_place_of(each) for each in there))
+            model = model.with_forces(*new)
         return model
 
     def chosen_model(self, dataset: forcegp.Dataset, path: Path) -> forcegp.Model:
@@ -255,11 +254,9 @@ def parse_feet(texts: Sequence[str]) -> tuple[forcegp.Contact, ...]:
         if frame in feet:
             raise InvalidInput(f"--feet names {frame} twice; a frame has one foot.")
         switch = STANDS.format(frame)
-        feet[frame] = (
-            forcegp.mechanics.fixed_frame(frame, switch)
-            if flat
-            else forcegp.mechanics.fixed_point(frame, point, switch, radius[0])
-        )
+        feet[frame] = forcegp.mechanics.fixed_point(frame, point, switch, radius[0])
+        if flat:
+            feet[frame] = forcegp.mechanics.fixed_frame(frame, switch)
     return tuple(contact for points in feet.values() for contact in points)
 
 

@@ -142,10 +142,8 @@ class Score(Command):
         model = self.robot.chosen_model(raw, data)
         for note in forces_of(model):
             terminal.note(note)
-        preparation = self.filter.preparation()
-        rows, recording = prepared_rows(
-            terminal, preparation, replace(raw, model=model), thin=self.filter.every is None
-        )
+        raw, preparation = replace(raw, model=model), self.filter.preparation()
+        rows, recording = prepared_rows(terminal, preparation, raw, thin=self.filter.every is None)
         guard, cutoff = self.guard, forcegp.data.preparation_report(rows.metadata).get("cutoff")
         if cutoff is not None:  # a filter mixes what lies on both sides of a border, two time constants wide
             guard = max(guard, 2.5 * forcegp.data.LowPass(float(cutoff)).memory)

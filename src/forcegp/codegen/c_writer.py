@@ -137,10 +137,8 @@ def write_function(
     text.append(f"static APART void {name}({arguments}) {{\n  real w[{max(waiting, 1)}];")
     text += [f"  {name}_{number}(t, live, x, y, w);" for number in range(len(parts))]
     text.append("}")
-    constants = [
-        f"static const double {name}_table{k}[] = {{{', '.join(map(_number, table))}}};"
-        for table, k in looked_up.items()
-    ]
+    contents = {k: ", ".join(map(_number, table)) for table, k in looked_up.items()}
+    constants = [f"static const double {name}_table{k}[] = {{{numbers}}};" for k, numbers in contents.items()]
     return "\n".join(constants + text)
 
 

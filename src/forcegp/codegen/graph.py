@@ -239,9 +239,8 @@ def jacobian(
     if seeds is None:
         seeds = [[ONE if i == j else ZERO for j in range(len(inputs))] for i in range(len(inputs))]
     directions = range(len(seeds[0]) if seeds else 0)
-    tangents: dict[int, dict[int, int]] = {
-        node: {j: row[j] for j in directions if row[j] != ZERO} for node, row in zip(inputs, seeds, strict=True)
-    }
+    given = zip(inputs, seeds, strict=True)
+    tangents = {node: {j: row[j] for j in directions if row[j] != ZERO} for node, row in given}
     for node in graph.needed(outputs):
         if node in tangents:
             continue
@@ -320,8 +319,5 @@ def _slopes_of_call(graph: Graph, node: int) -> list[tuple[int, Callable[[], int
     found = graph.slopes.get(call)
     if found is None:
         raise InvalidInput(f"{graph.nodes[call][1]} gives no derivatives; make the program with slopes.")
-    return [
-        (operand, partial(graph.output, call, found[position, k]))
-        for k, operand in enumerate(graph.operands(call))
-        if (position, k) in found
-    ]
+    operands = ((operand, found.get((position, k))) for k, operand in enumerate(graph.operands(call)))
+    return [(operand, partial(graph.output, call, slope)) for operand, slope in operands if slope is not None]

@@ -161,9 +161,8 @@ def code_digest() -> str:
 
 def own_folder(folder: Path | None = None) -> Path:
     """``folder`` without symbolic links, made if it is missing, where nobody else can put or exchange anything."""
-    folder = Path(
-        os.path.realpath(folder or default_folder())
-    )  # what is checked is what is used, wherever a link points later
+    # what is checked is what is used, wherever a link points later
+    folder = Path(os.path.realpath(folder or default_folder()))
     try:
         for part in (*reversed(folder.parents), folder):
             if not part.is_dir():
@@ -224,9 +223,8 @@ class RowFunction:
         Batches of `least` states for each take as many threads as torch has, or `threads`.
         """
         parts = max(1, min(torch.get_num_threads() if threads is None else threads, count // least))
-        given = [
-            x for each in (*inputs, *outputs) for x in (each.data_ptr(), each.shape[1] if len(each) == count else 0)
-        ]
+        steps = ((each, each.shape[1] if len(each) == count else 0) for each in (*inputs, *outputs))
+        given = [x for each, step in steps for x in (each.data_ptr(), step)]
         bounds = [MOST_LANES * (count * k // parts // MOST_LANES) for k in range(parts)] + [count]
 
         def part(k: int) -> int:

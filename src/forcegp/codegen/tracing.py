@@ -123,10 +123,8 @@ def _basis(matrix: Tensor, tolerance: float) -> Tensor:
         row, square = rest[..., 0, :], squares[..., 0]
         for i in range(1, matrix.shape[-2]):
             longer = squares[..., i] > square
-            row, square = (
-                torch.where(longer[..., None], rest[..., i, :], row),
-                torch.where(longer, squares[..., i], square),
-            )
+            row = torch.where(longer[..., None], rest[..., i, :], row)
+            square = torch.where(longer, squares[..., i], square)
         largest = square if largest is None else largest
         if k:  # again, since rounding of the remainder is not orthogonal
             row = row - ((basis @ row[..., None])[..., 0][..., None, :] @ basis)[..., 0, :]
@@ -337,9 +335,8 @@ def _sum(graph: Graph, x: _Numbers, dim: Any = None, keepdim: bool = False) -> _
     count, width = (math.prod(nodes.shape[d] for d in which) for which in (kept, dims))
     rows = nodes.permute(*kept, *dims).reshape(count, width)
     total = torch.tensor([graph.sum(row) for row in rows.tolist()], dtype=torch.long)
-    return _Numbers(
-        total.view([1 if d in dims else size for d, size in enumerate(nodes.shape) if keepdim or d in kept])
-    )
+    shape = [1 if d in dims else size for d, size in enumerate(nodes.shape) if keepdim or d in kept]
+    return _Numbers(total.view(shape))
 
 
 def _mean(graph: Graph, x: _Numbers, dim: Any = None, keepdim: bool = False) -> _Numbers:

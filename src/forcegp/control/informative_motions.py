@@ -176,12 +176,10 @@ class Excitation(Summary):
         time = np.arange(round(self.seconds * rate) + 1) / rate
         states = self.trajectory(time)
         names = ["t", *(f"{what}_{joint}" for what in "qvau" for joint in self.robot.joint_names)]
-        header = ",".join(
-            f'"{name.replace(chr(34), 2 * chr(34))}"' if set(name) & {",", '"'} else name for name in names
-        )
+        quoted = (f'"{name.replace(chr(34), 2 * chr(34))}"' if set(name) & {",", '"'} else name for name in names)
         with atomic_file(path) as temporary:
             table = np.hstack([time[:, None], *states, self.torques(*states)])
-            np.savetxt(temporary, table, "%.9g", ",", header=header, comments="", encoding="utf-8")
+            np.savetxt(temporary, table, "%.9g", ",", header=",".join(quoted), comments="", encoding="utf-8")
 
     def used(self, name: str, x: Values) -> Float[np.ndarray, " nv"]:
         """The largest value of a quantity over its limit; of the position from its control points."""

@@ -65,9 +65,8 @@ class MujocoForces:
         if mujoco.get_mjcb_passive() is not None:
             raise InvalidInput("MuJoCo has a passive callback already; leave its context, or set_mjcb_passive(None).")
         self._library.evaluate(self._tables)
-        mujoco.set_mjcb_passive(
-            ctypes.cast(self._library.passive, ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p))
-        )
+        kind = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
+        mujoco.set_mjcb_passive(ctypes.cast(self._library.passive, kind))
         return self
 
     def __exit__(

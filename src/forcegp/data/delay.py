@@ -116,9 +116,8 @@ def estimate_delay(dataset: Dataset, cutoff: float | None = None) -> Delay:
 
 def _told_apart(dataset: Dataset, largest: float, cutoff: float | None) -> Delay:
     """The delay under friction of velocity if it shows beside friction that remembers, too, else that beside memory."""
-    (alone, left), (beside, least) = (
-        _estimated(log, largest, cutoff) for log in (replace(dataset, strokes=None), with_strokes(dataset))
-    )
+    logs = replace(dataset, strokes=None), with_strokes(dataset)
+    (alone, left), (beside, least) = (_estimated(log, largest, cutoff) for log in logs)
     if least < REMEMBERS * left:
         return beside
     used, width = alone.significant, 4.0 * beside.common_std
@@ -176,9 +175,8 @@ def least_squares(
     right = np.stack([basis[rows].T @ targets[rows] for rows in blocks])
     square = np.stack([np.square(targets[rows]).sum(axis=0) for rows in blocks])
     sums = [part.sum(axis=0) for part in (normal, right, square)]
-    without = [
-        _unexplained(sums[0] - n, sums[1] - r, sums[2] - s) for n, r, s in zip(normal, right, square, strict=True)
-    ]
+    left_out = zip(normal, right, square, strict=True)
+    without = [_unexplained(sums[0] - n, sums[1] - r, sums[2] - s) for n, r, s in left_out]
     return np.stack([_unexplained(*sums), *without])
 
 

@@ -67,9 +67,8 @@ class Stance:
         rows, decided = np.arange(len(self.flags)), np.isfinite(self.flags)
         if not decided.any(axis=0).all():
             raise self._open(len(rows))
-        nearest = [
-            np.interp(rows, rows[known], own[known]) > 0.5 for own, known in zip(self.flags.T, decided.T, strict=True)
-        ]
+        of_feet = zip(self.flags.T, decided.T, strict=True)
+        nearest = [np.interp(rows, rows[known], own[known]) > 0.5 for own, known in of_feet]
         return replace(dataset, u=np.column_stack([dataset.u[:, : -len(self.names)], *nearest]))
 
     def written(self, dataset: Dataset) -> Dataset:

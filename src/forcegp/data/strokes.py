@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from forcegp.data.dataset import Dataset
+from forcegp.mechanics import State
 
 COUNT = 12
 """Strokes that a row remembers: of more, what friction still feels is smaller than 12 encoder steps times sigma."""
@@ -73,12 +74,8 @@ def motor_positions(
 
 def joint_positions(dataset: Dataset) -> Float[np.ndarray, "rows nv"]:
     """Positions of joints of one degree of freedom; 0 for the others."""
-    model = dataset.model
-    if model.robot.space.is_vector_space:
-        return np.asarray(dataset.q)
-    robot, out = model.robot, np.zeros((len(dataset), dataset.nv))
-    out[:, np.isin(robot.joint_names, robot.single_joint_names)] = robot.space.singles(torch.tensor(dataset.q)).numpy()
-    return out
+    q, v = torch.tensor(dataset.q), torch.tensor(dataset.v)
+    return State(q, v, v, dataset.model.robot).positions.numpy()
 
 
 def encoder_step(dataset: Dataset, q: Float[np.ndarray, " rows"]) -> float:

@@ -140,15 +140,13 @@ class Bodies:
     def slopes(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "standard k"]:
         """Derivatives of the standard parameters of all bodies, one after the other, in the coordinates."""
         own = self._standard(self._congruent(_log_cholesky(x)[1])).swapaxes(-1, -2)
-        return block_diag(*own) if len(own) else np.zeros((0, 0))
+        return block_diag(np.zeros((0, 0)), *own)
 
     def moved(self, x: Float[np.ndarray, " k"], step: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         """x + step to first order: parameters change by exactly their derivatives times the step, if a body can.
 
         Torque is linear in them: with many rows of little noise, straight lines in x leave its narrow valley.
         """
-        if not self.priors:
-            return x + step
         inner, derivatives = _log_cholesky(x)
         inner = inner + np.einsum("nk,nkab->nab", step.reshape(-1, 10), derivatives)
         values = np.linalg.eigvalsh(inner)
@@ -161,8 +159,6 @@ class Bodies:
 
     def distance(self, x: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
         """A vector whose norm is the distance from the references times the root of its weight, and its Jacobian."""
-        if not self.priors:
-            return np.zeros(0), np.zeros((0, 0))
         inner, change = _log_cholesky(x)
         values, vectors = np.linalg.eigh(inner)
         values = np.maximum(values, np.finfo(np.float64).tiny)
@@ -176,7 +172,7 @@ class Bodies:
         divided = np.where(equal, 1.0 / mean, (logs[:, :, None] - logs[:, None, :]) / np.where(equal, 1.0, gap))
         inside = turned[:, None] @ change @ vectors[:, None] * divided[:, None]
         moved = vectors[:, None] @ inside @ turned[:, None]
-        jacobian = block_diag(*np.einsum("kab,niab->nki", _SYMMETRIC, moved))
+        jacobian = block_diag(np.zeros((0, 0)), *np.einsum("kab,niab->nki", _SYMMETRIC, moved))
         distance = np.einsum("kab,nab->nk", _SYMMETRIC, logarithm).ravel()
         return self._weights * distance, self._weights[:, None] * jacobian
 
@@ -188,10 +184,8 @@ class Bodies:
 
     def number_slopes(self, x: Float[np.ndarray, " k"], frames: Float[np.ndarray, "n 4 4"]) -> np.ndarray:
         """Derivatives of `numbers` in the coordinates."""
-        if not self.priors:
-            return np.zeros((0, 0))
         changes = _in_frames(self._congruent(_log_cholesky(x)[1]), frames[:, None])
-        blocks = []
+        blocks = [np.zeros((0, 0))]
         for pseudo, change in zip(_in_frames(self.pseudo_inertias(x), frames), changes, strict=True):
             mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
             dm = change[:, 3, 3]

@@ -66,12 +66,9 @@ class NoiseLevels:
             left = torch.cat([precision.diagonal(dim1=-2, dim2=-1), both.diagonal(dim1=-2, dim2=-1)], -1).sum(0)
             explained = torch.cat([weighted, (inverse @ weighted[..., None])[..., 0]], -1).square().sum(0)
             squares = torch.cat([acceleration, force]).square()
-            curvature = torch.cat(
-                [
-                    torch.cat([precision.square().sum(0), across.square().sum(0).mT], 1),
-                    torch.cat([across.square().sum(0), both.square().sum(0)], 1),
-                ]
-            )
+            mixed = across.square().sum(0)
+            parts = torch.cat([precision.square().sum(0), mixed.mT], 1), torch.cat([mixed, both.square().sum(0)], 1)
+            curvature = torch.cat(parts)
             curvature = (2.0 * squares * squares[:, None] * curvature).numpy() + np.eye(len(x))
             slope = (squares * (left - explained)).numpy() + x - middle
             return _Point(x, float(value) + 0.5 * float(((x - middle) ** 2).sum()), slope, curvature)

@@ -323,12 +323,6 @@ class MarginalLikelihood:
         learned = {name: value for name, value in parameters.items() if name in wanted}
         return learned, {name: value for name, value in parameters.items() if name not in learned}
 
-    @property
-    def parameter_shapes(self) -> dict[str, tuple[int, ...]]:
-        """Names and shapes of the parameters that a posterior on these rows needs."""
-        named = self.kernels.initial_parameters() | self.noise.parameters(self.model.robot.nv)
-        return {name: tuple(value.shape) for name, value in named.items()}
-
 
 def problem_size(model: Model, rows: int) -> ProblemSize:
     """Of the posterior of so many rows, computing nothing; contacts count as independent and leave some motion."""

@@ -336,19 +336,15 @@ def _derivatives(
         out = []
         for term in terms:
             if term.joints is not None:  # amplitude j depends on entry j alone
-                found = torch.autograd.grad(
-                    amplitude.sum(), numbers[term.name], retain_graph=True, materialize_grads=True
-                )
-                slope = found[0]
+                total, number = amplitude.sum(), numbers[term.name]
+                slope = torch.autograd.grad(total, number, retain_graph=True, materialize_grads=True)[0]
                 if B is None:
                     out.append(-slope.cpu().numpy())
                     continue
                 each = slope.diag_embed()[..., list(term.joints)]
             else:
-                parts = [
-                    torch.autograd.grad(amplitude[..., k].sum(), numbers[term.name], retain_graph=True)[0]
-                    for k in range(amplitude.shape[-1])
-                ]
+                totals = amplitude.flatten(0, -2).sum(0)
+                parts = [torch.autograd.grad(total, numbers[term.name], retain_graph=True)[0] for total in totals]
                 each = torch.stack(parts, dim=-1)[..., None]
             out.append(-(each if B is None else B @ each).cpu().numpy())
     amplitude = amplitude.detach()

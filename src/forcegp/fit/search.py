@@ -249,11 +249,8 @@ class Search:
         if not usable:
             causes = "; ".join(f"restart {k}: {error}" for k, error in enumerate(results))
             raise FitError(f"none of {restarts} restarts could be evaluated ({causes})")
-        best = replace(
-            best_of(usable),
-            evaluations=sum(search.evaluations for search in usable),
-            cpu_seconds=sum(search.cpu_seconds for search in usable),
-        )
+        work: Any = {name: sum(getattr(x, name) for x in usable) for name in ("evaluations", "cpu_seconds")}
+        best = replace(best_of(usable), **work)
         settings = {
             "restarts": restarts,
             "warm_start": self.start is not None,

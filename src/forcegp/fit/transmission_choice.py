@@ -44,9 +44,8 @@ def choose_transmission(
         motors = np.einsum("nkc,kj->njkc", columns, T * weight).reshape(*v.shape, -1)
         X = np.concatenate([bodies, motors], axis=-1)
         X = X / np.sqrt((X**2).sum((0, 1))).clip(1e-300)
-        normal, right = (
-            np.stack([np.tensordot(X[k], y[k], ((0, 1), (0, 1))) for k in rows]) for y in (X, torque[..., None])
-        )
+        sides = X, torque[..., None]
+        normal, right = (np.stack([np.tensordot(X[k], y[k], ((0, 1), (0, 1))) for k in rows]) for y in sides)
         others = normal.sum(0) - normal + RIDGE * np.eye(X.shape[-1])
         each = np.linalg.solve(others, right.sum(0) - right)[..., 0]
         return np.stack([((torque[k] - X[k] @ x) ** 2).sum(0) for k, x in zip(rows, each, strict=True)])
@@ -63,11 +62,9 @@ def _candidates(model: Model, T: Float[np.ndarray, "nv nv"]) -> Iterator[tuple[n
     robot, nv = model.robot, len(T)
     named = {joint.name: joint.type == "prismatic" for joint in robot.joints}
     slides = [named.get(name) if name in robot.single_joint_names else None for name in robot.joint_names]
-    pairs = {
-        (robot.layout.drives[body].joint, robot.layout.drives[parent].joint)
-        for body, parent in enumerate(robot.layout.parents)
-        if parent >= 0
-    }
+    drives = robot.layout.drives
+    bodies = zip(drives, robot.layout.parents, strict=True)
+    pairs = {(drive.joint, drives[parent].joint) for drive, parent in bodies if parent >= 0}
     for a, b in sorted(pairs | {pair[::-1] for pair in pairs}):
         if a != b and slides[a] is not None and slides[a] == slides[b] and T[a, b] == 0.0:
             for sign in (1.0, -1.0):

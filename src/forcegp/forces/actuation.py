@@ -14,7 +14,7 @@ from forcegp.errors import InvalidInput, require_type
 from forcegp.forces.force import Coefficient, Force, Law, Number, as_numbers
 from forcegp.forces.joint_law import PerJointLaw
 from forcegp.forces.joint_laws import Coulomb, Spring, Viscous
-from forcegp.forces.rigid_bodies import RigidBodies
+from forcegp.forces.rigid_bodies import RigidBodies, WholeLaw
 from forcegp.mechanics.gauss_principle import State
 from forcegp.robots import Robot
 from forcegp.robots.mjcf_model import Translation
@@ -209,21 +209,13 @@ class ObservedWrench(LinkForce):
 
 
 @dataclass(frozen=True, eq=False)
-class ObservedWind(Law):
+class ObservedWind(WholeLaw):
     """The velocity of the air [m/s] along the world's axes, which an observer estimates, in columns of u.
 
     It is no force: `AerodynamicForce` takes velocities against it.
     """
 
     names: Any = ("wind_velocity_x", "wind_velocity_y", "wind_velocity_z")
-
-    @override
-    def features(self, state: State) -> tuple[Tensor, ...]:
-        return (state.v,)
-
-    @override
-    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
-        return torch.zeros_like(features[0])
 
     @classmethod
     def at(cls, state: State) -> Float[Tensor, "*batch 3"] | None:

@@ -18,11 +18,11 @@ from forcegp.forces.link_forces import (
     SMALLEST_SPEED,
     ToolPoint,
     contact_axes,
-    is_contact_number,
     nominal_normal_force,
     require_contact,
+    require_contact_number,
 )
-from forcegp.forces.unknown import ExpressedKernels, Scaling, Unknown, UnknownForces
+from forcegp.forces.unknown import ExpressedKernels, Scaling, UnknownForces
 from forcegp.mechanics import ConstrainedDynamics, Contact
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, is_sequence
@@ -154,8 +154,7 @@ class ContactFriction(ExpressedKernels):
     @usable_arguments("ContactFriction")
     def __post_init__(self) -> None:
         require_type("load", self.load, bool)
-        if not is_contact_number(self.contact):
-            raise InvalidInput(f"ContactFriction has contact {self.contact!r}; give a contact's number from 0.")
+        require_contact_number("ContactFriction", self.contact)
         if self.expected is not None and not self.load:
             raise InvalidInput("ContactFriction has an expected friction but no load; give load=True, or leave it out")
         object.__setattr__(self, "expected", ExpectedFriction.of(self.expected))
@@ -237,25 +236,15 @@ def refined_loads(forces: UnknownForces, robot: Robot, table: Table) -> UnknownF
 
     That of the sliding, and of the `JointFriction` beside it. None for forces without such a term.
     """
-    names = forces.latent_names(robot)
-    if not any(_wants_load(term) for term in forces.terms):
+    names, terms = forces.latent_names(robot), list(forces.terms)
+    loaded = {k: term for k, term in enumerate(terms) if isinstance(term, ContactFriction) and term.load}
+    wanting = {k: term for k, term in loaded.items() if term.expected is None}
+    if not wanting:
         return None
-    joints = tuple(
-        (joint, table(latent))
-        for _, term, which in forces.named(robot)
-        if isinstance(term, JointFriction)
-        for joint, latent in zip(term.latent_names(robot), names[which], strict=True)
-    )
-    return UnknownForces(
-        tuple(
-            replace(term, expected=ExpectedFriction(table(names[which][0]), joints))
-            if isinstance(term, ContactFriction) and _wants_load(term)
-            else term
-            for _, term, which in forces.named(robot)
-        )
-    )
-
-
-def _wants_load(term: Unknown) -> bool:
-    """Whether its latent is a friction coefficient, and the load is still to be found."""
-    return isinstance(term, ContactFriction) and term.load and term.expected is None
+    latents, joints = [names[which] for which in forces.slices(robot)], list[tuple[str, TabulatedCurve]]()
+    for term, own in zip(terms, latents, strict=True):
+        if isinstance(term, JointFriction):
+            joints += zip(term.latent_names(robot), map(table, own), strict=True)
+    for k, term in wanting.items():
+        terms[k] = replace(term, expected=ExpectedFriction(table(latents[k][0]), tuple(joints)))
+    return UnknownForces(tuple(terms))

@@ -56,9 +56,10 @@ def nominal_normal_force(dynamics: ConstrainedDynamics, contact: int) -> Float[T
     return size * dynamics.multiplier_map().offset[..., contact].abs()
 
 
-def is_contact_number(value: object) -> bool:
-    """Whether it can be the number of a contact, counted from 0."""
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+def require_contact_number(force: str, contact: object) -> None:
+    """Raise InvalidInput for what cannot be the number of a contact, counted from 0."""
+    if isinstance(contact, bool) or not isinstance(contact, int) or contact < 0:
+        raise InvalidInput(f"{force} has contact {contact!r}; give a contact's number from 0.")
 
 
 def require_contact(force: str, contact: int, contacts: Sequence[Contact]) -> None:
@@ -97,8 +98,7 @@ class ToolForces(SharedInputs):
     @usable_arguments("ToolForces")
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not is_contact_number(self.contact):
-            raise InvalidInput(f"ToolForces has contact {self.contact!r}; give a contact's number from 0.")
+        require_contact_number("ToolForces", self.contact)
 
     @property
     @override

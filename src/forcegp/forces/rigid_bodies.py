@@ -18,15 +18,8 @@ from forcegp.robots.inertia import physical_of_pseudo_inertia, pseudo_inertia
 from forcegp.robots.urdf_file import replace_inertial
 
 
-@dataclass(frozen=True, eq=False)
-class RigidBodies(Law):
-    """Coriolis, centrifugal and gravity forces of the robot's bodies, -bias(q, v); their inertia is the mass matrix.
-
-    learn: which bodies a fit estimates, from those of the robot's file: "all" bodies that move, or by name of a link:
-        (link, ...), or {link: Body(strength)}. A body is what one joint moves as one; any link of it names it.
-    """
-
-    learn: Literal["all"] | Sequence[str] | Mapping[str, Body] = ()
+class WholeLaw(Law):
+    """A law that is no sum of amplitudes: `force_at` is its force, none unless a subclass has one."""
 
     @override
     def features(self, state: State) -> tuple[Tensor, ...]:
@@ -34,7 +27,22 @@ class RigidBodies(Law):
 
     @override
     def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
-        raise NotImplementedError("bodies are no sum of amplitudes: `force_at` is their bias")
+        raise NotImplementedError(f"{self.title} is no sum of amplitudes: `force_at` is its force")
+
+    @override
+    def force_at(self, state: State, values: Mapping[str, Tensor]) -> Tensor:
+        return torch.zeros_like(state.v)
+
+
+@dataclass(frozen=True, eq=False)
+class RigidBodies(WholeLaw):
+    """Coriolis, centrifugal and gravity forces of the robot's bodies, -bias(q, v); their inertia is the mass matrix.
+
+    learn: which bodies a fit estimates, from those of the robot's file: "all" bodies that move, or by name of a link:
+        (link, ...), or {link: Body(strength)}. A body is what one joint moves as one; any link of it names it.
+    """
+
+    learn: Literal["all"] | Sequence[str] | Mapping[str, Body] = ()
 
     @override
     def force_at(self, state: State, values: Mapping[str, Tensor]) -> Tensor:
@@ -70,7 +78,7 @@ WEAK = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Payload(Law):
+class Payload(WholeLaw):
     """A body that the robot carries on `link`: its weight, and what its inertia adds to the robot's.
 
     link: None stands for the base that moves, else for the last link of the last joint.
@@ -121,18 +129,6 @@ class Payload(Law):
         if self.link is not None and robot.frame(self.link)[0] < 0:
             raise InvalidInput(f"link {self.link!r} does not move, so nothing on it shows; give a moving one.")
         return self
-
-    @override
-    def features(self, state: State) -> tuple[Tensor, ...]:
-        return (state.v,)
-
-    @override
-    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
-        raise NotImplementedError("a payload is part of its body, whose force is the bias")
-
-    @override
-    def force_at(self, state: State, values: Mapping[str, Tensor]) -> Tensor:
-        return torch.zeros_like(state.v)  # of what moves with it, `RigidBodies` has the force
 
     @property
     def prior(self) -> Body:

@@ -78,9 +78,8 @@ class WeightSpace:
     ) -> "WeightSpace":
         """Condition on all rows; time O(N P^2). Raises NumericalError where the points cannot be factorised."""
         points = tuple(z.detach() for z in points)
-        lowers = tuple(
-            factorize(partial(kernel.cross, z, z)).lower.tril() for kernel, z in zip(kernels.dense, points, strict=True)
-        )
+        own = zip(kernels.dense, points, strict=True)
+        lowers = tuple(factorize(partial(kernel.cross, z, z)).lower.tril() for kernel, z in own)
         prior = cls(kernels, points, lowers, CholeskyFactor(C.new_zeros(0, 0)), C.new_zeros(0), 0.0)
         slices = prior.slices
         pairs = (C[..., :, None] * C[..., None, :]).sum(1)  # C_i^T C_i
@@ -121,10 +120,8 @@ class WeightSpace:
 
     def center_weights(self, weights: Float[Tensor, "P S"]) -> list[Float[Tensor, "_ S"]]:
         """Weights w_c of the features phi_c as those of the kernel functions about the points p_c: L_c^-T w_c."""
-        return [
-            torch.linalg.solve_triangular(lower.mT, weights[part], upper=True)
-            for lower, part in zip(self.lowers, self.slices, strict=True)
-        ]
+        own = zip(self.lowers, self.slices, strict=True)
+        return [torch.linalg.solve_triangular(lower.mT, weights[part], upper=True) for lower, part in own]
 
 
 CANDIDATES = 20_000
@@ -191,10 +188,8 @@ class InducingPosterior(LatentPosterior):
         size = (len(self.space.mean), samples)
         draws = torch.randn(size, generator=generator, dtype=torch.float64, device=self.space.mean.device)
         drawn = self.space.mean[:, None] + self.space.precision.solve_upper(draws)
-        whitened = [
-            torch.linalg.solve_triangular(lower, values.mT, upper=False)
-            for lower, values in zip(self.space.lowers, prior, strict=True)
-        ]
+        own = zip(self.space.lowers, prior, strict=True)
+        whitened = [torch.linalg.solve_triangular(lower, values.mT, upper=False) for lower, values in own]
         return tuple(w.mT for w in self.space.center_weights(drawn - torch.cat(whitened)))
 
 
@@ -213,7 +208,5 @@ def inducing_pivots(
     candidates = torch.linspace(0, count - 1, min(count, CANDIDATES), dtype=torch.float64).round().long().to(C.device)
     relevance = C.square().sum(1)[candidates]
     share = tolerance / max(1, C.shape[-1]) * len(candidates)
-    return [
-        candidates[pivoted_cholesky(kernel, z[candidates], relevance[:, c], points, share)]
-        for c, (kernel, z) in enumerate(zip(kernels.dense, features, strict=True))
-    ]
+    each = zip(kernels.dense, features, relevance.mT, strict=True)
+    return [candidates[pivoted_cholesky(kernel, z[candidates], own, points, share)] for kernel, z, own in each]

@@ -232,13 +232,9 @@ def negative_log_likelihood(
     """
     count, outputs, _ = W.shape
     if outputs > 1 and noise.ndim == 2 and _acts_apart(W):
-        one = range(outputs)
-        return torch.stack(
-            [
-                negative_log_likelihood(W[:, d : d + 1, d : d + 1], residual[:, d : d + 1], noise[:, d : d + 1], [K])
-                for d, K in zip(one, kernel_matrices, strict=True)
-            ]
-        ).sum()
+        each = zip((slice(d, d + 1) for d in range(outputs)), kernel_matrices, strict=True)
+        alone = [negative_log_likelihood(W[:, d, d], residual[:, d], noise[:, d], [K]) for d, K in each]
+        return torch.stack(alone).sum()
     W_white, y_white, log_noise = whiten(W.detach(), residual, noise)
     quadratic_and_logdet = _DeflatedNLL.apply(W_white, y_white, *kernel_matrices)
     return quadratic_and_logdet + log_noise + 0.5 * count * outputs * math.log(2.0 * math.pi)
@@ -299,9 +295,7 @@ class _DeflatedNLL(torch.autograd.Function):
         deflation = deflate(W_white, y_white)
         system = solve_deflated(deflation, kernel_matrices)
         alpha, beta = system.alpha, system.beta
-        value = 0.5 * (
-            (deflation.t * alpha).sum() + system.factor.log_determinant() + deflation.remainder.square().sum()
-        )
+        value = (deflation.t * alpha).sum() + system.factor.log_determinant() + deflation.remainder.square().sum()
         W_needed, y_needed, *K_needed = ctx.needs_input_grad
         gradients: list[Tensor | None] = [None] * (2 + len(kernel_matrices))
         if y_needed:
@@ -315,7 +309,7 @@ class _DeflatedNLL(torch.autograd.Function):
                 C_gradient = C_gradient - alpha[..., None] * latent_mean[:, None, :]
                 gradients[0] = deflation.U @ C_gradient - deflation.remainder[..., None] * latent_mean[:, None, :]
         ctx.gradients = gradients
-        return value
+        return 0.5 * value
 
     @staticmethod
     def backward(ctx, upstream: Tensor):  # type: ignore[override]  # the base takes *args

@@ -361,12 +361,10 @@ def drawn_calls(
     """The functions that `draw_functions` draws, in the forms that `calls` have; None where one has no such form."""
     drawn = draw_functions(latent, samples, seed, widening)
     forms = [(part, drawn_form(drawn, latent, part.latents[0])) for part in calls]
-    if any(form is None for _, form in forms):
+    known = [(part, form) for part, form in forms if form is not None]
+    if len(known) < len(forms):
         return None
-    return [
-        tuple(OneInputCall.in_pieces(part, form.only(r)) for part, form in forms if form is not None)
-        for r in range(samples)
-    ]
+    return [tuple(OneInputCall.in_pieces(part, form.only(r)) for part, form in known) for r in range(samples)]
 
 
 def _once(functions: OneInputFunctions, purpose: str, lanes: int) -> tuple[str, str]:

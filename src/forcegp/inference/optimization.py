@@ -3,7 +3,7 @@
 import operator
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -96,21 +96,18 @@ class _Search:
         """Objective and gradient; None, with the cause kept, where they cannot be evaluated or are not finite."""
         self.evaluations += 1
         parameters = {name: value.requires_grad_() for name, value in self.unflatten(point).items()}
-        gradients: Sequence[Tensor | None] = [None] * len(parameters)
+        slopes = {name: torch.zeros_like(parameter) for name, parameter in parameters.items()}
         try:
             # Trial points far out may need jitter; whether the result does, shows in the factorisation at the end.
             with torch.enable_grad(), warnings.catch_warnings():
                 warnings.simplefilter("ignore", NumericalWarning)
                 value = self.objective(parameters)
             if parameters and value.requires_grad:
-                gradients = torch.autograd.grad(value, list(parameters.values()), allow_unused=True)
+                found = torch.autograd.grad(value, list(parameters.values()), materialize_grads=True)
+                slopes = dict(zip(parameters, found, strict=True))
         except (NumericalError, torch.linalg.LinAlgError) as error:
             return self._fail(str(error))
-        filled = {
-            name: torch.zeros_like(parameter) if gradient is None else gradient
-            for (name, parameter), gradient in zip(parameters.items(), gradients, strict=True)
-        }
-        number, slope = float(value.detach()), self.flatten(filled)
+        number, slope = float(value.detach()), self.flatten(slopes)
         if not (np.isfinite(number) and np.isfinite(slope).all()):
             return self._fail("the objective or its gradient is not finite")
         if number < self.best_value:

@@ -127,10 +127,9 @@ class DrawnTerm:
             numbers[..., 0] /= news
             values = lfilter([news], [1.0, -decay], numbers.cpu().numpy())
             return cls(term, (), (torch.as_tensor(values, device=generator.device),), grid)
-        frequencies = tuple(
-            factor.frequencies((samples, e.shape[-1], count), generator)
-            for factor, e in zip(term.factors, embedded, strict=True)
-        )
+        sizes = [(samples, e.shape[-1], count) for e in embedded]
+        each = zip(term.factors, sizes, strict=True)
+        frequencies = tuple(factor.frequencies(size, generator) for factor, size in each)
         cosines, sines = torch.randn(2, samples, columns, count, **options) / math.sqrt(count)
         return cls(term, frequencies, (cosines, sines))
 
@@ -149,10 +148,8 @@ class DrawnTerm:
             return (columns.mT * beyond * between).sum(1)
         if not self.frequencies:
             return (columns @ weights[0][..., None])[..., 0]
-        phase = sum(
-            factor.embedding(z).unflatten(0, (count, -1)) @ frequencies[samples]
-            for factor, frequencies in zip(self.term.factors, self.frequencies, strict=True)
-        )
+        drawn = zip(self.term.factors, self.frequencies, strict=True)
+        phase = sum(factor.embedding(z).unflatten(0, (count, -1)) @ omega[samples] for factor, omega in drawn)
         assert isinstance(phase, Tensor)
         waves = phase.cos() @ weights[0].mT + phase.sin() @ weights[1].mT
         return (columns * waves).sum(-1)

@@ -168,17 +168,14 @@ class KernelSum:
             return self._loop(name, made, owner, lanes, False)
         both = [self._loop(f"{name}_{'one' if one else 'many'}", made, owner, lanes, one) for one in (True, False)]
         choice = f"if (live == 1) {name}_one(t, live, z, f); else {name}_many(t, live, z, f);"
-        return "\n".join(
-            [*both, f"static void {name}(const double *t, long live, const real *z, real *f) {{ {choice} }}"]
-        )
+        both.append(f"static void {name}(const double *t, long live, const real *z, real *f) {{ {choice} }}")
+        return "\n".join(both)
 
     def roots_source(self, lanes: int, rank: int) -> str:
         """`NAME_roots(t, F, z, P)`: P (G, rank) += k(z, Z) F for one state, F (G, N filled up, rank)."""
         kernels = self._loop(f"{self.name}_kernels", list(self.kernels), [], lanes, True)
-        return kernels + filled(
-            c_text(__name__, "kernel_roots.c"),
-            {"NAME": self.name, "RANK": rank, "LATENTS": len(self.latents), "BLOCK": BLOCK},
-        )
+        words = {"NAME": self.name, "RANK": rank, "LATENTS": len(self.latents), "BLOCK": BLOCK}
+        return kernels + filled(c_text(__name__, "kernel_roots.c"), words)
 
     def _loop(self, name: str, made: list[int], owner: list[int], lanes: int, one: bool) -> str:
         """One state and several centres at a time with `one`, else several states."""
@@ -301,9 +298,8 @@ def _directions(latent: ExactPosterior, sample: Sample) -> tuple[Float[Tensor, "
     found = []
     for start in range(0, points, height):
         features, W = [z[start : start + height] for z in sample.features], sample.W[start : start + height]
-        cross = torch.stack(
-            [k.cross(z, at) for k, z, at in zip(latent.kernels.dense, features, latent.features, strict=True)]
-        )
+        places = zip(latent.kernels.dense, features, latent.features, strict=True)
+        cross = torch.stack([k.cross(z, at) for k, z, at in places])
         # W = Y Z with as few rows Z as it has rank: contacts and few latents leave fewer columns to solve for
         Y, scales, Z = torch.linalg.svd(W, full_matrices=False)
         needed = max(1, int((scales > ROUNDING**2 * scales.amax()).sum(1).max()))

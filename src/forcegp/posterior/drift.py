@@ -179,9 +179,8 @@ def random_walk(
     def nats(at: tuple[float, ...]) -> float:
         if at not in found:
             rate, between, lasting, seconds = at
-            covariance = (
-                np.diag(1.0 / information) + rate * walked + same * (between + lasting * np.exp(-lag / seconds))
-            )
+            of_record = same * (between + lasting * np.exp(-lag / seconds))
+            covariance = np.diag(1.0 / information) + rate * walked + of_record
             found[at] = restricted_likelihood(y, covariance)
         return found[at][0]
 

@@ -151,9 +151,7 @@ class Estimates(Summary, Mapping[str, Estimate]):
         known = Estimate.__dataclass_fields__
         entries = tuple(Estimate(**{k: v for k, v in x.items() if k in known}) for x in stored["parameters"].values())
         covariance = None if stored["covariance"] is None else np.array(stored["covariance"], dtype=np.float64)
-        kept: dict[str, Any] = {
-            name: stored[name] for name in ("by_body", "evidence", "rows", "evaluations", "settled")
-        }
+        kept: Any = {name: stored[name] for name in ("by_body", "evidence", "rows", "evaluations", "settled")}
         return cls(entries, covariance, thickened=tuple(stored["thickened"]), **kept)
 
     @classmethod

@@ -94,10 +94,8 @@ class Posterior(Fitted):
                 raise InvalidInput(f"a {self.description} predicts no forces, which a could tell about; leave a out.")
             rows = state_tensor("a", a, self.model.robot.nv, self.model.robot.device)
             states = [*states, rows.expand(*batch, -1).reshape(batch.numel(), -1)]
-        blocks = [
-            predict(q, v, u, covariance, *seen)
-            for q, v, u, *seen in zip(*(x.split(ROWS_PER_BLOCK) for x in states), strict=True)
-        ]
+        parts = zip(*(x.split(ROWS_PER_BLOCK) for x in states), strict=True)
+        blocks = [predict(q, v, u, covariance, *seen) for q, v, u, *seen in parts]
         predicted = join_predictions(blocks, batch)
         # lost where a state is so large, or a system so singular, that nothing is left of the numbers
         variance = predicted.mean if predicted.covariance is None else predicted.variance

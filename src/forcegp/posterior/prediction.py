@@ -140,10 +140,7 @@ def without_past(
     mean, variance = memory.likely(v, training.u[:, columns], training.v)
 
     def at(z: Float[Tensor, "rows m"], covariance: bool) -> Prediction:
-        given: Prediction = posterior.predict_rows(
-            q, v, torch.cat([u[:, :first], z, u[:, first:]], dim=1), covariance, a
-        )
-        return given
+        return posterior.predict_rows(q, v, torch.cat([u[:, :first], z, u[:, first:]], dim=1), covariance, a)
 
     found = at(mean, covariance)
     if not covariance:

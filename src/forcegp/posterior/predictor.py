@@ -191,7 +191,8 @@ class Predictor(Summary):
         threads = None if threads is None else whole_number("threads", threads, 1)
         functions, seed = whole_number("functions", functions, 0), whole_number("seed", seed, 0)
         start, v, forces, batch = checked_start(self.sizes, self.device, q0, v0, u)
-        method = integrator_named(integrator, self.posterior.model)
+        model = self.posterior.model
+        method = integrator_named(integrator, model)
         check_time_step(dt)
         loops, acceleration = None, self.mean
         if integrator in steps_of(self.space):
@@ -199,14 +200,12 @@ class Predictor(Summary):
         if functions:
 
             def acceleration(q: Tensor, v: Tensor, u: Tensor) -> Tensor:  # drawn when a motion is left to torch
-                return accelerations(self.posterior, self.posterior.model, functions, seed)(q, v, u)
+                return accelerations(self.posterior, model, functions, seed)(q, v, u)
 
             start, v, forces = start.repeat(functions, 1), v.repeat(functions, 1), forces.repeat(1, functions, 1)
             batch = (functions, *batch)
         with torch.no_grad():
-            return moved(
-                batch, loops, method, acceleration, self.posterior.model, start, v, forces, dt, threads=threads
-            )
+            return moved(batch, loops, method, acceleration, model, start, v, forces, dt, threads=threads)
 
     def joint_forces(self, q: Any, v: Any, u: Any) -> JointForces:
         """Known and learned forces at a state (nv,) or states (n, nv) and what they act on, without a graph."""
@@ -268,9 +267,8 @@ class Predictor(Summary):
                 q, v, u = states
                 Q, slope = rows_jacobian(lambda u: joint_force(self.posterior, self.posterior.dynamics(q, v, u)), u)
                 at = self.posterior.dynamics(q, v, u)
-                return Q, torch.cat(
-                    [slope.flatten(1), at.M.flatten(1), at.A.flatten(1), at.b, at.off()], dim=-1
-                ).detach()
+                around = slope.flatten(1), at.M.flatten(1), at.A.flatten(1), at.b, at.off()
+                return Q, torch.cat(around, dim=-1).detach()
         nq, nv, nu = self.sizes
         a, slopes = rows_jacobian(lambda x: self.by_torch(*x.split(self.sizes, dim=-1)), torch.cat([*states], dim=-1))
         if self.space.is_vector_space:

@@ -202,18 +202,16 @@ class Programs:
         features = [copied(at.features[part.latents[0]]) for part in self.sums]
         for part, z in zip(self.sums, features, strict=True):
             f |= dict(zip(part.latents, part.call(graph, z, slopes), strict=True))
-        copied.known.update(
-            zip(at.graph.inputs[count:], [*(f[c] for c in sorted(f)), *graph.inputs[count:]], strict=False)
-        )
+        more = [*(f[c] for c in sorted(f)), *graph.inputs[count:]]
+        copied.known.update(zip(at.graph.inputs[count:], more, strict=False))
         match kind:
             case "forces":
                 slope = jacobian(graph, Q := copied(at.forces), graph.inputs[-self.sizes[2] :])
                 outputs = {"Q": Q, "around": [node for row in slope for node in row] + copied(at.around)}
             case "passive":
                 zeros = [ZERO] * self.sizes[1]
-                outputs = {
-                    "Q": reduce(lambda x, y: list(map(partial(graph.apply, "add"), x, y)), map(copied, at.parts), zeros)
-                }
+                add = partial(graph.apply, "add")
+                outputs = {"Q": reduce(lambda x, y: list(map(add, x, y)), map(copied, at.parts), zeros)}
             case "components" | "deviations":
                 outputs = {"Q": [node for part in at.parts for node in copied(part)]}
                 if kind == "deviations":

@@ -103,9 +103,8 @@ def load_posterior(path: str | Path) -> Posterior:
         training = _rows(TRAINING, tensors, model)
         if any(name.startswith(REFERENCE) for name in tensors):
             training = replace(training, reference=_rows(REFERENCE, tensors, model))
-        parameters = {
-            name.removeprefix(PARAMETERS): value for name, value in tensors.items() if name.startswith(PARAMETERS)
-        }
+        own = [name for name in tensors if name.startswith(PARAMETERS)]
+        parameters = {name.removeprefix(PARAMETERS): tensors[name] for name in own}
         found: dict[str, Any] = {name: kind(document["result"][name]) for name, kind in RESULT.items()}
         engine, settings = document["engine"], dict(document["settings"])
         _require_numbers(settings, model.robot.nv)
@@ -118,7 +117,10 @@ def load_posterior(path: str | Path) -> Posterior:
             None if engine is None else engine_from_dict(engine),
             Estimates.from_dict(document["estimates"]),
         )
-        if posterior.likelihood.parameter_shapes != {name: tuple(value.shape) for name, value in parameters.items()}:
+        of_rows = posterior.likelihood
+        needed = of_rows.kernels.initial_parameters() | of_rows.noise.parameters(model.robot.nv)
+        wanted, there = ({name: x.shape for name, x in each.items()} for each in (needed, parameters))
+        if wanted != there:
             raise ValueError("its parameters are not those of its model")
         if "target" in document:
             posterior = posterior.with_model(_model(path / TARGET, document["target"]))

@@ -17,6 +17,7 @@ from forcegp.data import Dataset
 from forcegp.errors import required_extra
 from forcegp.forces import Actuation, AerodynamicForce, ObservedWrench, RigidBodies, Rotor, Thrusters, Unknown
 from forcegp.mechanics import ConstrainedDynamics
+from forcegp.mechanics.gauss_principle import placed
 from forcegp.posterior.joint_forces import joint_forces_given
 from forcegp.posterior.posterior import Posterior
 from forcegp.report.shapes import LinkShape, link_shapes, poses_of_links, reach
@@ -162,9 +163,7 @@ def _place(term: Unknown, dynamics: ConstrainedDynamics) -> torch.Tensor:
     frame = term.link(dynamics.state.robot) if isinstance(term, AerodynamicForce) else getattr(term, "frame", None)
     if frame is None:
         return dynamics.contacts[getattr(term, "contact", 0)].position(dynamics.state.kinematics)
-    pose = dynamics.state.kinematics.frame_pose(frame)
-    local = torch.tensor(getattr(term, "point", (0.0, 0.0, 0.0)), dtype=pose.dtype, device=pose.device)
-    return pose[..., :3, :3] @ local + pose[..., :3, 3]
+    return placed(dynamics.state.kinematics, frame, getattr(term, "point", (0.0, 0.0, 0.0)))[1]
 
 
 def _at_joints(

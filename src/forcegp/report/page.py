@@ -61,9 +61,8 @@ def write_page(path: str | Path, page: Page, *, overwrite: bool = True) -> None:
     template = environment.from_string(files("forcegp.report").joinpath("page.html").read_text(encoding="utf-8"))
     details = json.dumps(page.details, indent=1, default=str) if page.details else ""
     with atomic_file(path, overwrite=overwrite) as temporary:
-        temporary.write_text(
-            template.render(page=page, details=details, version=__version__, mark=MARK) + "\n", encoding="utf-8"
-        )
+        text = template.render(page=page, details=details, version=__version__, mark=MARK)
+        temporary.write_text(text + "\n", encoding="utf-8")
 
 
 SECONDS = 10.0
@@ -92,11 +91,9 @@ def model_page(
 
 def scene_notes(recorded: RecordedScene) -> list[str]:
     """What the arrows of a scene mean, and what of the robot could not be drawn."""
-    arrows = [
-        f"{group.title}: {group.largest:.3g} {group.unit} would be {recorded.arrow_length:.2g} m long"
-        for group in recorded.arrows
-        if group.largest > 0.0
-    ]
+    long = f"would be {recorded.arrow_length:.2g} m long"
+    drawn = (group for group in recorded.arrows if group.largest > 0.0)
+    arrows = [f"{group.title}: {group.largest:.3g} {group.unit} {long}" for group in drawn]
     meaning = "Arrows are forces that the model found, torques along the axes of joints; pale ends are 95 % intervals"
     return ([f"{meaning}. {'; '.join(arrows)}."] if arrows else []) + recorded.doubts
 

@@ -129,12 +129,6 @@ def physical_objection(mass: float, center_of_mass: np.ndarray, inertia: np.ndar
     return None
 
 
-def axis_inertia_vanishes(pseudo: np.ndarray) -> bool:
-    """Whether all mass of a body (pseudo-inertia (4, 4), axis along z through the origin) lies on that axis."""
-    second_moments = pseudo.diagonal()[:3]
-    return bool(second_moments[:2].sum() <= SINGULAR * second_moments.sum())
-
-
 def turns_with_inertia(pseudo: np.ndarray) -> bool:
     """Whether a body (pseudo-inertia (4, 4)) that moves freely resists every turn."""
     first, mass = pseudo[:3, 3], pseudo[3, 3]

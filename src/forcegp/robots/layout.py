@@ -7,7 +7,7 @@ the joint axis, and what is fixed to it. A mimic joint moves by ``multiplier q +
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -29,12 +29,6 @@ ROTOR = r".*(rotor|propeller)s?"
 BODY = r"pelvis|flying|drone|uav|quadrotor|.*copter"
 ENOUGH = {LIMB: 2, ROTOR: 3, BODY: 1}
 """So many tell. Rotors count on the links that stand still: motors of arms have some in other places."""
-
-
-def check_choice(base: str | None) -> None:
-    """Raise InvalidInput for another base than `BaseChoice` has."""
-    if base is not None and base not in get_args(BaseChoice):
-        raise InvalidInput(f"base is {base!r}; give one of {', '.join(get_args(BaseChoice))}.")
 
 
 def check_base(description: RobotDescription, standing: Sequence[str], problems: Problems) -> None:
@@ -87,11 +81,9 @@ def followed(
             if above is None or above.name in passed or above.type == "floating":
                 last = (at if above is None else joint).mimics
                 seen = f"{description.source}: joint {joint.name!r} mimics {last.joint if last else None!r}"
-                why = (
-                    "and so at last itself, or a joint of several degrees of freedom"
-                    if above
-                    else "which the file lacks"
-                )
+                why = "which the file lacks"
+                if above:
+                    why = "and so at last itself, or a joint of several degrees of freedom"
                 advice = f", {why}; correct its <mimic>, or lock the joint."
                 problems.errors.append(RobotModelError(seen, advice, {"locked": {joint.name: 0.0}}))
                 multiplier, offset = 0.0, 0.0

@@ -195,9 +195,8 @@ def integrated(q: Float[Tensor, "*batch 7"], step: Float[Tensor, "*batch 6"]) ->
 def velocity_of(q: Float[Tensor, "*#batch 7"], v: Float[Tensor, "*#batch 6"]) -> Tensor:
     """dq/dt under the body velocity v."""
     linear, angular = _parts(v)
-    turned = quaternion_product(
-        q[..., TURN].expand(*v.shape[:-1], -1), torch.cat([0.5 * angular, torch.zeros_like(angular[..., :1])], -1)
-    )
+    rate = torch.cat([0.5 * angular, torch.zeros_like(angular[..., :1])], -1)
+    turned = quaternion_product(q[..., TURN].expand(*v.shape[:-1], -1), rate)
     return torch.cat([(pose(q)[0] @ linear[..., None])[..., 0], turned], -1)
 
 

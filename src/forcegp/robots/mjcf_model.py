@@ -176,10 +176,8 @@ class CompiledModel:
         """Those that act on one joint by a constant ratio."""
         kinds = self.mujoco.mjtTrn
         direct = (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT))
-        model = self.model
-        return [
-            k for k in range(model.nu) if model.actuator_trntype[k] in direct and model.actuator_trnid[k][0] == joint
-        ]
+        acts = np.isin(self.model.actuator_trntype, direct) & (self.model.actuator_trnid[:, 0] == joint)
+        return np.flatnonzero(acts).tolist()
 
     def _effort(self, joint: int) -> float:
         """The largest force of the actuators in Nm or N; infinite where one has no limit, or there is none."""

@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from forcegp.robots.arguments import (
 from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import SINGULAR
 from forcegp.robots.kinematics import Kinematics
-from forcegp.robots.layout import BaseChoice, check_base, check_choice, check_tree, lay_out
+from forcegp.robots.layout import BaseChoice, check_base, check_tree, lay_out
 from forcegp.robots.mjcf import MjcfWriter, is_mjcf, translate
 from forcegp.robots.mjcf_model import Translation
 from forcegp.robots.structure import RigidBodyDynamics, RobotStructure, bodies_without_inertia, compile_tree
@@ -152,7 +152,8 @@ class Robot(RobotStructure, RigidBodyDynamics):
     ) -> "Robot":
         """The robot of URDF text; `problems` has the arguments and what is wrong already, `loops` are refused."""
         base, inertias = problems.given["base"], problems.given["inertias"]
-        check_choice(base)
+        if base is not None and base not in get_args(BaseChoice):
+            raise InvalidInput(f"base is {base!r}; give one of {', '.join(get_args(BaseChoice))}.")
         locked = locked_positions(problems.given["locked"] or {})
         named = problems.given | {"locked": locked, "inertias": inertias if inertias != "strict" else None}
         problems.given = {name: value for name, value in named.items() if value}
@@ -261,10 +262,9 @@ class Robot(RobotStructure, RigidBodyDynamics):
         writer = MjcfWriter(self)
         text = writer.text()
         if writer.left_out:
-            left_out = (
-                f"{self.source}: MJCF has no frames that move without mass; left out: {', '.join(writer.left_out)}."
-            )
-            warnings.warn(left_out, RobotFileWarning, stacklevel=3)
+            left_out = ", ".join(writer.left_out)
+            seen = f"{self.source}: MJCF has no frames that move without mass; left out: {left_out}."
+            warnings.warn(seen, RobotFileWarning, stacklevel=3)
         if path is not None:
             write_text(path, text)
         return text

@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput, NonPhysicalInertia, RobotModelError, UnknownName, require_known
 from forcegp.robots.arguments import JointValues, Positions, Vector, checked_tensor, usable_device
-from forcegp.robots.inertia import axis_inertia_vanishes, pseudo_inertia, skew, turns_with_inertia
+from forcegp.robots.inertia import SINGULAR, pseudo_inertia, skew, turns_with_inertia
 from forcegp.robots.layout import BASE, WORLD, BaseChoice, Layout
 from forcegp.robots.manifold import ConfigurationSpace, Group, pose
 from forcegp.robots.urdf import Joint, Link, RobotDescription
@@ -60,10 +60,9 @@ class Tree:
         if self.coupling.shape != other.coupling.shape or self.groups != other.groups:
             return False
         constants = ("rest", "sine", "cosine", "slide", "descendants", "inertias", "gravity", "armature", "coupling")
-        return all(
-            torch.allclose(getattr(self, name), getattr(other, name).to(self.rest.device), rtol=1e-9, atol=1e-12)
-            for name in (*constants, "shift")
-        )
+        there = other.to(self.rest.device)
+        pairs = ((getattr(self, name), getattr(there, name)) for name in (*constants, "shift"))
+        return all(torch.allclose(mine, others, rtol=1e-9, atol=1e-12) for mine, others in pairs)
 
 
 def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndarray) -> Tree:
@@ -329,9 +328,8 @@ class RobotStructure(Summary):
         """In float64; :class:`~forcegp.errors.InvalidInput` unless it is (..., nv), or a possible q, on its device."""
         if name != "q" or not self.layout.groups:
             return checked_tensor(name, value, self.nv, f"one value per joint of {self.name}", self.device)
-        q = checked_tensor(
-            name, value, self.nq, f"positions of {self.name}: {', '.join(self.position_names)}", self.device
-        )
+        meaning = f"positions of {self.name}: {', '.join(self.position_names)}"
+        q = checked_tensor(name, value, self.nq, meaning, self.device)
         self.space.check(q)
         return q
 
@@ -366,6 +364,7 @@ def bodies_without_inertia(
         link, remedy = f"{description.source}: link {joint.child!r}{others}", {"locked": {name: 0.0}}
         if name == BASE and body in whole:
             remedy = {"base": "fixed"}
+        moments = pseudo[body].diagonal()[:3]  # second ones; the axis is z
         if pseudo[body, 3, 3] == 0.0:
             seen = f"{link} moves with joint {name!r} but has no mass, and nor has what it carries"
             advice = "; add an <inertial> element, make the joint fixed, or lock it."
@@ -373,7 +372,7 @@ def bodies_without_inertia(
         elif body in whole and not turns_with_inertia(pseudo[body]):
             seen = f"{link} turns with joint {name!r} but has no rotational inertia about some axis"
             found.append((drive.joint, NonPhysicalInertia(seen, "; correct its <inertial> element.", remedy)))
-        elif body not in whole and joint.type != "prismatic" and axis_inertia_vanishes(pseudo[body]):
+        elif body not in whole and joint.type != "prismatic" and moments[:2].sum() <= SINGULAR * moments.sum():
             seen = f"{link} turns with joint {name!r} but has no rotational inertia about its axis"
             advice = (
                 ": any force would accelerate it infinitely. Correct its <inertial> element, give the joint the "

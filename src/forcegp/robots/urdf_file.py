@@ -109,13 +109,11 @@ def with_limits(text: str) -> str:
     """URDF text whose joints have the limits that urdfdom needs: `LARGEST`, which reads as none, where it has none."""
     document, lacking = _document(text), False
     for joint in document.documentElement.childNodes:
-        bounded = joint.nodeName == "joint" and joint.getAttribute("type") in ("revolute", "prismatic")
-        if not bounded:
+        if joint.nodeName != "joint" or joint.getAttribute("type") not in ("revolute", "prismatic"):
             continue
         limit = _child(joint, "limit") or joint.appendChild(document.createElement("limit"))
-        ends = (
-            {} if limit.hasAttribute("lower") or limit.hasAttribute("upper") else {"lower": -LARGEST, "upper": LARGEST}
-        )
+        free = {"lower": -LARGEST, "upper": LARGEST}
+        ends = {} if any(map(limit.hasAttribute, free)) else free
         for name, value in {**ends, "effort": LARGEST, "velocity": LARGEST}.items():
             if not limit.hasAttribute(name):
                 limit.setAttribute(name, f"{value:g}")

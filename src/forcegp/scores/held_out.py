@@ -246,9 +246,8 @@ def motion_scores(
     if not len(held_out):
         return {}, None
     posterior, motions = held_out.of(posterior)
-    rollout = posterior.rollout(
-        motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, integrator=integrator, baumgarte=None
-    )
+    start = motions.q[:, 0], motions.v[:, 0]
+    rollout = posterior.rollout(*start, motions.u, motions.dt, integrator=integrator, baumgarte=None)
     recorded = torch.as_tensor(motions.q.copy(), device=rollout.q.device)
     off = rollout.steps_to(recorded)
     found = {"position": off, "velocity": torch.as_tensor(motions.v.copy(), device=rollout.q.device) - rollout.v}

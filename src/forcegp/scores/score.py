@@ -97,11 +97,8 @@ def score(
     if horizons is not None and not isinstance(horizons, Sequence):
         raise InvalidInput(f"horizons is {horizons!r}; give a sequence of seconds.")
     horizons = None if horizons is None else tuple(horizons)
-    before = (
-        {name: each for name, each in given.items() if isinstance(each, Posterior)}
-        if isinstance(given, Mapping)
-        else {}
-    )
+    named = given.items() if isinstance(given, Mapping) else ()
+    before = {name: each for name, each in named if isinstance(each, Posterior)}
     if before and len(before) == len(given) and split is None:
         known = {name: candidate(name, each, each.model, "") for name, each in before.items()}
         if folder is not None:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 
 from forcegp.data import Dataset
-from forcegp.errors import MissingExtra, RobotModelError, SimulationError
+from forcegp.errors import RobotModelError, SimulationError, required_extra
 from forcegp.forces import Actuation, RigidBodies
 from forcegp.forces.registry import force_class
 from forcegp.mechanics import Baumgarte, Contact, Surface
@@ -41,11 +41,8 @@ BASE_HEIGHT = 0.05  # m, of the robot above the origin
 
 def kuka_file() -> Path:
     """The URDF of the arm, with meshes beside it, in PyBullet's data. Raises MissingExtra without PyBullet."""
-    try:
-        import pybullet_data
-    except ImportError as error:
-        raise MissingExtra("the kuka-surface scenario needs PyBullet: pip install 'forcegp[sim]'") from error
-    return Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"
+    data = required_extra("pybullet_data", "sim", "the kuka-surface scenario, of PyBullet,")
+    return Path(data.getDataPath()) / "kuka_iiwa" / "model.urdf"
 
 
 def kuka_urdf(config: KukaSurfaceConfig) -> str:

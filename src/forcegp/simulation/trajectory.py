@@ -180,12 +180,10 @@ def recorded(
     streams = [np.random.default_rng([config.seed, episode, 1]) for episode in range(config.episodes)]
     noise = np.concatenate([stream.standard_normal((steps, nv)) for stream in streams])
     about = {"scenario": scenario, "config": dataclasses.asdict(config), "versions": {"forcegp": __version__}}
+    rows: dict[str, Any] = {"time": np.tile(np.arange(steps) / RATE, config.episodes), **motion}
+    rows["a"] = motion["a"] + config.noise * noise
     return Dataset(
-        **{
-            "time": np.tile(np.arange(steps) / RATE, config.episodes),
-            **motion,
-            "a": motion["a"] + config.noise * noise,
-        },
+        **rows,
         episode=np.repeat(np.arange(config.episodes), steps),
         model=model,
         noise_std=np.full(nv, config.noise) if config.noise > 0 else None,
