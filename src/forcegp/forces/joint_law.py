@@ -18,7 +18,7 @@ from forcegp.robots import Robot
 from forcegp.robots.arguments import by_joint
 
 AnyJointLaw = TypeVar("AnyJointLaw", bound="JointLaw")
-Transmission = str | Sequence[Sequence[float]] | Tensor | None
+Transmission = str | Sequence[Sequence[float]] | np.ndarray | Tensor | None
 
 
 class PerJointLaw(Law):
