@@ -16,7 +16,8 @@ from forcegp.evidence import Accelerations, Torques, motion_residuals
 from forcegp.evidence.least_squares import Fit
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.fit import fit
-from forcegp.fit.physical import Equations, _with_noise_in_both, typical_sizes
+from forcegp.fit.equations import Equations
+from forcegp.fit.physical import _with_noise_in_both, typical_sizes
 from forcegp.forces import (
     Actuation,
     Body,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from math import nan
 from typing import Any, ClassVar, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 from typing_extensions import override

@@ -48,7 +48,7 @@ class WindowMotions:
     middle_q: Float[Tensor, "K T nq"]
     middle_v: Float[Tensor, "K T nv"]
     found: Bool[Tensor, " K"]
-    in_start: Float[Tensor, "K rows nv 2*nv"] | None = None
+    in_start: Float[Tensor, "K rows nv _"] | None = None
     in_parameters: Float[Tensor, "K rows nv P"] | None = None
 
 
