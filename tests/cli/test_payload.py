@@ -9,6 +9,7 @@ from tests.fit.test_payload import CENTER, MASS, TEXT, loaded, log
 from tests.goldens.compare import assert_unchanged
 
 from forcegp import Dataset, Robot
+from forcegp.cli.payload import other_causes
 
 
 @pytest.fixture(scope="module")
@@ -105,3 +106,11 @@ def test_what_cannot_be_is_one_line(folder, forcegp, words, message):
     assert refused.returncode == 2
     assert message in refused.stderr
     assert len(refused.stderr.strip().splitlines()) == 1
+
+
+def test_causes_of_so_many_factors_that_nobody_can_look_for_them_are_not_in_the_answer():
+    few, many = (
+        {"about": "payload", "what": "so", "numbers": {"gains": dict.fromkeys(x, 1.1)}} for x in ("abc", "abcd")
+    )
+    assert other_causes({"doubts": [few]}) == {"gains": "so"}
+    assert other_causes({"doubts": [many, {**few, "about": "torque sensor"}]}) == other_causes({}) == {}

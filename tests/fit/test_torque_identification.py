@@ -18,17 +18,7 @@ from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.fit import fit
 from forcegp.fit.equations import Equations
 from forcegp.fit.physical import _with_noise_in_both, typical_sizes
-from forcegp.forces import (
-    Actuation,
-    Body,
-    Coulomb,
-    LoadFriction,
-    Offset,
-    RigidBodies,
-    Rotor,
-    Spring,
-    Viscous,
-)
+from forcegp.forces import Actuation, Body, Coulomb, LoadFriction, Offset, RigidBodies, Rotor, Spring, Viscous
 from forcegp.model import Model
 from forcegp.progress import watched
 from forcegp.robots import Robot

@@ -24,7 +24,7 @@ from forcegp.atomic_files import atomic_file, atomic_folder, write_json
 from forcegp.cli.command import CONFIG, LOG, Command, options_of, unless_given
 from forcegp.cli.fit import write_estimates
 from forcegp.cli.logs import ColumnOptions, FilterOptions, prepared_rows, resolved, stance_text
-from forcegp.cli.payload import LAWS, drives_of, payload_dict, payload_text, with_payload
+from forcegp.cli.payload import LAWS, drives_of, other_causes, payload_dict, payload_text, with_payload
 from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal, doubts_table, facts, shown
 from forcegp.doubts import Doubt, Doubts, wrong
@@ -344,16 +344,16 @@ def answer_lines(
     def each(field: str, unit: str) -> str:
         own = {name: values[f"{field}.{name}"] for name in joints}
         lost = [name for name, value in own.items() if name in still or value.interval[0] <= 0.0]
-        return ", ".join("–" if x in lost else f"{own[x].value:.3g}" for x in own) + f" {unit}{but_for(lost)}"
+        told = ", ".join("–" if x in lost else f"{own[x].value:.3g}" for x in own) + f" {unit}{but_for(lost)}"
+        return told if len(lost) < len(own) else "not known from this log"
 
     of_joints = [
         ("dry friction", friction_in_words(identified.model, recording, force, still) + but_for(still)),
         ("viscous", each("viscous", f"{force} per {q}/s")),
         ("rotors", each("rotor", inertia)),
     ] if joints else []  # fmt: skip
-    beside = [each for each in (content["payload"] or {}).get("doubts", ()) if each["numbers"]]
-    mass, error = values.total_mass
-    if any("gains" in each["numbers"] for each in beside):  # what it changes of a payload, it changes of all
+    (mass, error), causes = values.total_mass, other_causes(content["payload"] or {})
+    if "gains" in causes:  # what it changes of a payload, it changes of all
         error = math.hypot(error, content["payload"]["parameters"]["payload.mass"]["std"])
     weight = f"{mass:.4g} ± {1.96 * error:.1g} kg, if {drives_of(identified.model)} are right"
     errors = "; ".join(
@@ -376,7 +376,7 @@ def answer_lines(
         *of_joints,
         *([("whole mass", weight)] if moving else []),
         ("payload", held),
-        *((next(iter(x["numbers"])), f"{x['what']} {x['do']}") for x in beside if x["about"] == "payload"),
+        *causes.items(),
         ("models", f"error of q{ahead} / nRMSE of the acceleration, on unseen time: {errors}"),
         *left_of_torques(scores, best),
         ("best", f"{short_name(best)}{intervals}"),

@@ -176,3 +176,13 @@ def drives_of(model: forcegp.Model) -> str:
     """What the masses of a base that moves are as right as."""
     thrusters = forcegp.data.thruster_columns(model)
     return "" if model.robot.base == "fixed" else "thrust coefficients" if thrusters else "torques"
+
+
+MOST_FACTORS = 3  # of one cause that a person can look for
+
+
+def other_causes(payload: Mapping[str, Any]) -> dict[str, str]:
+    """What would explain more than this payload, by cause."""
+    doubts = [each for each in payload.get("doubts", ()) if each["about"] == "payload"]
+    causes = ((cause, len(own), each["what"]) for each in doubts for cause, own in each["numbers"].items())
+    return {cause: what for cause, factors, what in causes if factors <= MOST_FACTORS}

@@ -117,7 +117,7 @@ def changes_without_rests(
 
 CAUSES = {
     "gains": (0.2, "torques of the log times", "Check these drives; `gain` among the forces estimates them."),
-    "lengths": (0.1, "lengths before the joints times", "Correct the URDF's lengths."),
+    "lengths": (0.1, "lengths before the joints times", "Compare the URDF's lengths with the robot."),
     "masses": (0.2, "masses of the links times", "Give a baseline (a log without the payload), or identify all links."),
 }
 """Usual deviations of the logarithms of factors, what they are of, and what to do. All factors of a cause are tried,
