@@ -56,10 +56,10 @@ def fixed_text(text: Any) -> np.ndarray:
 
 def _attribute(file: h5py.File, name: str) -> Any:
     """Number or text; None for texts that no file of ours holds."""
-    if name not in file.attrs or (stored := file.attrs.get_id(name).dtype).hasobject:
+    if name not in file.attrs or file.attrs.get_id(name).dtype.hasobject:
         return None
     value = file.attrs[name]
-    return value.decode("utf-8", "replace") if stored.kind == "S" else value
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
 
 def is_dataset(path: Path) -> bool:
