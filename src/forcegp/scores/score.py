@@ -126,11 +126,12 @@ def score(
         runs = {name: [kept(store, job.name) for job in fits if job.spec["name"] == name] for name in chosen}
         for name in (name for name, each in chosen.items() if each.all_rows):  # they use no chance
             runs[name] = [{**run, "seed": seed} for seed in range(seeds) for run in runs[name]]
-        about |= {"splits": [], "configuration": experiment.configuration, "seeds": list(range(seeds))}
+        facts = list[dict[str, Any]]()
+        about |= {"splits": facts, "configuration": experiment.configuration, "seeds": list(range(seeds))}
         for each in splits:
             (train, test), motions = each.apply(experiment.rows), experiment.motions(each)
             sides = {"training_rows": len(train), "test_rows": len(test), "motions": len(motions)}
-            about["splits"].append(each.to_dict() | sides | {"notes": list(motions.notes)})
+            facts.append(each.to_dict() | sides | {"notes": list(motions.notes)})
         scores = _scores(log, runs, chosen, about, partial(_on_all_rows, experiment, chosen))
         if folder is not None:
             with store.locked():
