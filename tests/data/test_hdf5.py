@@ -61,15 +61,9 @@ def change(file: Path, name: str, values: object = None) -> None:
             opened[name] = values
 
 
+TWO = np.full(2, b"forcegp-dataset")
 OTHERS = {
-    "format": [
-        np.bytes_("another"),
-        "forcegp-dataset",
-        np.full(2, b"forcegp-dataset"),
-        1.0,
-        np.zeros(0),
-        h5py.Empty("f8"),
-    ],
+    "format": [np.bytes_("another"), "forcegp-dataset", TWO, 1.0, np.zeros(0), h5py.Empty("f8")],
     "format_version": [2, 1000, 0, -1, np.bytes_("one"), 1.5],
 }
 
