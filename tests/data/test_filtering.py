@@ -6,16 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.data.samples import arrays, dataset, model
 
-from forcegp.data import (
-    Dataset,
-    LowPass,
-    differentiate,
-    differentiated,
-    lagged,
-    low_pass,
-    resample,
-    uniform_step,
-)
+from forcegp.data import Dataset, LowPass, differentiate, differentiated, lagged, low_pass, resample, uniform_step
 from forcegp.errors import DatasetError, InvalidInput
 
 RATE = 1000.0

@@ -9,15 +9,7 @@ import torch
 from tests.data.samples import assert_equal, dataset, model
 from tests.posterior.arm import arm_model
 
-from forcegp.data import (
-    Dataset,
-    Delay,
-    Preparation,
-    differentiated,
-    estimate_delay,
-    low_pass,
-    motion_spectrum,
-)
+from forcegp.data import Dataset, Delay, Preparation, differentiated, estimate_delay, low_pass, motion_spectrum
 from forcegp.data.spectrum import _knee_and_floor
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 

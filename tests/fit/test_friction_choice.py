@@ -12,13 +12,7 @@ from tests.posterior.arm import arm_model
 from forcegp import Torques, fit, score
 from forcegp.data import Dataset
 from forcegp.evidence import motion_residuals
-from forcegp.fit.friction_choice import (
-    WIDTHS,
-    _precision,
-    _Regression,
-    choose_friction,
-    friction_in_words,
-)
+from forcegp.fit.friction_choice import WIDTHS, _precision, _Regression, choose_friction, friction_in_words
 from forcegp.fit.transmission_choice import SHARE, _clearly
 from forcegp.forces import Actuation, Coulomb, DirectionalFriction, GearFriction, JointFriction, Rotor, Viscous
 from forcegp.inference import OptimizerOptions

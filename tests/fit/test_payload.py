@@ -211,6 +211,32 @@ def test_a_cause_is_what_ridge_regression_finds(times):
     assert move == pytest.approx(expected[6:] - best, rel=1e-6)
 
 
+@pytest.mark.parametrize(("nats", "rest", "named"), [(15, 0, True), (7, 0, False), (70, 1000, True), (20, 1000, False)])
+def test_causes_are_named_from_ten_nats_on_and_from_a_twentieth_of_what_is_left(nats, rest, named):
+    """A torque a twentieth too small, and noise of u that no gain explains."""
+    data, one = log(loaded(), 1, seconds=6.7), np.arange(6) == 1
+    model = data.model.with_forces(Payload("tool0", MASS, CENTER, INERTIA.tolist()))
+    space = ParameterSpace(model.with_forces(Viscous()), typical_sizes(model, [data]))
+    rows = RecordedRows(space, data.q, data.v, data.u)
+    noise = data.u.std(axis=0) * (len(data) / (nats * 800)) ** 0.5  # with which that are about so many
+    jacobian = rows.in_torque(space.start, rows.moving(data.a))[2]
+
+    def white(torques):
+        return torques[0] / noise[:, None]
+
+    def cause(left):
+        noisy = RecordedRows(space, data.q, data.v, data.u - left)
+        found = Fit(space.start, left, jacobian, noise, np.eye(space.size), 1, True)
+        return misfit(space.model_at(space.start), [noisy], [data.a], [left], white, found)
+
+    basis = np.linalg.qr(white([np.concatenate([jacobian, data.u[:, :, None] * np.eye(6)], axis=-1)]).reshape(2010, -1))
+    other = np.random.default_rng(0).standard_normal(2010)
+    other = (other - basis[0] @ (basis[0].T @ other)).reshape(-1, 6)
+    wrong = 0.05 * data.u * one
+    left = wrong * (nats / cause(wrong)[2]) ** 0.5 + noise * other * (2.0 * rest / np.square(other).sum()) ** 0.5
+    assert (cause(left) is not None) == named
+
+
 def test_constants_of_currents_are_found_with_the_payload():
     """Beside the masses of the URDF, whatever the unit; friction and rotors are unknown, too."""
     constants = np.array([12.0, 3.0, 0.4, 0.05, 1.7, 0.2])

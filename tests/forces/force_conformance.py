@@ -19,14 +19,7 @@ from tests.posterior.arm import URDF, arm_data, arm_model
 from forcegp.data import Dataset
 from forcegp.errors import NumericalWarning
 from forcegp.fit import fit
-from forcegp.forces import (
-    JointPositionForces,
-    Scaling,
-    Unknown,
-    UnknownForces,
-    force_from_dict,
-    force_to_dict,
-)
+from forcegp.forces import JointPositionForces, Scaling, Unknown, UnknownForces, force_from_dict, force_to_dict
 from forcegp.inference import OptimizerOptions
 from forcegp.model import Model
 from forcegp.posterior import load_posterior, save_posterior

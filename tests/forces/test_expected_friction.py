@@ -12,13 +12,7 @@ from tests.mechanics.systems import model_with as model_of
 from tests.robots.robot_models import FRAMES
 
 from forcegp.errors import FileFormatError, InvalidInput, NumericalWarning, UnknownName
-from forcegp.forces import (
-    ContactFriction,
-    JointFriction,
-    UnknownForces,
-    force_from_dict,
-    force_to_dict,
-)
+from forcegp.forces import ContactFriction, JointFriction, UnknownForces, force_from_dict, force_to_dict
 from forcegp.forces.contact_friction import SMALLEST_SHARE, ExpectedFriction, TabulatedCurve, refined_loads
 from forcegp.mechanics import Contact, ImplicitSurface, Plane, Sphere
 

@@ -7,10 +7,7 @@ from tests.scores.moving_arm import moving_arm
 
 from forcegp import JointFriction, Noise, Posterior, fit
 from forcegp.inference import ExactPosterior, Inducing
-from forcegp.inference.inducing import (
-    InducingPosterior,
-    pivoted_cholesky,
-)
+from forcegp.inference.inducing import InducingPosterior, pivoted_cholesky
 from forcegp.inference.likelihood import Terms
 
 SHAPES = {

@@ -9,12 +9,7 @@ from tests.robots.random_positions import random_positions
 from tests.robots.test_moving_bases import LIMBS
 
 from forcegp.errors import InvalidInput, NumericalWarning
-from forcegp.integration import (
-    INTEGRATORS,
-    SPEED_LIMIT,
-    integrate,
-    integrator_named,
-)
+from forcegp.integration import INTEGRATORS, SPEED_LIMIT, integrate, integrator_named
 from forcegp.integration.integrators import VECTORS, find_roots
 from forcegp.model import Model
 from forcegp.robots import Robot

@@ -11,13 +11,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 from numpy.lib import format as npy
-from tests.recordings.log_files import (
-    motion,
-    table,
-    write_bag2,
-    write_hdf5,
-    write_text,
-)
+from tests.recordings.log_files import motion, table, write_bag2, write_hdf5, write_text
 
 FLAGS = "--time time --q q_{joints} --v v_{joints} --u u_{joints} --robot arm.urdf"
 ARRAYS = "--time time --q q --v v --u u --robot arm.urdf"

@@ -9,13 +9,7 @@ from PIL import Image
 
 from forcegp import score
 from forcegp.errors import InvalidInput
-from forcegp.report import (
-    Page,
-    is_page,
-    model_page,
-    scores_sentence,
-    write_page,
-)
+from forcegp.report import Page, is_page, model_page, scores_sentence, write_page
 from forcegp.scores.figures.model import PICTURES
 
 

@@ -14,10 +14,7 @@ from tests.robots.random_positions import random_positions
 from tests.robots.test_moving_bases import LIMBS
 
 from forcegp import Model, Robot
-from forcegp.errors import (
-    RobotFileWarning,
-    RobotModelError,
-)
+from forcegp.errors import RobotFileWarning, RobotModelError
 
 mujoco = untyped
 FOLLOWERS = {"gripper": {"right": ("left", -1.5, np.radians(10) + 0.02)}}

@@ -15,14 +15,7 @@ from tests.robots.robot_models import CHAIN, MODELS, loaded
 from tests.robots.test_mimic import CHAIN_MIMICS, with_mimics
 from tests.robots.test_urdf_errors import SMALL
 
-from forcegp.errors import (
-    LARGEST,
-    MissingExtra,
-    NonPhysicalInertia,
-    RobotFileWarning,
-    RobotModelError,
-    UnknownName,
-)
+from forcegp.errors import LARGEST, MissingExtra, NonPhysicalInertia, RobotFileWarning, RobotModelError, UnknownName
 from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.robots.inertia import physical_objection

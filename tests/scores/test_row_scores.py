@@ -20,14 +20,7 @@ from forcegp.fit import fit
 from forcegp.forces import ContactFriction, JointFriction, Rotor
 from forcegp.model import Model
 from forcegp.progress import watched
-from forcegp.scores.accuracy import (
-    LEVELS,
-    by_stretch,
-    force_errors,
-    mass_matrices,
-    predict_rows,
-    row_scores,
-)
+from forcegp.scores.accuracy import LEVELS, by_stretch, force_errors, mass_matrices, predict_rows, row_scores
 
 TRUE = "true acceleration"
 SIGMA = np.array([3.0, 2.0, 5.0])

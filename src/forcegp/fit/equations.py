@@ -16,6 +16,9 @@ from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, Recorded
 from forcegp.forces import Actuation
 from forcegp.posterior.fitted import STRETCHES
 
+SLIGHT = 0.1
+"""Share of what a joint needs by the start, below which known torques do not tell how much it carries."""
+
 
 class Equations:
     """Rows of one log or several as one array each, and the equations that they give at x."""
@@ -53,12 +56,15 @@ class Equations:
         self.windows = None if seconds is None else WindowMeans(logs, seconds)
         self._stays: tuple[np.ndarray, ...] = ()
         """Regressors of the last search, which no coordinate changes."""
-        robot, logged = space.model.robot, np.concatenate([part.delivered for part in self.parts])
-        idle = evidence.of_torque and space.bodies.size and robot.base == "fixed" and not self.held.shape[1]
-        alone = {j: row for j, row in enumerate(np.eye(robot.nv)) if idle and not logged[:, j].any()}
+        # what drives deliver is among the known laws, unless their gains are estimated
+        known = np.concatenate([part.force + gains * part.delivered + part.at_contacts for part in self.parts])
+        slight = np.sqrt(np.square(known).mean(axis=0)) <= (0.0 if gains else SLIGHT) * space.typical["force"]
+        free = evidence.of_torque and space.bodies.size and space.model.robot.base == "fixed" and not self.held.shape[1]
+        alone = {j: np.eye(known.shape[1])[j] for j in np.flatnonzero(slight & bool(free)).tolist()}
         motions = {j: [self._moving(0.0 * row), self._moving(row)] for j, row in alone.items()}
-        self.passive = {j: (own, self._inertia(space.start, j, own)[0]) for j, own in motions.items()}
-        """Joints without any torque: motions at rest and with 1 rad/s^2 of this joint, and the inertia at the start."""
+        inertias = {j: float(self._inertia(space.start, j, own)[0]) for j, own in motions.items()}
+        self.passive = {j: (motions[j], inertia) for j, inertia in inertias.items() if inertia > 0.0}
+        """Joints without torque: motions at rest and with 1 rad/s^2 of this joint, and the inertia at the start."""
 
     def each(self, values: np.ndarray) -> list[np.ndarray]:
         """Rows by log."""

@@ -75,9 +75,8 @@ def doubts_of_payloads(space: ParameterSpace, fit: Fit, least: float) -> Iterato
         cost = 0.5 * float((white**2).sum())
         more = cost - 0.5 * float((left**2).sum())
         moves = payload @ space.standard_parameters(fit.x)[body]
-        if np.linalg.norm(fit.residual) > RIGHT * np.linalg.norm(moves) and more > max(
-            CLEARLY_MORE, LEAST * cost, least
-        ):
+        clearly = max(CLEARLY_MORE, LEAST * cost, least + 4.5 * np.log(white.size))  # nine numbers more than one cause
+        if np.linalg.norm(fit.residual) > RIGHT * np.linalg.norm(moves) and more > clearly:
             yield look(
                 about="payload",
                 what=f"no body on {getattr(space.model.laws[each.payload], 'link', '')} explains the log: free numbers "
@@ -207,13 +206,10 @@ def _instead(
     inner = np.linalg.solve(curvature, np.c_[slope, across])
     size = np.square(C).sum(0) - (across * inner[:, 1:]).sum(0) + usual**-2
     change = -(C.T @ left - across.T @ inner[:, 0]) / size
-    own = 0.5 * change**2 * size  # nats
-    k = int(np.argmax(own))
-    if (
-        not none.any()
-        or own[k] < least
-        or own[k] + 0.5 * (r @ r - left @ left + slope @ inner[:, 0]) < max(-CLEARLY_MORE, most - least)
-    ):
+    explained = 0.5 * change**2 * size  # nats
+    k = int(np.argmax(explained))
+    more = explained[k] + 0.5 * (r @ r - left @ left + slope @ inner[:, 0])
+    if not none.any() or explained[k] < least or more < max(-CLEARLY_MORE, most - least):
         return None
     none[free] -= inner[:, 0] + inner[:, 1 + k] * change[k]
     return np.where(np.arange(len(change)) == k, change, 0.0), none
