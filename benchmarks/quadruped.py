@@ -23,7 +23,9 @@ from forcegp import Dataset, Model, Robot, load_posterior
 from forcegp.atomic_files import read_json
 from forcegp.cli.main import main as command
 from forcegp.data import Preparation
+from forcegp.data.views import decided
 from forcegp.mechanics import fixed_point
+from forcegp.mechanics.gauss_principle import OPEN
 
 mujoco: Any = untyped  # its stubs lack what is called here
 LEGS = {"FL": (1, 1), "FR": (1, -1), "RL": (-1, 1), "RR": (-1, -1)}
@@ -127,9 +129,11 @@ def main(runs: int) -> None:
         with TemporaryDirectory() as folder, redirect_stdout(None), redirect_stderr(None):
             loads = found(Path(folder), rows)
             posterior = load_posterior(Path(folder) / "fit")
-        right = (rows.u[:, -4:] == (logs[seed - 1][2][kept, :, 2] > 1.0)).mean()
+        flags = rows.u[:, -4:]
+        right = (flags == (logs[seed - 1][2][kept, :, 2] > 1.0))[flags != OPEN].mean()
         told = ", ".join(f"{name} {x:.3f} ({low:.3f} to {high:.3f}) kg" for name, (x, low, high) in loads.items())
         _, test, forces = logs[seed % runs]
+        test = decided(test)
         cutoff = test.metadata["preparation"]["cutoff"]
         smooth = sosfiltfilt(butter(2, cutoff, fs=1.0 / (STEP * EVERY), output="sos"), forces, axis=0)
         smooth = smooth[np.searchsorted(logs[seed % runs][0].time, test.time - 0.5 * STEP)]
@@ -137,7 +141,9 @@ def main(runs: int) -> None:
         with torch.no_grad():
             predicted = posterior.dynamics(q, v, u).multiplier_map().offset.reshape(-1, 4, 3).numpy()
         error, size = (np.sqrt(np.square(x[..., 2]).mean()) for x in (predicted - smooth[::10], smooth[::10]))
-        print(f"{seed}: rows {len(rows) / len(log):.0%}, flags right {right:.2%}; {told}; forces of feet off by")
+        print(
+            f"{seed}: rows {len(rows) / len(log):.0%}, of {len(decided(rows)) / len(rows):.0%} the stance, flags right {right:.2%}; {told}; forces of feet off by"
+        )
         print(f"   {error:.2f} N of {size:.0f} along z", flush=True)
 
 

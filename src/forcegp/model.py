@@ -18,7 +18,7 @@ from forcegp.forces.actuation import OBSERVED, forces_of_file, forces_of_mjcf
 from forcegp.forces.force import Memory
 from forcegp.forces.registry import force_from_dict, force_to_dict
 from forcegp.forces.rigid_bodies import carrying
-from forcegp.mechanics.gauss_principle import Baumgarte, ConstrainedDynamics, Contact, State
+from forcegp.mechanics.gauss_principle import OPEN, Baumgarte, ConstrainedDynamics, Contact, State
 from forcegp.mechanics.surfaces import Held
 from forcegp.noise import Noise
 from forcegp.robots import Kinematics, Robot
@@ -206,9 +206,18 @@ class Model(Summary):
     @cached_property
     def inputs(self) -> tuple[str, ...]:
         """Names of the columns of u: actuators, what is observed, memory, then switches of contacts (1 or 0)."""
-        switches = dict.fromkeys(contact.switch for contact in self.contacts if contact.switch is not None)
         observed = (force.names for force in self.forces if isinstance(force, OBSERVED))
-        return (*self.actuators, *(name for names in observed for name in names), *self.memory.names, *switches)
+        return (*self.actuators, *(name for names in observed for name in names), *self.memory.names, *self.switches)
+
+    @cached_property
+    def switches(self) -> tuple[str, ...]:
+        """Names of the last columns of u: 1 or 0, or `OPEN` in rows of a log that leave it open."""
+        return tuple(dict.fromkeys(contact.switch for contact in self.contacts if contact.switch is not None))
+
+    def bearing(self, u: Float[Tensor, "*batch nu"]) -> Float[Tensor, "*batch nu"]:
+        """The inputs with all contacts that may bear a force, also where the log leaves them open."""
+        last = torch.arange(u.shape[-1], device=u.device) >= u.shape[-1] - len(self.switches)
+        return torch.where(last & (u == OPEN), 1.0, u)
 
     @cached_property
     def memory(self) -> Memory:
@@ -309,8 +318,7 @@ class Model(Summary):
             if isinstance(contact.surface, Held):  # in a plane some directions of a held point constrain nothing
                 alike = [k for k, x in enumerate(self.contacts) if (x.frame, x.point) == (contact.frame, contact.point)]
                 size[..., index] = torch.linalg.vector_norm(A[..., alike, :], dim=(-2, -1)) + 0.0 * b[..., index]
-            if contact.switch is not None:  # where it does not act it needs no direction
-                size[..., index] += 1.0 - (u[..., self.inputs.index(contact.switch)] > 0.5).to(size.dtype)
+            size[..., index] += ~contact.acts(u, self.inputs)  # where it does not act it needs no direction
         bad = torch.nonzero(~(size > 1e-12))
         if len(bad):
             row, index = (int(entry) for entry in bad[0])

@@ -7,10 +7,13 @@ import pytest
 import torch
 from scipy.optimize import brentq
 
-from forcegp import Dataset, Model, Robot
+from forcegp import Accelerations, Dataset, Model, Robot, Torques, fit, score
 from forcegp.data import Preparation, estimate_stance, motion_spectrum
 from forcegp.data.stance import _bearing, _between
+from forcegp.data.views import decided
 from forcegp.errors import ContactError, DatasetError, InvalidInput
+from forcegp.evidence import motion_residuals
+from forcegp.forces import Viscous
 from forcegp.mechanics import fixed_point
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
@@ -95,17 +98,36 @@ def test_stance_as_short_as_what_a_filter_smears_is_never_called_swing(rate, sta
     assert decided.mean() > 0.5
 
 
-def test_prepared_rows_carry_the_flags_and_leave_open_ones_out():
+def test_prepared_rows_carry_the_flags_and_open_ones_half():
     log, flags = walk(9)
     prepared = Preparation(stance="auto", every=2).apply(log)
-    found = estimate_stance(log).flags
-    kept = np.flatnonzero(np.isfinite(found).all(axis=1))
-    kept = kept[kept % 2 == 0]
-    np.testing.assert_array_equal(prepared.u[:, SWITCHES], found[kept])
-    np.testing.assert_array_equal(prepared.time, log.time[kept])
+    found = estimate_stance(log).flags[::2]
+    np.testing.assert_array_equal(prepared.u[:, SWITCHES], np.where(np.isnan(found), 0.5, found))
+    np.testing.assert_array_equal(prepared.time, log.time[::2])
+    known = np.isfinite(found).all(axis=1)
     report = prepared.metadata["preparation"]["stance"]
-    assert report["open_rows"] == -(-len(log) // 2) - len(kept)
+    assert report["open_rows"] == (~known).sum() > 50
     assert report["standing"]["front_left_stands"] == pytest.approx(flags[:, 0].mean(), abs=0.03)
+    np.testing.assert_array_equal(decided(prepared).time, prepared.time[known])
+
+
+def test_open_rows_show_torques_beside_what_feet_may_bear_and_nothing_else():
+    """Forces of feet that stand or may stand are taken out by least squares; accelerations learn from decided rows."""
+    rows = Preparation(stance="auto", every=5).apply(walk(9, seconds=3.0)[0])
+    model, there = rows.model, decided(rows)
+    q, v, u = (torch.tensor(x) for x in (rows.q, rows.v, rows.u))
+    dynamics = model.dynamics(q, v, u)
+    left = (dynamics.Q_K - (dynamics.M @ torch.tensor(rows.a)[..., None])[..., 0]).numpy()
+    feet = [dynamics.state.kinematics.frame_jacobian(name[: -len("stands")] + "foot", (0.0, 0.0, 0.0))[:, :3]
+            for name in model.switches]  # fmt: skip
+    for k in range(len(rows)):
+        arms = torch.cat([torch.zeros(0, 18), *(x[k] for x, flag in zip(feet, u[k, SWITCHES], strict=True) if flag)]).T
+        left[k] -= arms.numpy() @ np.linalg.lstsq(arms.numpy(), left[k], rcond=None)[0]
+    np.testing.assert_allclose(motion_residuals(rows, model)[0], left, atol=1e-9)
+    for evidence, used in ((Torques(), rows), (Accelerations(), there)):
+        posterior = fit(model.with_forces(Viscous()), rows, evidence)
+        assert len(posterior.training) == len(used)
+    assert score(posterior, rows).runs["model"][0]["test_rows"] == len(there) < len(rows)
 
 
 def test_open_rows_are_filled_by_the_nearest_decided_one():

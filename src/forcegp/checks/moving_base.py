@@ -16,6 +16,7 @@ from forcegp.data.configurations import in_base
 from forcegp.data.views import consecutive, whole_windows
 from forcegp.doubts import Doubt, look, ok, wrong
 from forcegp.errors import ContactError
+from forcegp.mechanics.gauss_principle import OPEN
 from forcegp.model import Model
 from forcegp.robots.manifold import TURN, Group, difference, pose
 
@@ -283,15 +284,14 @@ def stance_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     except ContactError as error:
         counted = f" (rows are counted in every {every}. one)" if every > 1 else ""
         yield wrong(about="contacts", what=f"{error}{counted}")
-    names = dict.fromkeys(contact.switch for contact in model.contacts if contact.switch is not None)
-    if not names:
+    if not model.switches:
         return
     found = estimate_stance(dataset, model)
     for k, name in enumerate(found.names):
         logged, shown, speed = dataset.u[:, model.inputs.index(name)], found.flags[:, k], found.speed[:, k]
         frame = next(contact.frame for contact in model.contacts if contact.switch == name)
-        stands = logged > 0.5
-        odd = int(((logged != 0.0) & (logged != 1.0)).sum())
+        stands = logged > OPEN
+        odd = int((~np.isin(logged, [0.0, OPEN, 1.0])).sum())
         if odd:
             yield wrong(
                 about="contact flag",
@@ -299,7 +299,7 @@ def stance_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
                 do="Write 1 where the contact holds and 0 elsewhere, for example force > threshold.",
                 numbers={"rows": odd},
             )
-        lifted, resting = stands & ((shown == 0.0) | found.moves[:, k]), ~stands & (shown == 1.0)
+        lifted, resting = stands & ((shown == 0.0) | found.moves[:, k]), (logged == 0.0) & (shown == 1.0)
         sliding, rests = (float(x.sum() / max(y.sum(), 1)) for x, y in ((lifted, stands), (resting, ~stands)))
         numbers = {"standing": float(stands.mean()), "moving while standing": sliding, "resting while free": rests}
         numbers |= {"limit": float(found.slow[k]), "open": float(np.isnan(shown).mean())}

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from forcegp.checks.check_input import CheckInput
 from forcegp.checks.explanations import NUMBER, SIGN, Cause, candidates, changed
-from forcegp.checks.torques import Comparison, positive_fit, positive_solution, torque_noise
+from forcegp.checks.torques import WIDTHS, Comparison, positive_fit, positive_solution, torque_noise
 from forcegp.data import Dataset
 from forcegp.data.views import white_noise
 from forcegp.doubts import Doubt, listed, look, wrong
@@ -33,6 +33,7 @@ FREE = 4.0  # share that an explanation may leave, over what a robot with any ma
 GOOD = 0.03  # share that a good log may leave
 DOUBTFUL = 2e-3  # share above which causes are tried
 EXPLAINED = 0.1  # share that a robot with rough masses leaves
+HELD = 3.0  # of the dry friction and of what remains in motion, from which on no gear holds the joint
 RESTS = 0.5  # share of what friction leaves that a torque must explain, for a factor of it to mean something
 MOSTLY, EDGES = 0.75, 25  # share of what is left that sits somewhere; rows between which that is sought first
 ROUGH = 2.5  # factor either way that wrong masses make of a torque
@@ -355,6 +356,18 @@ def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -
 def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     """That something is wrong which is none of the causes, and where it sits."""
     bad = np.flatnonzero(root.rough > EXPLAINED)
+    sticky = [k for k in bad if _sticks(root, k)]
+    if sticky:
+        names = inputs.named(sticky)
+        yield look(
+            about="dry friction",
+            what=f"what stays of the torque of {listed(names)} is near rest and no more than dry friction holds: gears "
+            "that stick, or give way before they slip.",
+            do="Friction that remembers explains it; forcegp auto and forcegp fit --forces gear choose it.",
+            joints=names,
+            numbers={"unexplained": root.rough[sticky].tolist()},
+        )
+    bad = np.setdiff1d(bad, sticky)
     if not len(bad):
         return
     rows, shares = root.log.rows, ", ".join(f"{inputs.names[k]} {100.0 * root.rough[k]:.0f} %" for k in bad)
@@ -371,6 +384,21 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         joints=inputs.named(bad),
         numbers={"unexplained": root.rough[bad].tolist(), "rows": len(rows)},
     )
+
+
+def _sticks(root: Explanation, joint: int) -> bool:
+    """Whether in motion nothing stays of a torque, and near rest no more than `HELD` times what dry friction holds."""
+    rows, tau, friction = root.log.rows, root.log.tau[:, joint], root.log.friction[:, joint]
+    speed, u, ones = np.abs(rows.v[:, joint]), rows.u[:, joint], np.ones(len(tau))
+    moves = speed > AT_REST * np.sqrt(np.square(speed).mean())
+    if moves.sum() < FEWEST_ROWS or moves.all():
+        return False
+    moving = replace(root, log=replace(root.log, rows=rows.rows(np.flatnonzero(moves))))
+    columns = np.c_[tau, friction, ones, -ones]
+    number, _ = positive_fit(columns[moves], u[moves])
+    left = np.abs(u - columns @ number)
+    holds = number[-2 - len(WIDTHS) : -2].sum() + np.sqrt(np.square(left[moves]).mean())
+    return moving.rough[joint] <= EXPLAINED and bool(left[~moves].max() <= HELD * holds)
 
 
 def _where(root: Explanation, joint: int, inputs: CheckInput) -> tuple[str, str, Dataset | None]:

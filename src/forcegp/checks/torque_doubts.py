@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
-from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, Explanation
+from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, Explanation
 from forcegp.checks.torques import WIDTHS, Comparison, with_gravity
 from forcegp.data import Dataset, estimate_delay
 from forcegp.data.views import consecutive, rests
@@ -21,7 +21,6 @@ LEAST_DELAY = 0.75  # time steps below which a delay is not reported
 MUCH = 0.5  # a delay that leaves less of what was unexplained is wrong to leave in
 BEYOND = 4.0  # of the frequency of the torque, from which on a resonance shows in none
 BLOCKS = 8  # of time, every other of which is held out
-HELD = 3.0  # of the dry friction and of what remains in motion, from which on no gear holds the joint
 RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
 
 

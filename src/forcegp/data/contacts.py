@@ -78,9 +78,7 @@ def _on_surfaces(
     for index, contact in enumerate(model.contacts):
         if contact.switch is not None and not flagged:
             continue
-        acts = np.ones(len(rows), bool)
-        if contact.switch is not None:
-            acts = rows.u[:, model.inputs.index(contact.switch)] > 0.5
+        acts = np.broadcast_to(contact.acts(u, model.inputs).numpy(), len(rows))
         if not acts.any():
             continue
         A, b, gradient = contact.constraint(state, model.baumgarte)

@@ -23,7 +23,7 @@ from forcegp.data.filters import (
 from forcegp.data.spectrum import FEWEST_ROWS, held_out_cutoff, motion_spectrum
 from forcegp.data.stance import estimate_stance
 from forcegp.data.strokes import with_strokes
-from forcegp.data.views import at_rest, postures
+from forcegp.data.views import at_rest, decided, postures
 from forcegp.data.wind import thruster_columns
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.robots.arguments import whole_number
@@ -217,7 +217,7 @@ def _prepared(chosen: Preparation, raw: Dataset) -> tuple[Dataset, dict[str, Any
     found = estimate_stance(filtered)
     rows = found.rows(kept).written(filtered.rows(kept))
     stands = {name: float(share) for name, share in zip(found.names, np.nanmean(found.flags, axis=0), strict=True)}
-    return rows, {"stance": {"standing": stands, "open_rows": len(kept) - len(rows)}}
+    return rows, {"stance": {"standing": stands, "open_rows": len(rows) - len(decided(rows))}}
 
 
 def _report(chosen: Preparation, raw: Dataset, prepared: Dataset) -> dict[str, Any]:

@@ -16,8 +16,9 @@ import forcegp.mechanics
 from forcegp.data.dataset import Dataset
 from forcegp.data.views import in_blocks
 from forcegp.errors import ContactError, DatasetError, DataWarning
+from forcegp.mechanics.gauss_principle import OPEN
 
-WINDOW, OPEN, EDGE = 0.04, 0.1, 0.015
+WINDOW, BETWEEN, EDGE = 0.04, 0.1, 0.015
 """s: of the averages; of open rows that follow those around them; on either side of what is not sure."""
 SLOW, DEVIATIONS, CLEARLY, LOUD = 0.01, 2.3, 2.0, 0.3
 """m/s that is rest, or root-mean-square noises (99.9 % of three normal numbers) if more; times that which moves; m/s
@@ -72,20 +73,24 @@ class Stance:
         return replace(dataset, u=np.column_stack([dataset.u[:, : -len(self.names)], *nearest]))
 
     def written(self, dataset: Dataset) -> Dataset:
-        """The rows that are decided, with these flags in the last columns of u. Raises DatasetError where none is."""
-        u = np.concatenate([dataset.u[:, : -len(self.names)], self.flags], axis=1)
-        decided = np.flatnonzero(np.isfinite(u).all(axis=1))
-        if not len(decided):
-            raise self._open(len(u))
-        if len(decided) < (1.0 - MANY_OPEN) * len(u):
+        """The rows with these flags in the last columns of u, open ones as `OPEN`. Raises DatasetError for no other.
+
+        Whether a foot rests or slides, its force pushes at one point: open rows still show what joints need beside it.
+        """
+        flags = np.nan_to_num(self.flags, nan=OPEN)
+        rows = replace(dataset, u=np.column_stack([dataset.u[:, : -len(self.names)], flags]))
+        decided = np.isfinite(self.flags).all(axis=1)
+        if not decided.any():
+            raise self._open(len(rows))
+        if decided.mean() < 1.0 - MANY_OPEN:
             warn(
-                f"motion and forces leave the stance open in {1.0 - len(decided) / len(u):.0%} of the rows, which are "
-                "left out: velocities are noisy (filter them: `cutoff='auto'`), stance is as short as what a filter "
-                "smears, feet slip or lean, or touch at other points than those given.",
+                f"motion and forces leave the stance open in {1.0 - decided.mean():.0%} of the rows, of which torques "
+                "alone are used: velocities are noisy (filter them: `cutoff='auto'`), stance is as short as what a "
+                "filter smears, feet slip or lean, or touch at other points than those given.",
                 DataWarning,
                 stacklevel=3,
             )
-        return replace(dataset, u=np.where(np.isfinite(u), u, 0.0)).rows(decided)
+        return rows
 
     def _open(self, rows: int) -> DatasetError:
         return DatasetError(
@@ -103,8 +108,7 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
     2.3 times the noise of v. Raises ContactError without contacts that have a switch.
     """
     model = dataset.model if model is None else model
-    names = tuple(dict.fromkeys(each.switch for each in model.contacts if each.switch))
-    if not names:
+    if not (names := model.switches):
         raise ContactError(
             "no contact of the model has a switch, so there is no stance to find; give one, for example "
             "fixed_point('foot', switch='foot_stands')."
@@ -228,7 +232,7 @@ def _between(flags: np.ndarray, time: Float[np.ndarray, " rows"]) -> np.ndarray:
         if len(decided):
             after = decided[np.minimum(np.searchsorted(decided, rows), len(decided) - 1)]
             before = decided[np.maximum(np.searchsorted(decided, rows, side="right") - 1, 0)]
-            same = (own[before] == own[after]) & (time[after] - time[before] <= OPEN)
+            same = (own[before] == own[after]) & (time[after] - time[before] <= BETWEEN)
             out[same] = own[before[same]]
         unsure = np.isnan(out)
         unsure[:-1] |= np.diff(out) != 0.0

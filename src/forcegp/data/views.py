@@ -11,6 +11,7 @@ from torch import Tensor
 from forcegp.data.dataset import Dataset
 from forcegp.data.filters import JITTER
 from forcegp.errors import InvalidInput
+from forcegp.mechanics.gauss_principle import OPEN
 from forcegp.model import Model
 from forcegp.robots.arguments import whole_number
 
@@ -41,6 +42,12 @@ def in_blocks(
 def evenly(dataset: Dataset, count: int) -> Int[np.ndarray, " chosen"]:
     """Rows at even distances over the log, the first and the last among them; a `Select`."""
     return np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).astype(int))
+
+
+def decided(dataset: Dataset) -> Dataset:
+    """The rows of which it is known which contacts act: only torques show anything in the others."""
+    known = (dataset.u[:, dataset.u.shape[1] - len(dataset.model.switches) :] != OPEN).all(axis=1)
+    return dataset if known.all() else dataset.rows(np.flatnonzero(known))
 
 
 def consecutive(dataset: Dataset) -> Bool[np.ndarray, " rows"]:

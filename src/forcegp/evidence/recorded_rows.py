@@ -56,7 +56,8 @@ def motion_residuals(
         force = force + (arm(dynamics.state.kinematics, model, frame) @ torch.tensor(values[..., None]).to(a))[..., 0]
     open_ = [k for k, contact in enumerate(model.contacts) if f"{FORCE}{contact.frame}" not in dataset.measured]
     if open_ and not any(slides(model.contacts[k]) for k in open_):
-        held, _ = independent_rows(dynamics.A[:, open_].cpu().numpy(), dynamics.b[:, open_].cpu().numpy())
+        A, b, _ = model.constraint(replace(dynamics.state, u=model.bearing(dynamics.state.u)))
+        held, _ = independent_rows(A[:, open_].cpu().numpy(), b[:, open_].cpu().numpy())
         return without(force.cpu().numpy(), held.swapaxes(1, 2)), missed.cpu().numpy()
     return force.cpu().numpy(), missed.cpu().numpy()
 
@@ -171,7 +172,10 @@ class RecordedRows:
         forces = (each @ sensed[frame][..., None] for frame, each in arms.items())
         self.at_contacts = sum(forces, np.zeros((*self.v.shape, 1)))[..., 0]
         """Joint forces of what sensors measured."""
-        self.open = self._unseen(A.cpu().numpy(), pushed) if sensed or pushed else self.held
+        bearing = model.bearing(at_u)
+        if more := bool((bearing != at_u).any()):
+            A = model.constraint(replace(self.state, u=bearing))[0]
+        self.open = self._unseen(A.cpu().numpy(), pushed) if sensed or pushed or more else self.held
         """Orthonormal rows (rows, m, nv): directions of joint forces that nothing measured, of contacts and pushes."""
         self.force, self.in_gears, self.inertia = 0.0 * self.v, 0.0 * self.v, np.zeros((robot.nv, robot.nv))
         for force in kept_laws(space, any_contact, sensed):

@@ -120,7 +120,7 @@ def doubts_of_past(model: Model, log: Dataset, known: Bool[np.ndarray, " rows"])
         yield look(
             about="friction that remembers",
             what="until a joint has moved a little, a log does not tell which way its gear was turned last: "
-            f"{share:.0%} of the rows come before that, and levels of dry friction are too small.",
+            f"{share:.0%} of the rows come before that, and levels of dry friction may be too small by as much.",
             do="Give longer episodes, or leave memory out.",
         )
 

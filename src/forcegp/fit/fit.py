@@ -11,7 +11,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset, farthest_rows
 from forcegp.data.dataset import require_rows
-from forcegp.data.views import past_known, with_memory
+from forcegp.data.views import decided, past_known, with_memory
 from forcegp.doubts import Doubts
 from forcegp.errors import DataWarning, InvalidInput, require_type, usable_arguments
 from forcegp.evidence import Evidence, Motions, Sensor, Torques, TrainingData
@@ -170,7 +170,7 @@ def fit(
     if unseen is not None and not posterior.is_black_box:
         posterior = posterior.with_settings(**unseen.stated)
     if refinement is not None:
-        posterior = refine_on_motions(posterior, dataset, refinement.seconds, refinement.bodies, model)
+        posterior = refine_on_motions(posterior, decided(dataset), refinement.seconds, refinement.bodies, model)
     Doubts([*doubts, *doubts_of_reversals(posterior.model, dataset)]).warn(stacklevel=3)
     return with_drift(posterior, dataset)
 
@@ -203,6 +203,7 @@ def _chosen(
 def _checked(model: Model, dataset: Dataset, evidence: Any, refinement: Motions | None) -> Dataset:
     """The log, if it has what the evidence needs; of equal rows, or episodes of rows in order, the first alone."""
     require_rows("dataset", dataset, model.robot.joint_names, "the robot")
+    dataset = dataset if isinstance(evidence, Torques) else decided(dataset)
     if len(dataset) < 2:
         raise InvalidInput(f"the dataset has {len(dataset)} rows; at least 2 are needed")
     for each in (evidence, refinement):

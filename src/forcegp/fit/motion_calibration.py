@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from forcegp.data import Dataset, farthest_rows, with_memory
-from forcegp.data.views import RecordedMotions, recorded_motions
+from forcegp.data.views import RecordedMotions, decided, recorded_motions
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence.likelihood import TrainingData
 from forcegp.fit.motion_fit import refine_on_motions
@@ -44,7 +44,7 @@ def calibrated(
     require_type("posterior", posterior, Posterior, ", as in calibrated(posterior, log)")
     require_type("dataset", dataset, Dataset)
     require_unobserved(posterior, "intervals of motions")
-    dataset = with_memory(dataset, posterior.model)
+    dataset = decided(with_memory(dataset, posterior.model))
     wanted = tuple(sorted(set(horizons)))
     if not wanted or not all(math.isfinite(h) and h > 0.0 for h in wanted):
         raise InvalidInput(f"horizons are {list(horizons)}; give one or more positive numbers of seconds.")

@@ -1,6 +1,7 @@
 """Which motors turn with two joints, as those of wrists do, by stretches of a log that are held out."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,20 +36,44 @@ def choose_transmission(
     bodies = model.robot.kinematics(q, v).torque_regressor(a).flatten(2).cpu().numpy() * weight[:, None]
     rows = [stretch == k for k in np.unique(stretch)]
 
+    def motor(row: Float[np.ndarray, " nv"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Friction and rotor of a motor that turns by `row` v, with what its joints share of bodies and torques."""
+        v, a, w = log.v @ row, log.a @ row, row * weight
+        speed = np.sqrt((v**2).mean()).clip(1e-12)
+        signs = [np.tanh(v / (width * speed)) for width in WIDTHS]
+        C = np.stack([v, a, np.ones_like(v), *signs, np.sqrt(abs(v)) * signs[0]], axis=-1)
+        at = np.flatnonzero(w)
+        own, asked = np.einsum("nkc,k->nc", bodies[:, at], w[at]), torque[:, at] @ w[at]
+        return C, *(np.stack([C[k].T @ each[k] for k in rows]) for each in (own, asked[:, None]))
+
+    of_bodies, asked = (
+        np.stack([np.tensordot(bodies[k], y[k], ((0, 1), (0, 1))) for k in rows]) for y in (bodies, torque[..., None])
+    )
+    motors = dict[bytes, Any]()  # candidates differ in one of them
+
     def left(T: Float[np.ndarray, "nv nv"]) -> Float[np.ndarray, "stretches nv"]:
         """Squared residuals of each stretch by the numbers of the others."""
-        v, a = log.v @ T.T, log.a @ T.T
-        speed = np.sqrt((v**2).mean(0)).clip(1e-12)
-        signs = [np.tanh(v / (width * speed)) for width in WIDTHS]
-        columns = np.stack([v, a, np.ones_like(v), *signs, np.sqrt(abs(v)) * signs[0]], axis=-1)
-        motors = np.einsum("nkc,kj->njkc", columns, T * weight).reshape(*v.shape, -1)
-        X = np.concatenate([bodies, motors], axis=-1)
-        X = X / np.sqrt((X**2).sum((0, 1))).clip(1e-300)
-        sides = X, torque[..., None]
-        normal, right = (np.stack([np.tensordot(X[k], y[k], ((0, 1), (0, 1))) for k in rows]) for y in sides)
-        others = normal.sum(0) - normal + RIDGE * np.eye(X.shape[-1])
-        each = np.linalg.solve(others, right.sum(0) - right)[..., 0]
-        return np.stack([((torque[k] - X[k] @ x) ** 2).sum(0) for k, x in zip(rows, each, strict=True)])
+        for row in T:
+            if row.tobytes() not in motors:
+                motors[row.tobytes()] = motor(row)
+        columns, with_bodies, of_motors = zip(*(motors[row.tobytes()] for row in T), strict=True)
+        C, shared = np.stack(columns, axis=1), (T * weight) @ (T * weight).T
+        size, count = C.shape[-1], of_bodies.shape[-1]
+        normal = np.zeros((len(rows), count + C[0].size, count + C[0].size))
+        normal[:, :count, :count], across = of_bodies, np.concatenate(with_bodies, axis=1)
+        normal[:, count:, :count], normal[:, :count, count:] = across, across.swapaxes(1, 2)
+        for m, n in np.argwhere(shared):
+            block = np.stack([C[k, m].T @ C[k, n] for k in rows]) * shared[m, n]
+            normal[:, count + m * size :, count + n * size :][:, :size, :size] = block
+        right = np.concatenate([asked, *of_motors], axis=1)
+        size_of = np.sqrt(np.diagonal(normal.sum(0)))
+        scale = np.where(size_of > 0.0, size_of, 1.0)
+        normal, right = normal / np.outer(scale, scale), right / scale[:, None]
+        others = normal.sum(0) - normal + RIDGE * np.eye(len(scale))
+        each = np.linalg.solve(others, right.sum(0) - right)[..., 0] / scale
+        of_rows = zip(rows, each[:, :count], each[:, count:].reshape(len(rows), -1, size), strict=True)
+        misses = (torque[k] - bodies[k] @ b - np.einsum("nmc,mc->nm", C[k], m) @ (T * weight) for k, b, m in of_rows)
+        return np.stack([(miss**2).sum(0) for miss in misses])
 
     found = np.eye(log.nv)
     best = left(found)

@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from forcegp.errors import ContactError, InvalidInput, NumericalError, require_number
@@ -42,6 +42,10 @@ def placed(
     pose = kinematics.frame_pose(frame)
     axes, local = pose[..., :3, :3], torch.tensor(point, dtype=pose.dtype, device=pose.device)
     return axes, axes @ local + pose[..., :3, 3]
+
+
+OPEN = 0.5
+"""Of a switch, where a log leaves open whether the contact holds: it may bear a force, and its motion is not known."""
 
 
 @dataclass(frozen=True)
@@ -134,8 +138,13 @@ class Contact:
             b = b - 2.0 * baumgarte.zeta * baumgarte.omega * (A * v).sum(-1) - baumgarte.omega**2 * c
         if self.switch is None:
             return A, b, gradient
-        acts = (state.u[..., state.inputs.index(self.switch)] > 0.5).to(b.dtype)
+        acts = self.acts(state.u, state.inputs).to(b.dtype)
         return acts[..., None] * A, acts * b, gradient  # a row of zeros has no multiplier and constrains nothing
+
+    def acts(self, u: Float[Tensor, "*batch nu"], inputs: Sequence[str]) -> Bool[Tensor, "*#batch"]:
+        """Where it holds: where its switch is beyond `OPEN`, or everywhere."""
+        always = torch.ones(1, dtype=torch.bool, device=u.device)
+        return always if self.switch is None else u[..., inputs.index(self.switch)] > OPEN
 
 
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -267,8 +276,7 @@ class ConstrainedDynamics:
         """How far the points of the contacts are off their surfaces, in m."""
         state, found = self.state, list[Tensor]()
         for each in self.contacts:  # 0 where a switch lets it go
-            acts = 1.0 if each.switch is None else (state.u[..., state.inputs.index(each.switch)] > 0.5).to(self.b)
-            found.append(acts * each.off(state.kinematics))
+            found.append(each.acts(state.u, state.inputs) * each.off(state.kinematics))
         return torch.stack(found, dim=-1) if found else self.b
 
     def acceleration_map(self) -> AffineMap:

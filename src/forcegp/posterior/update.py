@@ -6,6 +6,7 @@ from typing import Any
 import torch
 
 from forcegp.data import Dataset
+from forcegp.data.views import decided
 from forcegp.evidence.likelihood import TrainingData, check_distance
 from forcegp.inference import exact
 from forcegp.inference.memory import blas_threads, require_memory
@@ -17,6 +18,7 @@ Structured = Any
 
 def learn_more_rows(posterior: Structured, rows: Dataset) -> Structured:
     """What `Posterior.update` documents."""
+    rows = decided(rows)
     latent, training = exact(posterior.latent, "learning from more rows"), posterior.training
     count, rank, latents = latent.system.deflation.C.shape
     size, new = rank * (count + len(rows)), rank * len(rows)

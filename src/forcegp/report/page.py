@@ -13,6 +13,7 @@ from jinja2 import Environment, StrictUndefined
 from forcegp import __version__
 from forcegp.atomic_files import atomic_file
 from forcegp.data import Dataset
+from forcegp.data.views import decided
 from forcegp.errors import MissingExtra
 from forcegp.posterior.posterior import Posterior
 from forcegp.report.motion import RecordedScene, recorded_scene, recording
@@ -80,6 +81,7 @@ def model_page(
 
     What cannot be drawn is named on the page with the reason. `shapes` is a URDF with visual elements.
     """
+    dataset = decided(dataset)
     drawn, missing = model_pictures(posterior, dataset)
     try:
         recorded = recorded_scene(dataset, posterior, seconds=SECONDS, shapes=shapes)

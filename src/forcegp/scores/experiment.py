@@ -18,6 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from forcegp.data import Dataset, contact_doubts, farthest_rows, with_strokes
 from forcegp.data.dataset import require_rows
+from forcegp.data.views import decided
 from forcegp.errors import ForceGPError, InvalidInput, require_type
 from forcegp.fit import fit
 from forcegp.integration import integrator_named
@@ -99,7 +100,7 @@ class Experiment:
         if len({split.name for split in self.splits}) < len(self.splits) or not self.splits:
             raise InvalidInput("give one split or more, each of its own name.")
         for split in self.splits:  # refused now, not after an hour
-            training_subset(split.apply(self.rows)[0], self.points, 0)
+            training_subset(decided(split.apply(self.rows)[0]), self.points, 0)
             self.motions(split)
 
     @cached_property
@@ -109,7 +110,8 @@ class Experiment:
 
     def motions(self, split: Split) -> HeldOutMotions:
         """The motions to predict in what this split holds out."""
-        return held_out_motions(self.recording, split.test_rows(self.recording), self.horizons, self.starts)
+        recording = decided(self.recording)
+        return held_out_motions(recording, split.test_rows(recording), self.horizons, self.starts)
 
     def rows_for(self, identified: Model | str | None) -> Dataset:
         """All rows, which know the strokes of the motors that an identified model has found, also those of a split."""
@@ -126,7 +128,7 @@ class Experiment:
         if not few:
             how |= {"iterations": self.iterations, "points": self.points}
         if not few and (model.unknown_forces or not model.is_open):
-            rows = training_subset(rows, self.points, seed)
+            rows = training_subset(decided(rows), self.points, seed)
         posterior: Any = learn(model, rows, work.evidence, **how)[0]
         return fit(posterior.model, recording, work.motions, start=posterior) if work.motions else posterior
 
@@ -215,6 +217,7 @@ def _score(
 ) -> dict[str, Any]:
     identified, before = identified_before(store, spec["identified"]) if "identified" in spec else (None, 0.0)
     train, test = split.apply(experiment.rows_for(identified))
+    test = decided(test)
     start = time.process_time()
     posterior = experiment.fitted(work, train, split.apply(experiment.recording)[0], identified, spec["seed"])
     seconds = before + time.process_time() - start

@@ -13,6 +13,7 @@ from forcegp import __version__
 from forcegp.atomic_files import write_json, write_text
 from forcegp.data import Dataset, with_strokes
 from forcegp.data.dataset import require_rows
+from forcegp.data.views import decided
 from forcegp.errors import InvalidInput, require_type
 from forcegp.integration import integrator_named
 from forcegp.jobs import JobStore, machine, run_jobs
@@ -105,7 +106,8 @@ def score(
             digests = {name: each.digest for name, each in known.items()}
             how = {"rows_sha256": fingerprint(log), "models": digests, "horizons": horizons, "integrator": integrator}
             JobStore.open(Path(folder), KIND, how, overwrite=overwrite)
-        motions = held_out_motions(recording or log, np.ones(len(recording or log), dtype=bool), horizons or (), starts)
+        log, recording = decided(log), decided(recording or log)
+        motions = held_out_motions(recording, np.ones(len(recording), dtype=bool), horizons or (), starts)
         runs = _runs_of(before, log, motions, integrator)
         about |= {"splits": [], "seeds": [0], "notes": list(motions.notes)}
         scores = _scores(log, runs, known, about, before.__getitem__)
