@@ -141,9 +141,8 @@ def main(runs: int) -> None:
         with torch.no_grad():
             predicted = posterior.dynamics(q, v, u).multiplier_map().offset.reshape(-1, 4, 3).numpy()
         error, size = (np.sqrt(np.square(x[..., 2]).mean()) for x in (predicted - smooth[::10], smooth[::10]))
-        print(
-            f"{seed}: rows {len(rows) / len(log):.0%}, of {len(decided(rows)) / len(rows):.0%} the stance, flags right {right:.2%}; {told}; forces of feet off by"
-        )
+        print(f"{seed}: rows {len(rows) / len(log):.0%}, decided {len(decided(rows)) / len(rows):.0%}, flags right")
+        print(f"   {right:.2%}; {told}; forces of feet off by")
         print(f"   {error:.2f} N of {size:.0f} along z", flush=True)
 
 

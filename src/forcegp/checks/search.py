@@ -365,7 +365,6 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
             "that stick, or give way before they slip.",
             do="Friction that remembers explains it; forcegp auto and forcegp fit --forces gear choose it.",
             joints=names,
-            numbers={"unexplained": root.rough[sticky].tolist()},
         )
     bad = np.setdiff1d(bad, sticky)
     if not len(bad):

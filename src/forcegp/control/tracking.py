@@ -96,14 +96,7 @@ class TrackingController(Controller):
     Raises InvalidInput for arguments that do not fit and references out of range, NumericalError without a torque.
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        *,
-        stiffness: Any,
-        damping: Any = None,
-        torque_limits: Any = None,
-    ) -> None:
+    def __init__(self, robot: Robot, *, stiffness: Any, damping: Any = None, torque_limits: Any = None) -> None:
         super().__init__(robot, torque_limits)
         self.stiffness = per_joint("stiffness", stiffness, robot.nv)
         self.damping = 2.0 * self.stiffness.sqrt() if damping is None else per_joint("damping", damping, robot.nv)

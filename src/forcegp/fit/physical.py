@@ -15,13 +15,7 @@ from forcegp.doubts import Doubts
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence import Accelerations, Torques
 from forcegp.evidence.bodies import thickened
-from forcegp.evidence.least_squares import (
-    LEAST,
-    ROUNDS,
-    Fit,
-    NoiseLevels,
-    weighted_least_squares,
-)
+from forcegp.evidence.least_squares import LEAST, ROUNDS, Fit, NoiseLevels, weighted_least_squares
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.fit.doubts import doubts_of_memory
 from forcegp.fit.equations import Equations

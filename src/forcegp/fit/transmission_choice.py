@@ -66,8 +66,7 @@ def choose_transmission(
             block = np.stack([C[k, m].T @ C[k, n] for k in rows]) * shared[m, n]
             normal[:, count + m * size :, count + n * size :][:, :size, :size] = block
         right = np.concatenate([asked, *of_motors], axis=1)
-        size_of = np.sqrt(np.diagonal(normal.sum(0)))
-        scale = np.where(size_of > 0.0, size_of, 1.0)
+        scale = np.sqrt(np.diagonal(normal.sum(0))).clip(1e-100)
         normal, right = normal / np.outer(scale, scale), right / scale[:, None]
         others = normal.sum(0) - normal + RIDGE * np.eye(len(scale))
         each = np.linalg.solve(others, right.sum(0) - right)[..., 0] / scale

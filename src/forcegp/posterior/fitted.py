@@ -26,14 +26,7 @@ from typing_extensions import override
 from forcegp.errors import UnknownName, require_known
 from forcegp.evidence.likelihood import MarginalLikelihood, TrainingData
 from forcegp.forces import IndependentAccelerations, JointAccelerations, JointForces
-from forcegp.inference import (
-    Engine,
-    Exact,
-    LatentKernels,
-    LatentPosterior,
-    OptimizationResult,
-    exact,
-)
+from forcegp.inference import Engine, Exact, LatentKernels, LatentPosterior, OptimizationResult, exact
 from forcegp.model import Model
 from forcegp.noise import ACCELERATION
 from forcegp.posterior.drift import Drift

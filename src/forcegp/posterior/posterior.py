@@ -46,14 +46,7 @@ from forcegp.posterior.prediction import (
 from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.preparation import prepared_predictor, rows_for
 from forcegp.posterior.programs import Physics, Programs
-from forcegp.posterior.rollout import (
-    Rollout,
-    accelerations,
-    checked_start,
-    flat_feedback,
-    loops_for,
-    moved,
-)
+from forcegp.posterior.rollout import Rollout, accelerations, checked_start, flat_feedback, loops_for, moved
 from forcegp.posterior.update import learn_more_rows
 from forcegp.robots.arguments import whole_number
 

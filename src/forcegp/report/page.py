@@ -70,13 +70,7 @@ SECONDS = 10.0
 """Of the recording in the scene."""
 
 
-def model_page(
-    posterior: Posterior,
-    dataset: Dataset,
-    *,
-    shapes: str | Path | None = None,
-    **texts: Any,
-) -> Page:
+def model_page(posterior: Posterior, dataset: Dataset, *, shapes: str | Path | None = None, **texts: Any) -> Page:
     """A page of `texts`, with the robot in motion, and pictures of the model (`scores.model_pictures`).
 
     What cannot be drawn is named on the page with the reason. `shapes` is a URDF with visual elements.

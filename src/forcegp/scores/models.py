@@ -22,13 +22,7 @@ from forcegp.fit import calibrated, default_options, fit, held_out_noise
 from forcegp.fit.friction_choice import with_friction_chosen
 from forcegp.fit.search import MOST_POINTS_FOR_RESTARTS
 from forcegp.fit.sensors import usual_evidence
-from forcegp.forces import (
-    IndependentAccelerations,
-    JointAccelerations,
-    has_few_inputs,
-    parse_forces,
-    split_outside,
-)
+from forcegp.forces import IndependentAccelerations, JointAccelerations, has_few_inputs, parse_forces, split_outside
 from forcegp.inference import Inducing
 from forcegp.model import Model
 from forcegp.noise import Noise

@@ -24,14 +24,7 @@ from forcegp.progress import part
 from forcegp.robots.arguments import whole_number
 from forcegp.scores.experiment import Experiment, fingerprint, kept, scored
 from forcegp.scores.held_out import STARTS, HeldOutMotions, Split, held_out_motions, split_named
-from forcegp.scores.models import (
-    Candidate,
-    Given,
-    candidate,
-    candidates,
-    default_models,
-    identified_model,
-)
+from forcegp.scores.models import Candidate, Given, candidate, candidates, default_models, identified_model
 from forcegp.scores.page import page, preparation_lines
 from forcegp.scores.scores import Scores
 
