@@ -11,7 +11,7 @@ from tests.goldens.compare import assert_unchanged
 
 from forcegp import Dataset, Model, Robot, check, import_recordings
 from forcegp.checks import quick_check
-from forcegp.checks.moving_base import base_doubts, carried_doubts, stance_doubts
+from forcegp.checks.moving_base import base_doubts, carried_doubts, stance_doubts, unmeasured_base_doubts
 from forcegp.data.configurations import rates
 from forcegp.forces import Actuation, RigidBodies, Thrusters
 from forcegp.recordings import ColumnMapping
@@ -251,5 +251,11 @@ def test_what_is_said_of_growing_mistakes(log):
         flips[some, 12:] = 1.0 - flips[some, 12:]
         found[f"flags {share}"] = numbers(list(stance_doubts(replace(few, u=flips, truth={}), few.model))[2:])
     lifted = np.where(np.arange(few.u.shape[1]) < 12, few.u, 0.0)
+    still = replace(few, q=few.q[:1] + 0.0 * few.q, v=0.0 * few.v, a=0.0 * few.a, truth={})
+    turning, gliding, moving = still.v.copy(), still.v.copy(), few.v * (np.arange(few.nv) > 5)
+    turning[7, 4] = gliding[:, 0] = 1e-3
+    for name, v in (("still", still.v), ("moving", moving), ("turning", moving + turning), ("gliding", gliding)):
+        found[name] = [each.what for each in unmeasured_base_doubts(replace(still, v=v), few.model)]
+    found["row"] = list(unmeasured_base_doubts(replace(still, v=moving).rows([0]), few.model))
     found["no feet"] = numbers(carried_doubts(replace(few, u=lifted, truth={}), few.model))
     assert_unchanged("checks/bases", found, rtol=1e-5)
