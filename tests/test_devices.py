@@ -8,6 +8,7 @@ import torch
 from tests.devices import DEVICES, PRETEND, MixedDevices, PretendTensor, pretend_device
 from tests.inference.dense import dense_covariance
 from tests.posterior.arm import arm_data, arm_model
+from torch.testing import assert_close
 
 from forcegp.errors import InvalidInput
 from forcegp.evidence import MarginalLikelihood, TrainingData
@@ -20,10 +21,7 @@ from forcegp.robots.arguments import usable_device
 
 QUICK = OptimizerOptions(iterations=2)
 PRIORS = (
-    "gp:joint",
-    "gp:load-friction,gp:joint-friction",
-    "gp:tool-friction",
-    "gp:joint-position",
+    *("gp:joint", "gp:load-friction,gp:joint-friction", "gp:tool-friction", "gp:joint-position"),
     "gp:joint:kernel=matern-3/2",
 )
 
@@ -59,9 +57,7 @@ def test_the_pretended_device_computes_and_differentiates():
 @pytest.mark.parametrize(
     "mix",
     [
-        lambda x, y: x + y,
-        lambda x, y: torch.cat([x, y]),
-        lambda x, y: x[torch.tensor([0, 1])],
+        *(lambda x, y: x + y, lambda x, y: torch.cat([x, y]), lambda x, y: x[torch.tensor([0, 1])]),
         lambda x, y: torch.stack([x[0], y[0]]),
         lambda x, y: torch.randn(2, generator=torch.Generator(), device=PRETEND),
     ],
@@ -104,7 +100,7 @@ def test_robots_and_constrained_dynamics_never_wait_for_the_host():
         assert not trips
         assert all(isinstance(x, PretendTensor) for x in results)
         for name in ("M", "A", "b", "H", "Q_K"):
-            torch.testing.assert_close(getattr(dynamics, name).inner, getattr(expected, name))
+            assert_close(getattr(dynamics, name).inner, getattr(expected, name))
 
 
 @pytest.mark.parametrize("prior", PRIORS)
@@ -122,7 +118,7 @@ def test_the_likelihood_waits_for_a_few_flags_whatever_the_number_of_rows(prior)
         counts.append((trips - before)["number"])
         values.append((numbers(value), plain[0]))
         for name, slope in slopes.items():
-            torch.testing.assert_close(numbers(slope), plain[1][name], rtol=1e-6, atol=1e-6)
+            assert_close(numbers(slope), plain[1][name], rtol=1e-6, atol=1e-6)
     assert counts[0] == counts[1] <= 6
     # y^T K^-1 y by two orders of the same operations: eps cond(K), times 10 for their number. Positions alone
     # do not explain these accelerations, so that their value rests on the noise, with a large cond(K).
@@ -171,7 +167,7 @@ def test_structured_models_on_the_pretended_device(prior, integrators, tmp_path)
         for name in ("acceleration", "multiplier", "contact_force", "unknown_force"):
             for part in ("mean", "covariance"):
                 found, known = (getattr(getattr(p, name), part) for p in (prediction, expected))
-                torch.testing.assert_close(found.inner, known, rtol=1e-7, atol=1e-7)
+                assert_close(found.inner, known, rtol=1e-7, atol=1e-7)
         there.components(test.q, test.v, test.u)
         for integrator in integrators:
             motion = there.rollout(test.q[0], test.v[0], test.u[:1], 0.001, integrator=integrator, samples=2)
@@ -190,8 +186,8 @@ def test_inducing_points_on_the_pretended_device():
     expected = posterior.predict(test.q, test.v, test.u)
     with pretend_device():
         found = posterior.to(PRETEND).predict(test.q, test.v, test.u)
-        torch.testing.assert_close(found.mean.inner, expected.mean, rtol=1e-6, atol=1e-6)
-        torch.testing.assert_close(found.covariance.inner, expected.covariance, rtol=1e-6, atol=1e-6)
+        assert_close(found.mean.inner, expected.mean, rtol=1e-6, atol=1e-6)
+        assert_close(found.covariance.inner, expected.covariance, rtol=1e-6, atol=1e-6)
 
 
 def test_independent_processes_on_the_pretended_device():
@@ -201,9 +197,7 @@ def test_independent_processes_on_the_pretended_device():
         fitted = fit(data.model.to(PRETEND).black_box(), data, **how)
         for posterior in (fitted, expected.to(PRETEND)):
             mean = posterior.predict(data.q[:3], data.v[:3], data.u[:3]).mean
-            torch.testing.assert_close(
-                mean.inner, expected.predict(data.q[:3], data.v[:3], data.u[:3]).mean, rtol=1e-6, atol=1e-6
-            )
+            assert_close(mean.inner, expected.predict(data.q[:3], data.v[:3], data.u[:3]).mean, rtol=1e-6, atol=1e-6)
 
 
 # ---------------------------------------------------------------- real devices
@@ -218,13 +212,11 @@ def test_a_fit_on_a_real_device_is_that_on_the_cpu(device):
     assert found.predict(test.q, test.v, test.u).mean.device.type == device
     assert found.result.value == pytest.approx(expected.result.value, rel=1e-4)
     there, states_ = expected.to(device), (test.q, test.v, test.u)
-    torch.testing.assert_close(
-        there.predict(*states_).covariance.cpu(), expected.predict(*states_).covariance, rtol=1e-6, atol=1e-9
-    )
+    assert_close(there.predict(*states_).covariance.cpu(), expected.predict(*states_).covariance, rtol=1e-6, atol=1e-9)
     motions = [p.rollout(test.q[0], test.v[0], test.u, 0.001, samples=2).q.cpu() for p in (there, expected)]
-    torch.testing.assert_close(*motions, rtol=1e-7, atol=1e-9)
+    assert_close(*motions, rtol=1e-7, atol=1e-9)
     grown = [p.update(arm_data(5, seed=8)).predict(*states_).mean.cpu() for p in (there, expected)]
-    torch.testing.assert_close(*grown, rtol=1e-6, atol=1e-8)
+    assert_close(*grown, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("device", ["gpu", "cuda:999"])
@@ -242,6 +234,6 @@ def test_moving_keeps_where_a_posterior_was_carried_and_what_standardises_it():
     again = posterior.to("cpu")
     assert again.target is not None
     np.testing.assert_array_equal(again.training.reference.q, posterior.training.reference.q)
-    torch.testing.assert_close(
+    assert_close(
         again.predict(data.q, data.v, data.u).mean, posterior.predict(data.q, data.v, data.u).mean, rtol=1e-8, atol=1e-9
     )

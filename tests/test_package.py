@@ -134,9 +134,8 @@ def test_releases_are_published_without_a_secret_and_only_from_tags(repository):
     assert publish["permissions"] == {"id-token": "write"}
     assert publish["needs"] == ["check", "wheel", "try"]
     installs = [step["run"] for step in content["jobs"]["wheel"]["steps"] if "install" in step.get("run", "")]
-    assert installs == [
-        "python -m pip install --require-hashes --only-binary :all: -r .github/release-requirements.txt"
-    ]
+    options = "--require-hashes --only-binary :all: -r .github/release-requirements.txt"
+    assert installs == [f"python -m pip install {options}"]
     pinned = (repository / ".github" / "release-requirements.txt").read_text()
     assert len(re.findall(r"^[\w-]+==", pinned, re.M)) <= pinned.count("--hash=sha256:")
     made = project(repository)["build-system"]["requires"]
@@ -161,9 +160,8 @@ def test_the_conda_recipe_needs_what_the_wheel_needs(repository):
     project = tomllib.loads((repository / "pyproject.toml").read_text())["project"]
     there = {"torch": "pytorch", "matplotlib": "matplotlib-base"}
     parts = (re.fullmatch(r"([\w-]+)(.*)", each) for each in project["dependencies"])
-    needed = {
-        f"{there.get(name, name).lower()} {pin}".strip() for name, pin in (part.groups() for part in parts if part)
-    }
+    pins = dict(part.groups() for part in parts if part)
+    needed = {f"{there.get(name, name).lower()} {pin}".strip() for name, pin in pins.items()}
     assert set(recipe["requirements"]["run"][1:]) == needed
     assert recipe["context"]["version"] == project["version"]
 

@@ -60,9 +60,8 @@ COLUMNS = (
 def test_the_results_of_real_robots_are_those_of_their_page(repository: Path):
     readme = (repository / "README.md").read_text(encoding="utf-8")
     page = (repository / "docs" / "benchmarks" / "real-robots.md").read_text(encoding="utf-8")
-    rows = {
-        cells[1].strip(): cells[2:5] for cells in (line.split("|") for line in page.splitlines()) if len(cells) == 6
-    }
+    lines = (line.split("|") for line in page.splitlines())
+    rows = {cells[1].strip(): cells[2:5] for cells in lines if len(cells) == 6}
     for robot, column in ROBOTS.items():
         (quantity, shown) = re.findall(rf"^\| {robot}[^|]*\|([^|]*)\|(.*)\|$", readme, re.MULTILINE)[0]
         if "nRMSE" in quantity:  # which the page has of the recommended model alone
@@ -129,9 +128,8 @@ def test_the_commands_and_forces_of_the_page_on_forces_exist(repository: Path):
     assert all(is_unknown(name) for name in told)
     assert len(told) == 9
     rows = page.partition("## Kernels")[2].partition("\n## ")[0]
-    told = {
-        name for cell in re.findall(r"^\| (`[^|]+) \|", rows, re.MULTILINE) for name in re.findall(r"`(.+?)`", cell)
-    }
+    cells = re.findall(r"^\| (`[^|]+) \|", rows, re.MULTILINE)
+    told = {name for cell in cells for name in re.findall(r"`(.+?)`", cell)}
     assert told == set(KERNELS)
     model = simulate_kuka_surface(KukaSurfaceConfig(seconds=0.1)).model
     count = 0

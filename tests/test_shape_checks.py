@@ -22,22 +22,11 @@ from tests.robots.random_positions import random_positions
 from tests.shapes import MisfitError, checked, unchecked
 from torch import Tensor
 
-from forcegp import (
-    Dataset,
-    JointForces,
-    JointFriction,
-    Noise,
-    Viscous,
-    check,
-    fit,
-    load_posterior,
-    save_posterior,
-    score,
-)
+from forcegp import Dataset, JointForces, JointFriction, Noise, Viscous, check, fit, load_posterior, save_posterior
 from forcegp.errors import InvalidInput
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics.surfaces import surface_axes
-from forcegp.scores import split_named
+from forcegp.scores import score, split_named
 
 QUICK = OptimizerOptions(iterations=2)
 
@@ -131,10 +120,7 @@ def test_what_does_not_fit_must_be_refused_by_the_function_itself():
 
 SIZES = {"q": "nq", "v": "nv", "a": "nv", "u": "nu"}
 ARMS = {
-    "control/informative_motions",
-    "forces/columns",
-    "simulation/joint_friction",
-    "simulation/trajectory",
+    *("control/informative_motions", "forces/columns", "simulation/joint_friction", "simulation/trajectory"),
     "simulation/kuka_motion",
 }
 """Modules of robots that are bolted to the world and driven in every joint, where these sizes are one."""

@@ -86,9 +86,7 @@ LINE = Plane((1.0, 0.0, 0.0), 0.35)
 POINT = (0.0, 0.0, -0.3)
 
 
-def on_a_line(
-    seed: int, *, rate: float = 250.0, seconds: float = 8.0, noise: float = 0.1, push: float = 8.0
-) -> Dataset:
+def on_a_line(seed: int, *, rate: float = 250.0, seconds: float = 8, noise: float = 0.1, push: float = 8) -> Dataset:
     """A planar arm whose tip stays on the line x = 0.35 m, pushed against it, with friction along the line."""
     robot = two_links()
     generator = np.random.default_rng(seed)
@@ -96,10 +94,8 @@ def on_a_line(
     omega, phase = 2 * np.pi * generator.uniform(0.15, 0.8, (4, 1)), generator.uniform(0, 2 * np.pi, (4, 1))
     size = generator.uniform(0.02, 0.05, (4, 1))
     z = -0.4 + (size * np.sin(omega * time + phase)).sum(0)
-    dz, ddz = (
-        (size * omega * np.cos(omega * time + phase)).sum(0),
-        (-size * omega**2 * np.sin(omega * time + phase)).sum(0),
-    )
+    dz = (size * omega * np.cos(omega * time + phase)).sum(0)
+    ddz = (-size * omega**2 * np.sin(omega * time + phase)).sum(0)
     # the tip lies at -(l1 sin q1 + l2 sin(q1 + q2)), -(l1 cos q1 + l2 cos(q1 + q2)) in x and z
     reach = np.hypot(0.35, z)
     bend = np.arccos((reach**2 - 0.4**2 - 0.3**2) / (2 * 0.4 * 0.3))

@@ -112,9 +112,8 @@ def test_a_dead_torque_is_wrong_where_the_motion_needs_a_share_of_the_others(sha
         return needed[1] / needed[0] - share
 
     robot, u = lighter(brentq(above, 1e-3, 10.0))
-    (found,) = check(column(replace(data, u=u, model=Model(robot)), "u", 1, np.zeros_like)).doubts.of(
-        "constant channel"
-    )
+    dead = column(replace(data, u=u, model=Model(robot)), "u", 1, np.zeros_like)
+    (found,) = check(dead).doubts.of("constant channel")
     assert (found.level, found.joints) == (level, ("elbow",))
 
 

@@ -11,7 +11,7 @@ from tests.goldens.compare import assert_unchanged
 
 from forcegp import Dataset, Model, Robot, check, import_recordings
 from forcegp.checks import quick_check
-from forcegp.checks.moving_base import base_doubts, carried_doubts, stance_doubts
+from forcegp.checks.moving_base import _explained, base_doubts, carried_doubts, stance_doubts, unmeasured_base_doubts
 from forcegp.data.configurations import rates
 from forcegp.forces import Actuation, RigidBodies, Thrusters
 from forcegp.recordings import ColumnMapping
@@ -251,5 +251,15 @@ def test_what_is_said_of_growing_mistakes(log):
         flips[some, 12:] = 1.0 - flips[some, 12:]
         found[f"flags {share}"] = numbers(list(stance_doubts(replace(few, u=flips, truth={}), few.model))[2:])
     lifted = np.where(np.arange(few.u.shape[1]) < 12, few.u, 0.0)
+    noise, other = torch.randn(2, 300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    for size in (0.1, 0.4, 0.8, 1.3, 2.0):
+        mixed = [_explained(noise + share * size * other, size * other) for share in (0.4, 0.6, 0.75, 1.0, 1.25, 1.4)]
+        found[f"explained {size}"] = mixed
+    still = replace(few, q=few.q[:1] + 0.0 * few.q, v=0.0 * few.v, a=0.0 * few.a, truth={})
+    turning, gliding, moving = still.v.copy(), still.v.copy(), few.v * (np.arange(few.nv) > 5)
+    turning[7, 4] = gliding[:, 0] = 1e-3
+    for name, v in (("still", still.v), ("moving", moving), ("turning", moving + turning), ("gliding", gliding)):
+        found[name] = [each.what for each in unmeasured_base_doubts(replace(still, v=v), few.model)]
+    found["row"] = list(unmeasured_base_doubts(replace(still, v=moving).rows([0]), few.model))
     found["no feet"] = numbers(carried_doubts(replace(few, u=lifted, truth={}), few.model))
     assert_unchanged("checks/bases", found, rtol=1e-5)

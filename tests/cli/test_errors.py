@@ -37,21 +37,18 @@ def folder(tmp_path, monkeypatch):
 
 
 WRONG = [
-    ("fit missing.h5 --out run", "missing.h5 is not a file"),
-    ("fit damaged.h5 --out run", "damaged.h5 is damaged"),
+    *(("fit missing.h5 --out run", "missing.h5 is not a file"), ("fit damaged.h5 --out run", "damaged.h5 is damaged")),
     ("fit arm.h5 --robot other.urdf --out run", "other.urdf has joints pan, lift, wrist; arm.h5 has pan, lift, bend"),
     ("fit arm.h5 --points 1 --no-checks --out run", "--points 1 must be an integer from 2 to 20, the rows"),
     ("fit arm.h5 --noise loud --out run", "--noise is 'loud'; give learned, dataset or a number"),
     ("fit arm.h5 --contact hnd:plane:0,0,1,0 --out run", "no frame 'hnd' in arm; did you mean 'hand'?"),
     ("fit arm.h5 --out mine", "mine exists"),
-    ("fit arm.h5 --out mine --overwrite", "was not written by `forcegp fit`"),
-    ("fit arm.h5", "--out"),
+    *(("fit arm.h5 --out mine --overwrite", "was not written by `forcegp fit`"), ("fit arm.h5", "--out")),
     ("fit arm.h5 --device cuda:999 --out run", "device 'cuda:999' cannot be used here; there is cpu"),
     ("score mine arm.h5", "mine holds no model.json"),
     ("simulate kuka-surface --out arm.h5", "arm.h5 exists already"),
     ("simulate kuka-surface --out a.h5 --seconds -1", "seconds is -1.0; it must be one number, from"),
-    ("simulate mars --out a.h5", "'mars'"),
-    ("learn arm.h5", "Available subcommands: auto, demo, simulate, "),
+    *(("simulate mars --out a.h5", "'mars'"), ("learn arm.h5", "Available subcommands: auto, demo, simulate, ")),
 ]
 
 
@@ -81,13 +78,7 @@ def test_another_robot_keeps_gravity_armature_and_locked_joints_of_the_recording
     recorded = Robot.from_urdf_text(URDF, gravity=(0.0, 1.0, -9.0), armature=(0.1, 0.2), locked={"bend": 0.6})
     data = arm_data(20, seed=0)
     two = {name: getattr(data, name)[:, :2] for name in "qvua"}  # any numbers will do
-    dataclasses.replace(
-        data,
-        **two,
-        model=Model(recorded),
-        noise_std=np.full(2, 0.5),
-        truth={},
-    ).save("locked.h5")
+    dataclasses.replace(data, **two, model=Model(recorded), noise_std=np.full(2, 0.5), truth={}).save("locked.h5")
     (folder / "heavier.urdf").write_text(URDF.replace('value="0.6"', 'value="0.9"'))
     assert main(["fit", "locked.h5", "--robot", "heavier.urdf", *QUICK, "--out", "run"]) == 0
     robot = load_posterior("run").model.robot

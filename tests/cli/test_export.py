@@ -11,15 +11,7 @@ import pytest
 from tests.posterior.arm import arm_data
 
 QUICK = ("--points", 12, "--iterations", 2, "--restarts", 1, "--no-checks")
-FILES = {
-    "arm.c",
-    "arm.h",
-    "arm.hpp",
-    "CMakeLists.txt",
-    "example.c",
-    "self_test.c",
-    "README.txt",
-}
+FILES = {"arm.c", "arm.h", "arm.hpp", "CMakeLists.txt", "example.c", "self_test.c", "README.txt"}
 
 
 @pytest.fixture(scope="module")

@@ -94,10 +94,8 @@ def test_functions_beside_what_was_identified(forcegp, folder, identified):
 @pytest.mark.parametrize(
     ("forces", "description"),
     [
-        ("gp:joint", "analytical mean"),
-        ("only,gp:joint", "zero mean"),
-        ("only,gp:joint-accelerations", "unconstrained accelerations, zero mean"),
-        ("none", "analytical model"),
+        *(("gp:joint", "analytical mean"), ("only,gp:joint", "zero mean")),
+        *(("only,gp:joint-accelerations", "unconstrained accelerations, zero mean"), ("none", "analytical model")),
         ("gp:independent", "independent"),
     ],
 )

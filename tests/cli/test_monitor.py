@@ -46,10 +46,8 @@ def test_a_log_becomes_a_table_of_contacts(workshop, monkeypatch, tmp_path, caps
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ((), "--free S|FREE.h5"),
-        (("--free", "nowhere.h5"), "give seconds above 0, or a dataset that is there"),
-        (("--free", "5"), "too short for a threshold"),
-        (("--free", "-1"), "give seconds above 0"),
+        *(((), "--free S|FREE.h5"), (("--free", "nowhere.h5"), "give seconds above 0, or a dataset that is there")),
+        *((("--free", "5"), "too short for a threshold"), (("--free", "-1"), "give seconds above 0")),
         (("--free", "log.csv"), "log.csv is not an HDF5 file"),
         (("--free", "free.h5", "--bandwidth", "500"), "below 50"),
     ],

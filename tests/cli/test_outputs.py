@@ -28,9 +28,7 @@ FOLDERS = {
     "export": "export run --to c --overwrite --out OUT",
     "demo": "demo --overwrite --out OUT",
 }
-STORES = {
-    "score": "score arm.h5 --split blocks:5:3 --guard 0 --horizon 0.02 --points 9 --overwrite --out OUT",
-}
+STORES = {"score": "score arm.h5 --split blocks:5:3 --guard 0 --horizon 0.02 --points 9 --overwrite --out OUT"}
 COMMANDS = FILES | FOLDERS | STORES
 
 
@@ -170,14 +168,10 @@ OVER_INPUTS = [
     "import log.csv --time time --q q_a,q_a,q_a --u u_a,u_a,u_a --robot arm.urdf --out link.csv",
     "import log.csv --time time --q q_a,q_a,q_a --u u_a,u_a,u_a --robot arm.urdf --out hard.csv",
     "import log.csv --time time --q q_a --u u_a --robot arm.urdf --out arm.urdf",
-    "import arm.h5 --every 2 --out arm.h5",
-    "fit arm.h5 --robot arm.urdf --out arm.urdf",
-    "fit arm.h5 --identified run --out run",
-    "fit run/inner.h5 --out run",
+    *("import arm.h5 --every 2 --out arm.h5", "fit arm.h5 --robot arm.urdf --out arm.urdf"),
+    *("fit arm.h5 --identified run --out run", "fit run/inner.h5 --out run"),
     "fit arm.h5 --robot run/inner.urdf --forces bodies --out run",
-    "payload arm.h5 --baseline run/inner.h5 --out run",
-    "score run arm.h5 --out run",
-    "score arm.h5 --out arm.h5",
+    *("payload arm.h5 --baseline run/inner.h5 --out run", "score run arm.h5 --out run", "score arm.h5 --out arm.h5"),
 ]
 
 

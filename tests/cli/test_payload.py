@@ -109,8 +109,7 @@ def test_what_cannot_be_is_one_line(folder, forcegp, words, message):
 
 
 def test_causes_of_so_many_factors_that_nobody_can_look_for_them_are_not_in_the_answer():
-    few, many = (
-        {"about": "payload", "what": "so", "numbers": {"gains": dict.fromkeys(x, 1.1)}} for x in ("abc", "abcd")
-    )
+    numbers = ({"gains": dict.fromkeys(joints, 1.1)} for joints in ("abc", "abcd"))
+    few, many = ({"about": "payload", "what": "so", "numbers": each} for each in numbers)
     assert other_causes({"doubts": [few]}) == {"gains": "so"}
     assert other_causes({"doubts": [many, {**few, "about": "torque sensor"}]}) == other_causes({}) == {}

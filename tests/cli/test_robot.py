@@ -58,12 +58,8 @@ def test_rotors_beside_a_file_are_not_lost_for_those_of_a_recording(tmp_path):
     recorded.robot.with_armature({"spin": 0.3}).to_urdf(tmp_path / "identified.urdf")
     words = ["fit", "log.h5", "--out", "run", "--robot", str(tmp_path / "identified.urdf")]
     assert parse_arguments(words).robot.chosen(recorded).robot.armature.tolist() == [0.0, 0.3, 0.0, 0.0]
-    assert parse_arguments([*words, "--armature", "tilt=1"]).robot.chosen(recorded).robot.armature.tolist() == [
-        0,
-        0,
-        0,
-        1,
-    ]
+    words += ["--armature", "tilt=1"]
+    assert parse_arguments(words).robot.chosen(recorded).robot.armature.tolist() == [0, 0, 0, 1]
 
 
 def test_mjcf_is_written_by_extension(forcegp, tmp_path):

@@ -144,10 +144,8 @@ def test_pushes_are_found(monitor):
 def test_a_place_explains_the_torque_by_the_least_force():
     """Against all points of all links one by one, with rotors in the metric; of links that meet it is the first."""
     robot = Robot.from_urdf_text(files("forcegp.simulation").joinpath("ur5.urdf").read_text())
-    observer, rng = (
-        ContactMonitor(Model(robot, forces=(*Model(robot).forces, Rotor(0.2))), dt=DT),
-        np.random.default_rng(3),
-    )
+    observer = ContactMonitor(Model(robot, forces=(*Model(robot).forces, Rotor(0.2))), dt=DT)
+    rng = np.random.default_rng(3)
     observer.noise = noise = NoiseLevels(rng.uniform(0.1, 0.3, 6), rng.uniform(0.1, 0.5, 6))
     places = [(link, k / 4 * end.numpy()) for link, end in link_ends(robot).items() for k in range(5)]
     chosen = []

@@ -6,6 +6,7 @@ import pytest
 import torch
 from tests.goldens.compare import assert_unchanged
 from tests.posterior.arm import arm_data, arm_model, quick_fit
+from torch.testing import assert_close
 
 from forcegp import ComputedTorque, HybridForce, Model, Robot, Viscous, fit
 from forcegp.errors import ContactError, InvalidInput, NumericalError
@@ -17,12 +18,9 @@ JOINT = """<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2
 <axis xyz="{4}"/><limit lower="-3" upper="3" velocity="9" effort="60"/></joint>"""
 URDF = "".join(
     [
-        '<robot name="arm"><link name="base"/>',
-        LINK.format("upper", 2.0),
-        LINK.format("fore", 1.5),
+        *('<robot name="arm"><link name="base"/>', LINK.format("upper", 2.0), LINK.format("fore", 1.5)),
         JOINT.format("shoulder", "base", "upper", 0.0, "0 1 0"),
-        JOINT.format("elbow", "upper", "fore", -0.4, "0.6 0.8 0"),
-        "</robot>",
+        *(JOINT.format("elbow", "upper", "fore", -0.4, "0.6 0.8 0"), "</robot>"),
     ]
 )
 ROBOT = Robot.from_urdf_text(URDF)
@@ -102,14 +100,12 @@ def test_joint_forces_are_those_of_predict_and_of_torch(touching):
     u = torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64)
     found, expected, dynamics = compiled.joint_forces(q, v, u), plain.joint_forces(q, v, u), touching.dynamics(q, v, u)
     for one, other in zip(found, expected, strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-10)
-    torch.testing.assert_close(
-        found.Q, dynamics.Q_K + touching.predict(q, v, u).unknown_force.mean, rtol=1e-8, atol=1e-10
-    )
+        assert_close(one, other, rtol=1e-8, atol=1e-10)
+    assert_close(found.Q, dynamics.Q_K + touching.predict(q, v, u).unknown_force.mean, rtol=1e-8, atol=1e-10)
     step = 1e-5 * torch.eye(3, dtype=torch.float64)
     ahead, back = ([plain.joint_forces(q, v, u + sign * row).Q for row in step] for sign in (1.0, -1.0))
     difference = (torch.stack(ahead, -1) - torch.stack(back, -1)) / 2e-5
-    torch.testing.assert_close(found.dQ_du, difference, rtol=1e-5, atol=1e-7)
+    assert_close(found.dQ_du, difference, rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.parametrize("force", [None, -1.0, [1.0, 2.0], np.nan])
@@ -129,11 +125,11 @@ def test_a_force_is_asked_for_only_at_the_surface(touching):
         HybridForce(predictor, **GAINS, torque_limits=1e6)(lifted, v, q, v, *rest)
     control = HybridForce(predictor, off_surface="release", **GAINS, torque_limits=1e6)
     free = ComputedTorque(touching.with_contacts([]).predictor(covariance="none"), **GAINS, torque_limits=1e6)
-    torch.testing.assert_close(control(lifted, v, q, v, *rest), free(lifted, v, q, v, rest[0]))
+    assert_close(control(lifted, v, q, v, *rest), free(lifted, v, q, v, rest[0]))
     assert control.released
     on = control(q, v, q, v, *rest)
     assert not control.released
-    torch.testing.assert_close(on, HybridForce(predictor, **GAINS, torque_limits=1e6)(q, v, q, v, *rest))
+    assert_close(on, HybridForce(predictor, **GAINS, torque_limits=1e6)(q, v, q, v, *rest))
     contact, plane = touching.model.contacts[0], touching.model.contacts[0].surface  # a plane
     at = touching.model.robot.kinematics(torch.tensor(lifted))
     away = float(contact.position(at) @ torch.tensor(plane.normal).double()) - plane.offset
@@ -161,7 +157,7 @@ def test_friction_that_remembers_is_that_of_the_positions_seen(touching):
     inverse = np.linalg.inv(M)
     a = inverse @ A.T @ np.linalg.solve(A @ inverse @ A.T, b)
     expected = posterior.predictor(covariance="none").inverse_dynamics(q + step, v, a, [7.0], memory=z).mean
-    torch.testing.assert_close(u, expected)
+    assert_close(u, expected)
 
 
 def test_models_with_and_without_contacts(touching):

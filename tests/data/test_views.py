@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from tests.data.samples import dataset
 
 from forcegp.data.views import (
@@ -41,7 +42,7 @@ def test_recorded_motions_are_spread_over_the_log_and_hold_u_of_each_row():
         assert found.rows == (0, 7, 14, 27, 34)
         for k, row in enumerate(found.rows):
             for name, end in (("q", 6), ("v", 6), ("u", 5)):
-                np.testing.assert_array_equal(getattr(found, name)[k], getattr(log, name)[row : row + end])
+                assert_array_equal(getattr(found, name)[k], getattr(log, name)[row : row + end])
     assert recorded_motions(log.rows(np.delete(np.arange(40), 26)), 20, 0.1).rows[-4:] == (9, 26, 27, 28)
     late = 3e-3 * (np.arange(40) > 9)
     for starts, seconds, changed, words in (
@@ -71,9 +72,7 @@ def test_joints_rest_for_a_third_of_a_second_within_a_thousandth_of_their_range(
         assert time[rows[[0, -1]]] == pytest.approx([begins, begins + lasts], abs=0.02)
     numbers = postures(log)
     if found:
-        np.testing.assert_array_equal(
-            numbers, np.minimum(np.searchsorted([r[-1] for r in rests(log)], np.arange(len(q))), 3)
-        )
+        assert_array_equal(numbers, np.minimum(np.searchsorted([r[-1] for r in rests(log)], np.arange(len(q))), 3))
     assert (numbers is None) == (not found)
     assert rests_alone(log) is None  # of .5 s of motion between two rests each
 
@@ -98,5 +97,5 @@ def test_a_log_of_postures_alone_becomes_the_median_of_each(postures, moves):
     found = one_row_per_rest(log)
     assert len(found) == (3 if postures == 3 and not moves else len(log))
     if len(found) == 3:
-        np.testing.assert_array_equal(np.c_[found.q, found.v], np.c_[q[::9], 0.0 * q[::9]])
-        np.testing.assert_array_equal(found.u, np.median(log.u.reshape(3, 9, 2), axis=1))
+        assert_array_equal(np.c_[found.q, found.v], np.c_[q[::9], 0.0 * q[::9]])
+        assert_array_equal(found.u, np.median(log.u.reshape(3, 9, 2), axis=1))

@@ -40,10 +40,7 @@ def test_the_minimum_is_that_of_scipy_at_the_same_weights(bounds):
     fit = weighted_least_squares(residual, no_prior, np.ones(3), bounds)
     assert fit.settled
     theirs = least_squares(
-        lambda x: (residual(x)[0] / fit.noise).ravel(),
-        np.clip(TRUTH, *bounds) + 1e-3,
-        bounds=bounds,
-        xtol=1e-12,
+        lambda x: (residual(x)[0] / fit.noise).ravel(), np.clip(TRUTH, *bounds) + 1e-3, bounds=bounds, xtol=1e-12
     )
     spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
     np.testing.assert_allclose((fit.x - theirs.x) / spread, 0.0, atol=0.05)

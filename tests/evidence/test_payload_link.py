@@ -45,9 +45,8 @@ def carrying(text: str, name: str, mass: float) -> str:
     return replace_inertial(text, name, whole, center, inertia + 1e-3 * np.eye(3), source="a test")
 
 
-ROTORS = Thrusters(
-    "trunk", [(0.3, 0, 0), (-0.3, 0, 0), (0, 0.3, 0), (0, -0.3, 0)], thrust=1.0, torque=[0.1, 0.1, -0.1, -0.1]
-)
+PLACES = (0.3, 0, 0), (-0.3, 0, 0), (0, 0.3, 0), (0, -0.3, 0)
+ROTORS = Thrusters("trunk", PLACES, thrust=1.0, torque=[0.1, 0.1, -0.1, -0.1])
 
 
 def rows(base: str, loaded: str, noise: float) -> Dataset:
@@ -55,10 +54,8 @@ def rows(base: str, loaded: str, noise: float) -> Dataset:
     known = (Actuation(), *([ROTORS] if base == "floating" else []), RigidBodies())
     given, heavier = (Model(Robot.from_urdf_text(text, base=base), (), known) for text in (TWO_ARMS, loaded))
     draw = torch.Generator().manual_seed(0)
-    q, v = (
-        random_positions(given.robot, draw, 400),
-        torch.randn(400, given.robot.nv, generator=draw, dtype=torch.float64),
-    )
+    q = random_positions(given.robot, draw, 400)
+    v = torch.randn(400, given.robot.nv, generator=draw, dtype=torch.float64)
     u = 8.0 * torch.randn(400, len(given.inputs), generator=draw, dtype=torch.float64)
     friction = torch.zeros_like(v)
     friction[:, -4:] = -0.2 * v[:, -4:]

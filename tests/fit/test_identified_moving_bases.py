@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from scipy.linalg import eigh, null_space
 from tests.forces.test_thrusters import DRONE
 from tests.robots.random_positions import random_positions
@@ -91,7 +92,7 @@ def test_columns_and_their_rank_are_those_of_pinocchio(base):
     ids = [pair.model.frames[pair.model.getFrameId(link)].parentJoint - 1 for link in body_names(robot)]
     for k, q, v, a, _ in pair.states():
         theirs = pin.computeJointTorqueRegressor(pair.model, pair.data, q, v, a).reshape(robot.nv, -1, 10)
-        np.testing.assert_allclose(ours[k], theirs[pair.to_v][:, ids], atol=1e-10 * np.abs(theirs).max())
+        assert_allclose(ours[k], theirs[pair.to_v][:, ids], atol=1e-10 * np.abs(theirs).max())
     again = torque_regressor(robot, pair.q, pair.v, pair.a) @ standard_parameters(robot)
     torch.testing.assert_close(again, robot.inverse_dynamics(pair.q, pair.v, pair.a), atol=1e-10, rtol=1e-10)
     rng = np.random.default_rng(0)
@@ -127,14 +128,14 @@ def test_residuals_and_their_jacobians(walker, likelihood):
     if likelihood == "torque":  # H takes out the same directions, along A^T
         wrong = (dynamics.M @ torch.tensor(a)[..., None])[..., 0] - dynamics.Q_K
         seen, ours = (dynamics.H.numpy() @ each[..., None] for each in (wrong.numpy(), residual(start)[0]))
-        np.testing.assert_allclose(seen, ours, atol=1e-8)
+        assert_allclose(seen, ours, atol=1e-8)
         assert np.abs(dynamics.A.numpy() @ residual(start)[0][..., None]).max() < 1e-9
     else:
-        np.testing.assert_allclose(residual(start)[0], a - dynamics.acceleration_map().offset.numpy(), atol=1e-8)
+        assert_allclose(residual(start)[0], a - dynamics.acceleration_map().offset.numpy(), atol=1e-8)
     x = start + np.random.default_rng(2).uniform(0.05, 0.2, len(start))
     direction = np.random.default_rng(3).normal(size=len(x))
     numeric = (residual(x + 1e-6 * direction)[0] - residual(x - 1e-6 * direction)[0]) / 2e-6
-    np.testing.assert_allclose(residual(x)[1] @ direction, numeric, rtol=1e-5, atol=1e-5 * np.abs(numeric).max())
+    assert_allclose(residual(x)[1] @ direction, numeric, rtol=1e-5, atol=1e-5 * np.abs(numeric).max())
 
 
 def test_forces_that_are_left_out_are_those_of_least_squares_with_them_as_unknowns():
@@ -155,12 +156,12 @@ def test_forces_that_are_left_out_are_those_of_least_squares_with_them_as_unknow
         lambdas[nv * row : nv * row + nv, 2 * row : 2 * row + 2] = -(held[row] / fit.noise).T
     dense = np.concatenate([(J / fit.noise[:, None]).reshape(-1, k), lambdas], 1)
     wanted = np.linalg.lstsq(dense, (y / fit.noise).ravel(), rcond=1e-10)[0][:k]
-    np.testing.assert_allclose(fit.x, wanted, atol=1e-3)
+    assert_allclose(fit.x, wanted, atol=1e-3)
     hidden = np.linalg.qr(lambdas[:, lambdas.any(0)])[0]
     left = dense[:, :k] - hidden @ (hidden.T @ dense[:, :k])
     own = left.T @ left
-    np.testing.assert_allclose(fit.information, own, rtol=1e-8)
-    np.testing.assert_allclose(fit.noise, noise, rtol=0.5)
+    assert_allclose(fit.information, own, rtol=1e-8)
+    assert_allclose(fit.noise, noise, rtol=0.5)
 
 
 @pytest.mark.parametrize("likelihood", ["torque", "acceleration", "both"])
@@ -182,9 +183,9 @@ def test_a_walker_is_found_again(walker, likelihood):
     test = recorded(truth, 50, seed=9)
     Y = torque_regressor(walker.robot, *(torch.tensor(x) for x in (test.q, test.v, test.a))).flatten(0, 1).numpy()
     wanted = Y @ standard_parameters(truth.robot).numpy()
-    np.testing.assert_allclose(Y @ parameters_of(found), wanted, atol=0.02 * np.abs(wanted).max())
-    np.testing.assert_allclose(found.predict(test.q, test.v, test.u).mean, test.a, atol=0.05 * np.abs(test.a).max())
-    np.testing.assert_allclose(found.model.sizes, walker.sizes)
+    assert_allclose(Y @ parameters_of(found), wanted, atol=0.02 * np.abs(wanted).max())
+    assert_allclose(found.predict(test.q, test.v, test.u).mean, test.a, atol=0.05 * np.abs(test.a).max())
+    assert_allclose(found.model.sizes, walker.sizes)
 
 
 def test_likely_accelerations_cost_least(walker):
@@ -225,9 +226,9 @@ def test_likely_accelerations_cost_least(walker):
         return total
 
     r, in_parameters, in_laws, _ = rows.in_torque(x, likely.motion)
-    np.testing.assert_allclose((rows.held @ likely.motion.a[..., None])[..., 0], rows.right, atol=1e-8)
+    assert_allclose((rows.held @ likely.motion.a[..., None])[..., 0], rows.right, atol=1e-8)
     white = (likely.whitening @ (r + likely.offset)[..., None])[..., 0]
-    np.testing.assert_allclose((white**2).sum(), cost(x), rtol=1e-7)
+    assert_allclose((white**2).sum(), cost(x), rtol=1e-7)
     in_bodies = space.bodies.chained(x[: space.bodies.size], in_parameters)
     slope = 2.0 * np.einsum("ni,nij,njk->k", white, likely.whitening, np.concatenate([in_bodies, in_laws], -1))
     direction = np.random.default_rng(3).normal(size=len(x))
@@ -259,7 +260,7 @@ def test_a_drone_without_joints(walker):
     found = identified(log, model)
     carried = fit(model.with_forces(Payload()), log).parameters["payload.mass"]
     assert carried.value == pytest.approx(0.3 * locked.mass, rel=0.05)
-    np.testing.assert_allclose(parameters_of(found), standard_parameters(heavier.robot), atol=1e-3)
+    assert_allclose(parameters_of(found), standard_parameters(heavier.robot), atol=1e-3)
     assert [type(force) for force in found.model.forces] == [type(force) for force in model.forces]
     weak = replace(rotors, thrust=(1.0, 1.0, 0.8, 1.0), torque=(0.02, -0.02, 0.016, -0.02))
     weak = replace(model, forces=(Actuation(), weak, RigidBodies()))
@@ -286,7 +287,7 @@ def test_a_payload_on_the_trunk_of_a_walker(walker):
     assert mass.value == pytest.approx(0.8, abs=3.0 * mass.std)
     assert mass.std < 0.2
     center = [found[f"payload.center_of_mass.{axis}"].value for axis in "xyz"]
-    np.testing.assert_allclose(center, [0.05, 0.0, 0.1], atol=0.1)
+    assert_allclose(center, [0.05, 0.0, 0.1], atol=0.1)
 
 
 def test_noise_under_constraints_is_that_of_the_rows(walker):
@@ -299,14 +300,14 @@ def test_noise_under_constraints_is_that_of_the_rows(walker):
     H, truth = dynamics.H.numpy(), NoiseLevels(acceleration, force)
     found = NoiseLevels.of(residual, dynamics.M.numpy(), H)
     white = (truth.whitening(H) @ residual[..., None])[..., 0]
-    np.testing.assert_allclose(white.T @ white / len(white), np.eye(9), atol=0.25)
+    assert_allclose(white.T @ white / len(white), np.eye(9), atol=0.25)
 
     def cost(levels):
         lower = levels.whitening(H)
         return 0.5 * ((lower @ residual[..., None]) ** 2).sum() - np.linalg.slogdet(lower)[1].sum()
 
     assert cost(found) < cost(truth)
-    np.testing.assert_allclose(found.acceleration[:6], acceleration[:6], rtol=0.2)  # a light joint hides its own
+    assert_allclose(found.acceleration[:6], acceleration[:6], rtol=0.2)  # a light joint hides its own
 
 
 def test_a_robot_that_cannot_move_teaches_nothing(walker):
@@ -346,9 +347,7 @@ def test_masses_of_links_that_motions_do_not_show_stay_those_of_the_file():
     log = recorded(flying(2.0), 2000, noise=1e-3, switches=0)
     found = identified(log, flying(0.0))
     assert found.parameters.settled
-    np.testing.assert_allclose(
-        [found.parameters[f"{name}.mass"].value for name in ("body", "upper")], [2.5, 0.3], atol=0.1
-    )
+    assert_allclose([found.parameters[f"{name}.mass"].value for name in ("body", "upper")], [2.5, 0.3], atol=0.1)
     at, reference = (body_pseudo_inertias(model.robot).numpy() for model in (found.model, flying(0.0)))
     shoulder = ((0.05, 0, -0.05, 1), (0, 0, 0, 1))
 

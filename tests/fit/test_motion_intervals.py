@@ -7,6 +7,7 @@ import pytest
 import torch
 from tests.fit.test_motion_fit import QUIET, bump, recording, refined, slide
 from tests.posterior import floating_arm
+from torch.testing import assert_close
 
 from forcegp import JointFriction, fit, load_posterior, save_posterior
 from forcegp.data.views import recorded_motions
@@ -53,7 +54,7 @@ def test_widths_between_horizons_are_linear_and_grow_beyond_the_last():
     found = MotionIntervals(np.array([1.0, 2.0]), rms, factors)
     time = torch.tensor([0.0, 0.5, 1.0, 1.5, 2.0, 4.0], dtype=torch.float64)
     alone = found.half_width("q", time, None)[:, 0] / DEVIATIONS
-    torch.testing.assert_close(alone, torch.tensor([0.0, 0.05, 0.1, 0.2, 0.3, 0.6], dtype=torch.float64))
+    assert_close(alone, torch.tensor([0.0, 0.05, 0.1, 0.2, 0.3, 0.6], dtype=torch.float64))
     spread = torch.full((3, 6, 1), 0.4, dtype=torch.float64)
     both = found.half_width("q", time, spread)[0, :, 0] / DEVIATIONS
     expected = np.array([0.5, 0.5, 0.5, 1.0, 1.5, 1.5]) * np.hypot(0.4, [0.0, 0.05, 0.1, 0.2, 0.3, 0.6])
@@ -76,9 +77,7 @@ def test_without_calibration_the_samples_decide(log):
     q, v, u = log.q[:1, :], log.v[:1, :], log.u[None, :20]
     sampled = plain.rollout(q, v, u, 0.01, samples=8)
     low, high = sampled.interval()
-    torch.testing.assert_close(
-        torch.stack([low, high]), sampled.samples.q.quantile(torch.tensor([0.025, 0.975]).double(), dim=0)
-    )
+    assert_close(torch.stack([low, high]), sampled.samples.q.quantile(torch.tensor([0.025, 0.975]).double(), dim=0))
     with pytest.raises(InvalidInput, match="0 samples"):
         plain.rollout(q, v, u, 0.01).interval()
 
@@ -127,10 +126,8 @@ def test_where_the_base_moves_samples_spread_as_steps(floating):
     same = {name: getattr(plain, name).expand(6, *getattr(plain, name).shape) for name in others}
     samples = replace(plain, q=robot.integrate(plain.q, steps), **same)
     drawn = replace(plain, samples=samples)
-    torch.testing.assert_close(drawn.std(), steps.std(0))
-    torch.testing.assert_close(
-        torch.stack(drawn.interval()), steps.quantile(torch.tensor([0.025, 0.975]).double(), dim=0)
-    )
+    assert_close(drawn.std(), steps.std(0))
+    assert_close(torch.stack(drawn.interval()), steps.quantile(torch.tensor([0.025, 0.975]).double(), dim=0))
     low, high = replace(drawn, intervals=widths).interval()
-    torch.testing.assert_close(high, DEVIATIONS * steps.std(0))
-    torch.testing.assert_close(low, -high)
+    assert_close(high, DEVIATIONS * steps.std(0))
+    assert_close(low, -high)

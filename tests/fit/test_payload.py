@@ -347,11 +347,7 @@ def test_the_frame_is_that_of_the_link(found):
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [
-        ({"link": "base"}, "does not move"),
-        ({"link": "tool9"}, "tool9"),
-        ({"baseline": "empty.h5"}, "baseline|dataset"),
-    ],
+    [({"link": "base"}, "does not move"), ({"link": "tool9"}, "tool9"), ({"baseline": "empty.h5"}, "baseline|dataset")],
 )
 def test_what_makes_no_sense_is_refused(change, message):
     with pytest.raises(ForceGPError, match=message):

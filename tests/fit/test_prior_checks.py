@@ -9,6 +9,7 @@ import torch
 from tests.evidence.test_contact_forces import SENSOR, held, measured, on_plane, tensors
 from tests.forces.world_forces import WorldForces
 from tests.posterior.arm import arm_data, arm_model
+from torch.testing import assert_close
 
 from forcegp import ContactForces, Torques, Viscous
 from forcegp.errors import DataWarning, InvalidInput, UnknownName
@@ -66,10 +67,8 @@ def test_a_force_along_the_normal_is_hidden(on_a_table, prefix):
     states = [torch.tensor(x) for x in (on_a_table.q, on_a_table.v, on_a_table.u)]
     z = posterior.likelihood.standardization(posterior.model.unknown.features(on_a_table.model.dynamics(*states)))[2]
     prior_variance = list(posterior.latent.kernels)[2](z, diag=True)
-    torch.testing.assert_close(force.mean[:, 2], torch.zeros(12).double(), rtol=0.0, atol=1e-6)
-    torch.testing.assert_close(
-        force.variance[:, 2], posterior.widening**2 * prior_variance.detach(), rtol=1e-6, atol=0.0
-    )
+    assert_close(force.mean[:, 2], torch.zeros(12).double(), rtol=0.0, atol=1e-6)
+    assert_close(force.variance[:, 2], posterior.widening**2 * prior_variance.detach(), rtol=1e-6, atol=0.0)
 
 
 def test_along_the_surface_nothing_is_hidden(on_a_table):
@@ -104,10 +103,7 @@ def test_a_term_that_moves_no_joint_is_refused(data):
     ("prior", "message"),
     [
         (JointFriction(), r"latent 'lift' depends on velocity of lift \[rad/s\], which is the same in all 12"),
-        (
-            (JointPositionForces(), JointForces(("u",))),
-            "latent 'joint-position-forces lift' depends on position of",
-        ),
+        ((JointPositionForces(), JointForces(("u",))), "latent 'joint-position-forces lift' depends on position of"),
         ((JointFriction(), ContactFriction()), "latent 'joint-friction lift'"),
     ],
     ids=["friction", "position", "sum"],
@@ -161,12 +157,8 @@ def test_equal_terms_are_refused(data):
 @pytest.mark.parametrize(
     "prior",
     [
-        (JointFriction(), JointForces(("v",))),
-        (JointFriction(), JointForces()),
-        (ContactFriction(), ToolForces()),
-        (JointFriction(("pan",)), JointFriction(("lift",))),
-        (JointFriction(), ()),
-        (),
+        *((JointFriction(), JointForces(("v",))), (JointFriction(), JointForces()), (ContactFriction(), ToolForces())),
+        *((JointFriction(("pan",)), JointFriction(("lift",))), (JointFriction(), ()), ()),
     ],
     ids=["inputs", "all", "axes", "joints", "nothing", "none"],
 )

@@ -55,9 +55,7 @@ def test_an_unknown_variance_widens_as_the_closed_form_does():
     training = posterior.training
     z = (training.v[:, 0] / training.v[:, 0].square().mean().sqrt()).numpy()
     x, y = -z / 0.5, (training.a - training.u / 0.5)[:, 0].numpy()
-    ((name, fitted),) = [
-        (name, value) for name, value in posterior.hyperparameters.items() if name.startswith("kernels")
-    ]
+    ((name, fitted),) = [each for each in posterior.hyperparameters.items() if each[0].startswith("kernels")]
     # the kernel's parameter is the logarithm of s
     theta = float(posterior.latent.kernels[0].variance.log())
     assert theta == pytest.approx(float(fitted), abs=1e-9), name

@@ -52,9 +52,8 @@ def some_data(model: Model, rows: int, seed: int) -> Dataset:
 
 
 def some_states(*batch: int) -> list[torch.Tensor]:
-    return [
-        torch.randn(*batch, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) for seed in (1, 2, 3)
-    ]
+    generators = (torch.Generator().manual_seed(seed) for seed in (1, 2, 3))
+    return [torch.randn(*batch, 3, dtype=torch.float64, generator=generator) for generator in generators]
 
 
 class UnknownConformance:
@@ -135,9 +134,8 @@ class UnknownConformance:
         states = some_states()
         jacobians = torch.func.jacrev(lambda *given: self.values(model, *given), (0, 1, 2))(*states)
         steps = STEP * torch.eye(9, dtype=torch.float64)
-        ahead, behind = (
-            self.values(model, *(torch.cat(states) + sign * steps).split(3, dim=-1)) for sign in (1.0, -1.0)
-        )
+        places = ((torch.cat(states) + sign * steps).split(3, dim=-1) for sign in (1.0, -1.0))
+        ahead, behind = (self.values(model, *at) for at in places)
         assert_close(torch.cat(jacobians, dim=-1), (ahead - behind).mT / (2.0 * STEP), 1e-6)
 
     def test_values_and_derivatives_are_finite_at_rest(self, model):

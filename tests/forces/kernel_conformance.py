@@ -113,9 +113,8 @@ class KernelConformance:
             expected = latent(z)[0]
             stored = load(save({name: value.contiguous() for name, value in latent.initial_parameters().items()}))
             fresh = LatentKernels([kernel_of(self.expression, dimension, 0.2)])
-            assert {n: v.shape for n, v in fresh.initial_parameters().items()} == {
-                n: v.shape for n, v in stored.items()
-            }
+            begun = fresh.initial_parameters()
+            assert {n: v.shape for n, v in begun.items()} == {n: v.shape for n, v in stored.items()}
             moved = {name: value + 0.1 for name, value in stored.items()}
             for received in (pickle.loads(pickle.dumps(latent)), copy.deepcopy(latent)):
                 assert torch.equal(received(z)[0], expected)

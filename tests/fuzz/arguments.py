@@ -38,13 +38,9 @@ POSE = torch.tensor([0.0, 0.0, 1.0, 0.0, 0.0, 0.6, 0.8]).double()
 STILL = torch.zeros(6).double()
 TEXTS = ("", "\ud800", "a\nb", "joint +", *words("x abc 10 nan joint auto none base hand pan body floating planar"))
 TENSORS = (
-    lambda: torch.ones(3, dtype=torch.float64, requires_grad=True),
-    lambda: torch.ones(3, dtype=torch.complex128),
-    lambda: torch.ones(3, dtype=torch.bool),
-    lambda: torch.ones(3, device="meta"),
-    lambda: torch.zeros(0),
-    lambda: torch.tensor(float("nan")),
-    lambda: torch.ones(2, 3).to_sparse(),
+    *(lambda: torch.ones(3, dtype=torch.float64, requires_grad=True), lambda: torch.ones(3, dtype=torch.complex128)),
+    *(lambda: torch.ones(3, dtype=torch.bool), lambda: torch.ones(3, device="meta"), lambda: torch.zeros(0)),
+    *(lambda: torch.tensor(float("nan")), lambda: torch.ones(2, 3).to_sparse()),
 )
 VALUES = (None, True, False, Ellipsis, NotImplemented, 0, -1, 1, 2, 3, 7, 2**63, 10**30, -0.0, 0.5, 1.5, 1e308, -1e308)
 VALUES += (1e-320, float("nan"), float("inf"), float("-inf"), 1j, b"x", *TEXTS, (), (1,), (1, 2, 3), (0.0, 0.0, 0.0))
@@ -168,11 +164,7 @@ def _cost(q: torch.Tensor, v: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
     return q.square().sum((-1, -2))
 
 
-TRACKING = {
-    "stiffness": 10.0,
-    "damping": None,
-    "torque_limits": 50.0,
-}
+TRACKING = {"stiffness": 10.0, "damping": None, "torque_limits": 50.0}
 FIT = {"points": 6, "restarts": 1, "seed": 0, "options": QUICK}
 SURFACES = {"normal": (0.0, 0.0, 1.0), "offset": 0.1}
 
@@ -242,9 +234,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "curve": _call(Posterior.curve, _of_posterior("curve"), "features", lambda: {"latent": "pan", "points": 5}),
     "with_model": _call(Posterior.with_model, _of_posterior("with_model"), given=lambda: {"model": INPUTS.data.model}),
     "predictor": _call(
-        Posterior.predictor,
-        _of_posterior("predictor", lambda made: made(*STATE), compile=False),
-        "covariance",
+        Posterior.predictor, _of_posterior("predictor", lambda made: made(*STATE), compile=False), "covariance"
     ),
     "predictor()": (lambda **k: INPUTS.predictor(**k), _states),
     "Noise": _call(
@@ -332,10 +322,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         lambda: {"cutoff": 20.0},
     ),
     "ComputedTorque": _call(
-        forcegp.ComputedTorque,
-        lambda kind, **k: kind(arm_model(0), **k)(*STATE[:2], *STATE),
-        "",
-        lambda: TRACKING,
+        forcegp.ComputedTorque, lambda kind, **k: kind(arm_model(0), **k)(*STATE[:2], *STATE), "", lambda: TRACKING
     ),
     "ContactMonitor": _call(
         forcegp.ContactMonitor,

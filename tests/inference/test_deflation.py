@@ -40,9 +40,8 @@ def test_any_other_basis_gives_the_same(seed):
         deflation = deflate(W_white, y_white)
         matrices = given_problem.kernels(given_problem.features)
         Q = torch.linalg.qr(normal(5, deflation.rank, deflation.rank, seed=seed)).Q
-        turned = Deflation(
-            deflation.U @ Q.mT, Q @ deflation.C, (Q @ deflation.t[..., None])[..., 0], deflation.remainder
-        )
+        t = (Q @ deflation.t[..., None])[..., 0]
+        turned = Deflation(deflation.U @ Q.mT, Q @ deflation.C, t, deflation.remainder)
         here, there = (solve_deflated(basis, matrices) for basis in (deflation, turned))
         torch.testing.assert_close(quadratic_and_log_determinant(here), quadratic_and_log_determinant(there))
         torch.testing.assert_close(here.beta, there.beta, rtol=1e-9, atol=1e-9)

@@ -4,6 +4,7 @@ import pytest
 import torch
 from tests.inference.problems import Problem, normal, problem
 from tests.scores.moving_arm import moving_arm
+from torch.testing import assert_close
 
 from forcegp import JointFriction, Noise, Posterior, fit
 from forcegp.inference import ExactPosterior, Inducing
@@ -43,10 +44,10 @@ def test_inducing_points_everywhere_are_the_exact_posterior(shape):
     given = made(**shape)
     features = new_features(given)
     posterior, expected = inducing(given), exact(given)
-    torch.testing.assert_close(posterior.mean(features), expected.mean(features), rtol=1e-6, atol=1e-7)
-    torch.testing.assert_close(posterior.covariance(features), expected.covariance(features), rtol=1e-6, atol=1e-7)
+    assert_close(posterior.mean(features), expected.mean(features), rtol=1e-6, atol=1e-7)
+    assert_close(posterior.covariance(features), expected.covariance(features), rtol=1e-6, atol=1e-7)
     for index, z in enumerate(features):
-        torch.testing.assert_close(posterior.one(index, z), expected.one(index, z), rtol=1e-6, atol=1e-7)
+        assert_close(posterior.one(index, z), expected.one(index, z), rtol=1e-6, atol=1e-7)
 
 
 @torch.no_grad()
@@ -100,9 +101,7 @@ def test_pivots_reproduce_the_matrix_that_they_are_made_of():
     z, kernel = given.features[0], given.kernels[0]
     K = kernel(z, z).to_dense()
     pivots = pivoted_cholesky(given.kernels.dense[0], z, torch.ones(COUNT, dtype=torch.float64), COUNT)
-    torch.testing.assert_close(
-        K[:, pivots] @ torch.linalg.pinv(K[pivots][:, pivots]) @ K[pivots], K, rtol=1e-6, atol=1e-6
-    )
+    assert_close(K[:, pivots] @ torch.linalg.pinv(K[pivots][:, pivots]) @ K[pivots], K, rtol=1e-6, atol=1e-6)
     assert len(set(pivots.tolist())) == len(pivots)
     for count in (3, 6):  # each pivot is where most is left
         known = pivots[:count]
@@ -123,5 +122,5 @@ def test_a_latent_without_variance_has_a_predictor():
     q, v, u = (torch.tensor(each[:5]) for each in (log.q, log.v, log.u))
     mean, covariance = flat.predictor()(q, v, u)[:2]
     expected = flat.predict(q, v, u)
-    torch.testing.assert_close(mean, expected.mean)
-    torch.testing.assert_close(covariance, expected.covariance, rtol=1e-6, atol=1e-12)
+    assert_close(mean, expected.mean)
+    assert_close(covariance, expected.covariance, rtol=1e-6, atol=1e-12)

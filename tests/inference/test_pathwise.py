@@ -5,6 +5,7 @@ import pytest
 import torch
 from gpytorch.kernels import CosineKernel, LinearKernel, RBFKernel, ScaleKernel
 from tests.inference.kernel_functions import kernel_cross, kernel_matrix
+from tests.inference.problems import normal
 
 from forcegp.errors import InvalidInput
 from forcegp.forces.kernels import kernel_of
@@ -19,10 +20,9 @@ def conditioned(kernels: list, dimensions: tuple[int, ...]) -> ExactPosterior:
     generator = torch.Generator().manual_seed(0)
     features = [torch.randn(POINTS, d, dtype=torch.float64, generator=generator) for d in dimensions]
     W = torch.randn(POINTS, OUTPUTS, len(dimensions), dtype=torch.float64, generator=generator)
-    normal = torch.nn.functional.normalize(
-        torch.randn(POINTS, OUTPUTS, 1, dtype=torch.float64, generator=generator), dim=1
-    )
-    W = W - normal @ normal.mT @ W
+    hidden = torch.randn(POINTS, OUTPUTS, 1, dtype=torch.float64, generator=generator)
+    hidden = hidden / hidden.norm(dim=1, keepdim=True)
+    W = W - hidden @ hidden.mT @ W
     residual = torch.randn(POINTS, OUTPUTS, dtype=torch.float64, generator=generator)
     noise = torch.full((1, OUTPUTS), 0.09, dtype=torch.float64)
     latent = LatentKernels([kernel.double() for kernel in kernels])
@@ -54,12 +54,9 @@ COMPOSED = {"squared-exponential": 3, "friction": 1, "linear + matern-3/2": 3, "
 def test_functions_have_mean_and_covariance_of_the_posterior(expression):
     """At single points with all latents, and of the first latent across points."""
     dimension, count = COMPOSED[expression], 6000
-    latent = conditioned(
-        [kernel_of(expression, dimension, 1.3), kernel_of("squared-exponential", 1, 0.8)], (dimension, 1)
-    )
-    points = [
-        torch.randn(5, d, dtype=torch.float64, generator=torch.Generator().manual_seed(5)) for d in (dimension, 1)
-    ]
+    kernels = [kernel_of(expression, dimension, 1.3), kernel_of("squared-exponential", 1, 0.8)]
+    latent = conditioned(kernels, (dimension, 1))
+    points = [normal(5, d, seed=5) for d in (dimension, 1)]
     for z, training in zip(points, latent.features, strict=True):
         z[3], z[4] = 30.0, training[2]  # far away, and where data are
     functions = draw_functions(latent, count, seed=3, frequencies=16)

@@ -30,10 +30,7 @@ def observed_order(errors: list[float]) -> float:
     return math.log2(errors[0] / errors[-1]) / (len(errors) - 1)
 
 
-@pytest.mark.parametrize(
-    ("integrator", "order"),
-    [("symplectic-euler", 1), ("rk4", 4), ("implicit-midpoint", 2)],
-)
+@pytest.mark.parametrize(("integrator", "order"), [("symplectic-euler", 1), ("rk4", 4), ("implicit-midpoint", 2)])
 def test_order_on_a_damped_oscillator_with_its_closed_form(integrator, order):
     damping, q0, v0, end = 0.4, 0.7, -0.3, 2.0
     rate, omega = damping / 2, math.sqrt(1.0 - damping**2 / 4)

@@ -33,9 +33,8 @@ def given():
     """System, q0, v0 and u of the windows, and as guess of the middles that nothing moves."""
     model, generator = arm_model(0), torch.Generator().manual_seed(2)
     nv = model.robot.nv
-    q0 = torch.tensor([0.2, 0.7, 0.8]).double() + 0.3 * torch.randn(
-        WINDOWS, nv, generator=generator, dtype=torch.float64
-    )
+    q0 = 0.3 * torch.randn(WINDOWS, nv, generator=generator, dtype=torch.float64)
+    q0 += torch.tensor([0.2, 0.7, 0.8])
     v0 = 0.4 * torch.randn(WINDOWS, nv, generator=generator, dtype=torch.float64)
     u = 3.0 * torch.randn(WINDOWS, STEPS, model.sizes[2], generator=generator, dtype=torch.float64)
     rest = tuple(x[:, None].expand(WINDOWS, STEPS, -1) for x in (q0, v0))

@@ -30,9 +30,8 @@ def test_against_pinocchio(model, surface):
     touching, built = contact(model, surface), robot(model)
     q, v, u = states(built.nv, 10)
     A, b, gradient = constraint(model, surface, None, q, v, u)
-    assert_close(
-        touching.position(built.kinematics(q)), built.frame_pose(q, FRAMES[model])[:, :3] @ homogeneous(), 1e-12
-    )
+    place = built.frame_pose(q, FRAMES[model])[:, :3] @ homogeneous()
+    assert_close(touching.position(built.kinematics(q)), place, 1e-12)
     oracle = Oracle(MODELS[model](), built)
     index = oracle.with_point(FRAMES[model], np.array(POINT))
     for row in range(len(q)):

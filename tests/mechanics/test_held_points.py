@@ -8,6 +8,7 @@ import pytest
 import torch
 from tests.robots.random_positions import random_positions
 from tests.robots.test_moving_bases import LIMBS
+from torch.testing import assert_close
 
 from forcegp.errors import ContactError, InvalidInput
 from forcegp.forces import Actuation
@@ -62,19 +63,17 @@ def test_accelerations_and_foot_forces_are_those_of_the_equations_of_motion(walk
         zero = torch.zeros(len(A), len(A)).double()
         whole = torch.cat([torch.cat([M, -A.mT], 1), torch.cat([A, zero], 1)])
         solution = torch.linalg.solve(whole, torch.cat([tau - bias, -drift]))
-        torch.testing.assert_close(a[k], solution[: robot.nv], rtol=1e-7, atol=1e-7)
+        assert_close(a[k], solution[: robot.nv], rtol=1e-7, atol=1e-7)
         acting = torch.repeat_interleave(u[k, 3:] > 0, 3)
-        torch.testing.assert_close(forces[k][acting], solution[robot.nv :], rtol=1e-7, atol=1e-7)
+        assert_close(forces[k][acting], solution[robot.nv :], rtol=1e-7, atol=1e-7)
         assert (forces[k][~acting].abs() < 1e-12).all()
-    torch.testing.assert_close(found.force_at("b_foot")(torch.zeros_like(v)), forces[:, 3:])
+    assert_close(found.force_at("b_foot")(torch.zeros_like(v)), forces[:, 3:])
     assert torch.equal(found.as_measured("a_foot", forces[:, :3]), forces[:, :3])
     assert torch.equal(found.state.positions, torch.nn.functional.pad(q[:, -3:], (6, 0)))
-    torch.testing.assert_close(found.state.delivered, torch.nn.functional.pad(u[:, :3], (6, 0)))
+    assert_close(found.state.delivered, torch.nn.functional.pad(u[:, :3], (6, 0)))
     swinging = Contact("b_foot", POINT, ImplicitSurface(lambda p: 2.0 * p[2] - 0.6), switch="b_stands")
     off = Model(robot, (swinging,)).dynamics(q, v, u[:, [0, 1, 2, 4]]).off()[:, 0]
-    torch.testing.assert_close(
-        off, torch.where(u[:, 4] > 0, swinging.position(found.state.kinematics)[:, 2] - 0.3, 0.0)
-    )
+    assert_close(off, torch.where(u[:, 4] > 0, swinging.position(found.state.kinematics)[:, 2] - 0.3, 0.0))
 
 
 def test_a_frame_that_is_held_neither_moves_nor_turns(robot):
@@ -103,10 +102,10 @@ def test_the_point_of_a_ball_that_touches_level_ground_rests(robot):
     for k, offset in enumerate(below):
         point = tuple(np.add(POINT, offset))
         velocity = robot.frame_jacobian(q[k], "a_foot", point)[:3] @ v[k]
-        torch.testing.assert_close(touching[k], velocity, rtol=1e-12, atol=1e-12)
+        assert_close(touching[k], velocity, rtol=1e-12, atol=1e-12)
     step = 1e-6
     change = (rates(robot.integrate(q, step * v)) - rates(robot.integrate(q, -step * v)))[..., 0] / (2.0 * step)
-    torch.testing.assert_close(-model.dynamics(q, v, u).b, change, rtol=1e-6, atol=1e-6)
+    assert_close(-model.dynamics(q, v, u).b, change, rtol=1e-6, atol=1e-6)
     with pytest.raises(InvalidInput, match="must be a Held"):
         Contact("a_foot", POINT, Plane((0.0, 0.0, 1.0), 0.0), radius=radius)
     assert Contact.from_dict(json.loads(json.dumps(ball[0].to_dict()))) == ball[0]

@@ -8,6 +8,7 @@ import torch
 from scipy.stats import multivariate_normal
 from tests.posterior.arm import NOISE, arm_data, arm_model
 from tests.posterior.model_conformance import ModelConformance
+from torch.testing import assert_close
 
 from forcegp.errors import InvalidInput
 from forcegp.fit import fit
@@ -51,9 +52,9 @@ def test_equals_dense_conditioning_on_a_block_diagonal_covariance():
 
         S = kernel(z, z) + NOISE**2 * torch.eye(25, dtype=torch.float64)
         cross = kernel(new, z)
-        torch.testing.assert_close(found.mean[:, joint], cross @ torch.linalg.solve(S, y[:, joint]))
+        assert_close(found.mean[:, joint], cross @ torch.linalg.solve(S, y[:, joint]))
         spread = variance - (cross * torch.linalg.solve(S, cross.mT).mT).sum(-1)
-        torch.testing.assert_close(found.covariance[:, joint, joint], spread, rtol=1e-7, atol=1e-9)
+        assert_close(found.covariance[:, joint, joint], spread, rtol=1e-7, atol=1e-9)
         total -= multivariate_normal(np.zeros(25), S.numpy()).logpdf(y[:, joint].numpy())
     assert posterior.negative_log_likelihood == pytest.approx(total, rel=1e-9)
 
@@ -74,9 +75,7 @@ def test_joints_that_share_nothing_are_taken_apart_and_give_the_same(monkeypatch
         found.append((value.detach(), *torch.autograd.grad(value, [noise, *matrices])))
         monkeypatch.undo()
     for one, other in zip(*found, strict=True):
-        torch.testing.assert_close(
-            one + one.mT if one.dim() == 2 else one, other + other.mT if other.dim() == 2 else other
-        )
+        assert_close(one + one.mT if one.dim() == 2 else one, other + other.mT if other.dim() == 2 else other)
     assert not whole._acts_apart(W + 1e-9)
 
 

@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from tests.posterior.arm import arm_data, arm_model, quick_fit
 
 from forcegp.codegen.library import compile_library
@@ -39,11 +40,9 @@ def test_it_is_predict_with_the_derivatives_of_a_predictor(posterior, states):
     linear = posterior.predictor(covariance="none").linearize(*states)
     jacobians = torch.cat([linear.da_dq, linear.da_dv, linear.da_du], dim=-1).numpy()
     for k, state in enumerate(zip(*(x.numpy() for x in states), strict=True)):
-        np.testing.assert_allclose(
-            np.array(function(*state)).ravel(), expected[k], rtol=0, atol=1e-12 * abs(expected).max()
-        )
+        assert_allclose(np.array(function(*state)).ravel(), expected[k], rtol=0, atol=1e-12 * abs(expected).max())
         found = np.hstack([np.array(part) for part in slopes(*state, 0)])
-        np.testing.assert_allclose(found, jacobians[k], rtol=0, atol=1e-12 * abs(jacobians).max())
+        assert_allclose(found, jacobians[k], rtol=0, atol=1e-12 * abs(jacobians).max())
 
 
 @pytest.mark.usefixtures("unchecked")  # explicit steps add and scale CasADi's expressions as they do tensors
@@ -54,7 +53,7 @@ def test_steps_are_those_of_a_predictor(posterior, states, integrator):
     for k in range(len(states[0])):
         found = function(*(x[k].numpy() for x in states))
         for ours, theirs in zip(found, expected, strict=True):
-            np.testing.assert_allclose(np.array(ours).ravel(), theirs[k], rtol=1e-9, atol=1e-9)
+            assert_allclose(np.array(ours).ravel(), theirs[k], rtol=1e-9, atol=1e-9)
     for wrong, message in (({"steps": 0.0}, "dt is 0.0"), ({"steps": 0.1, "integrator": "leap"}, "'leap'")):
         with pytest.raises(InvalidInput, match=message):
             casadi_function(posterior, **wrong)
@@ -68,14 +67,14 @@ def test_its_own_code_compiles_to_the_same(posterior, states, tmp_path, monkeypa
     compile_library(source, ("-O1", "-fPIC", "-shared"), library, "arm")
     external = casadi.external("arm", str(library))
     state = [x[2].numpy() for x in states]
-    np.testing.assert_allclose(np.array(external(*state)), np.array(function(*state)), rtol=1e-12)
+    assert_allclose(np.array(external(*state)), np.array(function(*state)), rtol=1e-12)
 
 
 def test_a_kernel_that_is_the_same_for_all_centres(states):
     model = quick_fit(arm_model().with_forces(JointForces(kernel="constant", inputs=("q",))), arm_data(12, 0), 1)
     expected = model.predict(*states).mean[0].numpy()
     found = np.array(casadi_function(model)(*(x[0].numpy() for x in states))).ravel()
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * abs(expected).max())  # weights that cancel
+    assert_allclose(found, expected, rtol=0, atol=1e-9 * abs(expected).max())  # weights that cancel
 
 
 def test_a_step_that_newtons_method_does_not_find_is_one_line(friction, tmp_path, monkeypatch):

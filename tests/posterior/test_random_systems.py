@@ -46,10 +46,8 @@ def system(seed: int) -> tuple[Model, Dataset, Dataset, np.ndarray]:
     model = Model(robot, (), (Actuation(), RigidBodies(), Viscous(rng.uniform(0.1, 1.0))))
     count = 160
     q = robot.space.integrate(robot.neutral().expand(count, -1), torch.tensor(rng.normal(0.0, 0.7, (count, robot.nv))))
-    v, u = (
-        torch.tensor(rng.normal(size=(count, robot.nv))),
-        torch.tensor(3.0 * rng.normal(size=(count, model.sizes[2]))),
-    )
+    v = torch.tensor(rng.normal(size=(count, robot.nv)))
+    u = torch.tensor(3.0 * rng.normal(size=(count, model.sizes[2])))
     level = torch.tensor(rng.uniform(0.5, 2.0, robot.nv))
     if seed % 2 and base == "floating":
         level[:6] = 0.0  # a base has no friction

@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
+from numpy.testing import assert_array_equal
 from tests.data.samples import model
 from tests.recordings.log_files import (
     EPOCH,
@@ -78,12 +79,9 @@ class TestHeaderless(TestCsv):
 @pytest.mark.parametrize(
     ("head", "row", "begin"),
     [
-        ("Trace 2\nDate;2024-01-01\n\ns;rad\nt;größe", "{0},5;0,25", 0.5),
-        ("t,größe", "{0}.5,.25", 0.5),
-        ("t größe\n[s] [°]", "  {0}.5   .25 ", 0.5),
-        ("t;größe", "{0}.5;.25;", 0.5),
-        ("t;größe", "12:00:0{0},5;0,25", 43200.5),
-        ("t,größe", "1970-01-02T00:00:0{0}.5Z,.25", 86400.5),
+        *(("Trace 2\nDate;2024-01-01\n\ns;rad\nt;größe", "{0},5;0,25", 0.5), ("t,größe", "{0}.5,.25", 0.5)),
+        *(("t größe\n[s] [°]", "  {0}.5   .25 ", 0.5), ("t;größe", "{0}.5;.25;", 0.5)),
+        *(("t;größe", "12:00:0{0},5;0,25", 43200.5), ("t,größe", "1970-01-02T00:00:0{0}.5Z,.25", 86400.5)),
         ("t;größe", "2.1.1970 00:00:0{0},5;0,25", 86400.5),
     ],
 )
@@ -94,19 +92,19 @@ def test_texts_of_other_programs(tmp_path, encoding, head, row, begin):
     read = source.read(["t", "größe"])
     assert ("its letters are taken for cp1252" in source.notes()) == (encoding == "cp1252")
     assert ("a line beside the names is left out: s, rad" in source.notes()) == ("s;rad" in head)
-    np.testing.assert_array_equal(read["t"], begin + np.arange(8.0))
-    np.testing.assert_array_equal(read["größe"], 0.25)
+    assert_array_equal(read["t"], begin + np.arange(8.0))
+    assert_array_equal(read["größe"], 0.25)
 
 
 def test_the_last_lines_are_rows_whatever_stands_above(tmp_path):
     lines = [*["1,2,3"] * 30, "t;q", *["0;5"] * 20, ""]
     (tmp_path / "log.csv").write_text("\n".join(lines))
-    np.testing.assert_array_equal(open_source(tmp_path / "log.csv").read(["q"])["q"], [5.0] * 20)
+    assert_array_equal(open_source(tmp_path / "log.csv").read(["q"])["q"], [5.0] * 20)
 
 
 def test_clocks_go_on_over_midnight(tmp_path):
     (tmp_path / "log.csv").write_text("t,q\n23:59:59.5,0\n00:00:00.5,0\n00:00:01.5,0\n")
-    np.testing.assert_array_equal(open_source(tmp_path / "log.csv").read(["t"])["t"], 86399.5 + np.arange(3.0))
+    assert_array_equal(open_source(tmp_path / "log.csv").read(["t"])["t"], 86399.5 + np.arange(3.0))
     (tmp_path / "log.csv").write_text("t,q\n2024-01-02 01:00,0\n2024-01-01 01:00,0\n")
     assert np.diff(open_source(tmp_path / "log.csv").read(["t"])["t"]) == -86400.0  # no clock, but time that runs back
 
@@ -116,7 +114,7 @@ def test_a_line_that_was_cut_is_left_out_with_a_warning(tmp_path, end):
     (tmp_path / "log.csv").write_text("t,q,u\n1,2,3\n4,5,6\n" + end)
     with pytest.warns(DataWarning, match="middle of a line: the 2 whole lines before are read"):
         read = open_source(tmp_path / "log.csv").read(["t", "u"])
-    np.testing.assert_array_equal(read["u"], [3.0, 6.0])
+    assert_array_equal(read["u"], [3.0, 6.0])
     (tmp_path / "log.csv").write_text("t,q,u\n1,2,3\n4,5\n4,5,6\n" + end)
     with pytest.raises(FileFormatError, match=r"row 1 \(line 3\) has 2 fields instead of 3"):
         open_source(tmp_path / "log.csv").read(["t", "u"])
@@ -130,9 +128,7 @@ def test_lines_of_other_widths_and_texts_for_numbers_are_left_out_if_asked_for(t
         open_source(tmp_path / "log.csv").read(["q"])
     source = open_source(tmp_path / "log.csv")
     source.lenient = True
-    np.testing.assert_array_equal(
-        source.read(["q"])["q"], [np.nan if x == 20 else x for x in range(40) if x not in (7, 30)]
-    )
+    assert_array_equal(source.read(["q"])["q"], [np.nan if x == 20 else x for x in range(40) if x not in (7, 30)])
     assert source.notes() == ("lines left out because they have other than 2 fields: 2",)
     rows[31] = "31"
     (tmp_path / "log.csv").write_text("\n".join(["t,q", *rows, ""]))
@@ -244,9 +240,9 @@ def test_lists_of_objects_are_rows_or_episodes(tmp_path, write):
     source = open_source(write(tmp_path))
     assert set(source.columns()) == {"log/t", "log/q[0]", "log/q[1]", "runs/1/t", "runs/2/t"}
     read = source.read(["log/t", "log/q[1]"])
-    np.testing.assert_array_equal(read["log/t"], 0.5 * np.arange(7))
-    np.testing.assert_array_equal(read["log/q[1]"], -np.arange(7))
-    np.testing.assert_array_equal(open_source(tmp_path / source.path.name, within="runs/2").read(["t"])["t"], [2, 3, 4])
+    assert_array_equal(read["log/t"], 0.5 * np.arange(7))
+    assert_array_equal(read["log/q[1]"], -np.arange(7))
+    assert_array_equal(open_source(tmp_path / source.path.name, within="runs/2").read(["t"])["t"], [2, 3, 4])
 
 
 def test_lines_of_json_are_rows_and_the_last_may_be_cut(tmp_path):
@@ -258,9 +254,9 @@ def test_lines_of_json_are_rows_and_the_last_may_be_cut(tmp_path):
     (tmp_path / "log.jsonl").write_text("\n".join(map(json.dumps, lines))[:-5])
     with pytest.warns(DataWarning, match="the 3 whole lines before are read"):
         read = open_source(tmp_path / "log.jsonl").read(["stamp", "pos/a", "u"])
-    np.testing.assert_array_equal(read["stamp"] - read["stamp"][0], [0, 1, 2])
-    np.testing.assert_array_equal(read["pos/a"], [0, 2, 4])
-    np.testing.assert_array_equal(read["u"], [3, np.nan, np.nan])
+    assert_array_equal(read["stamp"] - read["stamp"][0], [0, 1, 2])
+    assert_array_equal(read["pos/a"], [0, 2, 4])
+    assert_array_equal(read["u"], [3, np.nan, np.nan])
     (tmp_path / "log.jsonl").write_text('{"t": 1\n{"t": 2}\n')
     with pytest.raises(FileFormatError, match=r"log\.jsonl cannot be read as JSON"):
         open_source(tmp_path / "log.jsonl").columns()
@@ -319,11 +315,8 @@ class TestTopicWithTwoPublishers(TestRos2Folder):
 class TestAnyMessage(TestRos2Folder):
     def expected(self):
         row = np.arange(200.0)
-        return {
-            "/wrench:wrench.force.x": row,
-            "/wrench:wrench.force.y": np.full(200, 0.5),
-            "/wrench:wrench.torque.z": row**2,
-        }
+        columns = {"force.x": row, "force.y": np.full(200, 0.5), "torque.z": row**2}
+        return {f"/wrench:wrench.{name}": values for name, values in columns.items()}
 
 
 def test_sensors_of_other_topics_are_vectors_of_their_messages(tmp_path):

@@ -77,9 +77,7 @@ def test_gaps_split_and_repeated_stamps_are_dropped(tmp_path):
     done = found.metadata["import"]["recordings"][0]
     assert (done["repeated_stamps_dropped"], done["rows_in_stretches_too_short"]) == (1, 3)
     assert len(done["gaps"]) == 2
-    assert done["seconds"] == pytest.approx(
-        np.sum([data["time"][b] - data["time"][a] for a, b in ((0, 99), (100, 196))])
-    )
+    assert done["seconds"] == pytest.approx(data["time"][[99, 196]].sum() - data["time"][[0, 100]].sum())
     kept = np.r_[0:11, 12:197]
     np.testing.assert_array_equal(found.q, data["q"][kept])
     np.testing.assert_array_equal(found.episode, np.where(kept < 100, 0, 1))
@@ -119,19 +117,10 @@ def test_wrapped_angles_are_continued_if_told_so(tmp_path):
 
 def test_coupled_angles_units_signs_and_constants(tmp_path):
     data = motion()
-    columns = {
-        "t": 1e3 * data["time"],
-        "upper": np.rad2deg(data["q"][:, 0]),
-        "lower": np.rad2deg(data["q"].sum(axis=1)),
-    }
-    mapping = ColumnMapping(
-        time="t",
-        q=("upper", "lower - upper - 90/pi"),
-        u=("0",),
-        joints=JOINTS,
-        unit={"time": ("ms",), "q": ("deg",)},
-        sign={"q": (1.0, -1.0)},
-    )
+    q = np.rad2deg(data["q"])
+    columns = {"t": 1e3 * data["time"], "upper": q[:, 0], "lower": q.sum(axis=1)}
+    how = {"joints": JOINTS, "unit": {"time": ("ms",), "q": ("deg",)}, "sign": {"q": (1.0, -1.0)}}
+    mapping = ColumnMapping(time="t", q=("upper", "lower - upper - 90/pi"), u=("0",), **how)
     found = imported(write_text(tmp_path / "log.csv", columns), mapping)
     np.testing.assert_allclose(found.q[:, 0], data["q"][:, 0], atol=1e-14)
     np.testing.assert_allclose(found.q[:, 1], 0.5 - data["q"][:, 1], atol=1e-14)
@@ -167,15 +156,8 @@ def test_files_side_by_side_are_one_recording(tmp_path):
     for name, values in data.items():
         text = "\n".join(repr(float(value)) for value in values.ravel()) + "\n"
         (tmp_path / f"run_{name}.txt").write_text(text)
-    mapping = ColumnMapping(
-        time="run_time:c1",
-        q=("run_q:c{1..2}",),
-        v=("run_v",),
-        u=("run_u",),
-        joints=JOINTS,
-        headerless=(1, 2, 2, 2),
-        side_by_side=True,
-    )
+    how = {"joints": JOINTS, "headerless": (1, 2, 2, 2), "side_by_side": True}
+    mapping = ColumnMapping(time="run_time:c1", q=("run_q:c{1..2}",), v=("run_v",), u=("run_u",), **how)
     paths = [tmp_path / f"run_{name}.txt" for name in data]
     found = import_recordings(paths, mapping, model=model())
     for signal in "qvu":
@@ -189,10 +171,8 @@ def test_files_side_by_side_are_one_recording(tmp_path):
 def test_stamps_in_nanoseconds_keep_their_last_digit(tmp_path):
     data = motion()
     stamps = 1_700_000_000_123_456_789 + np.round(data["time"] * 1e9).astype(np.int64)
-    lines = [
-        "stamp,q1,q2",
-        *(f"{stamp},{q!r},{q!r}" for stamp, q in zip(stamps, data["q"][:, 0].tolist(), strict=True)),
-    ]
+    rows = zip(stamps, data["q"][:, 0].tolist(), strict=True)
+    lines = ["stamp,q1,q2", *(f"{stamp},{q!r},{q!r}" for stamp, q in rows)]
     (tmp_path / "log.csv").write_text("\n".join(lines))
     mapping = ColumnMapping(time="stamp", q=("q{1..2}",), u=("0",), unit={"time": ("ns",)})
     found = imported(tmp_path / "log.csv", mapping)
@@ -225,10 +205,9 @@ def test_rows_that_lack_a_value_are_left_out_up_to_a_twentieth(tmp_path):
     for names, options in ((["u_elbow"], {"bad_rows": "skip"}), (everything, {}), (["time"], {"bad_rows": "skip"})):
         found = imported(log(0, 50, 51, names=names), NAMES, rate="log", **options)
         np.testing.assert_array_equal(found.q, np.delete(data["q"], [0, 50, 51], axis=0))
-        assert found.metadata["import"]["recordings"][0]["notes"] == [
-            "rows left out because they lack a value: 3 of 200"
-        ]
-        assert found.metadata["import"]["recordings"][0]["repeated_stamps_dropped"] == 0
+        done = found.metadata["import"]["recordings"][0]
+        assert done["notes"] == ["rows left out because they lack a value: 3 of 200"]
+        assert done["repeated_stamps_dropped"] == 0
     assert imported(log(*range(10, 20)), NAMES, bad_rows="skip").episodes == (0, 1)
     with pytest.raises(DatasetError, match=r"11 of 200 rows lack a value, .* 5% at most"):
         imported(log(*range(10, 21)), NAMES, bad_rows="skip")

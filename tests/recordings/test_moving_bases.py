@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 from tests.recordings.log_files import write_text
 
@@ -123,10 +124,10 @@ def test_every_convention_is_the_same_dataset(tmp_path, flight, convention):
     found = imported(tmp_path, flight, changes, replace(PLAIN, **stated))
     for name in "vua":
         expected = getattr(flight, name)
-        np.testing.assert_allclose(getattr(found, name), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-    np.testing.assert_allclose(found.q[:, :3], flight.q[:, :3], rtol=0, atol=1e-14)
+        assert_allclose(getattr(found, name), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    assert_allclose(found.q[:, :3], flight.q[:, :3], rtol=0, atol=1e-14)
     same = np.sign((found.q[:, 3:] * flight.q[:, 3:]).sum(axis=1))
-    np.testing.assert_allclose(found.q[:, 3:], same[:, None] * flight.q[:, 3:], rtol=0, atol=1e-14)
+    assert_allclose(found.q[:, 3:], same[:, None] * flight.q[:, 3:], rtol=0, atol=1e-14)
     assert (same == same[0]).all()
     assert model_of(found).inputs == ("rotor_1", "rotor_2", "rotor_3", "rotor_4")
 
@@ -136,11 +137,11 @@ def test_what_lacks_is_differentiated_on_the_manifold(tmp_path, flight):
     space = model_of(flight).robot.space
     found = imported(tmp_path, flight, mapping=replace(PLAIN, v=None, a=None))
     expected = differentiate(flight.q, flight.time, space)
-    np.testing.assert_allclose(found.v, expected, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(found.a, differentiate(expected, flight.time), rtol=0, atol=1e-8)
+    assert_allclose(found.v, expected, rtol=0, atol=1e-10)
+    assert_allclose(found.a, differentiate(expected, flight.time), rtol=0, atol=1e-8)
     mapping = replace(PLAIN, v=("derive{1..3}", "v{3..5}"), a=None)
     partly = imported(tmp_path, flight, mapping=mapping)
-    np.testing.assert_allclose(partly.v[:, :3], expected[:, :3], rtol=0, atol=1e-10)
+    assert_allclose(partly.v[:, :3], expected[:, :3], rtol=0, atol=1e-10)
     np.testing.assert_array_equal(partly.v[:, 3:], flight.v[:, 3:])
     assert partly.metadata["import"]["columns"]["v"] == ["derive", "derive", "derive", "v3", "v4", "v5"]
 
@@ -165,10 +166,10 @@ def test_a_spline_passes_signs_that_flip(tmp_path):
     expected = motion(found.time + time[0])
     same = np.sign((found.q[:, 3:] * expected[:, 3:]).sum(axis=1))
     inner = slice(5, -5)
-    np.testing.assert_allclose(found.q[inner, :3], expected[inner, :3], rtol=0, atol=1e-8)
-    np.testing.assert_allclose(found.q[inner, 3:], (same[:, None] * expected[:, 3:])[inner], rtol=0, atol=1e-8)
+    assert_allclose(found.q[inner, :3], expected[inner, :3], rtol=0, atol=1e-8)
+    assert_allclose(found.q[inner, 3:], (same[:, None] * expected[:, 3:])[inner], rtol=0, atol=1e-8)
     spin = (Rotation.from_euler("x", -0.3)).apply([3.0, -1.0, 2.0])
-    np.testing.assert_allclose(found.v[inner, 3:], np.tile(spin, (len(found) - 10, 1)), rtol=0, atol=1e-5)
+    assert_allclose(found.v[inner, 3:], np.tile(spin, (len(found) - 10, 1)), rtol=0, atol=1e-5)
 
 
 BODY = """<robot name="box"><link name="body"><inertial><mass value="1"/>
@@ -178,7 +179,7 @@ BODY = """<robot name="box"><link name="body"><inertial><mass value="1"/>
 def test_lengths_are_mended_or_refused(tmp_path, flight):
     rounded = np.round(flight.q, 4)
     found = imported(tmp_path, flight, {"q": rounded})
-    np.testing.assert_allclose(np.linalg.norm(found.q[:, 3:], axis=1), 1.0, rtol=0, atol=1e-15)
+    assert_allclose(np.linalg.norm(found.q[:, 3:], axis=1), 1.0, rtol=0, atol=1e-15)
     (note,) = found.metadata["import"]["recordings"][0]["notes"]
     assert note.startswith("orientations divided by their length")
     long = flight.q.copy()
@@ -242,11 +243,9 @@ def test_qpos_qvel_and_qacc_of_mujoco(tmp_path):
     axes = {"v": ("world", "body"), "a": ("world", "body")}
     found = import_recordings([path], replace(PLAIN, u=None, orientation="wxyz", axes=axes), model=model)
     moved = differentiate(found.q, found.time, model.robot.space)
-    np.testing.assert_allclose(found.v[1:-1], moved[1:-1], rtol=0, atol=1e-4)
+    assert_allclose(found.v[1:-1], moved[1:-1], rtol=0, atol=1e-4)
     q, v, u = (torch.tensor(x) for x in (found.q, found.v, found.u))
-    np.testing.assert_allclose(
-        found.a, model.dynamics(q, v, u).acceleration(torch.zeros_like(v)).numpy(), rtol=0, atol=1e-9
-    )
+    assert_allclose(found.a, model.dynamics(q, v, u).acceleration(torch.zeros_like(v)).numpy(), rtol=0, atol=1e-9)
 
 
 def walking_log(tmp_path, u: np.ndarray):
@@ -268,5 +267,5 @@ def test_flags_that_a_log_lacks_are_open(tmp_path):
     assert tuple(done["open_switches"]) == walk.model.inputs[12:]
     assert done["columns"]["u"] == [f"u{k}" for k in range(12)]
     u = found.u
-    np.testing.assert_allclose(u[:, :12], -walk.u[:, :12], rtol=1e-6)
+    assert_allclose(u[:, :12], -walk.u[:, :12], rtol=1e-6)
     assert (u[:, 12:] == 0.0).all()

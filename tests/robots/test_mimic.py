@@ -118,14 +118,12 @@ def test_frames_move_with_the_coordinates(case):
 def test_a_gear_reflects_inertia_damping_and_friction():
     """A rod that turns n times as fast counts n^2 times, whatever it is fixed to."""
     spun = SMALL.replace("0.1 0 0", "0 0 0").replace("</robot>", "")
-    rotor = (
-        '<link name="rotor"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="0.01"/>'
-    )
-    rotor += '</inertial></link><joint name="gear" type="continuous"><parent link="base"/><child link="rotor"/>'
+    rotor = '<link name="rotor"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0"'
     rotor += (
-        '<axis xyz="0 0 1"/><dynamics damping="0.2" friction="0.5"/><mimic joint="hinge" multiplier="-20"/></joint>'
+        ' izz="0.01"/></inertial></link><joint name="gear" type="continuous"><parent link="base"/><child link="rotor"/>'
     )
-    robot = Robot.from_urdf_text(spun + rotor + "</robot>")
+    rotor += '<axis xyz="0 0 1"/><dynamics damping="0.2" friction="0.5"/><mimic joint="hinge" multiplier="-20"/>'
+    robot = Robot.from_urdf_text(spun + rotor + "</joint></robot>")
     assert robot.joint_names == ("hinge",)
     assert robot.layout.bodies[robot.frame("rotor")[0]].name == "gear"
     assert robot.mass_matrix(torch.zeros(1).double()).item() == pytest.approx(0.1 + 400 * 0.01)

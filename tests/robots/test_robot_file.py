@@ -81,9 +81,8 @@ def test_written_urdf_moves_as_the_numbers_say(model, tmp_path):
     assert path.read_text(encoding="utf-8") == text
     assert [entry.name for entry in tmp_path.iterdir()] == ["identified.urdf"]  # no temporary file left
     again = Robot.from_urdf(path)
-    numbers = [
-        [(x.mass, *x.center_of_mass, *x.inertia.flat) for x in map(r.link, names)] for r in (robot, given, again)
-    ]
+    links = [[*map(each.link, names)] for each in (robot, given, again)]
+    numbers = [[(x.mass, *x.center_of_mass, *x.inertia.flat) for x in own] for own in links]
     assert numbers[0] != numbers[1] == numbers[2]
     mass, bias = again.mass_matrix_and_bias(q, v)
     oracle = Oracle(text, again)
@@ -101,9 +100,8 @@ def test_inertials_and_dynamics_are_replaced_or_added_and_the_rest_stays(before)
     written = replace_dynamics(TEXT % before, {"one": {"damping": 0.1, "friction": 0.25}}, source="a test")
     element = ElementTree.fromstring(written).find("joint/dynamics")
     assert {**element.attrib, "x": "7"} == {"damping": "0.1", "friction": "0.25", "x": "7"}
-    assert all(
-        part in written for part in ("<!-- Größe -->", "<!-- kept -->", "<x:macro", '<gazebo><joint name="one"/>')
-    )
+    parts = "<!-- Größe -->", "<!-- kept -->", "<x:macro", '<gazebo><joint name="one"/>'
+    assert all(part in written for part in parts)
     for _ in range(2):
         written = replace_inertial(written, "b", 2.0, np.zeros(3), np.eye(3), source="a test")
     assert Robot.from_urdf_text(written).mass == 2.0

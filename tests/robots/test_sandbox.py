@@ -71,9 +71,9 @@ ATTACKS = {
 
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_files_of_mujoco_cost_no_more_than_their_limits_and_read_only_their_folder(attack, tmp_path, monkeypatch):
-    monkeypatch.setattr(sandbox, "SECONDS", 1)
-    monkeypatch.setattr(sandbox, "MEMORY", 300 << 20)
     text, beside, message = ATTACKS[attack]
+    monkeypatch.setattr(sandbox, "SECONDS", 1 if "more than 1 s" in message else 30)  # a busy machine is slow
+    monkeypatch.setattr(sandbox, "MEMORY", 300 << 20)
     (folder := tmp_path / "robot").mkdir()
     (tmp_path / "secret.xml").write_text(f"<mujoco>{BODY}</mujoco>")
     for name, content in {"robot.xml": text, **beside}.items():

@@ -71,8 +71,12 @@ def test_every_kind_of_model_is_a_row_and_identified_is_always_among_them(found)
         assert {run["seed"] for run in scores.runs[name]} == {0, 1}, model
     parts = ("table", "stretches", "motions", "training_rows", "test_rows")
     runs = {name: [{p: run[p] for p in parts} for run in scores.finished(name)[:1]] for name in scores.models}
-    winner = scores.winner.model, scores.winner.difference
-    assert_unchanged("scores/comparison", {"runs": runs, "winner": winner}, rtol=1e-3)
+    told = {
+        "winner": [scores.winner.model, scores.winner.difference],
+        "facts": [*scores.facts()],
+        "lost": scores.failures,
+    }
+    assert_unchanged("scores/comparison", {"runs": runs, **told}, rtol=1e-3)
     # identified, functions of few inputs, and what was fitted before use all rows, so one seed stands for all
     assert len(changed(folder)) == 1 + 3 + 2 * 2
 
@@ -103,11 +107,7 @@ def test_a_run_resumes_and_grows(data, tmp_path):
         scored(["given"], data, folder)
     assert notes[-1][0] == notes[-1][1]
     kept = changed(folder)
-    assert set(kept) == {
-        f"episodes-1-seed0-identification-{USUAL}",
-        "episodes-1-seed0-given",
-        "episodes-1-seed0-identified",
-    }
+    assert set(kept) == {f"episodes-1-seed0-{x}" for x in (f"identification-{USUAL}", "given", "identified")}
     grown = scored(["given", "gp:joint"], data, folder, seeds=2)
     assert {name: changed(folder)[name] for name in kept} == kept, "finished pieces are not computed again"
     before = changed(folder)
@@ -157,17 +157,13 @@ def test_folders_of_others_are_not_touched(data, tmp_path):
 @pytest.mark.parametrize(
     ("models", "changes", "message"),
     [
-        (("given", "given"), {}, "named twice"),
-        ("given", {}, "models is a str"),
-        (("identifed",), {}, "give given, identified or"),
-        (("gp:joint@measured",), {}, "no evidence 'measured'"),
+        *((("given", "given"), {}, "named twice"), ("given", {}, "models is a str")),
+        *((("identifed",), {}, "give given, identified or"), (("gp:joint@measured",), {}, "no evidence 'measured'")),
         (("identified+viscous",), {}, "`identified` has its laws already"),
         (("given@motions:1",), {}, "nothing to refine on motions"),
         (("identified+gp:joint@motions:1",), {}, "the model has unknown forces"),
-        (("given",), {"seeds": 0}, "seeds=0"),
-        (("given",), {"points": 1000}, "two thirds"),
-        (("given",), {"restarts": 0}, "restarts is 0"),
-        (("given",), {"integrator": "euler"}, "euler"),
+        *((("given",), {"seeds": 0}, "seeds=0"), (("given",), {"points": 1000}, "two thirds")),
+        *((("given",), {"restarts": 0}, "restarts is 0"), (("given",), {"integrator": "euler"}, "euler")),
         (("given",), {"identification": "guessing"}, "no force 'guessing'"),
         (("given",), {"identification": "gp:joint"}, "nothing to identify, or unknown forces"),
         (("given",), {"split": "episodes:7"}, "held-out episodes are"),
@@ -199,13 +195,11 @@ def test_models_refined_on_motions_move_better_and_laws_stand_side_by_side():
 @pytest.mark.parametrize(
     ("name", "kind", "identification", "all_rows"),
     [
-        ("given", "given", None, False),
-        ("identified", "identified", "USUAL", True),
+        *(("given", "given", None, False), ("identified", "identified", "USUAL", True)),
         ("identified@torques", "identified", "bodies+viscous+coulomb@torques", True),
         ("identified@motions:1", "identified", "USUAL", True),
         ("viscous+stribeck@torques+motions:1", "identified", "viscous+stribeck@torques", True),
-        ("gp:joint", "force prior", None, False),
-        ("gp:joint-friction", "force prior", None, True),
+        *(("gp:joint", "force prior", None, False), ("gp:joint-friction", "force prior", None, True)),
         ("identified+gp:joint", "force prior", "USUAL", False),
         ("viscous+gp:joint:kernel=(linear + matern-3/2)", "force prior", None, False),
         ("identified+gp:joint-accelerations", "residual", "USUAL", False),

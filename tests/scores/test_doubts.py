@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from scipy.stats import multivariate_normal
 from tests.posterior.arm import NOISE, arm_data
 
@@ -95,9 +96,7 @@ def test_a_larger_noise_of_the_data_counts(posterior, test_data):
     std = NOISE * np.array([1.0, 1.4, 3.0])  # the model's is NOISE
     noisier = dataclasses.replace(test_data, noise_std=std)
     predicted = predict_rows(posterior, noisier)
-    np.testing.assert_allclose(
-        predicted["measurement_variance"] - predicted["variance"], np.tile(std**2, (60, 1)), rtol=1e-9
-    )
+    assert_allclose(predicted["measurement_variance"] - predicted["variance"], np.tile(std**2, (60, 1)), rtol=1e-9)
     prediction = posterior.predict(test_data.q[7], test_data.v[7], test_data.u[7])
     joint = multivariate_normal(prediction.mean.numpy(), prediction.covariance.numpy() + np.diag(std**2))
     assert predicted["negative_log_density"][7] == pytest.approx(-joint.logpdf(test_data.a[7]), rel=1e-8)
@@ -108,7 +107,7 @@ def test_a_larger_noise_of_the_model_counts(posterior, test_data, stated, counts
     quieter = dataclasses.replace(test_data, noise_std=None if stated is None else NOISE * np.array(stated))
     predicted = predict_rows(posterior, quieter)
     added = predicted["measurement_variance"] - predicted["variance"]
-    np.testing.assert_allclose(added, np.tile(np.square(NOISE * np.array(counts)), (60, 1)), rtol=1e-9)
+    assert_allclose(added, np.tile(np.square(NOISE * np.array(counts)), (60, 1)), rtol=1e-9)
 
 
 def test_the_constraint_is_that_of_the_data_and_a_model_without_it_is_named(without_contact, test_data):

@@ -57,11 +57,7 @@ def test_every_curve_has_a_panel_that_names_it_with_its_units(friction, data):
     assert (panels[3].get_xlabel(), panels[3].get_ylabel()) == ("sliding speed [m/s]", "force [N]")
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == [
-        "95 % band",
-        "learned",
-        "beyond the training data",
-        "training velocities",
-        "true",
+        *("95 % band", "learned", "beyond the training data", "training velocities", "true"),
     ]
 
 

@@ -228,7 +228,7 @@ class Read:
     notes: tuple[str, ...]
     held: tuple[int, ...] = ()
     silent: tuple[tuple[float, Float[np.ndarray, " rows"]], ...] = ()
-    lost: Bool[np.ndarray, " rows"] = field(default_factory=lambda: np.zeros(0, bool))
+    lost: Bool[np.ndarray, " _"] = field(default_factory=lambda: np.zeros(0, bool))  # `_lost` looks for them later
 
     def paused(self, gap: float | None, steps: float) -> Bool[np.ndarray, " rows"]:
         """Rows for which a topic was silent: for `gap` seconds, or so many of its median steps."""
