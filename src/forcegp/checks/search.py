@@ -356,7 +356,7 @@ def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -
 def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     """That something is wrong which is none of the causes, and where it sits."""
     bad = np.flatnonzero(root.rough > EXPLAINED)
-    sticky = [k for k in bad if _sticks(root, k)]
+    sticky = [k for k in bad.tolist() if _sticks(root, k)]
     if sticky:
         names = inputs.named(sticky)
         yield look(
@@ -397,7 +397,7 @@ def _sticks(root: Explanation, joint: int) -> bool:
     number, _ = positive_fit(columns[moves], u[moves])
     left = np.abs(u - columns @ number)
     holds = number[-2 - len(WIDTHS) : -2].sum() + np.sqrt(np.square(left[moves]).mean())
-    return moving.rough[joint] <= EXPLAINED and bool(left[~moves].max() <= HELD * holds)
+    return bool(moving.rough[joint] <= EXPLAINED and left[~moves].max() <= HELD * holds)
 
 
 def _where(root: Explanation, joint: int, inputs: CheckInput) -> tuple[str, str, Dataset | None]:

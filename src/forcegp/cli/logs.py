@@ -229,7 +229,7 @@ class Import(Command):
     out: Annotated[Path, arg(metavar="FILE.h5")]
     """The dataset to write (HDF5)."""
     stance: Literal["log", "auto"] = "log"
-    """auto: set the switches of contacts to what motion and forces show, and leave out rows that leave one open."""
+    """auto: set the switches of contacts to what motion and forces show, and mark open ones by .5."""
     robot: RobotOptions = RobotOptions()
     columns: ColumnOptions = ColumnOptions()
     filter: FilterOptions = FilterOptions()
@@ -328,7 +328,7 @@ def _price(out: Path, dataset: forcegp.Dataset, prepared: forcegp.Dataset) -> An
 def stance_text(report: Mapping[str, Any]) -> str:
     """How long each foot stands, and how many rows leave it open, of a report of `Preparation`."""
     shares = ", ".join(f"{name} {share:.0%}" for name, share in report["stance"]["standing"].items())
-    return f"{shares}; {report['stance']['open_rows']} rows left out, which leave one open"
+    return f"{shares}; {report['stance']['open_rows']} rows leave one open, of which torques alone are used"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -46,7 +46,7 @@ class Preparation:
     trim: seconds to drop at both ends of each episode, where a filter has samples of one side only.
     differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities.
     stance: "auto" sets the switches of contacts in u to what motion and forces show (`estimate_stance`), after the
-        filter, and drops rows that leave one open; "log" keeps them.
+        filter, .5 where they leave it open; "log" keeps what u has.
     why: reasons for the numbers in place of "auto", of a preparation that was `resolved`.
 
     Raises InvalidInput for values that are not allowed.

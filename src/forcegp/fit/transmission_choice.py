@@ -36,7 +36,7 @@ def choose_transmission(
     bodies = model.robot.kinematics(q, v).torque_regressor(a).flatten(2).cpu().numpy() * weight[:, None]
     rows = [stretch == k for k in np.unique(stretch)]
 
-    def motor(row: Float[np.ndarray, " nv"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def motor(row: Float[np.ndarray, " nv"]) -> tuple[np.ndarray, ...]:
         """Friction and rotor of a motor that turns by `row` v, with what its joints share of bodies and torques."""
         v, a, w = log.v @ row, log.a @ row, row * weight
         speed = np.sqrt((v**2).mean()).clip(1e-12)
