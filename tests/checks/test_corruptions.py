@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tests.checks.clean_logs import clean_logs
+from tests.checks.clean_logs import clean_logs, rests, with_motion
 from tests.checks.corruptions import (
     CORRUPTIONS,
     ROBOTS,
@@ -127,6 +127,22 @@ def test_what_no_cause_explains_is_said_with_its_place_and_without_a_remedy():
     stiff = replace(data, u=data.u + 2.0 * np.std(data.u[:, 1]) * data.q * np.array([0.0, 1.0]))
     assert said(stiff)[0].about == "spring"
     assert said(stiff)[0].numbers["value"] == pytest.approx(2.0 * np.std(data.u[:, 1]), rel=0.05)
+
+
+@pytest.mark.parametrize(("times", "about"), [(1.0, "dry friction"), (5.0, "unknown cause")])
+def test_gears_that_stick_are_no_unknown_cause_and_more_than_they_hold_is_one(times, about):
+    """LuGre friction (Canudas de Wit et al. 1995) of a joint that waits while another moves; a brake holds more."""
+    q = rests(two_links(), 3).q.copy()
+    time = np.arange(len(q)) / 200.0
+    q[:, 0] = 0.5 * np.sin(2.1 * time) + 0.3 * np.sin(3.7 * time)
+    data = with_motion(two_links(), q, 200.0, 3, 0.0)
+    bristle, held = 0.0, []
+    for v in np.repeat(data.v[:, 1], 20):
+        bristle += (v - abs(v) * bristle / 2e-3) / 4000.0
+        held.append(bristle / 2e-3)
+    force = np.std(data.u[:, 1]) * np.array(held)[19::20] * np.where(np.abs(data.v[:, 1]) < 1e-9, times, 1.0)
+    found = check(replace(data, u=data.u + np.stack([0.0 * force, force], axis=1))).doubts
+    assert [(each.about, each.joints) for each in found if each.level != "ok"] == [(about, ("joint2",))]
 
 
 def test_torques_in_steps_are_right_and_friction_that_fades_is_named():
