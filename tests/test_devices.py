@@ -21,9 +21,9 @@ from forcegp.robots.arguments import usable_device
 
 QUICK = OptimizerOptions(iterations=2)
 PRIORS = (
-    *("gp:joint", "gp:load-friction,gp:joint-friction", "gp:tool-friction", "gp:joint-position"),
+    "gp:joint", "gp:load-friction,gp:joint-friction", "gp:tool-friction", "gp:joint-position",
     "gp:joint:kernel=matern-3/2",
-)
+)  # fmt: skip
 
 pytestmark = pytest.mark.filterwarnings("ignore::forcegp.errors.NumericalWarning", "ignore::forcegp.errors.DataWarning")
 
@@ -57,12 +57,12 @@ def test_the_pretended_device_computes_and_differentiates():
 @pytest.mark.parametrize(
     "mix",
     [
-        *(lambda x, y: x + y, lambda x, y: torch.cat([x, y]), lambda x, y: x[torch.tensor([0, 1])]),
+        lambda x, y: x + y, lambda x, y: torch.cat([x, y]), lambda x, y: x[torch.tensor([0, 1])],
         lambda x, y: torch.stack([x[0], y[0]]),
         lambda x, y: torch.randn(2, generator=torch.Generator(), device=PRETEND),
     ],
     ids=["sum", "cat", "index", "stack of numbers", "generator"],
-)
+)  # fmt: skip
 def test_what_a_gpu_refuses_is_refused(mix):
     with pretend_device():
         x = torch.ones(3, device=PRETEND)

@@ -26,11 +26,11 @@ def shown(data):
     learned = fit(in_air, arm_data(20, 0, arm_model(0)))
     prediction = posterior.predict(data.q, data.v, data.u)
     return {
-        **{"Dataset": data, "Posterior": posterior, "Prediction": prediction, "Gaussian": prediction.unknown_force},
-        **{"Scores": score(posterior, arm_data(10, 1), horizons=()), "Robot": data.model.robot, "Model": data.model},
-        **{"Estimates": learned.estimates, "CheckReport": check(motion(1.0))},
+        "Dataset": data, "Posterior": posterior, "Prediction": prediction, "Gaussian": prediction.unknown_force,
+        "Scores": score(posterior, arm_data(10, 1), horizons=()), "Robot": data.model.robot, "Model": data.model,
+        "Estimates": learned.estimates, "CheckReport": check(motion(1.0)),
         "Predictor": posterior.predictor(compile=False),
-    }
+    }  # fmt: skip
 
 
 FACTS = {

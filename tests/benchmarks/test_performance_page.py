@@ -28,9 +28,9 @@ def test_every_number_has_a_meaning_and_every_question_a_module(results):
 @pytest.mark.parametrize(
     ("value", "bound", "expected"),
     [
-        *((0.5, "<= 0.5", "yes"), (0.51, "<= 0.5", "**no**"), (2.0, ">= 1.6", "yes"), (1.0, ">= 1.6", "**no**")),
+        (0.5, "<= 0.5", "yes"), (0.51, "<= 0.5", "**no**"), (2.0, ">= 1.6", "yes"), (1.0, ">= 1.6", "**no**"),
         (1.0, "", ""),
     ],
-)
+)  # fmt: skip
 def test_bounds(value, bound, expected):
     assert kept(value, bound) == expected

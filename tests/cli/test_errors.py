@@ -37,19 +37,19 @@ def folder(tmp_path, monkeypatch):
 
 
 WRONG = [
-    *(("fit missing.h5 --out run", "missing.h5 is not a file"), ("fit damaged.h5 --out run", "damaged.h5 is damaged")),
+    ("fit missing.h5 --out run", "missing.h5 is not a file"), ("fit damaged.h5 --out run", "damaged.h5 is damaged"),
     ("fit arm.h5 --robot other.urdf --out run", "other.urdf has joints pan, lift, wrist; arm.h5 has pan, lift, bend"),
     ("fit arm.h5 --points 1 --no-checks --out run", "--points 1 must be an integer from 2 to 20, the rows"),
     ("fit arm.h5 --noise loud --out run", "--noise is 'loud'; give learned, dataset or a number"),
     ("fit arm.h5 --contact hnd:plane:0,0,1,0 --out run", "no frame 'hnd' in arm; did you mean 'hand'?"),
     ("fit arm.h5 --out mine", "mine exists"),
-    *(("fit arm.h5 --out mine --overwrite", "was not written by `forcegp fit`"), ("fit arm.h5", "--out")),
+    ("fit arm.h5 --out mine --overwrite", "was not written by `forcegp fit`"), ("fit arm.h5", "--out"),
     ("fit arm.h5 --device cuda:999 --out run", "device 'cuda:999' cannot be used here; there is cpu"),
     ("score mine arm.h5", "mine holds no model.json"),
     ("simulate kuka-surface --out arm.h5", "arm.h5 exists already"),
     ("simulate kuka-surface --out a.h5 --seconds -1", "seconds is -1.0; it must be one number, from"),
-    *(("simulate mars --out a.h5", "'mars'"), ("learn arm.h5", "Available subcommands: auto, demo, simulate, ")),
-]
+    ("simulate mars --out a.h5", "'mars'"), ("learn arm.h5", "Available subcommands: auto, demo, simulate, "),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("words", "message"), WRONG, ids=[words or "nothing" for words, _ in WRONG])

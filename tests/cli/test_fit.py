@@ -94,11 +94,11 @@ def test_functions_beside_what_was_identified(forcegp, folder, identified):
 @pytest.mark.parametrize(
     ("forces", "description"),
     [
-        *(("gp:joint", "analytical mean"), ("only,gp:joint", "zero mean")),
-        *(("only,gp:joint-accelerations", "unconstrained accelerations, zero mean"), ("none", "analytical model")),
+        ("gp:joint", "analytical mean"), ("only,gp:joint", "zero mean"),
+        ("only,gp:joint-accelerations", "unconstrained accelerations, zero mean"), ("none", "analytical model"),
         ("gp:independent", "independent"),
     ],
-)
+)  # fmt: skip
 def test_models_by_name(forcegp, folder, forces, description):
     out = re.sub(r"\W", "-", forces)
     done = forcegp("fit", "arm.h5", "--forces", forces, *QUICK, "--out", out, "--json", folder=folder)

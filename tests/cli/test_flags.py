@@ -102,8 +102,8 @@ def test_a_box_becomes_a_sentence():
 ╰────────────────────────────────────────╯"""
     assert one_line(box) == "Unrecognized options: --pionts. Perhaps you meant: --points N."
     lines = (
-        *(" Required options", " ----- ", "  Missing from forcegp fit:", "      --out FOLDER", "          Where."),
+        " Required options", " ----- ", "  Missing from forcegp fit:", "      --out FOLDER", "          Where.",
         "  ---",
-    )
+    )  # fmt: skip
     plain = "\n".join(lines)
     assert one_line(plain) == "Missing from forcegp fit: --out FOLDER."

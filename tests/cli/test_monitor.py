@@ -46,12 +46,12 @@ def test_a_log_becomes_a_table_of_contacts(workshop, monkeypatch, tmp_path, caps
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        *(((), "--free S|FREE.h5"), (("--free", "nowhere.h5"), "give seconds above 0, or a dataset that is there")),
+        ((), "--free S|FREE.h5"), (("--free", "nowhere.h5"), "give seconds above 0, or a dataset that is there"),
         *((("--free", "5"), "too short for a threshold"), (("--free", "-1"), "give seconds above 0")),
         (("--free", "log.csv"), "log.csv is not an HDF5 file"),
         (("--free", "free.h5", "--bandwidth", "500"), "below 50"),
     ],
-)
+)  # fmt: skip
 def test_refusals_are_one_line(workshop, monkeypatch, tmp_path, capsys, words, message):
     monkeypatch.chdir(workshop)
     assert main(["monitor", "run", "log.h5", *words, "--out", str(tmp_path / "out")]) == 2

@@ -168,11 +168,11 @@ OVER_INPUTS = [
     "import log.csv --time time --q q_a,q_a,q_a --u u_a,u_a,u_a --robot arm.urdf --out link.csv",
     "import log.csv --time time --q q_a,q_a,q_a --u u_a,u_a,u_a --robot arm.urdf --out hard.csv",
     "import log.csv --time time --q q_a --u u_a --robot arm.urdf --out arm.urdf",
-    *("import arm.h5 --every 2 --out arm.h5", "fit arm.h5 --robot arm.urdf --out arm.urdf"),
-    *("fit arm.h5 --identified run --out run", "fit run/inner.h5 --out run"),
+    "import arm.h5 --every 2 --out arm.h5", "fit arm.h5 --robot arm.urdf --out arm.urdf",
+    "fit arm.h5 --identified run --out run", "fit run/inner.h5 --out run",
     "fit arm.h5 --robot run/inner.urdf --forces bodies --out run",
-    *("payload arm.h5 --baseline run/inner.h5 --out run", "score run arm.h5 --out run", "score arm.h5 --out arm.h5"),
-]
+    "payload arm.h5 --baseline run/inner.h5 --out run", "score run arm.h5 --out run", "score arm.h5 --out arm.h5",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("words", OVER_INPUTS)

@@ -78,11 +78,11 @@ def test_a_motion_that_diverges_ends_its_episode_at_its_last_state(settings):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        *(({"torque_limits": 0.0}, "not all zero"), ({"torque_limits": np.inf}, "give finite ones")),
-        *(({"num_envs": 0}, "num_envs"), ({"dt": -0.1}, "time step")),
-        *(({"dt": 10.0}, "dt is 10.0; one step lasts 1 s at most"), ({"steps": 0}, "steps")),
+        ({"torque_limits": 0.0}, "not all zero"), ({"torque_limits": np.inf}, "give finite ones"),
+        ({"num_envs": 0}, "num_envs"), ({"dt": -0.1}, "time step"),
+        ({"dt": 10.0}, "dt is 10.0; one step lasts 1 s at most"), ({"steps": 0}, "steps"),
     ],
-)
+)  # fmt: skip
 def test_settings_that_mean_nothing(settings, changes, message):
     with pytest.raises(InvalidInput, match=message):
         RobotVectorEnv(**settings | changes)

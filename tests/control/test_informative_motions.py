@@ -143,11 +143,11 @@ def test_the_file_has_the_motion(chosen, tmp_path):
         ({"start": [0.0, 3.5, 0.0]}, r"joint lift: no motion from 3.5 .* position limits of -6.2 and -0.8 from there"),
         ({"limits": {"velocity": [1.0, 0.0, 1.0]}}, "joint lift: no motion from 0.8 .* velocity limits of 0 and 0"),
         ({"limits": {"torque": [50.0, 1.0, 50.0]}}, r"joint lift needs .* times its torque limit at the start"),
-        *(({"limits": {"jerk": 1.0}}, "jerk"), ({"limits": {"velocity": [1.0, 2.0]}}, "velocity")),
-        *(({"seconds": 0.0}, "seconds"), ({"clearance": np.nan}, "clearance"), ({"rows": 0}, "rows")),
-        *(({"surfaces": [3]}, "contacts"), ({"task": 3}, "task")),
+        ({"limits": {"jerk": 1.0}}, "jerk"), ({"limits": {"velocity": [1.0, 2.0]}}, "velocity"),
+        ({"seconds": 0.0}, "seconds"), ({"clearance": np.nan}, "clearance"), ({"rows": 0}, "rows"),
+        ({"surfaces": [3]}, "contacts"), ({"task": 3}, "task"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_is_refused(posterior, changes, message):
     with pytest.raises(InvalidInput, match=message):
         excitation(posterior, **FEW | changes)

@@ -109,10 +109,10 @@ def test_motions_are_implicit_where_a_step_is_long_beside_the_rates(damping, wan
     [
         ({"torque_limits": 0.0}, "torque_limits are zero in every joint"),
         ({"torque_limits": [1.0, 2.0]}, r"torque_limits has shape \(2,\) on cpu; give one number, or 1"),
-        *(({"torque_limits": np.inf}, "noise is infinite"), ({"steps": 0}, "steps"), ({"dt": 0.0}, "time step")),
+        ({"torque_limits": np.inf}, "noise is infinite"), ({"steps": 0}, "steps"), ({"dt": 0.0}, "time step"),
         ({"cost": 3}, "give a function of motions"),
     ],
-)
+)  # fmt: skip
 def test_arguments_that_do_not_fit(predictor, changes, message):
     with pytest.raises(InvalidInput, match=message):
         controller(predictor, **changes)([0.0], [0.0])

@@ -18,11 +18,11 @@ JOINT = """<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2
 <axis xyz="{4}"/><limit lower="-3" upper="3" velocity="9" effort="60"/></joint>"""
 URDF = "".join(
     [
-        *('<robot name="arm"><link name="base"/>', LINK.format("upper", 2.0), LINK.format("fore", 1.5)),
+        '<robot name="arm"><link name="base"/>', LINK.format("upper", 2.0), LINK.format("fore", 1.5),
         JOINT.format("shoulder", "base", "upper", 0.0, "0 1 0"),
-        *(JOINT.format("elbow", "upper", "fore", -0.4, "0.6 0.8 0"), "</robot>"),
+        JOINT.format("elbow", "upper", "fore", -0.4, "0.6 0.8 0"), "</robot>",
     ]
-)
+)  # fmt: skip
 ROBOT = Robot.from_urdf_text(URDF)
 VISCOUS = (0.7, 0.3)
 URDF_ALONE = Model(ROBOT)

@@ -138,11 +138,11 @@ def test_rows_out_of_order_are_marked_and_may_be_sorted_again():
     [
         ([40], "Dataset.rows was given .* index 40 is out of bounds .* size 40"),
         ([1, 1], "time 0.01 s occurs twice in episode 0; drop the repeated rows"),
-        *(([1, -39], "time 0.01 s occurs twice"), (slice(0, 0), "q has no rows")),
-        *((np.zeros(40, bool), "q has no rows"), (np.ones(39, bool), "Dataset.rows was given .* size of axis is 40")),
+        ([1, -39], "time 0.01 s occurs twice"), (slice(0, 0), "q has no rows"),
+        (np.zeros(40, bool), "q has no rows"), (np.ones(39, bool), "Dataset.rows was given .* size of axis is 40"),
         (np.array([0.5]), "must be of integer"),
     ],
-)
+)  # fmt: skip
 def test_rows_that_do_not_exist_are_named(index, message):
     with pytest.raises((InvalidInput, DatasetError), match=message):
         dataset().rows(index)

@@ -57,11 +57,11 @@ def test_repeated_rows_come_last(points):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        *(({"count": 0}, "from 1 to 5"), ({"count": 6}, "from 1 to 5"), ({"count": 2.0}, "from 1 to 5")),
-        *(({"count": True}, "from 1 to 5"), ({"count": 2, "start": 5}, "from 0 to 4")),
+        ({"count": 0}, "from 1 to 5"), ({"count": 6}, "from 1 to 5"), ({"count": 2.0}, "from 1 to 5"),
+        ({"count": True}, "from 1 to 5"), ({"count": 2, "start": 5}, "from 0 to 4"),
         ({"count": 2, "start": -1}, "from 0 to 4"),
     ],
-)
+)  # fmt: skip
 def test_wrong_arguments(arguments, message):
     with pytest.raises(InvalidInput, match=message):
         inspect.unwrap(farthest_point_sampling)(np.zeros((5, 2)), **arguments)

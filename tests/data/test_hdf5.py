@@ -95,15 +95,15 @@ def test_a_missing_field_is_named(file, name):
         ("q", np.full((40, 2), np.nan), "not valid: q is nan at row 0"),
         ("q", np.full((40, 2), b"x"), "'q' must hold numbers"),
         ("episode", np.zeros(40), "episode must be an array of integers"),
-        *(("model", np.zeros(2), "'model' must hold text"), ("metadata", "{}", "must hold text of fixed length")),
-        *(("metadata", np.bytes_("{"), "is damaged"), ("metadata", np.bytes_("[1]"), "must be a JSON object")),
+        ("model", np.zeros(2), "'model' must hold text"), ("metadata", "{}", "must hold text of fixed length"),
+        ("metadata", np.bytes_("{"), "is damaged"), ("metadata", np.bytes_("[1]"), "must be a JSON object"),
         ("metadata", np.full(2, b"{}"), "must hold one text"),
-        *(("truth/a", np.zeros((40, 9)), r"truth\['a'\] has shape"), ("truth", np.zeros(3), "'truth' must be a group")),
+        ("truth/a", np.zeros((40, 9)), r"truth\['a'\] has shape"), ("truth", np.zeros(3), "'truth' must be a group"),
         ("strokes", np.zeros((40, 3)), "strokes have shape"),
         ("strokes", np.full((40, 2, 3), np.nan), "give finite numbers"),
         ("noise_std", -np.ones(2), "noise_std of joint 'shoulder' is -1.0"),
     ],
-)
+)  # fmt: skip
 def test_wrong_contents_are_named(file, name, values, message):
     change(file, name, values)
     with pytest.raises(FileFormatError, match=message) as error:

@@ -72,16 +72,16 @@ def late(f, _, time):
 @pytest.mark.parametrize(
     ("change", "level", "words"),
     [
-        *((lambda f, *_: f, "ok", "differs by 0.0"), (lambda f, *_: -f, "wrong", "1.0=-x,-y,-z")),
+        (lambda f, *_: f, "ok", "differs by 0.0"), (lambda f, *_: -f, "wrong", "1.0=-x,-y,-z"),
         (lambda f, *_: f[:, [1, 0, 2]] * [1, -1, 1], "wrong", "it is -y,x,z of its frame's x,y,z"),
         (lambda f, *_: f / 9.80665, "wrong", "it is in g. forcegp import --unit imu=g"),
         (lambda f, at_rest, _: f - at_rest, "wrong", "it is without gravity"),
         (lambda f, *_: 2.0 * f, "wrong", "Compare its frame, point, axes and unit"),
-        *((turned(0.034), "look", "turned by 1.9 degrees"), (turned(0.08), "wrong", "turned by 4.6 degrees")),
+        (turned(0.034), "look", "turned by 1.9 degrees"), (turned(0.08), "wrong", "turned by 4.6 degrees"),
         (turned(0.1, bias=0.6), "look", "Compare its frame"),
-        *((turned(1.2), "wrong", "turned by 69 degrees. State it"), (late, "look", "11.4 ms later than the motion")),
+        (turned(1.2), "wrong", "turned by 69 degrees. State it"), (late, "look", "11.4 ms later than the motion"),
     ],
-)
+)  # fmt: skip
 def test_check_names_what_is_wrong(change, level, words):
     rows = changed(change)
     found = Doubts(imu_doubts(rows, rows.model))

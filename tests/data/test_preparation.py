@@ -62,10 +62,10 @@ def test_noise_floor_and_acceleration_noise_are_those_of_white_noise(seed):
 @pytest.mark.parametrize(
     ("derivatives", "turn", "top", "segments", "found"),
     [
-        *((2, 12.0, 250.0, 1e9, True), (2, 100.0, 250.0, 1.0, True), (1, 12.0, 250.0, 4.0, True)),
-        *((2, 215.0, 250.0, 9.0, False), (2, 12.0, 28.0, 9.0, True), (2, 12.0, 24.0, 9.0, False)),
+        (2, 12.0, 250.0, 1e9, True), (2, 100.0, 250.0, 1.0, True), (1, 12.0, 250.0, 4.0, True),
+        (2, 215.0, 250.0, 9.0, False), (2, 12.0, 28.0, 9.0, True), (2, 12.0, 24.0, 9.0, False),
     ],
-)
+)  # fmt: skip
 def test_knee_floor_and_cutoff_of_a_power_law_over_white_noise(derivatives, turn, top, segments, found):
     """2 F where F (turn / f)^8 is the floor F; the knee is where f^(2 d) times the density is least."""
     frequency = np.arange(0.25, top + 0.1, 0.25)
@@ -212,12 +212,12 @@ def test_rows_that_no_longer_carry_the_motion_are_warned_of():
     ("wrong", "message"),
     [
         ({"cutoff": -1.0}, "cutoff is -1.0; give a frequency > 0 in Hz"),
-        *(({"cutoff": "automatic"}, "cutoff is 'automatic'"), ({"delay": "soon"}, "delay is 'soon'; give seconds")),
+        ({"cutoff": "automatic"}, "cutoff is 'automatic'"), ({"delay": "soon"}, "delay is 'soon'; give seconds"),
         ({"lag": -0.1}, "lag is -0.1; give seconds, at least 0"),
-        *(({"every": 0}, "`every=0` must be an integer of at least 1"), ({"trim": -1.0}, "trim is -1.0")),
+        ({"every": 0}, "`every=0` must be an integer of at least 1"), ({"trim": -1.0}, "trim is -1.0"),
         ({"differentiate": "u"}, "allowed: 'q' or 'v'"),
     ],
-)
+)  # fmt: skip
 def test_wrong_settings_are_refused(wrong, message):
     with pytest.raises(InvalidInput, match=message):
         inspect.unwrap(Preparation)(**wrong)

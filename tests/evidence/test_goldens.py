@@ -22,11 +22,11 @@ from forcegp.noise import Noise
 
 HELD = np.random.default_rng(5).normal(size=(60, 1, 2))
 SEARCHES = {
-    **{"free": {}, "bounds": {"bounds": (np.array([-9.0, -0.49, 0.0]), np.full(3, 9.0))}, "held": {"held": HELD}},
-    **{"known": {"known": np.array([0.02, 0.4])}, "sizes": {"sizes": np.array([1.0, 3.0])}},
-    **{"roughly": {"roughly": True}, "short": {"longest": 0.3, "evaluations": 9}},
+    "free": {}, "bounds": {"bounds": (np.array([-9.0, -0.49, 0.0]), np.full(3, 9.0))}, "held": {"held": HELD},
+    "known": {"known": np.array([0.02, 0.4])}, "sizes": {"sizes": np.array([1.0, 3.0])},
+    "roughly": {"roughly": True}, "short": {"longest": 0.3, "evaluations": 9},
     "turned": {"moved": lambda x, step: x + step + 0.1 * step**2},
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("start", [0.0, 4.0, -6.0])

@@ -25,18 +25,18 @@ from forcegp.model import Model
 
 COUPLED = [[3.0, 0.0, 0.0], [-1.0, 4.0, 0.0], [0.0, 1.0, 2.0]]
 LAWS = {
-    **{"viscous": Viscous([0.1, 0.2, 0.3]), "coulomb": Coulomb([0.5, 0.4, 0.3], [0.2, 0.3, 0.4])},
+    "viscous": Viscous([0.1, 0.2, 0.3]), "coulomb": Coulomb([0.5, 0.4, 0.3], [0.2, 0.3, 0.4]),
     "stribeck": Stribeck([0.5, 0.4, 0.3], [0.7, 0.4, 0.9], [0.5, 0.6, 0.7], [0.2, 0.3, 0.4]),
-    **{"load": LoadFriction([0.1, 0.05, 0.2], 0.3, [0.2, 0.3, 0.4]), "offset": Offset([0.5, -0.4, 0.1])},
-    **{"direction": DirectionalFriction([0.2, -0.1, 0.05]), "spring": Spring([2.0, 1.0, 3.0], [0.1, -0.2, 0.3])},
-    **{"rotor": Rotor([0.01, 0.02, 0.03]), "coupled": Rotor([1e-3, 2e-3, 3e-3], transmission=COUPLED)},
+    "load": LoadFriction([0.1, 0.05, 0.2], 0.3, [0.2, 0.3, 0.4]), "offset": Offset([0.5, -0.4, 0.1]),
+    "direction": DirectionalFriction([0.2, -0.1, 0.05]), "spring": Spring([2.0, 1.0, 3.0], [0.1, -0.2, 0.3]),
+    "rotor": Rotor([0.01, 0.02, 0.03]), "coupled": Rotor([1e-3, 2e-3, 3e-3], transmission=COUPLED),
     "load of motors": LoadFriction([0.1, 0.05, 0.2], 0.3, [0.2, 0.3, 0.4], transmission=COUPLED),
     "damped motors": Viscous([0.1, 0.2, 0.3], transmission=COUPLED),
-}
+}  # fmt: skip
 CHOICES = [
-    *(("viscous", "coulomb", "offset", "rotor"), ("stribeck", "coupled"), ("load", "offset", "rotor")),
-    *(("viscous", "direction", "spring"), ("load of motors", "damped motors", "coupled")),
-]
+    ("viscous", "coulomb", "offset", "rotor"), ("stribeck", "coupled"), ("load", "offset", "rotor"),
+    ("viscous", "direction", "spring"), ("load of motors", "damped motors", "coupled"),
+]  # fmt: skip
 
 
 def arm_rows(rows=6, seed=0):

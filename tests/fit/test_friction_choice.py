@@ -225,10 +225,10 @@ def gains(share: float, errors: float) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize(
     ("share", "errors", "memory", "expected"),
     [
-        *((0.06, 2.0, False, True), (0.06, 1.0, False, False), (0.04, 9.0, False, False), (0.01, 0.7, True, True)),
-        *((0.01, 0.3, True, False), (0.005, 9.0, True, False)),
+        (0.06, 2.0, False, True), (0.06, 1.0, False, False), (0.04, 9.0, False, False), (0.01, 0.7, True, True),
+        (0.01, 0.3, True, False), (0.005, 9.0, True, False),
     ],
-)
+)  # fmt: skip
 def test_memory_needs_less_evidence_than_other_parts(share, errors, memory, expected):
     regression = object.__new__(_Regression)
     regression.count, regression.coupled = 10, False

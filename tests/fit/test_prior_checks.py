@@ -157,11 +157,11 @@ def test_equal_terms_are_refused(data):
 @pytest.mark.parametrize(
     "prior",
     [
-        *((JointFriction(), JointForces(("v",))), (JointFriction(), JointForces()), (ContactFriction(), ToolForces())),
-        *((JointFriction(("pan",)), JointFriction(("lift",))), (JointFriction(), ()), ()),
+        (JointFriction(), JointForces(("v",))), (JointFriction(), JointForces()), (ContactFriction(), ToolForces()),
+        (JointFriction(("pan",)), JointFriction(("lift",))), (JointFriction(), ()), (),
     ],
     ids=["inputs", "all", "axes", "joints", "nothing", "none"],
-)
+)  # fmt: skip
 def test_terms_that_differ_are_fitted_without_a_word(data, prior):
     with warnings.catch_warnings():
         warnings.simplefilter("error")

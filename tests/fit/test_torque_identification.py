@@ -24,9 +24,9 @@ from forcegp.progress import watched
 from forcegp.robots import Robot
 
 TRUE_FORCES = (
-    *(Actuation(), RigidBodies(), Viscous([0.3, 0.2, 0.1]), Coulomb([0.8, 0.5, 0.3], 0.2), Offset([0.2, -0.1, 0.05])),
+    Actuation(), RigidBodies(), Viscous([0.3, 0.2, 0.1]), Coulomb([0.8, 0.5, 0.3], 0.2), Offset([0.2, -0.1, 0.05]),
     Rotor([0.05, 0.04, 0.03]),
-)
+)  # fmt: skip
 LAWS = Viscous(), Coulomb(), Offset()
 WEAK = 1e-3
 """Strength of the prior on bodies where the log shall decide."""

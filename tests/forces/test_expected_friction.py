@@ -49,13 +49,13 @@ class TestTabulatedCurve:
     @pytest.mark.parametrize(
         ("at", "values", "message"),
         [
-            *(((0.0,), (1.0,), "two or more"), ((0.0, 1.0), (1.0,), "2 places and 1 values")),
-            *(((0.0, 0.0), (1.0, 1.0), "increasing"), ((1.0, 0.0), (1.0, 1.0), "increasing")),
+            ((0.0,), (1.0,), "two or more"), ((0.0, 1.0), (1.0,), "2 places and 1 values"),
+            ((0.0, 0.0), (1.0, 1.0), "increasing"), ((1.0, 0.0), (1.0, 1.0), "increasing"),
             ((0.0, float("nan")), (1.0, 1.0), "at of a tabulated curve .* finite numbers"),
             ((0.0, 1.0), (1.0, float("inf")), "values of a tabulated curve .* finite numbers"),
-            *(((0.0, 1.0), ("a", 1.0), "finite numbers"), (0.0, (1.0, 1.0), "0 places and 2 values")),
+            ((0.0, 1.0), ("a", 1.0), "finite numbers"), (0.0, (1.0, 1.0), "0 places and 2 values"),
         ],
-    )
+    )  # fmt: skip
     def test_refusals(self, at, values, message):
         with pytest.raises(InvalidInput, match=message):
             TabulatedCurve(at, values)

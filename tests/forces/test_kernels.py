@@ -16,9 +16,9 @@ from forcegp.forces.kernels import KERNELS, checked_kernel, kernel_of
 from forcegp.inference import LatentKernels
 
 PLAIN = (
-    *("squared-exponential", "matern-1/2", "matern-3/2", "matern-5/2", "constant", "linear"),
+    "squared-exponential", "matern-1/2", "matern-3/2", "matern-5/2", "constant", "linear",
     "linear + squared-exponential + constant",
-)
+)  # fmt: skip
 for expression in PLAIN:
     name = f"Test {expression}"
     globals()[name] = type(name, (KernelConformance,), {"expression": expression, "__module__": __name__})

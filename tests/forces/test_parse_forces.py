@@ -37,17 +37,17 @@ from forcegp.forces.registry import SHORT, force_to_dict, is_unknown
 BUILT_IN = tuple(name for name, where in FORCES.items() if isinstance(where, str))
 SURFACE_FORCES = ToolForces(inputs=("velocity", "position"), kernel="squared-exponential")
 NAMES = {
-    **{"bodies": RigidBodies("all"), "gp:joint": JointForces()},
-    **{"gp:joint-position:joints=pan": JointPositionForces(("pan",)), "gp:tool-friction": ToolForces()},
-    **{"gp:tool-forces": SURFACE_FORCES, "gp:load-friction": ContactFriction(load=True), "rigid-bodies": RigidBodies()},
-    **{"gain": Actuation(gain=None), "payload:hand": Payload("hand"), "viscous": Viscous()},
-    **{"direction": DirectionalFriction(), "coulomb": Coulomb(), "stribeck": Stribeck(), "load": LoadFriction()},
-    **{"gear": GearFriction(), "offset": Offset(), "spring": Spring(), "rotor": Rotor()},
-    **{"gp:joint-forces": JointForces(), "gp:joint-accelerations": JointAccelerations()},
-    **{"gp:independent": IndependentAccelerations(), "gp:joint-friction": JointFriction()},
+    "bodies": RigidBodies("all"), "gp:joint": JointForces(),
+    "gp:joint-position:joints=pan": JointPositionForces(("pan",)), "gp:tool-friction": ToolForces(),
+    "gp:tool-forces": SURFACE_FORCES, "gp:load-friction": ContactFriction(load=True), "rigid-bodies": RigidBodies(),
+    "gain": Actuation(gain=None), "payload:hand": Payload("hand"), "viscous": Viscous(),
+    "direction": DirectionalFriction(), "coulomb": Coulomb(), "stribeck": Stribeck(), "load": LoadFriction(),
+    "gear": GearFriction(), "offset": Offset(), "spring": Spring(), "rotor": Rotor(),
+    "gp:joint-forces": JointForces(), "gp:joint-accelerations": JointAccelerations(),
+    "gp:independent": IndependentAccelerations(), "gp:joint-friction": JointFriction(),
     "gp:contact-friction": ContactFriction(),
     "gp:aerodynamic:frame=hand:observe=0.2": AerodynamicForce("hand", observe=0.2),
-}
+}  # fmt: skip
 EXPRESSIONS = {
     "gp:joint:inputs=v/q,kernel=matern-3/2": JointForces(("v", "q"), "matern-3/2"),
     "gp:joint:v": JointForces(("v",)),
@@ -151,18 +151,18 @@ def test_people_add_their_own(monkeypatch):
     ("make", "message"),
     [
         (lambda: JointForces("force"), "JointForces inputs are 'force'"),
-        *((lambda: JointForces(None), "JointForces inputs are None"), (lambda: JointForces(kernel=3), "kernel .*3")),
-        *((lambda: JointFriction(()), r"joints are \(\)"), (lambda: JointFriction(7), "joints are 7")),
+        (lambda: JointForces(None), "JointForces inputs are None"), (lambda: JointForces(kernel=3), "kernel .*3"),
+        (lambda: JointFriction(()), r"joints are \(\)"), (lambda: JointFriction(7), "joints are 7"),
         (lambda: JointFriction((1, 2)), r"joints are \(1, 2\)"),
         (lambda: AerodynamicForce(wind=None), "wind is None"),
         (lambda: AerodynamicForce(wind="top"), "wind is 'top'"),
         (lambda: AerodynamicForce(wind=(0.0, 0.0, math.inf)), r"wind is \(0.0, 0.0, inf\)"),
-        *((lambda: AerodynamicForce(frame=3), "frame is 3"), (lambda: ToolForces(contact="0"), "contact '0'")),
+        (lambda: AerodynamicForce(frame=3), "frame is 3"), (lambda: ToolForces(contact="0"), "contact '0'"),
         (lambda: ContactFriction(contact=True), "contact True"),
         (lambda: Payload(mass=2.0), "no link; name the link that carries it"),
         (lambda: Payload("hand", -1.0), "mass is -1.0"),
     ],
-)
+)  # fmt: skip
 def test_wrong_arguments_of_constructors(make, message):
     with pytest.raises(InvalidInput, match=message):
         make()
@@ -171,11 +171,11 @@ def test_wrong_arguments_of_constructors(make, message):
 @pytest.mark.parametrize(
     "stored",
     [
-        *({"type": "magic"}, {"type": 3}, {"type": "joint-forces", "more": 1}),
-        *({"type": "joint-friction", "joints": []}, "sum"),
+        {"type": "magic"}, {"type": 3}, {"type": "joint-forces", "more": 1},
+        {"type": "joint-friction", "joints": []}, "sum",
     ],
     ids=str,
-)
+)  # fmt: skip
 def test_damaged_files_are_refused(stored):
     with pytest.raises((FileFormatError, InvalidInput)):
         force_from_dict(stored)

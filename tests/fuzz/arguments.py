@@ -38,10 +38,10 @@ POSE = torch.tensor([0.0, 0.0, 1.0, 0.0, 0.0, 0.6, 0.8]).double()
 STILL = torch.zeros(6).double()
 TEXTS = ("", "\ud800", "a\nb", "joint +", *words("x abc 10 nan joint auto none base hand pan body floating planar"))
 TENSORS = (
-    *(lambda: torch.ones(3, dtype=torch.float64, requires_grad=True), lambda: torch.ones(3, dtype=torch.complex128)),
-    *(lambda: torch.ones(3, dtype=torch.bool), lambda: torch.ones(3, device="meta"), lambda: torch.zeros(0)),
-    *(lambda: torch.tensor(float("nan")), lambda: torch.ones(2, 3).to_sparse()),
-)
+    lambda: torch.ones(3, dtype=torch.float64, requires_grad=True), lambda: torch.ones(3, dtype=torch.complex128),
+    lambda: torch.ones(3, dtype=torch.bool), lambda: torch.ones(3, device="meta"), lambda: torch.zeros(0),
+    lambda: torch.tensor(float("nan")), lambda: torch.ones(2, 3).to_sparse(),
+)  # fmt: skip
 VALUES = (None, True, False, Ellipsis, NotImplemented, 0, -1, 1, 2, 3, 7, 2**63, 10**30, -0.0, 0.5, 1.5, 1e308, -1e308)
 VALUES += (1e-320, float("nan"), float("inf"), float("-inf"), 1j, b"x", *TEXTS, (), (1,), (1, 2, 3), (0.0, 0.0, 0.0))
 VALUES += (("pan",), (None,), (float("nan"),) * 3)

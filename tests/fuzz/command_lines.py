@@ -31,14 +31,14 @@ PATHS = st.sampled_from((*FILES, *NAMES, *ODD))
 SMALL = "--points 6 --iterations 2 --restarts 1"
 COLUMNS = "--time time --q q_{joints} --v v_{joints} --u u_{joints} --robot pair.urdf"
 VALID = {
-    **{"import": f"import log.csv {COLUMNS} --out out.h5", "auto": "auto log.csv --robot arm.urdf --step 0 --out out"},
-    **{"payload": "payload test.h5 --forces none-such", "robot": "robot arm.urdf", "check": "check test.h5"},
-    **{"fit": f"fit train.h5 {SMALL} --out out", "score": "score carried train.h5 --starts 1 --horizon 0.02"},
+    "import": f"import log.csv {COLUMNS} --out out.h5", "auto": "auto log.csv --robot arm.urdf --step 0 --out out",
+    "payload": "payload test.h5 --forces none-such", "robot": "robot arm.urdf", "check": "check test.h5",
+    "fit": f"fit train.h5 {SMALL} --out out", "score": "score carried train.h5 --starts 1 --horizon 0.02",
     "monitor": "monitor carried train.h5 --free 0.1 --out out",
-    **{"export": "export carried --to c --unchecked --out out", "view": "view train.h5 --out nowhere/scene.html"},
-    **{"excite": "excite carried --tries 2 --seconds 1 --out out.csv", "simulate": "simulate none-such --out out.h5"},
-    **{"reproduce": "reproduce --preset none-such", "demo": "demo --seconds 0"},
-}
+    "export": "export carried --to c --unchecked --out out", "view": "view train.h5 --out nowhere/scene.html",
+    "excite": "excite carried --tries 2 --seconds 1 --out out.csv", "simulate": "simulate none-such --out out.h5",
+    "reproduce": "reproduce --preset none-such", "demo": "demo --seconds 0",
+}  # fmt: skip
 """Command lines that are done at once, or refused at once."""
 MOVING = {
     "robot": "robot drone.xml",

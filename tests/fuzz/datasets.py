@@ -22,18 +22,18 @@ from forcegp.data.hdf5 import fixed_text
 NAMES = words("q v u a time episode noise_std strokes truth/a truth/lambda joint_names metadata model")
 ATTRIBUTES = ("format", "format_version", "written_by", "time_ordered", "units")
 ARRAYS = {
-    **{"no quaternions": lambda x: x * 1.5, "fewer columns": lambda x: x[..., :-1]},
+    "no quaternions": lambda x: x * 1.5, "fewer columns": lambda x: x[..., :-1],
     "more columns": lambda x: np.concatenate([x, x[..., :1]], -1) if x.ndim else x,
     "w first": lambda x: np.roll(x, 1, -1),
-    **{"nan": lambda x: np.where(np.arange(x.size).reshape(x.shape) == 1, np.nan, x), "infinite": lambda x: x + np.inf},
-    **{"huge": lambda x: x * 1e300, "zero": lambda x: x * 0, "negative": lambda x: -x - 1},
-    **{"integers": lambda x: x.astype(np.int8), "float16": lambda x: x.astype(np.float16)},
-    **{"complex": lambda x: x.astype(complex), "booleans": lambda x: x > 0, "bytes": lambda x: np.full(x.shape, b"x")},
-    **{"flat": lambda x: x.ravel(), "empty": lambda x: x.ravel()[:0], "no rows": lambda x: x[:0]},
-    **{"fewer rows": lambda x: x[:-1], "scalar": lambda x: np.float64(3.0), "deeper": lambda x: x[None]},
-    **{"backwards": lambda x: x[::-1], "big ends": lambda x: x.astype(">f8")},
+    "nan": lambda x: np.where(np.arange(x.size).reshape(x.shape) == 1, np.nan, x), "infinite": lambda x: x + np.inf,
+    "huge": lambda x: x * 1e300, "zero": lambda x: x * 0, "negative": lambda x: -x - 1,
+    "integers": lambda x: x.astype(np.int8), "float16": lambda x: x.astype(np.float16),
+    "complex": lambda x: x.astype(complex), "booleans": lambda x: x > 0, "bytes": lambda x: np.full(x.shape, b"x"),
+    "flat": lambda x: x.ravel(), "empty": lambda x: x.ravel()[:0], "no rows": lambda x: x[:0],
+    "fewer rows": lambda x: x[:-1], "scalar": lambda x: np.float64(3.0), "deeper": lambda x: x[None],
+    "backwards": lambda x: x[::-1], "big ends": lambda x: x.astype(">f8"),
     "record": lambda x: np.zeros(x.shape, [("a", "f8"), ("b", "i4")]),
-}
+}  # fmt: skip
 OTHERS = (
     *({"preparation": value} for value in ({"cutoff": "x"}, 5, [], {"delay": [None]}, {"why": []}, {"earlier": 5})),
     *({"import": value} for value in (5, [1], {"recordings": 5}, {"recordings": [1]}, {"recordings": [{"gaps": 5}]})),

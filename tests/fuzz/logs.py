@@ -15,10 +15,10 @@ from tests.fuzz.values import DAMAGE, WORDS, Damage, Hostile, damaged, words
 TABLE = "--time time --q q_{joints} --v v_{joints} --u u_{joints} --robot pair.urdf"
 ARRAYS = "--time time --q q --v v --u u --robot pair.urdf"
 FLAGS = {
-    **{"log.csv": TABLE, "log.parquet": TABLE, "log.npz": ARRAYS},
-    **{"log.mat": ARRAYS.replace("time", "log.time", 2).replace("--log.time", "--time"), "log73.mat": ARRAYS},
-    **{"log.h5": ARRAYS, "log.mcap": "--q /joint_states:position --u /joint_states:effort --robot pair.urdf"},
-}
+    "log.csv": TABLE, "log.parquet": TABLE, "log.npz": ARRAYS,
+    "log.mat": ARRAYS.replace("time", "log.time", 2).replace("--log.time", "--time"), "log73.mat": ARRAYS,
+    "log.h5": ARRAYS, "log.mcap": "--q /joint_states:position --u /joint_states:effort --robot pair.urdf",
+}  # fmt: skip
 CELLS = st.sampled_from(
     ("0", "1", "", "nan", "inf", "x", "1e400", "-", "1,5", '"', "'", "\x00", "a" * 140_000, "é", "1 2", "#", "\r")
 )
@@ -44,17 +44,17 @@ class Array:
 
 
 QS = {
-    **{"object": lambda q: np.array([{}, []], object), "hostile": lambda q: np.array([Hostile()], object)},
-    **{"text": lambda q: np.array([["a", "b"]] * len(q)), "complex": lambda q: q * 1j},
+    "object": lambda q: np.array([{}, []], object), "hostile": lambda q: np.array([Hostile()], object),
+    "text": lambda q: np.array([["a", "b"]] * len(q)), "complex": lambda q: q * 1j,
     "dates": lambda q: np.full(q.shape, np.datetime64("2024-01-01")),
-    **{"record": lambda q: np.zeros(len(q), [("a", "f8")]), "float16": lambda q: q.astype(np.float16)},
-    **{"booleans": lambda q: q > 0, "int8": lambda q: q.astype(np.int8)},
-    **{"unsigned": lambda q: np.full(q.shape, 2**64 - 1, np.uint64), "long double": lambda q: q.astype(np.longdouble)},
-    **{"fortran": lambda q: np.asfortranarray(q), "transposed": lambda q: q.T, "scalar": lambda q: np.float64(1.0)},
-    **{"deeper": lambda q: q[:, :, None], "empty": lambda q: q[:0], "no columns": lambda q: q[:, :0]},
-    **{"nan": lambda q: q * np.nan, "huge": lambda q: q * 1e308, "void": lambda q: np.zeros(len(q), "V8")},
+    "record": lambda q: np.zeros(len(q), [("a", "f8")]), "float16": lambda q: q.astype(np.float16),
+    "booleans": lambda q: q > 0, "int8": lambda q: q.astype(np.int8),
+    "unsigned": lambda q: np.full(q.shape, 2**64 - 1, np.uint64), "long double": lambda q: q.astype(np.longdouble),
+    "fortran": lambda q: np.asfortranarray(q), "transposed": lambda q: q.T, "scalar": lambda q: np.float64(1.0),
+    "deeper": lambda q: q[:, :, None], "empty": lambda q: q[:0], "no columns": lambda q: q[:, :0],
+    "nan": lambda q: q * np.nan, "huge": lambda q: q * 1e308, "void": lambda q: np.zeros(len(q), "V8"),
     "bytes": lambda q: np.full(q.shape, b"1"),
-}
+}  # fmt: skip
 TABLES = st.builds(
     Table,
     st.lists(

@@ -22,13 +22,13 @@ from forcegp.atomic_files import write_digests
 
 TENSORS = "tensors.safetensors"
 CHANGES = {
-    **{"float32": lambda x: x.float(), "integers": lambda x: x.long(), "booleans": lambda x: x > 0},
-    **{"nan": lambda x: x * float("nan"), "infinite": lambda x: x + float("inf"), "huge": lambda x: x * 1e300},
-    **{"zero": lambda x: x * 0.0, "negative": lambda x: -1.0 * x - 1.0, "flat": lambda x: x.reshape(-1)},
-    **{"one": lambda x: x.reshape(-1)[:1], "empty": lambda x: x.reshape(-1)[:0], "scalar": lambda x: x.sum()},
-    **{"deeper": lambda x: x[None], "longer": lambda x: torch.cat([x.reshape(-1)] * 2)},
+    "float32": lambda x: x.float(), "integers": lambda x: x.long(), "booleans": lambda x: x > 0,
+    "nan": lambda x: x * float("nan"), "infinite": lambda x: x + float("inf"), "huge": lambda x: x * 1e300,
+    "zero": lambda x: x * 0.0, "negative": lambda x: -1.0 * x - 1.0, "flat": lambda x: x.reshape(-1),
+    "one": lambda x: x.reshape(-1)[:1], "empty": lambda x: x.reshape(-1)[:0], "scalar": lambda x: x.sum(),
+    "deeper": lambda x: x[None], "longer": lambda x: torch.cat([x.reshape(-1)] * 2),
     "fewer rows": lambda x: x[:1] if x.dim() else x,
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

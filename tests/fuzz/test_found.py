@@ -145,26 +145,26 @@ def test_tensors_of_other_shapes_and_kinds_are_refused(tmp_path, name, how):
 # ---------------------------------------------------------------- arguments
 
 WRONG = {
-    **{"curve": {"latent": 1}, "components": {"covariance": np.array(["a", "b"])}},
-    **{"predict": {"q": torch.ones(3, device="meta")}, "predict ": {"q": torch.ones(2, 3).to_sparse()}},
-    **{"predictor": {"covariance": 0.1}, "predictor()": {"q": "abc"}, "rollout": {"baumgarte": 3}},
-    **{"Dataset": {"truth": 5}, "Dataset ": {"model": ()}},
-    **{"Dataset.rows": {"index": torch.ones(3, requires_grad=True)}, "Dataset.load": {"path": 7}},
-    **{"load_posterior": {"path": 7}, "Robot.from_urdf": {"path": "a\0b"}, "Robot.from_urdf_text": {"text": None}},
-    **{"Robot.from_urdf_text ": {"inertias": np.ones((3, 3))}, "normalized": {"q": torch.zeros(7).double()}},
-    **{"Model.from_file": {"path": 7}, "Thrusters": {"names": ("one", 2)}},
+    "curve": {"latent": 1}, "components": {"covariance": np.array(["a", "b"])},
+    "predict": {"q": torch.ones(3, device="meta")}, "predict ": {"q": torch.ones(2, 3).to_sparse()},
+    "predictor": {"covariance": 0.1}, "predictor()": {"q": "abc"}, "rollout": {"baumgarte": 3},
+    "Dataset": {"truth": 5}, "Dataset ": {"model": ()},
+    "Dataset.rows": {"index": torch.ones(3, requires_grad=True)}, "Dataset.load": {"path": 7},
+    "load_posterior": {"path": 7}, "Robot.from_urdf": {"path": "a\0b"}, "Robot.from_urdf_text": {"text": None},
+    "Robot.from_urdf_text ": {"inertias": np.ones((3, 3))}, "normalized": {"q": torch.zeros(7).double()},
+    "Model.from_file": {"path": 7}, "Thrusters": {"names": ("one", 2)},
     "Plane": {"normal": torch.tensor([0.0, 0.0, 1.0]).to_sparse()},
-    **{"with_armature": {"armature": torch.ones(2, 3).to_sparse()}, "Model": {"contacts": torch.tensor(1.0)}},
-    **{"fit": {"options": "fast"}, "fit ": {"start": ["a"]}, "fit  ": {"engine": np.zeros(3, [("a", "f8")])}},
-    **{"Noise": {"acceleration": torch.ones(3, device="meta")}, "fit (laws)": {"rows": 1.5}, "Torques": {"mean": "x"}},
-    **{"Motions": {"seconds": "x"}, "IndependentAccelerations": {"inputs": np.zeros(3, [("a", "f8")])}},
-    **{"ContactFriction": {"load": np.ones(3)}, "ToolForces": {"inputs": np.ones(3)}, "Baumgarte": {"omega": 1e308}},
-    **{"Payload": {"mass": np.ones(3)}, "parse_forces": {"expression": 5}},
-    **{"Preparation": {"trim": 10**30, "delay": 10**30}, "split_named": {"guard": {}}, "ColumnMapping": {"unit": 5}},
-    **{"ColumnMapping ": {"q": torch.zeros(3).to_sparse()}, "ColumnMapping  ": {"step": torch.ones(()).to_sparse()}},
-    **{"score": {"starts": []}, "ImportOptions": {"gap": "x"}, "KukaSurfaceConfig": {"tool_mass": None}},
-    **{"JointFriction": {"joints": torch.tensor(5.0)}, "rollout ": {"dt": ""}, "MPPI": {"integrator": torch.zeros(4)}},
-}
+    "with_armature": {"armature": torch.ones(2, 3).to_sparse()}, "Model": {"contacts": torch.tensor(1.0)},
+    "fit": {"options": "fast"}, "fit ": {"start": ["a"]}, "fit  ": {"engine": np.zeros(3, [("a", "f8")])},
+    "Noise": {"acceleration": torch.ones(3, device="meta")}, "fit (laws)": {"rows": 1.5}, "Torques": {"mean": "x"},
+    "Motions": {"seconds": "x"}, "IndependentAccelerations": {"inputs": np.zeros(3, [("a", "f8")])},
+    "ContactFriction": {"load": np.ones(3)}, "ToolForces": {"inputs": np.ones(3)}, "Baumgarte": {"omega": 1e308},
+    "Payload": {"mass": np.ones(3)}, "parse_forces": {"expression": 5},
+    "Preparation": {"trim": 10**30, "delay": 10**30}, "split_named": {"guard": {}}, "ColumnMapping": {"unit": 5},
+    "ColumnMapping ": {"q": torch.zeros(3).to_sparse()}, "ColumnMapping  ": {"step": torch.ones(()).to_sparse()},
+    "score": {"starts": []}, "ImportOptions": {"gap": "x"}, "KukaSurfaceConfig": {"tool_mass": None},
+    "JointFriction": {"joints": torch.tensor(5.0)}, "rollout ": {"dt": ""}, "MPPI": {"integrator": torch.zeros(4)},
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("call", WRONG)

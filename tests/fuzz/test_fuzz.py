@@ -13,11 +13,11 @@ from tests.fuzz.values import Hostile, hostile_pickle
 pytestmark = pytest.mark.usefixtures("unchecked")
 
 TARGETS = {
-    **{"stored models": stored.TARGET, "models of commands": stored.COMMANDS_TARGET},
-    **{"stored systems": stored.SYSTEMS_TARGET, "robot files": robots.TARGET, "datasets": datasets.TARGET},
-    **{"datasets of commands": datasets.COMMANDS_TARGET, "logs": logs.TARGET, "words": command_lines.WORDS_TARGET},
-    **{"command lines": command_lines.TARGET, "arguments": arguments.TARGET},
-}
+    "stored models": stored.TARGET, "models of commands": stored.COMMANDS_TARGET,
+    "stored systems": stored.SYSTEMS_TARGET, "robot files": robots.TARGET, "datasets": datasets.TARGET,
+    "datasets of commands": datasets.COMMANDS_TARGET, "logs": logs.TARGET, "words": command_lines.WORDS_TARGET,
+    "command lines": command_lines.TARGET, "arguments": arguments.TARGET,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", TARGETS)

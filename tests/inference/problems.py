@@ -13,12 +13,12 @@ from forcegp.inference import ExactPosterior, LatentKernels, Terms
 from forcegp.inference.prepared_kernels import KernelSum
 
 SHAPES = {
-    **{"no constraint": {"constraints": 0}, "one constraint": {"constraints": 1}},
-    **{"three constraints": {"constraints": 3}, "fewer latents than outputs": {"latents": 2, "constraints": 0}},
+    "no constraint": {"constraints": 0}, "one constraint": {"constraints": 1},
+    "three constraints": {"constraints": 3}, "fewer latents than outputs": {"latents": 2, "constraints": 0},
     "fewer latents than the rank of H": {"latents": 2, "constraints": 1},
-    **{"more latents than outputs": {"latents": 6, "outputs": 3, "constraints": 1}, "one latent": {"latents": 1}},
-    **{"one output": {"outputs": 1, "constraints": 0}, "one point": {"count": 1}, "two points": {"count": 2}},
-}
+    "more latents than outputs": {"latents": 6, "outputs": 3, "constraints": 1}, "one latent": {"latents": 1},
+    "one output": {"outputs": 1, "constraints": 0}, "one point": {"count": 1}, "two points": {"count": 2},
+}  # fmt: skip
 
 
 def normal(*shape: int, seed: int = 0) -> torch.Tensor:

@@ -55,9 +55,9 @@ def test_few_points_and_compressed_covariances():
 
 
 OPTIONS = {
-    **{"plain": {"iterations": 20}, "slow": {"slow": 3.0}, "loose": {"tolerance": 1e-2}, "limited": {"iterations": 3}},
-    **{"patient": {"patience": 6}, "none": {"iterations": 0}},
-}
+    "plain": {"iterations": 20}, "slow": {"slow": 3.0}, "loose": {"tolerance": 1e-2}, "limited": {"iterations": 3},
+    "patient": {"patience": 6}, "none": {"iterations": 0},
+}  # fmt: skip
 
 
 def test_every_value_of_a_search():

@@ -17,9 +17,9 @@ from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import kernel_sums
 
 EXACT = [
-    *("friction", "matern-1/2", "matern-3/2", "matern-5/2", "linear", "constant"),
+    "friction", "matern-1/2", "matern-3/2", "matern-5/2", "linear", "constant",
     "friction + matern-3/2 + matern-1/2 + constant",
-]
+]  # fmt: skip
 
 
 @LatentPosterior.register

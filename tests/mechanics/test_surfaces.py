@@ -102,12 +102,12 @@ def test_a_function_must_return_a_scalar_tensor(function, batch, what):
 @pytest.mark.parametrize(
     "stored",
     [
-        *({"type": "torus", "radius": 1.0}, {"type": ["plane"]}, {"normal": [0, 0, 1], "offset": 0.0}),
+        {"type": "torus", "radius": 1.0}, {"type": ["plane"]}, {"normal": [0, 0, 1], "offset": 0.0},
         {"type": "plane", "normal": [0, 0, 1]},
-        *({"type": "plane", "normal": [0, 0, 1], "offset": 0.0, "color": "red"}, "plane", None, [["type", "plane"]]),
+        {"type": "plane", "normal": [0, 0, 1], "offset": 0.0, "color": "red"}, "plane", None, [["type", "plane"]],
     ],
     ids=str,
-)
+)  # fmt: skip
 def test_damaged_surfaces_are_refused(stored):
     with pytest.raises(FileFormatError, match="surface"):
         surface_from_dict(stored)

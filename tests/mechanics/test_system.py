@@ -28,12 +28,12 @@ def complete() -> Model:
             Contact("left_arm", (0.3, 0.0, 0.0), Sphere((0.0, 0.1, 0.0), 0.4)),
         ),
         (
-            *(Actuation(), RigidBodies()),
+            Actuation(), RigidBodies(),
             Viscous({joint.name: joint.damping for joint in built.joints if joint.name in built.single_joint_names}),
-            *(Coulomb({"torso": 0.3}, 0.02), Rotor(0.05)),
+            Coulomb({"torso": 0.3}, 0.02), Rotor(0.05),
         ),
         baumgarte=Baumgarte(7.0, 0.8),
-    )
+    )  # fmt: skip
 
 
 def assert_same_dynamics(one: Model, other: Model) -> None:
@@ -65,12 +65,12 @@ def test_contacts_that_do_not_fit_the_robot(contact, error, message):
     ("shapes", "message"),
     [
         (((5, 1), (5, 4), (5, 4)), r"q has shape \(5, 1\); its last dimension must be 4"),
-        *((((5, 4), (5, 1), (5, 4)), r"v has shape \(5, 1\)"), (((5, 4), (5, 4), (5, 1)), r"u has shape \(5, 1\)")),
+        (((5, 4), (5, 1), (5, 4)), r"v has shape \(5, 1\)"), (((5, 4), (5, 4), (5, 1)), r"u has shape \(5, 1\)"),
         (((5, 4), (4, 4), (5, 4)), "batch shapes do not broadcast"),
-        *((((5, 4), (5, 4), (4, 4)), "batch shapes do not broadcast"), (((), (4,), (4,)), "q has shape")),
+        (((5, 4), (5, 4), (4, 4)), "batch shapes do not broadcast"), (((), (4,), (4,)), "q has shape"),
     ],
     ids=str,
-)
+)  # fmt: skip
 def test_states_of_wrong_shape_are_never_stretched(shapes, message):
     with pytest.raises(InvalidInput, match=message):
         Model(robot("chain")).dynamics(*(torch.zeros(shape, dtype=torch.float64) for shape in shapes))

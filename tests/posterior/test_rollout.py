@@ -130,12 +130,12 @@ def test_without_samples_there_is_no_interval(posterior, start):
         ({"u": torch.zeros(0, 3)}, "u has no rows"),
         ({"v0": torch.full((3,), float("nan"))}, "v0 has values that are not finite"),
         ({"v0": torch.zeros(3, 3)}, "shapes do not broadcast"),
-        *(({"q0": "here"}, "q0 must be an array of real numbers"), ({"q0": torch.zeros(0, 1, 3)}, "no motion at all")),
-        *(({"samples": -1}, "samples=-1"), ({"seed": -1}, "seed=-1")),
+        ({"q0": "here"}, "q0 must be an array of real numbers"), ({"q0": torch.zeros(0, 1, 3)}, "no motion at all"),
+        ({"samples": -1}, "samples=-1"), ({"seed": -1}, "seed=-1"),
         ({"integrator": "euler"}, "no integrator 'euler' in forcegp; did you mean 'symplectic-euler'"),
         ({"dt": 0.0}, r"dt is 0\.0"),
     ],
-)
+)  # fmt: skip
 def test_wrong_arguments_are_named(posterior, start, changed, message):
     q, v, u = start
     arguments = {"q0": q, "v0": v, "u": u, "dt": DT} | changed

@@ -79,12 +79,12 @@ class TestHeaderless(TestCsv):
 @pytest.mark.parametrize(
     ("head", "row", "begin"),
     [
-        *(("Trace 2\nDate;2024-01-01\n\ns;rad\nt;größe", "{0},5;0,25", 0.5), ("t,größe", "{0}.5,.25", 0.5)),
-        *(("t größe\n[s] [°]", "  {0}.5   .25 ", 0.5), ("t;größe", "{0}.5;.25;", 0.5)),
-        *(("t;größe", "12:00:0{0},5;0,25", 43200.5), ("t,größe", "1970-01-02T00:00:0{0}.5Z,.25", 86400.5)),
+        ("Trace 2\nDate;2024-01-01\n\ns;rad\nt;größe", "{0},5;0,25", 0.5), ("t,größe", "{0}.5,.25", 0.5),
+        ("t größe\n[s] [°]", "  {0}.5   .25 ", 0.5), ("t;größe", "{0}.5;.25;", 0.5),
+        ("t;größe", "12:00:0{0},5;0,25", 43200.5), ("t,größe", "1970-01-02T00:00:0{0}.5Z,.25", 86400.5),
         ("t;größe", "2.1.1970 00:00:0{0},5;0,25", 86400.5),
     ],
-)
+)  # fmt: skip
 def test_texts_of_other_programs(tmp_path, encoding, head, row, begin):
     lines = [row.format(second) for second in range(8)]
     (tmp_path / "log.txt").write_bytes("\n".join([head, *lines]).encode(encoding))

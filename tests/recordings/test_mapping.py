@@ -35,13 +35,13 @@ VALUES = {name: np.array([1.0 + k, 0.5 * k]) for k, name in enumerate(COLUMNS)}
         ("theta1", lambda x: x["theta1"]),
         ("2*theta1/4 - 1e-3*theta2", lambda x: x["theta1"] / 2 - x["theta2"] / 1000),
         ("2*(theta1 - (theta2 + 1))", lambda x: 2 * x["theta1"] - 2 * x["theta2"] - 2),
-        *(("pi/2 - theta", lambda x: np.pi / 2 - x["theta"]), ("a-b", lambda x: x["a-b"])),
-        *(("a - b", lambda x: x["a"] - x["b"]), ("`a-b` - a", lambda x: x["a-b"] - x["a"])),
-        *(("/js:position.j1 - x[0]", lambda x: x["/js:position.j1"] - x["x[0]"]), ("1e3", lambda x: x["1e3"])),
+        ("pi/2 - theta", lambda x: np.pi / 2 - x["theta"]), ("a-b", lambda x: x["a-b"]),
+        ("a - b", lambda x: x["a"] - x["b"]), ("`a-b` - a", lambda x: x["a-b"] - x["a"]),
+        ("/js:position.j1 - x[0]", lambda x: x["/js:position.j1"] - x["x[0]"]), ("1e3", lambda x: x["1e3"]),
         ("-.5e1", lambda x: np.full(2, -5.0)),
         ("20*(a - theta1) - 1.5*b*theta", lambda x: 20 * (x["a"] - x["theta1"]) - 1.5 * x["b"] * x["theta"]),
     ],
-)
+)  # fmt: skip
 def test_combinations(text, value):
     found = parse_expression(text, COLUMNS, "log.csv")
     np.testing.assert_allclose(found.value(VALUES, 2), value(VALUES), rtol=1e-15)
@@ -89,11 +89,11 @@ def test_a_combination_has_the_value_of_its_terms(terms, data):
 @pytest.mark.parametrize(
     ("pattern", "names"),
     [
-        *(("pos{1..3}", ["pos1", "pos2", "pos3"]), ("pos{2..1}", ["pos2", "pos1"])),
-        *(("q{09..11}", ["q09", "q10", "q11"]), ("{left,right}_{1..2}", ["left_1", "left_2", "right_1", "right_2"])),
-        *(("pos.{joints}", ["pos.shoulder", "pos.elbow"]), ("plain", ["plain"])),
+        ("pos{1..3}", ["pos1", "pos2", "pos3"]), ("pos{2..1}", ["pos2", "pos1"]),
+        ("q{09..11}", ["q09", "q10", "q11"]), ("{left,right}_{1..2}", ["left_1", "left_2", "right_1", "right_2"]),
+        ("pos.{joints}", ["pos.shoulder", "pos.elbow"]), ("plain", ["plain"]),
     ],
-)
+)  # fmt: skip
 def test_patterns(pattern, names):
     assert expanded(pattern, JOINTS) == names
 
@@ -127,10 +127,10 @@ def test_lists_are_split_at_the_commas_that_separate():
 @pytest.mark.parametrize(
     ("quantity", "name", "given", "si"),
     [
-        *(("q", "deg", 180.0, np.pi), ("v", "rpm", 60.0, 2 * np.pi), ("u", "mNm", 3.0, 3e-3)),
-        *(("a", "deg/s²", 180.0, np.pi), ("time", "us", 5.0, 5e-6)),
+        ("q", "deg", 180.0, np.pi), ("v", "rpm", 60.0, 2 * np.pi), ("u", "mNm", 3.0, 3e-3),
+        ("a", "deg/s²", 180.0, np.pi), ("time", "us", 5.0, 5e-6),
     ],
-)
+)  # fmt: skip
 def test_units(quantity, name, given, si):
     np.testing.assert_allclose(log_unit(quantity, name).in_si(np.array([given])), si, rtol=1e-15)
     assert named_unit(quantity, f"q1 [{name}]") == named_unit(quantity, f"q1 ({name})") == log_unit(quantity, name).name
@@ -141,12 +141,12 @@ def test_units(quantity, name, given, si):
     "flags",
     [
         *(
-            *("--unit deg", "--unit q=metres", "--unit x=m", "--sign q=2", "--sign q=0", "--sign q=x"),
+            "--unit deg", "--unit q=metres", "--unit x=m", "--sign q=2", "--sign q=0", "--sign q=x",
             "--headerless seven",
         ),
-        *("--step -1", "--time t --step 1", "--unit q=", "--unit q=deg,q=rad", "--q a,,b"),
+        "--step -1", "--time t --step 1", "--unit q=", "--unit q=deg,q=rad", "--q a,,b",
     ],
-)
+)  # fmt: skip
 def test_flags_that_mean_nothing_are_refused(flags):
     with pytest.raises(InvalidInput):
         parse_arguments(["import", "log.csv", *flags.split(), "--out", "o.h5"]).columns.mapped([], Terminal(json=True))

@@ -20,9 +20,9 @@ from forcegp.robots.compiled import trace_dynamics
 
 ARMATURE = {"a_hip": 0.2, "b_slide": 0.4}
 METHODS = {
-    **{"mass_matrix": 1, "bias_forces": 2, "mass_matrix_and_bias": 2, "gravity_forces": 1, "inverse_dynamics": 3},
+    "mass_matrix": 1, "bias_forces": 2, "mass_matrix_and_bias": 2, "gravity_forces": 1, "inverse_dynamics": 3,
     "forward_dynamics": 3,
-}
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

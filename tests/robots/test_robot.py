@@ -29,8 +29,8 @@ def chain() -> Robot:
 
 def test_joints_come_depth_first_and_branches_in_file_order(tree):
     assert tree.joint_names == (
-        *("torso", "right_shoulder", "right_wrist", "left_shoulder", "left_gripper", "second_finger"),
-    )
+        "torso", "right_shoulder", "right_wrist", "left_shoulder", "left_gripper", "second_finger",
+    )  # fmt: skip
     assert tree.nv == 6
     assert tree.name == "tree"
 

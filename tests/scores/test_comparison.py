@@ -157,18 +157,18 @@ def test_folders_of_others_are_not_touched(data, tmp_path):
 @pytest.mark.parametrize(
     ("models", "changes", "message"),
     [
-        *((("given", "given"), {}, "named twice"), ("given", {}, "models is a str")),
-        *((("identifed",), {}, "give given, identified or"), (("gp:joint@measured",), {}, "no evidence 'measured'")),
+        (("given", "given"), {}, "named twice"), ("given", {}, "models is a str"),
+        (("identifed",), {}, "give given, identified or"), (("gp:joint@measured",), {}, "no evidence 'measured'"),
         (("identified+viscous",), {}, "`identified` has its laws already"),
         (("given@motions:1",), {}, "nothing to refine on motions"),
         (("identified+gp:joint@motions:1",), {}, "the model has unknown forces"),
-        *((("given",), {"seeds": 0}, "seeds=0"), (("given",), {"points": 1000}, "two thirds")),
-        *((("given",), {"restarts": 0}, "restarts is 0"), (("given",), {"integrator": "euler"}, "euler")),
+        (("given",), {"seeds": 0}, "seeds=0"), (("given",), {"points": 1000}, "two thirds"),
+        (("given",), {"restarts": 0}, "restarts is 0"), (("given",), {"integrator": "euler"}, "euler"),
         (("given",), {"identification": "guessing"}, "no force 'guessing'"),
         (("given",), {"identification": "gp:joint"}, "nothing to identify, or unknown forces"),
         (("given",), {"split": "episodes:7"}, "held-out episodes are"),
     ],
-)
+)  # fmt: skip
 def test_what_makes_no_sense_is_refused_before_anything_is_written(data, tmp_path, models, changes, message):
     with pytest.raises(InvalidInput, match=message):
         scored(models, data, tmp_path / "out", **changes)
@@ -195,17 +195,17 @@ def test_models_refined_on_motions_move_better_and_laws_stand_side_by_side():
 @pytest.mark.parametrize(
     ("name", "kind", "identification", "all_rows"),
     [
-        *(("given", "given", None, False), ("identified", "identified", "USUAL", True)),
+        ("given", "given", None, False), ("identified", "identified", "USUAL", True),
         ("identified@torques", "identified", "bodies+viscous+coulomb@torques", True),
         ("identified@motions:1", "identified", "USUAL", True),
         ("viscous+stribeck@torques+motions:1", "identified", "viscous+stribeck@torques", True),
-        *(("gp:joint", "force prior", None, False), ("gp:joint-friction", "force prior", None, True)),
+        ("gp:joint", "force prior", None, False), ("gp:joint-friction", "force prior", None, True),
         ("identified+gp:joint", "force prior", "USUAL", False),
         ("viscous+gp:joint:kernel=(linear + matern-3/2)", "force prior", None, False),
         ("identified+gp:joint-accelerations", "residual", "USUAL", False),
         ("gp:independent", "black box", None, False),
     ],
-)
+)  # fmt: skip
 def test_what_a_name_stands_for(name, kind, identification, all_rows):
     usual = "bodies+viscous+coulomb@accelerations"
     found = candidate(name, name, given_system(), usual)

@@ -57,8 +57,8 @@ def test_every_curve_has_a_panel_that_names_it_with_its_units(friction, data):
     assert (panels[3].get_xlabel(), panels[3].get_ylabel()) == ("sliding speed [m/s]", "force [N]")
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == [
-        *("95 % band", "learned", "beyond the training data", "training velocities", "true"),
-    ]
+        "95 % band", "learned", "beyond the training data", "training velocities", "true",
+    ]  # fmt: skip
 
 
 def test_a_panel_shows_the_curve_its_band_the_training_velocities_and_the_truth(friction, data):

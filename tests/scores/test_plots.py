@@ -48,9 +48,9 @@ def test_a_window_holds_the_rows_of_one_episode_in_order_of_time(test_data):
     ("names", "short"),
     [
         (["lbr_iiwa_joint_1", "lbr_iiwa_joint_2"], ["joint 1", "joint 2"]),
-        *((["shoulder_pan", "shoulder_lift"], ["pan", "lift"]), (["pan", "lift"], ["pan", "lift"])),
-        *((["panel", "pan"], ["panel", "pan"]), (["only_joint_1"], ["only_joint_1"])),
+        (["shoulder_pan", "shoulder_lift"], ["pan", "lift"]), (["pan", "lift"], ["pan", "lift"]),
+        (["panel", "pan"], ["panel", "pan"]), (["only_joint_1"], ["only_joint_1"]),
     ],
-)
+)  # fmt: skip
 def test_short_names_drop_what_all_joints_share(names, short):
     assert short_joint_names(names) == short

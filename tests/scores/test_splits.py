@@ -71,9 +71,9 @@ def test_a_decimated_recording_is_divided_at_the_same_moments():
 
 WRONG = [
     ("episodes:7", r"held-out episodes are \[7\]; name some of \[0, 1, 2\]"),
-    *(("episodes:0,1,2", "leave one to learn from"), ("episodes:", "give auto, folds, episodes:N")),
-    *(("blocks:5:6", r"name some of \[1, 2, 3, 4, 5\]"), ("thirds", "give auto, folds, episodes:N")),
-]
+    ("episodes:0,1,2", "leave one to learn from"), ("episodes:", "give auto, folds, episodes:N"),
+    ("blocks:5:6", r"name some of \[1, 2, 3, 4, 5\]"), ("thirds", "give auto, folds, episodes:N"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("text", "message"), WRONG, ids=[text for text, _ in WRONG])

@@ -108,13 +108,13 @@ def test_the_noise_leaves_the_motion_as_it_is(short):
 @pytest.mark.parametrize(
     ("config", "field", "least", "most"),
     [
-        *((KukaSurfaceConfig, "seconds", 0.1, 1e5), (KukaSurfaceConfig, "noise", 0.0, 1e9)),
-        *((KukaSurfaceConfig, "seed", 0, 2**63 - 1), (KukaSurfaceConfig, "episodes", 1, 10_000)),
-        *((KukaSurfaceConfig, "time_step", 1e-5, 0.01), (KukaSurfaceConfig, "settle_seconds", 0.5, 1e3)),
-        *((KukaSurfaceConfig, "tool_mass", 1e-12, 1e9), (QuadrotorConfig, "wind", 0.0, 15.0)),
+        (KukaSurfaceConfig, "seconds", 0.1, 1e5), (KukaSurfaceConfig, "noise", 0.0, 1e9),
+        (KukaSurfaceConfig, "seed", 0, 2**63 - 1), (KukaSurfaceConfig, "episodes", 1, 10_000),
+        (KukaSurfaceConfig, "time_step", 1e-5, 0.01), (KukaSurfaceConfig, "settle_seconds", 0.5, 1e3),
+        (KukaSurfaceConfig, "tool_mass", 1e-12, 1e9), (QuadrotorConfig, "wind", 0.0, 15.0),
         (QuadrotorConfig, "lag", 0.005, 0.2),
     ],
-)
+)  # fmt: skip
 def test_numbers_are_taken_from_their_range_only(config, field, least, most):
     step = 1 if isinstance(least, int) else 1e-14 + 1e-9 * least
     for value in (least, most):
