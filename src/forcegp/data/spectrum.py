@@ -49,7 +49,7 @@ class MotionSpectrum:
     @property
     def noise_density(self) -> Float[np.ndarray, "frequencies nv"]:
         """Power density of the noise of `source`: the floor below the knee, what was seen above it; NaN if unknown."""
-        below = self.frequency[:, None] < self.knee
+        below = self.frequency[:, None] <= self.knee * (1.0 + 1e-9)  # a band of one frequency has its knee there
         noise = np.where(below, np.minimum(self.density, self.floor), self.density)
         return np.where(np.isfinite(self.floor), noise, np.nan)
 
