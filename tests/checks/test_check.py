@@ -13,7 +13,7 @@ from tests.robots.robot_models import with_link
 
 from forcegp.checks import CheckReport, check, quick_check, without_stops
 from forcegp.checks.residuals import pushed_where_they_are
-from forcegp.checks.search import moving
+from forcegp.checks.search import UNKNOWN, moving
 from forcegp.checks.torques import with_gravity
 from forcegp.data import Dataset, Preparation
 from forcegp.errors import InvalidInput
@@ -151,9 +151,9 @@ def test_a_model_whose_friction_remembers_is_compared_as_if_its_joints_had_slid_
     assert reports[0] == reports[1]
 
 
-@pytest.mark.parametrize("stiffness", [300.0, 4e4])
-def test_a_chirp_across_the_resonance_of_a_gear_is_named(stiffness):
-    """Two masses, an encoder at the link, friction at the motor, by small steps; the stiff one is as good as rigid."""
+@pytest.mark.parametrize(("stiffness", "at_motor"), [(300.0, False), (4e4, False), (300.0, True)])
+def test_a_chirp_across_the_resonance_of_a_gear_is_named(stiffness, at_motor):
+    """Two masses, friction at the motor, by small steps; the stiff one is as good as rigid."""
     robot = Robot.from_urdf_text(PENDULUM, locked={"elbow": 0.0})
     link = float(robot.mass_matrix(torch.zeros(1).double()))
     weight = float(robot.gravity_forces(torch.full((1,), np.pi / 2).double()))
@@ -164,7 +164,8 @@ def test_a_chirp_across_the_resonance_of_a_gear_is_named(stiffness):
         t = k * dt
         u = 4.0 * np.sin(2.0 * np.pi * (0.3 + 10.0 * t / seconds) * t) + 1.5 * np.sin(1.3 * t) - 0.4 * speed
         if k % 10 == 0:
-            rows.append((t, q + 2e-5 * rng.standard_normal(), u + 0.02 * rng.standard_normal()))
+            seen = motor if at_motor else q
+            rows.append((t, seen + 2e-5 * rng.standard_normal(), u + 0.02 * rng.standard_normal()))
         spring = stiffness * (motor - q) + 0.3 * (speed - v)
         v += dt * (spring - weight * np.sin(q) - 0.05 * v) / link
         speed += dt * (u - spring - 0.3 * np.tanh(speed / 0.01)) / rotor
@@ -173,11 +174,14 @@ def test_a_chirp_across_the_resonance_of_a_gear_is_named(stiffness):
     v = np.gradient(q, time)
     columns = {"q": q, "v": v, "a": np.gradient(v, time), "u": u}
     found = check(Dataset(**{name: x[:, None] for name, x in columns.items()}, time=time, model=Model(robot))).doubts
-    resonance = np.sqrt(stiffness * (1.0 / rotor + 1.0 / link)) / (2.0 * np.pi)
+    resonance = np.sqrt(stiffness / link if at_motor else stiffness * (1.0 / rotor + 1.0 / link)) / (2.0 * np.pi)
     if stiffness > 1e4:
         assert not found.of("elastic joint")
     else:  # below it, since a rotor nobody states is taken for friction
-        assert 0.7 * resonance < found.of("elastic joint")[0].numbers["resonance"]["shoulder"] < 1.1 * resonance
+        numbers = found.of("elastic joint")[0].numbers
+        assert 0.7 * resonance < numbers["resonance"]["shoulder"] < 1.1 * resonance
+        assert 0.2 * resonance < numbers["cutoff"] < 0.4 * resonance
+        assert not found.of(UNKNOWN)
 
 
 def test_nothing_is_differentiated_across_postures():

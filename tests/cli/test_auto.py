@@ -15,7 +15,8 @@ from tests.goldens.compare import assert_unchanged
 from tests.simulation.pendulum import double_pendulum
 
 from forcegp import Coulomb, Dataset, Noise, Robot, Viscous, fit, load_posterior
-from forcegp.cli.auto import default_models, verdict
+from forcegp.cli.answer import verdict
+from forcegp.cli.auto import default_models
 from forcegp.cli.logs import prepared_rows
 from forcegp.cli.main import parse_arguments
 from forcegp.cli.terminal import Terminal

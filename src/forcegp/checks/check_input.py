@@ -96,6 +96,15 @@ class CheckInput:
         """Of the filter of the check [Hz]."""
         return None if self.prepared is None else preparation_report(self.prepared.metadata)["cutoff"]
 
+    def below(self, cutoff: float) -> "CheckInput":
+        """The same behind a filter at this frequency [Hz]."""
+        shortest = min(np.ptp(self.even.time[self.even.episode == number]) for number in self.even.episodes)
+        trim = float(min(1.0 / cutoff, LONGEST_TRIM * shortest))
+        rows = Preparation(cutoff=cutoff, trim=trim).apply(self.even)
+        noise = np.array(preparation_report(rows.metadata)["acceleration_noise"]["after"], float)
+        found = {"prepared": rows, "compared": rows, "compared_noise": np.nan_to_num(noise), "sharper": None}
+        return replace(self, **found, compared_cutoff=cutoff)
+
     @classmethod
     def of(cls, dataset: Dataset, model: Model) -> "CheckInput":
         """Prepare a log for the checks. Raises InvalidInput for one that is too short, or whose rows lack an order."""

@@ -138,7 +138,11 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
             if not heard or heard[-1].about != UNKNOWN:
                 found, said = sharp, heard
         if said[-1].about == UNKNOWN if said else inputs.sharper is not None:  # a filter may hide a resonance
-            said = [*said, *elastic_doubts(inputs, found.log)]
+            elastic = elastic_doubts(inputs, found.log)
+            if said and elastic:  # below the resonance other causes are sought
+                inputs = inputs.below(elastic[0].numbers["cutoff"])
+                found, said = search(inputs)
+            said = [*elastic, *said]
         doubts, comparison = [*doubts, *said, *torque_doubts(inputs, found)], found
     return doubts, comparison
 

@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 
 from forcegp.checks.check_input import DEGREE, STEPS, CheckInput
 from forcegp.checks.torques import needed_torques
-from forcegp.data import Dataset, differentiate, low_pass
+from forcegp.data import Dataset, differentiate, low_pass, preparation_report
 from forcegp.data.delay import lowest
 from forcegp.data.views import consecutive, ends_of_range, resolution, runs
 from forcegp.doubts import Doubt, Level, listed, look, ok, wrong
@@ -302,7 +302,7 @@ def motion_doubts(inputs: CheckInput, joints: Sequence[int] | None = None) -> li
     """Factor, sign, delay and fit of v against dq/dt and of a against dv/dt, of all joints or of some."""
     if inputs.prepared is None:
         return []
-    even = inputs.even
+    even, ends = inputs.even, preparation_report(inputs.prepared.metadata)["trim"]  # where a filter shows itself
     if inputs.cutoff is not None:  # all three signals by one filter: what it takes from one it takes from the others
         even = low_pass(even, float(inputs.cutoff), signals=("q", "v", "a"))
     joints = range(even.nv) if joints is None else joints
@@ -315,7 +315,7 @@ def motion_doubts(inputs: CheckInput, joints: Sequence[int] | None = None) -> li
         size = np.sqrt([np.square(x).mean(axis=0) for x in (getattr(even, name), slopes)]).max(axis=0)
         kinds = (max(size[k] for k in joints if inputs.rotates[k] == inputs.rotates[joint]) for joint in joints)
         moved = [joint for joint, most in zip(joints, kinds, strict=True) if size[joint] > IDLE * most]
-        compared = ((joint, _compared(pieces, name, source, joint)) for joint in moved)
+        compared = ((joint, _compared(pieces, name, source, joint, ends)) for joint in moved)
         fits = {joint: fit for joint, fit in compared if fit is not None}
         found += _differences(inputs, name, source, fits, joints)
         if not found and fits and name == "v":
@@ -325,11 +325,14 @@ def motion_doubts(inputs: CheckInput, joints: Sequence[int] | None = None) -> li
     return found
 
 
-def _compared(pieces: list[Dataset], name: str, source: str, joint: int) -> tuple[float, float, float] | None:
+def _compared(
+    pieces: list[Dataset], name: str, source: str, joint: int, ends: float = 0.0
+) -> tuple[float, float, float] | None:
     """Factor, delay [s] and unexplained share of `name` against the derivative of `source`; None without motion."""
     left, right = [], []
     for rows in pieces:
-        inner = (rows.time >= rows.time[0] + SHIFTS[-1]) & (rows.time <= rows.time[-1] + SHIFTS[0])
+        first, last = (rows.time[k] + side * max(SHIFTS[-1], ends) for k, side in ((0, 1.0), (-1, -1.0)))
+        inner = (rows.time >= first) & (rows.time <= last)
         if inner.sum() >= 3:
             left.append(CubicSpline(rows.time, getattr(rows, name)[:, joint])(rows.time[inner] + SHIFTS[:, None]))
             right.append(differentiate(getattr(rows, source)[:, [joint]], rows.time)[inner, 0])

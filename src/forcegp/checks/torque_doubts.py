@@ -21,6 +21,10 @@ LEAST_DELAY = 0.75  # time steps below which a delay is not reported
 MUCH = 0.5  # a delay that leaves less of what was unexplained is wrong to leave in
 BEYOND = 4.0  # of the frequency of the torque, from which on a resonance shows in none
 BLOCKS = 8  # of time, every other of which is held out
+SPRINGS, DAMPING = tuple(np.geomspace(1.0, 40.0, 24).tolist()), (0.02, 0.1, 0.3)
+"""Resonances that are tried [Hz], and shares of critical damping."""
+BELOW = 1.0 / 3.0  # of a resonance, where a robot is as good as rigid
+MOST_ROWS = 2000  # on which that is judged
 RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
 
 
@@ -51,44 +55,74 @@ def _drift(found: Explanation) -> Iterator[Doubt]:
         yield look(about="drift", what=what, do=do, joints=tuple(changed), numbers={"ratio": changed})
 
 
-def elastic_doubts(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
-    """Joints whose torque grows with the square of the frequency, beyond what rigid links and a delay tell.
+def elastic_doubts(inputs: CheckInput, log: Comparison) -> list[Doubt]:
+    """Joints whose torque shows a gear that gives way, beyond what rigid links and a delay tell.
 
-    With a gear of stiffness k between rotor J and link, u = tau + J a + (J / k) tau'' where the encoder is at the link
-    (Spong 1987, J. Dyn. Sys. Meas. Control 109).
+    With a stiffness k between rotor J and link, u = tau + J a + (J / k) tau'' where the encoder is at the link (Spong
+    1987, J. Dyn. Sys. Meas. Control 109). Where it is at the motor, the spring passes on tau as `_behind_spring`.
     """
     rows = inputs.sharper or inputs.compared  # the cut-off that a rigid robot asks for lies below the resonance
     if rows is None or not rows.time_ordered or np.unique(rows.episode, return_counts=True)[1].min() < FEWEST_ROWS:
-        return  # without an order, or too short to be differentiated
+        return []  # without an order, or too short to be differentiated
     log = replace(log, rows=log.changed(rows))
     rows, found = log.rows, dict[str, float]()
     slopes, bends = np.zeros_like(log.tau), np.zeros_like(log.tau)
     for own in (rows.episode == number for number in rows.episodes):
         slopes[own] = np.gradient(log.tau[own], rows.time[own], axis=0)
         bends[own] = np.gradient(slopes[own], rows.time[own], axis=0)
-    fitted = np.arange(len(rows)) * BLOCKS // len(rows) % 2 == 0
-    for j, name in enumerate(inputs.names):
-        u, left, number = rows.u[:, j], np.zeros(2), np.zeros(2)
-        columns = np.c_[bends[:, j], log.tau[:, j], slopes[:, j], log.friction[:, j], np.ones(len(u))]
-        columns = columns / (np.linalg.norm(columns, axis=0) + 1e-300)
+    some = slice(None, None, max(1, len(rows) // MOST_ROWS))
+    passed = {(f, d): _behind_spring(log.tau, rows, f, d)[some] for f in SPRINGS for d in DAMPING}
+    tau, slopes, bends, friction, every = log.tau[some], slopes[some], bends[some], log.friction[some], rows.u[some]
+    fitted = np.arange(len(tau)) * BLOCKS // len(tau) % 2 == 0
+
+    def left(u: np.ndarray, *columns: np.ndarray) -> tuple[float, np.ndarray]:
+        """What every other block leaves of the others, and the numbers."""
+        each, missed, number = np.c_[*columns, np.ones(len(u))], 0.0, np.zeros(0)
+        each = each / (np.linalg.norm(each, axis=0) + 1e-300)
         for part in (fitted, ~fitted):
-            for k, first in enumerate((1, 0)):
-                number = np.linalg.lstsq(columns[part, first:], u[part], rcond=1e-9)[0]
-                left[k] += np.square(u[~part] - columns[~part, first:] @ number).sum()
-        moved = float(np.sqrt(np.linalg.norm(bends[:, j]) / (np.linalg.norm(log.tau[:, j]) + 1e-300)))  # rad/s
+            number = np.linalg.lstsq(each[part], u[part], rcond=1e-9)[0]
+            missed += np.square(u[~part] - each[~part] @ number).sum()
+        return missed, number
+
+    for j, name in enumerate(inputs.names):
+        u, rigid = every[:, j], (tau[:, j], slopes[:, j], friction[:, j])
+        least = MUCH * left(u, *rigid)[0]
+        if least <= MUCH * DOUBTFUL * np.square(u - u.mean()).sum():
+            continue
+        missed, number = left(u, bends[:, j], *rigid)
         beyond = np.sqrt(max(number[1], 0.0) / max(number[0], 1e-300))
-        much = left[0] > DOUBTFUL * np.square(u - u.mean()).sum() and left[1] < MUCH * left[0]
-        if much and 0.0 < beyond < BEYOND:
+        at_motor = {spring: left(u, x[:, j], friction[:, j])[0] for spring, x in passed.items()}
+        hertz = min(at_motor, key=at_motor.__getitem__)[0]
+        if missed < least and 0.0 < beyond < BEYOND:
+            moved = np.sqrt(np.linalg.norm(bends[:, j]) / (np.linalg.norm(tau[:, j]) + 1e-300))  # rad/s
             found[name] = float(beyond * moved) / (2.0 * np.pi)
-    if found:
-        yield look(
+        elif min(at_motor.values()) < least and SPRINGS[0] < hertz < SPRINGS[-1]:
+            found[name] = hertz
+    if not found:
+        return []
+    cutoff = BELOW * min(found.values())
+    return [
+        look(
             about="elastic joint",
-            what="the torque grows with the square of the frequency, as behind an elastic gear with a resonance near "
+            what="the torque grows with the frequency as behind an elastic gear, with a resonance near "
             f"{', '.join(f'{hertz:.2g} Hz ({name})' for name, hertz in found.items())}.",
-            do="No rigid model predicts motions near it: filter by forcegp import --cutoff, at a third of it.",
+            do=f"No rigid model predicts motions near it: filter by forcegp import --cutoff {cutoff:.2g}.",
             joints=tuple(found),
-            numbers={"resonance": found},
+            numbers={"resonance": found, "cutoff": cutoff},
         )
+    ]
+
+
+def _behind_spring(tau: np.ndarray, rows: Dataset, hertz: float, damping: float) -> np.ndarray:
+    """What reaches the motor of the torque that its motion asks for: x'' + 2 d w x' + w^2 x = w^2 tau, by Tustin."""
+    from scipy.signal import bilinear, lfilter, lfilter_zi  # half a second, which only few logs should cost
+
+    passed, rate = tau.copy(), 1.0 / float(np.median(np.diff(rows.time)))
+    w = 2.0 * rate * np.tan(np.pi * min(hertz / rate, 0.4))
+    b, a = bilinear([w * w], [1.0, 2.0 * damping * w, w * w], rate)
+    for own in (rows.episode == number for number in rows.episodes):
+        passed[own] = lfilter(b, a, tau[own], axis=0, zi=lfilter_zi(b, a)[:, None] * tau[own][:1])[0]
+    return passed
 
 
 def _delays(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:

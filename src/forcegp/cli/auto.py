@@ -21,16 +21,15 @@ import forcegp.recordings
 import forcegp.report
 import forcegp.scores
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json
+from forcegp.cli.answer import answer_lines, short_name, verdict
 from forcegp.cli.command import CONFIG, LOG, Command, options_of, unless_given
 from forcegp.cli.fit import write_estimates
-from forcegp.cli.logs import ColumnOptions, FilterOptions, prepared_rows, resolved, stance_text
-from forcegp.cli.payload import LAWS, drives_of, other_causes, payload_dict, payload_text, with_payload
+from forcegp.cli.logs import ColumnOptions, FilterOptions, prepared_rows, resolved
+from forcegp.cli.payload import LAWS, payload_dict, payload_text, with_payload
 from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
-from forcegp.cli.terminal import Terminal, doubts_table, facts, shown
+from forcegp.cli.terminal import Terminal, doubts_table, facts
 from forcegp.doubts import Doubt, Doubts, wrong
 from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUnit, NumericalError
-from forcegp.scores.accuracy import ACCELERATION, TORQUE
-from forcegp.scores.page import number
 from forcegp.scores.scores import USABLE
 
 MOST_CORRECTIONS = 8
@@ -106,7 +105,7 @@ class Auto(Command):
         with atomic_file(self.out / "log.h5", overwrite=True) as temporary:
             dataset.save(temporary)
         with terminal.progress("preparing"):
-            rows, recording = self._prepared_rows(terminal, dataset, bool(done["open_switches"]))
+            rows, recording = self._prepared_rows(terminal, dataset, bool(done["open_switches"]), report)
         settings = dict(rows.metadata["preparation"])
         with terminal.progress("identifying"):
             expression, found = forcegp.scores.identify(recording, identification(model))
@@ -186,10 +185,13 @@ class Auto(Command):
         return shlex.join([*words, "--out", str(self.out)])
 
     def _prepared_rows(
-        self, terminal: Terminal, raw: forcegp.Dataset, open_switches: bool
+        self, terminal: Terminal, raw: forcegp.Dataset, open_switches: bool, report: forcegp.checks.CheckReport
     ) -> tuple[forcegp.Dataset, forcegp.Dataset]:
         """Rows to learn from, and the same at the full rate."""
-        wanted = self.filter.preparation()
+        wanted, elastic = self.filter.preparation(), report.doubts.of("elastic joint")
+        if wanted.cutoff == "auto" and elastic:
+            slow = min(elastic[0].numbers["cutoff"], report.inputs.cutoff or math.inf)
+            wanted = replace(wanted, cutoff=slow, why={"cutoff": "below the resonance of an elastic joint"})
         numbers = resolved(terminal, replace(wanted, every=1, stance="log"), raw)
         period = 0.0 if numbers.cutoff is None else 1.0 / float(numbers.cutoff)  # in which a filter spoils the ends
         stance, every = "auto" if open_switches else "log", wanted.every
@@ -266,15 +268,6 @@ class Auto(Command):
         return str(self.out / "c")
 
 
-def short_name(name: str) -> str:
-    """What a model is called in the answer."""
-    laws, air = "gp:joint-friction" in name, "gp:aerodynamic" in name
-    learned = " and ".join(what for what, has in (("friction", laws), ("air forces", air)) if has)
-    plain = {"given": "the URDF", "identified@accelerations": "identified by accelerations"}
-    plain |= {"identified@torques:both": "identified by torques and accelerations"}
-    return f"{learned} learned" if learned else plain.get(name, name)
-
-
 def identification(model: forcegp.Model) -> str:
     """What is found of the robot by itself, as `forcegp score --identification` takes it."""
     laws = f"+{'+'.join(LAWS)}" if model.robot.single_joint_names else ""
@@ -298,153 +291,3 @@ def default_models(
         share = (missed < USABLE * rows.a.std(axis=0)).mean()
         models += [f"identified@{'accelerations' if share == 1.0 else 'torques:both'}"] if share > 0.5 else []
     return tuple(models)
-
-
-def answer_lines(
-    content: Mapping[str, Any],
-    dataset: forcegp.Dataset,
-    recording: forcegp.Dataset,
-    identified: Any,
-    held: str,
-    scores: forcegp.scores.Scores,
-    still: Sequence[str],
-) -> list[tuple[str, str]]:
-    """What was found, in ten lines."""
-    from forcegp.fit.friction_choice import friction_in_words  # PyTorch is not needed for a page of help
-
-    values, robot, best = identified.estimates, identified.model.robot, scores.recommended
-    assert best is not None, "a model was scored"
-    done, prepared, seconds, out = content["import"], content["preparation"], content["seconds"], content["out"]
-    deviation = max(each["largest_deviation_of_a_step"] for each in done["recordings"])
-    jitter = f", steps up to {deviation:.0%} off (evened out)" if done["resampled_to_step"] is not None else ""
-    told, doubts = {"stop", "spring", "drift", "unknown cause"}, (*done["stops"], *content["check"]["doubts"])
-    seen = [(x["about"], f"{x['what']} {x['do']}") for x in doubts if x["about"] in told]
-    flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
-    mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
-    late, lag, rate = prepared["delay"], prepared["lag"], (len(dataset) - len(dataset.episodes)) / seconds
-    early = "early: a controller that holds u is half a time step" if -late * rate < 1.0 else "early, or q and v late"
-    why = prepared["why"].get("delay", "u is taken to be on time").partition(";")[0].rstrip(".")
-    on_time = why if why.startswith("u is") else f"delay of u: {why}"
-    shifted = f"u was logged {1e3 * abs(late):.1f} ms {'late' if late > 0.0 else early} (shifted)" if late else on_time
-    shifted += f", rotors follow within {1e3 * lag:.0f} ms" if lag else ""
-    filtered = "no filter" if prepared["cutoff"] is None else f"filter at {prepared['cutoff']:g} Hz"
-    joints, moving = robot.single_joint_names, robot.base != "fixed"
-    filtered += f", every {prepared['every']}. row" if prepared["every"] > 1 else ", all rows"
-    freedoms = f"a base that moves and {len(joints)} joints" if moving else f"{len(dataset.joint_names)} joints"
-    q, force, inertia = (
-        " or ".join(dict.fromkeys(two[robot.joint(name).type == "prismatic"] for name in joints))
-        for two in (("rad", "m"), ("Nm", "N"), ("kg m²", "kg"))
-    )
-
-    still = scores.not_known("identified", still)
-
-    def but_for(names: Sequence[str]) -> str:
-        return f"; of {', '.join(names)} not known from this log" if names else ""
-
-    def each(field: str, unit: str) -> str:
-        own = {name: values[f"{field}.{name}"] for name in joints}
-        lost = [name for name, value in own.items() if name in still or value.interval[0] <= 0.0]
-        told = ", ".join("–" if x in lost else f"{own[x].value:.3g}" for x in own) + f" {unit}{but_for(lost)}"
-        return told if len(lost) < len(own) else "not known from this log"
-
-    of_joints = [
-        ("dry friction", friction_in_words(identified.model, recording, force, still) + but_for(still)),
-        ("viscous", each("viscous", f"{force} per {q}/s")),
-        ("rotors", each("rotor", inertia)),
-    ] if joints else []  # fmt: skip
-    (mass, error), causes = values.total_mass, other_causes(content["payload"] or {})
-    if "gains" in causes:  # what it changes of a payload, it changes of all
-        error = math.hypot(error, content["payload"]["parameters"]["payload.mass"]["std"])
-    weight = f"{mass:.4g} ± {1.96 * error:.1g} kg, if {drives_of(identified.model)} are right"
-    errors = "; ".join(
-        f"{short_name(name)} {number(_motion(scores, name))} / {number(_known(scores, 'nrmse', ACCELERATION, name))}"
-        for name in scores.models
-    )
-    ahead = (f" after {scores.horizons[-1]:g} s" if scores.horizons else "") + f" [{'rad or m' if moving else q}]"
-    covered = scores.value("coverage_95", model=best)
-    intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered:.0f} % of unseen rows"
-    weak = ", ".join(list(values.by_body or {})[:3])
-    command = f"forcegp excite {out}/model --seconds 10 --out next.csv"
-    command = "faster and larger motions, also of what hardly moved" if moving else command
-    return [
-        ("log", f"{len(dataset)} rows, {seconds:.3g} s at {rate:.4g} Hz, {freedoms}{jitter}"),
-        *(("by name", each) for each in ["; ".join(done["guessed"])] if each),
-        ("corrected", mistakes),
-        *seen,
-        ("timing", f"{shifted}; {filtered}"),
-        *([("stance", stance_text(prepared))] if "stance" in prepared else []),
-        *of_joints,
-        *([("whole mass", weight)] if moving else []),
-        ("payload", held),
-        *causes.items(),
-        ("models", f"error of q{ahead} / nRMSE of the acceleration, on unseen time: {errors}"),
-        *left_of_torques(scores, best),
-        ("best", f"{short_name(best)}{intervals}"),
-        ("record next", command + (f" (least is known of {weak})" if weak else "")),
-        ("wrote", f"{out}/report.html, {out}/model, {out}/identified.urdf, {out}/validation/report.md"),
-    ]  # fmt: skip
-
-
-def left_of_torques(scores: forcegp.scores.Scores, best: str) -> list[tuple[str, str]]:
-    """The line on what each model leaves of the recorded torques of the joints; none where u has other columns."""
-    shares = {}
-    for name in dict.fromkeys(("given", "identified", best)):
-        quantity, left = scores.left(name) if name in scores.models else (ACCELERATION, {})
-        if quantity == TORQUE:
-            numbers = (shown(x, "{:.2g}" if x and x < 0.1 else "{:.0f}", 100.0) for x in left.values())
-            shares[short_name(name)] = " ".join(numbers)
-    told = "; ".join(f"{name} {numbers}" for name, numbers in shares.items())
-    return [("torque left", f"on unseen time, % of the recorded one of each joint: {told}")] if told else []
-
-
-LEAST_COVERAGE = 0.8  # of 95 % intervals that is no reason to doubt them
-
-
-def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset, still: Sequence[str] = ()) -> str:
-    """Use it, use it for these joints, or do not use it; what it was measured by, and against the URDF alone."""
-    best = scores.recommended
-    assert best is not None, "a model was scored"
-    quantity, shares = scores.left(best)
-    left = {name: math.inf if x is None else x for name, x in shares.items()}
-    good = [name for name, x in left.items() if x <= USABLE]
-    lost = [f"{name} {100.0 * x:.0f} %" if math.isfinite(x) else f"{name} not known from this log"
-            for name, x in left.items() if x > USABLE]  # fmt: skip
-    use = f"“{short_name(best)}”"
-    if not good:
-        return (
-            f"Do not use any of these models: on unseen time the best one, {use}, leaves of the {quantity} of "
-            f"{', '.join(lost)}. Forces, flags of stance, units or the robot's file are wrong, or it hardly moves."
-        )
-    ends = dict.fromkeys(f"{100.0 * x:.2g}" for x in (min(left.values()), max(left[name] for name in good)))
-    told = f"on unseen time it leaves {' to '.join(ends)} % of each {quantity}"
-    motion, urdf = _motion(scores, best), _motion(scores, "given")
-    if motion is not None:
-        unit = dataset.units["q"] if isinstance(dataset.units["q"], str) else "rad or m"
-        against = "they diverge" if urdf is None else f"by {urdf:.2g}"
-        against = f"; with the URDF alone {against}" if "given" in scores.models and best != "given" else ""
-        ahead = f"positions {scores.horizons[-1]:g} s ahead are wrong by {motion:.2g} {unit}{against}"
-        errors = zip(scores.joint_names, scores.columns("nrmse", ACCELERATION, best), strict=True)
-        there = [x or 0.0 for name, x in errors if name not in still]
-        lost_there = sum(there) >= max(len(there), 1)  # no better than a = 0, as of light wrists
-        told += f", but it is for torques: do not predict motions, {ahead}" if lost_there else f", and {ahead}"
-    elif scores.horizons:
-        told += ", but its motions diverge: do not simulate with it"
-    covered = scores.value("coverage_95", model=best)
-    doubt = "" if covered is None or covered >= LEAST_COVERAGE else (
-        f" Do not trust its intervals: those of 95 % hold {100.0 * covered:.0f} %."
-    )  # fmt: skip
-    if not lost:
-        return f"Use {use}: {told}.{doubt}"
-    others = f"Not for the others, of whose {quantity} is left: {', '.join(lost)}."
-    return f"Use {use} for {', '.join(good)}: {told}. {others}{doubt}"
-
-
-def _motion(scores: forcegp.scores.Scores, model: str) -> float | None:
-    """Error of q at the longest horizon; None where all motions diverge, or none was scored."""
-    quantity = f"position after {scores.horizons[-1]:g} s" if scores.horizons else ""
-    return _known(scores, "rmse", quantity, model)
-
-
-def _known(scores: forcegp.scores.Scores, score: str, quantity: str, model: str) -> float | None:
-    there = model in scores.models and quantity in scores.quantities(model)
-    return scores.value(score, quantity, model) if there else None
