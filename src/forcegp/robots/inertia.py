@@ -16,12 +16,6 @@ from torch import Tensor
 Array = np.ndarray
 
 
-def skew(vector: Sequence[float] | Array) -> Array:
-    """Cross-product matrix ``[w]x`` with ``[w]x p = w x p``, shape (3, 3)."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
 def rotation_from_rpy(rpy: Sequence[float] | Array) -> Array:
     """Rotation ``Rz(yaw) Ry(pitch) Rx(roll)`` in rad: URDF's fixed-axis convention, shape (3, 3)."""
     return Rotation.from_euler("xyz", rpy).as_matrix()

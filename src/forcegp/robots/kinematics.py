@@ -306,7 +306,4 @@ class Kinematics:
 
 def _columns(values: Tensor, batch: torch.Size) -> Tensor:
     """(..., nv) broadcast to (*batch, nv) -> (nv, flattened batch), contiguous."""
-    size = values.shape[-1]
-    if values.shape[:-1] != batch:
-        values = values.expand(*batch, size)
-    return values.reshape(batch.numel(), size).mT.contiguous()
+    return values.expand(*batch, -1).reshape(batch.numel(), values.shape[-1]).mT.contiguous()

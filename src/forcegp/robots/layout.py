@@ -302,12 +302,10 @@ def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]
             f"{source}: the links form {len(roots)} separate parts, with base links {', '.join(map(repr, roots))}; "
             "connect them by (fixed) joints so that one base link remains."
         )
-    reached = set(roots)
-    queue = list(roots)
-    while queue:
-        below = [joint.child for joint in children[queue.pop()]]
-        reached.update(below)
-        queue.extend(below)
+    below = list(roots)
+    for link in below:
+        below += [joint.child for joint in children[link]]
+    reached = set(below)
     stray = next((link for link in description.links if link not in reached), None)
     if stray is not None:
         loop, link = [], stray

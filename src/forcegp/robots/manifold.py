@@ -181,7 +181,7 @@ def pose(q: Float[Tensor, "*batch 7"]) -> tuple[Tensor, Tensor]:
 
 def integrated(q: Float[Tensor, "*batch 7"], step: Float[Tensor, "*batch 6"]) -> Tensor:
     """q after the constant body velocity `step` has acted for one second."""
-    linear, angular = _parts(step)
+    linear, angular = step.split(3, -1)
     square = (angular * angular).sum(-1, keepdim=True)
     rotation, origin = pose(q)
     once = torch.linalg.cross(angular, linear)
@@ -194,7 +194,7 @@ def integrated(q: Float[Tensor, "*batch 7"], step: Float[Tensor, "*batch 6"]) ->
 
 def velocity_of(q: Float[Tensor, "*#batch 7"], v: Float[Tensor, "*#batch 6"]) -> Tensor:
     """dq/dt under the body velocity v."""
-    linear, angular = _parts(v)
+    linear, angular = v.split(3, -1)
     rate = torch.cat([0.5 * angular, torch.zeros_like(angular[..., :1])], -1)
     turned = quaternion_product(q[..., TURN].expand(*v.shape[:-1], -1), rate)
     return torch.cat([(pose(q)[0] @ linear[..., None])[..., 0], turned], -1)
@@ -218,7 +218,7 @@ def difference(start: Float[Tensor, "*batch 7"], end: Float[Tensor, "*batch 7"])
 
 def chart_velocity(step: Float[Tensor, "*#batch 6"], v: Float[Tensor, "*#batch 6"]) -> Tensor:
     """d step / dt where `q0 integrated by step` moves with velocity v: ad / (1 - exp(-ad)) v, to the tenth power."""
-    (along, turn), moved, cross = _parts(step), _parts(v), torch.linalg.cross
+    (along, turn), moved, cross = step.split(3, -1), v.split(3, -1), torch.linalg.cross
     total = torch.cat(moved, -1)
     for coefficient in _BERNOULLI:
         moved = cross(turn, moved[0]) + cross(along, moved[1]), cross(turn, moved[1])  # ad of SE(3)
@@ -239,11 +239,6 @@ def quaternion_product(left: Float[Tensor, "*batch 4"], right: Float[Tensor, "*b
 
 def _unit(turn: Tensor) -> Tensor:
     return turn / torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
-
-
-def _parts(step: Tensor) -> tuple[Tensor, Tensor]:
-    """Linear and angular velocity (..., 3)."""
-    return step[..., :3], step[..., 3:]
 
 
 SMALL = 0.05

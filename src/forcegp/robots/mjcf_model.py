@@ -55,14 +55,13 @@ class CompiledModel:
         self.couplings: dict[int, tuple[int, float, float]] = {}
         self.locked: dict[int, float] = {}
         self.bodies = [self._named(model.body(k).name or f"body_{k}", self.links) for k in range(model.nbody)]
-        taken: set[str] = set()
+        self.taken_joints: set[str] = set()
         self.joints = []
         for k in range(model.njnt):
             kind, body = ("free", "ball", "slide", "hinge")[model.jnt_type[k]], self.bodies[model.jnt_bodyid[k]]
             if kind == "ball":
                 raise RobotModelError(f"{problems.source}: body {body!r} has a ball joint; give it three hinges.")
-            self.joints.append(self._named(model.joint(k).name or f"{body}_{kind}", taken))
-        self.taken_joints = taken
+            self.joints.append(self._named(model.joint(k).name or f"{body}_{kind}", self.taken_joints))
 
     def translation(self) -> Translation:
         """Links and joints; notes of what is left out."""

@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from forcegp.errors import InvalidInput, NonPhysicalInertia, RobotModelError, UnknownName, require_known
 from forcegp.robots.arguments import JointValues, Positions, Vector, checked_tensor, usable_device
-from forcegp.robots.inertia import SINGULAR, pseudo_inertia, skew, turns_with_inertia
+from forcegp.robots.inertia import SINGULAR, pseudo_inertia, turns_with_inertia
 from forcegp.robots.layout import BASE, WORLD, BaseChoice, Layout
 from forcegp.robots.manifold import ConfigurationSpace, Group, pose
 from forcegp.robots.urdf import Joint, Link, RobotDescription
@@ -93,7 +93,7 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
     descendants[:, list(layout.empty)] = 0.0
     twist_basis = np.zeros((6, 3, 4))
     for k, axis in enumerate(np.eye(3)):
-        twist_basis[k, :, :3] = skew(axis)
+        twist_basis[k, :, :3] = np.cross(axis, np.eye(3)).T  # [w]x
         twist_basis[3 + k, :, 3] = axis
     inertias = np.zeros((n, 4, 4))
     for name in layout.moving:
