@@ -46,12 +46,10 @@ class Actuation(PerJointLaw):
     @override
     def bound_to(self, robot: Robot) -> "Actuation":
         if self.matrix is None:
-            free = {row for group in robot.layout.groups for row in range(*group.rows.indices(robot.nv))}
-            if not free:
+            if not robot.layout.groups:
                 return self._of(robot, None, robot.joint_names)
-            driven = [row for row in range(robot.nv) if row not in free]
-            matrix = torch.eye(robot.nv, dtype=torch.float64, device=robot.device)[:, driven]
-            return self._of(robot, matrix, tuple(robot.joint_names[row] for row in driven))
+            matrix = torch.eye(robot.nv, dtype=torch.float64, device=robot.device)[:, robot.space.single_rows]
+            return self._of(robot, matrix, robot.single_joint_names)
         matrix = as_numbers("Actuation matrix", self.matrix, robot, f"{robot.nv} rows of numbers")
         names = tuple(self.names) or tuple(f"actuator_{k + 1}" for k in range(matrix.shape[-1] if matrix.dim() else 0))
         if matrix.dim() != 2 or len(matrix) != robot.nv or not bool(torch.isfinite(matrix).all()):

@@ -196,9 +196,8 @@ class State:
         """Positions of the joints; 0 in the places of joints of several degrees of freedom."""
         if self.robot.space.is_vector_space:
             return self.q
-        names = self.robot.joint_names
         out = torch.zeros_like(self.v)
-        out[..., [names.index(name) for name in self.robot.single_joint_names]] = self.robot.space.singles(self.q)
+        out[..., self.robot.space.single_rows] = self.robot.space.singles(self.q)
         return out
 
     @cached_property
