@@ -138,7 +138,7 @@ class Graph:
             inner = self.nodes[x]
             if inner[0] == "subtract":
                 return self._record(("subtract", inner[2], inner[1]))
-            return self._negated(x)
+            return inner[1] if inner[0] == "negate" else None
         if len(operands) < 2:
             return None
         y = operands[1]
@@ -158,13 +158,6 @@ class Graph:
             case "divide" if known[1]:
                 return self.apply("multiply", x, self.constant(1.0 / known[1]))
         return None
-
-    def _negated(self, node: int) -> int | None:
-        """x where the node is -x or a negative number."""
-        operation, *operands = self.nodes[node]
-        if operation == "constant" and operands[0] < 0.0:
-            return self.constant(-operands[0])
-        return operands[0] if operation == "negate" else None
 
     def _record(self, entry: tuple) -> int:
         found = self._found.get(entry)

@@ -78,10 +78,9 @@ def compile_library(source: str, options: Iterable[str], library: Path, function
         try:
             loaded = ctypes.CDLL(str(library))
             getattr(loaded, function)
+            return loaded
         except (OSError, AttributeError) as error:
             why = f"what it wrote cannot be loaded ({error}): its linker is broken, or no program may be run there"
-        else:
-            return loaded
     raise CompilerError(
         f"the C compiler failed: {shlex.join(command)}: {why}; name another (GCC or Clang) by the environment variable "
         f"{VARIABLE}, {ELSEWHERE}, {WITHOUT}."
