@@ -7,7 +7,7 @@ A kernel class of anybody may have `matern_embedding(z)` (n, e) and `nu` (inf: k
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
-from functools import partial, reduce
+from functools import cached_property, partial, reduce
 from operator import add, mul
 from typing import Any, NamedTuple, cast
 
@@ -84,14 +84,11 @@ def of_distance(left: Tensor, right: Tensor, smoothness: float) -> Tensor:
     """The squared exponential (smoothness inf) or a Matern of the distances between points that are scaled already."""
     if smoothness == math.inf:
         return torch.exp(-0.5 * squared_distance(left, right))
-    a = math.sqrt(2.0 * smoothness) * distance(left, right)  # Rasmussen & Williams (2006), eq. 4.17
+    # from the differences themselves: a root would make 1e-8 of what cancels in `squared_distance`
+    r = torch.cdist(left, right, compute_mode="donot_use_mm_for_euclid_dist")
+    a = math.sqrt(2.0 * smoothness) * r  # Rasmussen & Williams (2006), eq. 4.17
     polynomial = {0.5: lambda: 1.0, 1.5: lambda: 1.0 + a, 2.5: lambda: 1.0 + a * (1.0 + a / 3.0)}[smoothness]()
     return polynomial * torch.exp(-a)
-
-
-def distance(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:
-    """|x_i - y_j| from the differences themselves: a root would make 1e-8 of what cancels in `squared_distance`."""
-    return torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 class DenseKernel(NamedTuple):
@@ -160,20 +157,17 @@ class LatentKernels(torch.nn.Module):
     def __init__(self, kernels: Iterable[Kernel]) -> None:
         super().__init__()
         self.kernels = torch.nn.ModuleList(kernels)
-        self._dense: list[DenseKernel] | None = None
         for name, value in self.named_parameters():
             if value.dtype != torch.float64:
                 raise InvalidInput(f"{name} is {value.dtype}; inference needs float64, call .double() on the kernel.")
 
-    @property
+    @cached_property
     def dense(self) -> list[DenseKernel]:
         """The same kernels, taken apart."""
-        if self._dense is None:
-            self._dense = [taken_apart(kernel) for kernel in self]
-        return self._dense
+        return [taken_apart(kernel) for kernel in self]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_dense": None}  # a copy takes its own kernels apart
+        return {name: x for name, x in vars(self).items() if name != "dense"}  # a copy takes its own kernels apart
 
     def __iter__(self) -> Iterator[Kernel]:
         return iter(cast("list[Kernel]", list(self.kernels)))

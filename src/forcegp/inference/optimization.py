@@ -5,6 +5,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -155,29 +156,16 @@ def minimize_objective(
     def pace() -> float:
         return history[-1 - SLOW_ITERATIONS :][0] - history[-1]
 
-    if search.best_point.size:
-        status, converged = "no iterations asked for", False
-    else:
-        status, converged = "no parameters to search for", True
+    converged = not search.best_point.size
+    status = "no parameters to search for" if converged else "no iterations asked for"
     remaining = options.iterations
     for _attempt in range(3):
         if remaining <= 0 or not search.best_point.size:
             break
         failures_before = search.failures
-        result = minimize(
-            search,
-            search.best_point,
-            jac=True,
-            method="L-BFGS-B",
-            callback=after_iteration,
-            options={
-                "maxiter": remaining,
-                "maxfun": 4 * remaining,
-                "maxcor": MEMORY,
-                "ftol": options.tolerance,
-                "gtol": GRADIENT,
-            },
-        )
+        ends = {"maxiter": remaining, "maxfun": 4 * remaining, "ftol": options.tolerance, "gtol": GRADIENT}
+        how: Any = ends | {"maxcor": MEMORY}
+        result = minimize(search, search.best_point, jac=True, method="L-BFGS-B", callback=after_iteration, options=how)
         remaining -= int(result.nit)
         converged = bool(result.success) or result.status == HALTED
         status = _sentence(int(result.status), str(result.message), options)
