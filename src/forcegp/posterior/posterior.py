@@ -349,15 +349,8 @@ class Posterior(Fitted):
         model = self.trained.to(device)
         at: torch.device = model.robot.device
         result = replace(self.result, parameters=_all_on(self.result.parameters, at))
-        there = Posterior.conditioned(
-            model,
-            self.training.to(at),
-            _all_on(self.hyperparameters, at),
-            result,
-            self.settings,
-            engine=self.engine,
-            estimates=self.estimates,
-        )
+        learned = self.training.to(at), _all_on(self.hyperparameters, at), result
+        there = Posterior.conditioned(model, *learned, self.settings, self.engine, self.estimates)
         carried = there if self.target is None else there.with_model(self.target.to(device))
         return carried.with_settings(**self.settings)
 

@@ -106,17 +106,12 @@ def load_posterior(path: str | Path) -> Posterior:
         own = [name for name in tensors if name.startswith(PARAMETERS)]
         parameters = {name.removeprefix(PARAMETERS): tensors[name] for name in own}
         found: dict[str, Any] = {name: kind(document["result"][name]) for name, kind in RESULT.items()}
-        engine, settings = document["engine"], dict(document["settings"])
+        stored, settings = document["engine"], dict(document["settings"])
         _require_numbers(settings, model.robot.nv)
-        posterior = Posterior.conditioned(
-            model,
-            training,
-            parameters,
-            OptimizationResult(parameters, **found),
-            settings,
-            None if engine is None else engine_from_dict(engine),
-            Estimates.from_dict(document["estimates"]),
-        )
+        engine = None if stored is None else engine_from_dict(stored)
+        learned = training, parameters, OptimizationResult(parameters, **found)
+        estimates = Estimates.from_dict(document["estimates"])
+        posterior = Posterior.conditioned(model, *learned, settings, engine, estimates)
         of_rows = posterior.likelihood
         needed = of_rows.kernels.initial_parameters() | of_rows.noise.parameters(model.robot.nv)
         wanted, there = ({name: x.shape for name, x in each.items()} for each in (needed, parameters))
