@@ -66,9 +66,8 @@ class ArrayFile(Source):
             raise InvalidInput(
                 f"no array or group of {self.path} matches {pattern!r}; it has {listed(names, MOST_NAMES)}."
             )
-        return sorted(
-            found, key=lambda name: [x.zfill(20) for x in re.findall(r"\d+|\D", name)]
-        )  # demo_10 after demo_9
+        # demo_10 after demo_9
+        return sorted(found, key=lambda name: [x.zfill(20) for x in re.findall(r"\d+|\D", name)])
 
     @cached_property
     def _places(self) -> dict[str, tuple[str, int | None]]:

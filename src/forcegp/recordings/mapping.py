@@ -203,13 +203,8 @@ class ColumnMapping:
         """The words of `forcegp import` that state columns, units and signs."""
         words: list[str] = []
         for name, value in self.plain().items():
-            text = (
-                stated_as(value)
-                if isinstance(value, Mapping)
-                else ",".join(map(str, value))
-                if isinstance(value, tuple)
-                else str(value)
-            )
+            entries = value if isinstance(value, tuple) else (value,)
+            text = stated_as(value) if isinstance(value, Mapping) else ",".join(map(str, entries))
             words += [f"--{name.replace('_', '-')}", *([] if value is True else [text])]
         return words
 

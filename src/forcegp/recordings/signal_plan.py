@@ -232,10 +232,8 @@ def signal_plan(
 
 def _joints(mapping: ColumnMapping, robot: Robot) -> tuple[str, ...]:
     """Joints of one degree of freedom, in the order of the log."""
-    own_axes = mapping.axes.keys() - {"force"}
-    stated = [
-        name for name in ("orientation", "axes", "ned") if (own_axes if name == "axes" else getattr(mapping, name))
-    ]
+    given = {"orientation": mapping.orientation, "axes": mapping.axes.keys() - {"force"}, "ned": mapping.ned}
+    stated = [name for name, value in given.items() if value]
     if stated and robot.space.is_vector_space:
         raise InvalidInput(f"{stated[0]} is about a base that moves; give a robot with one, by base='floating'.")
     own = robot.single_joint_names

@@ -220,17 +220,12 @@ class DelimitedText(Source):
             ragged: list[Any] = []
             words = {*arrow_csv.ConvertOptions().null_values, *self._no_numbers}
             skip = (lambda row: ragged.append(row) or "skip") if self.lenient else None
+            reads = arrow_csv.ReadOptions(use_threads=threads, block_size=BLOCK, column_names=stored)
+            parses = arrow_csv.ParseOptions(delimiter="\t" if blanks else self._delimiter, invalid_row_handler=skip)
+            converts = {"include_columns": wanted, "column_types": kinds, "decimal_point": self._decimal}
+            converts["null_values"] = [*words]
             try:
-                table = arrow_csv.read_csv(
-                    source,
-                    read_options=arrow_csv.ReadOptions(use_threads=threads, block_size=BLOCK, column_names=stored),
-                    parse_options=arrow_csv.ParseOptions(
-                        delimiter="\t" if blanks else self._delimiter, invalid_row_handler=skip
-                    ),
-                    convert_options=arrow_csv.ConvertOptions(
-                        include_columns=wanted, column_types=kinds, decimal_point=self._decimal, null_values=[*words]
-                    ),
-                )
+                table = arrow_csv.read_csv(source, reads, parses, arrow_csv.ConvertOptions(**converts))
             except pa.ArrowInvalid as error:
                 if threads:  # pyarrow counts rows on one thread only
                     return self._parsed(stored, wanted, kinds, threads=False)
