@@ -15,6 +15,7 @@ from forcegp.data.filters import LowPass, Signal, differentiated, episodes_in_or
 from forcegp.data.strokes import with_strokes
 from forcegp.errors import DatasetError
 
+DERIVATIVES = {"q": 2, "v": 1}  # that lead from a signal to the acceleration
 SEGMENT = 4.0  # s
 FEWEST_ROWS = 64
 BANDS_PER_OCTAVE = 6
@@ -58,7 +59,7 @@ class MotionSpectrum:
 
         `behind` is the filter before them. Central differences have the gain `sin(2 pi f h) / h` per derivative.
         """
-        response = (np.sin(2.0 * np.pi * self.frequency * self.step) / self.step) ** (2 * _derivatives(self.source))
+        response = (np.sin(2.0 * np.pi * self.frequency * self.step) / self.step) ** (2 * DERIVATIVES[self.source])
         if behind is not None:
             response = response * behind.gain(self.frequency, 1.0 / self.step) ** 2
         return np.sqrt((self.noise_density * response[:, None]).sum(axis=0) * (self.frequency[1] - self.frequency[0]))
@@ -70,13 +71,13 @@ def motion_spectrum(dataset: Dataset, source: Literal["q", "v"] = "q") -> Motion
     Raises DatasetError for fewer than 64 rows in the longest episode, rows out of order or sampled unevenly.
     """
     values = as_vectors(dataset) if source == "q" else dataset.v
-    frequency, density, segments, step = power_density(dataset, values, _derivatives(source))
-    found = [_knee_and_floor(frequency, column, segments, _derivatives(source)) for column in density.T]
+    frequency, density, segments, step = power_density(dataset, values, DERIVATIVES[source])
+    found = [_knee_and_floor(frequency, column, segments, DERIVATIVES[source]) for column in density.T]
     knee, floor, cutoff = (np.array(values) for values in zip(*found, strict=True))
     spectrum = MotionSpectrum(
         source=source, step=step, frequency=frequency, density=density, knee=knee, floor=floor, cutoff=cutoff
     )
-    acceleration = density * (2.0 * np.pi * frequency[:, None]) ** (2 * _derivatives(source))
+    acceleration = density * (2.0 * np.pi * frequency[:, None]) ** (2 * DERIVATIVES[source])
     motion = np.sqrt((acceleration * (frequency[:, None] <= knee)).sum(axis=0) * frequency[0])
     with np.errstate(invalid="ignore"):
         quiet = spectrum.acceleration_noise() < LEAST_NOISE * motion
@@ -113,11 +114,6 @@ def power_density(
         segments += 1.0 + max(0.0, len(change) / (window / 2.0) - 2.0) * 9.0 / 11.0
     response = (2.0 * np.sin(np.pi * frequency[1:] * step) / step) ** (2 * differences)
     return frequency[1:], (total / weight)[1:] / response[:, None], segments, step
-
-
-def _derivatives(source: str) -> int:
-    """Derivatives that lead from the signal to the acceleration."""
-    return 2 if source == "q" else 1
 
 
 def _knee_and_floor(
