@@ -161,14 +161,8 @@ class JointTorques(Sensor):
     kind: ClassVar[str] = TORQUE
 
 
-EVIDENCE: dict[str, type[Evidence]] = {
-    "accelerations": Accelerations,
-    "torques": Torques,
-    "motions": Motions,
-    "contact-forces": ContactForces,
-    "frame-acceleration": FrameAcceleration,
-    "joint-torques": JointTorques,
-}
+KINDS = (Accelerations, Torques, Motions, ContactForces, FrameAcceleration, JointTorques)
+EVIDENCE: dict[str, type[Evidence]] = {kind.name: kind for kind in KINDS}
 """Kinds by the name that commands and files have for them. Add yours: EVIDENCE["mine"] = Mine."""
 
 
