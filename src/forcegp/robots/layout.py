@@ -249,16 +249,10 @@ def lay_out(
     places = {name: place for place, name in enumerate(names)}
     joints = with_followers({body.name: body for body in bodies if body.name not in drives}, bodies, drives)
     moved = [drives.get(joint.name, (joint.name, 1.0, 0.0)) for joint in bodies]
-    return Layout(
-        tuple(bodies),
-        tuple(Drive(places[name], multiplier, offset) for name, multiplier, offset in moved),
-        joints,
-        tuple(parents),
-        tuple(origins),
-        {name: place for name, place in links.items() if name != OUTSIDE},
-        tuple(groups),
-        base or ("floating" if own else "fixed"),
-    )
+    drive = tuple(Drive(places[name], multiplier, offset) for name, multiplier, offset in moved)
+    links.pop(OUTSIDE, None)
+    hold: BaseChoice = base or ("floating" if own else "fixed")
+    return Layout(tuple(bodies), drive, joints, tuple(parents), tuple(origins), links, tuple(groups), hold)
 
 
 def check_tree(layout: Layout, loops: Sequence[tuple[str, str, str]], problems: Problems) -> None:

@@ -151,13 +151,9 @@ def _has_mass(mujoco: Any, spec: Any, geom: Any) -> bool:
     compiler, kinds = spec.compiler, mujoco.mjtInertiaFromGeom
     given = compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_AUTO and geom.parent.explicitinertial
     low, high = compiler.inertiagrouprange
+    counts = not (given or compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_FALSE) and low <= geom.group <= high
     weighs = (geom.density if math.isnan(geom.mass) else geom.mass) != 0.0
-    return (
-        not (given or compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_FALSE)
-        and low <= geom.group <= high
-        and weighs
-        and geom.parent.name != "world"
-    )
+    return counts and weighs and geom.parent.name != "world"
 
 
 if __name__ == "__main__":

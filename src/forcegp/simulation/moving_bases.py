@@ -50,14 +50,9 @@ def simulate_quadruped(config: QuadrupedConfig) -> Dataset:
         parts.append(_episode(loaded, model, config, episode, steps))
         tell(episode + 1, config.episodes)
     q, v, u, a, Q_U, forces = (torch.cat(part).numpy() for part in zip(*parts, strict=True))
-    return recorded(
-        "quadruped",
-        config,
-        model,
-        {"q": q, "v": v, "u": u, "a": a},
-        {"lambda": forces, "Q_U": Q_U, "Q_U.joint-friction": Q_U},
-        {"payload": {"frame": "trunk", "mass": config.payload, "center": list(PLACE)}},
-    )
+    motion, truth = {"q": q, "v": v, "u": u, "a": a}, {"lambda": forces, "Q_U": Q_U, "Q_U.joint-friction": Q_U}
+    load = {"frame": "trunk", "mass": config.payload, "center": list(PLACE)}
+    return recorded("quadruped", config, model, motion, truth, {"payload": load})
 
 
 def _episode(robot: Robot, model: Model, config: QuadrupedConfig, episode: int, steps: int) -> tuple[Tensor, ...]:
