@@ -20,7 +20,7 @@ from forcegp.progress import part, tell
 from forcegp.robots import Robot
 from forcegp.robots.structure import RigidBodyDynamics
 from forcegp.robots.urdf import numbers
-from forcegp.simulation.joint_friction import LawsOfJoints
+from forcegp.simulation.joint_friction import Friction, laws_of_joints
 from forcegp.simulation.scenarios import KukaSurfaceConfig
 from forcegp.simulation.trajectory import (
     ArmState,
@@ -282,12 +282,12 @@ def tool_friction_of(config: KukaSurfaceConfig) -> PointFriction:
     return PointFriction(0.0, config.coulomb_coefficient, static, config.breakaway_velocity, config.friction_smoothing)
 
 
-def joint_friction_of(config: KukaSurfaceConfig, robot: Robot) -> LawsOfJoints:
+def joint_friction_of(config: KukaSurfaceConfig, robot: Robot) -> Friction:
     """The laws that `joint_friction` names, with the numbers of the scenario where it gives none."""
     more = tuple(near - level for near, level in zip(config.joint_static, config.joint_coulomb, strict=True))
     numbers: dict[str, Any] = {"damping": config.joint_viscous, "level": config.joint_coulomb, "breakaway": more}
     numbers |= {"velocity_scale": config.joint_smoothing, "velocity": config.joint_breakaway_velocity}
-    return LawsOfJoints.named(config.joint_friction, robot, numbers)
+    return laws_of_joints(config.joint_friction, robot, numbers)
 
 
 def simulate_kuka_surface(config: KukaSurfaceConfig) -> Dataset:

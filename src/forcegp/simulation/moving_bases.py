@@ -21,7 +21,7 @@ from forcegp.mechanics import fixed_point
 from forcegp.model import Model
 from forcegp.progress import tell
 from forcegp.robots import Robot
-from forcegp.simulation.joint_friction import LawsOfJoints
+from forcegp.simulation.joint_friction import laws_of_joints
 from forcegp.simulation.scenarios import QuadrotorConfig, QuadrupedConfig
 from forcegp.simulation.trajectory import RATE, recorded
 
@@ -80,7 +80,7 @@ def _episode(robot: Robot, model: Model, config: QuadrupedConfig, episode: int, 
     kinematics = robot.kinematics(q, v)
     drift = torch.stack([kinematics.frame_bias_acceleration(f"{leg}_foot")[:, :3] for leg in LEGS], 1)
     a = torch.cat([dV, joints(dV, ddx - drift)], -1)
-    friction = LawsOfJoints.named(str(config.joint_friction), robot, FRICTION)
+    friction = laws_of_joints(str(config.joint_friction), robot, FRICTION)
     Q_U = torch.as_tensor(friction(v.numpy()))
     needed = robot.inverse_dynamics(q, v, a) - Q_U
     A = (J * stands[..., None, None]).flatten(1, 2)
