@@ -188,11 +188,8 @@ class Bodies:
         blocks = [np.zeros((0, 0))]
         for pseudo, change in zip(_in_frames(self.pseudo_inertias(x), frames), changes, strict=True):
             mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
-            dm = change[:, 3, 3]
-            dc = (change[:, :3, 3] - dm[:, None] * center) / mass
-            outer = center[:, None] * dc[:, None, :]
-            dS = change[:, :3, :3] - dm[:, None, None] * np.outer(center, center)
-            dS = dS - mass * (outer + outer.swapaxes(1, 2))
+            about = np.column_stack([np.eye(3), -center])  # of second moments, to those about the centre of mass
+            dm, dc, dS = change[:, 3, 3], change[:, 3] @ about.T / mass, about @ change @ about.T
             dI = np.trace(dS, axis1=1, axis2=2)[:, None, None] * np.eye(3) - dS
             blocks.append(np.concatenate([dm[None], dc.T, np.array([dI[:, *at] for at in _INERTIA])]))
         return block_diag(*blocks)
@@ -216,9 +213,9 @@ DEFINITE = 1e-9
 """Matrices whose smallest eigenvalue is this fraction of the largest have factors in spite of rounding."""
 
 
-def upper_cholesky(matrices: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
+def upper_cholesky(matrices: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"]:
     """Upper triangular V with V V^T equal to each matrix. Raises numpy.linalg.LinAlgError where one is not definite."""
-    return np.linalg.cholesky(matrices[:, ::-1, ::-1])[:, ::-1, ::-1]
+    return np.linalg.cholesky(matrices[..., ::-1, ::-1])[..., ::-1, ::-1]
 
 
 def _log_cholesky(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -278,10 +275,7 @@ def with_bodies(robot: Robot, wanted: Mapping[int, Float[np.ndarray, "4 4"]]) ->
             "log more motion, or a prior."
         )
     now = body_pseudo_inertias(robot).cpu().numpy()
-    change = {
-        body: upper_cholesky(pseudo[None])[0] @ np.linalg.inv(upper_cholesky(now[own.index(body)][None])[0])
-        for body, pseudo in wanted.items()
-    }
+    change = {k: upper_cholesky(P) @ np.linalg.inv(upper_cholesky(now[own.index(k)])) for k, P in wanted.items()}
     text = robot.urdf_text
     for name, placement in robot.layout.links.items():
         link, body = robot.link(name), placement.body
