@@ -387,10 +387,7 @@ def _terms(model: Model, typical: Mapping[str, np.ndarray]) -> list[Term]:
                     spread = spread if given.std is None else of(given.std) / of(given.mean)
                 center = start
             else:
-                if coefficient.unit != "1":
-                    low, high = low / size, high / size
-                else:
-                    low, high = low / coefficient.factor, high / coefficient.factor
+                low, high = low / size, high / size
                 center, spread = np.zeros_like(size), np.full_like(size, LINEAR_SPREAD)
                 start = of(coefficient.default) / size if coefficient.default else np.ones_like(size)
                 if isinstance(given, Normal):

@@ -190,9 +190,8 @@ class RecordedRows:
         self._stated = np.zeros((len(robot.layout.bodies), 10))
         self._stated[space.own] = standard_parameters(robot).reshape(-1, 10).cpu().numpy()
         own = [each.body for each in space.carried if each.payload is None]
-        self._stated[own] -= (
-            standard_parameters(model.robot).reshape(-1, 10).cpu().numpy()[[space.own.index(body) for body in own]]
-        )
+        unloaded = standard_parameters(model.robot).reshape(-1, 10).cpu().numpy()
+        self._stated[own] -= unloaded[[space.own.index(body) for body in own]]
         self._beyond = np.array([not space.model.laws[term.law].in_gear for term in space.terms for _ in term.size])
         """Of the coordinates of laws: which of them are at the links' side of gears."""
         self._caches: dict[float | None, dict[Any, Any]] = {None: {}, 0.0: {}, 1.0: {}}
