@@ -139,11 +139,8 @@ def _found(name: str, urdf: Path) -> Path | None:
     plain = name.removeprefix("file://")
     package = plain.removeprefix("package://").removeprefix("model://")
     within = package.partition("/")[2] if package != plain else package
-    for folder in urdf.resolve().parents:
-        for candidate in (folder / package, folder / within):
-            if candidate.is_file():
-                return candidate
-    return None
+    candidates = (folder / end for folder in urdf.resolve().parents for end in (package, within))
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
 def _few_faces(mesh: Any) -> Any:
