@@ -310,13 +310,8 @@ class RobotStructure(Summary):
     def facts(self) -> dict[str, object]:
         """Name, sizes and joints."""
         kinds = listed((f"{joint.name} ({joint.type})" for joint in self.layout.joints), most=7)
-        return {
-            "name": repr(self.name),
-            "nv": self.nv,
-            **({"nq": self.nq} if self.layout.groups else {}),
-            "links": len(self.layout.links),
-            "joints": kinds,
-        }
+        sizes = {"nv": self.nv} | ({"nq": self.nq} if self.layout.groups else {})
+        return {"name": repr(self.name), **sizes, "links": len(self.layout.links), "joints": kinds}
 
     def frame(self, name: str) -> tuple[int, Float[Tensor, "4 4"]]:
         """Body (``WORLD`` = -1) that carries a frame, and the frame's pose in that body's frame."""
