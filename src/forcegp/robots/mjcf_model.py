@@ -12,7 +12,7 @@ from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import rotation_about, rpy_from_rotation, transform
 from forcegp.robots.manifold import VELOCITIES
 from forcegp.robots.urdf import numbers
-from forcegp.robots.urdf_file import inertial_parts
+from forcegp.robots.urdf_file import inertial_element
 
 KINDS = {0: "floating", 2: "prismatic", 3: "revolute"}
 """Of MuJoCo's joints (mjtJoint) in URDF."""
@@ -146,7 +146,7 @@ class CompiledModel:
             return ""
         pose = self._pose(model.body_ipos[body], model.body_iquat[body])
         inertia = pose[:3, :3] @ np.diag(model.body_inertia[body]) @ pose[:3, :3].T
-        return f"<inertial>{''.join(inertial_parts(model.body_mass[body], pose[:3, 3], inertia))}</inertial>"
+        return inertial_element(model.body_mass[body], pose[:3, 3], inertia)
 
     def _parts(self, joint: int, kind: str) -> str:
         """Axis, limits, damping, friction, rotor and coupling of one joint."""

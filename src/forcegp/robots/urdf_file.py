@@ -1,6 +1,6 @@
 """URDF files: inertials, friction and impossible inertias replaced in the text."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -56,8 +56,7 @@ def replace_inertial(
     """URDF text with the ``<inertial>`` (kg, m, kg m^2, link axes) of ``link`` replaced or added, read back exactly."""
     document = _document(text)
     owner = _found(document, "link", link, source)
-    parts = "".join(inertial_parts(mass, center_of_mass, inertia))
-    new = minidom.parseString(f"<inertial>{parts}</inertial>").documentElement
+    new = minidom.parseString(inertial_element(mass, center_of_mass, inertia)).documentElement
     old = _child(owner, "inertial")
     owner.replaceChild(new, old) if old else owner.appendChild(new)
     return _written(document)
@@ -141,12 +140,12 @@ def _written(document: Any) -> str:
     return "".join(node.toxml() for node in document.childNodes) + "\n"
 
 
-def inertial_parts(mass: float, center_of_mass: np.ndarray, inertia: np.ndarray) -> list[str]:
-    """The elements inside of an ``<inertial>``."""
+def inertial_element(mass: float, center_of_mass: Iterable[float], inertia: np.ndarray) -> str:
+    """The text of an ``<inertial>``, in the axes of its link."""
     entries = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
     moments = " ".join(f'{key}="{float(inertia[index])!r}"' for key, index in entries.items())
     origin = f'<origin xyz="{numbers(center_of_mass)}" rpy="0 0 0"/>'
-    return [origin, f'<mass value="{float(mass)!r}"/>', f"<inertia {moments}/>"]
+    return f'<inertial>{origin}<mass value="{float(mass)!r}"/><inertia {moments}/></inertial>'
 
 
 InertiaChoice = Literal["strict", "nearest"]

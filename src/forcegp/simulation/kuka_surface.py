@@ -1,7 +1,6 @@
 """The `kuka-surface` scenario: an iiwa slides its tool on a surface with friction (after Rath, Geist, Trimpe 2021)."""
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +19,7 @@ from forcegp.progress import part, tell
 from forcegp.robots import Robot
 from forcegp.robots.structure import RigidBodyDynamics
 from forcegp.robots.urdf import numbers
+from forcegp.robots.urdf_file import inertial_element
 from forcegp.simulation.joint_friction import Friction, laws_of_joints
 from forcegp.simulation.scenarios import KukaSurfaceConfig
 from forcegp.simulation.trajectory import (
@@ -68,8 +68,9 @@ def kuka_urdf(config: KukaSurfaceConfig) -> str:
         raise RobotModelError(
             f"{path} lacks {TOOL_LINK!r} or {BASE_LINK!r} with inertia; install pybullet 3.2.6 or 3.2.7."
         )
-    _write_inertial(tool, config.tool_mass, config.tool_center_of_mass, config.tool_inertia)
-    _write_inertial(base, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    loaded = inertial_element(config.tool_mass, config.tool_center_of_mass, np.diag(config.tool_inertia))
+    for link, element in ((tool, loaded), (base, inertial_element(0.0, np.zeros(3), np.zeros((3, 3))))):
+        link[:] = ElementTree.fromstring(element)
     joint = (
         f'<joint name="world_joint" type="fixed"><parent link="world"/><child link="{BASE_LINK}"/>'
         f'<origin rpy="0 0 0" xyz="{numbers((0.0, 0.0, BASE_HEIGHT))}"/></joint>'
@@ -79,16 +80,6 @@ def kuka_urdf(config: KukaSurfaceConfig) -> str:
     head = text[: text.index("<robot")]
     changes = "<!-- Changed by forcegp: base mounted on `world`, tool inertia and damping set, meshes left out. -->\n"
     return head + changes + ElementTree.tostring(root, encoding="unicode") + "\n"
-
-
-def _write_inertial(
-    inertial: ElementTree.Element, mass: float, center_of_mass: Sequence[float], moments: Sequence[float]
-) -> None:
-    ixx, iyy, izz = map(float, moments)
-    inertial[:] = ElementTree.fromstring(
-        f'<inertial><origin rpy="0 0 0" xyz="{numbers(center_of_mass)}"/><mass value="{float(mass)}"/>'
-        f'<inertia ixy="0" ixz="0" iyz="0" ixx="{ixx}" iyy="{iyy}" izz="{izz}"/></inertial>'
-    )
 
 
 def kuka_robot(config: KukaSurfaceConfig) -> Robot:
