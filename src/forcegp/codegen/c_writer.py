@@ -233,17 +233,9 @@ def _number(value: float) -> str:
 
 def _order(graph: Graph, outputs: Sequence[int]) -> list[int]:
     """Nodes in the order of their statements: outputs of a call follow it at once, for its array is not kept."""
-    wanted = set(outputs)
-    needed = [node for node in graph.needed(outputs) if node in wanted or graph.nodes[node][0] not in LEAVES]
-    of_call: dict[int, list[int]] = {}
-    for node in needed:
-        if graph.nodes[node][0] == "output":
-            of_call.setdefault(graph.nodes[node][1], []).append(node)
-    order: list[int] = []
-    for node in needed:
-        if graph.nodes[node][0] != "output":
-            order += [node, *of_call.get(node, ())]
-    return order
+    wanted, nodes = set(outputs), graph.nodes
+    needed = [node for node in graph.needed(outputs) if node in wanted or nodes[node][0] not in LEAVES]
+    return sorted(needed, key=lambda node: (nodes[node][1], node) if nodes[node][0] == "output" else (node, -1))
 
 
 def _places(graph: Graph, parts: list[list[int]]) -> tuple[dict[int, tuple[int, int]], int]:
