@@ -156,13 +156,9 @@ def _estimated(dataset: Dataset, largest: float, cutoff: float | None) -> tuple[
     likelihoods = np.log(finite + TINY * finite.max(initial=0.0)).sum(axis=0)
     common = np.array([lowest(profile, shifts) for profile in likelihoods])
     gained = likelihoods[0].min() - likelihoods[0, STEPS]
-    found = Delay(
-        common=float(common[0]),
-        common_std=float(jackknife(common[None, 1:])[0]),
-        seconds=seconds[:, 0],
-        std=jackknife(seconds[:, 1:]),
-        remains=float(np.exp(gained / max(len(finite), 1))),
-    )
+    remains, spread = float(np.exp(gained / max(len(finite), 1))), float(jackknife(common[None, 1:])[0])
+    each, std = seconds[:, 0], jackknife(seconds[:, 1:])
+    found = Delay(common=float(common[0]), common_std=spread, seconds=each, std=std, remains=remains)
     return found, float(np.exp(likelihoods[0].min() / max(len(finite), 1)))
 
 
@@ -210,8 +206,7 @@ def torque_columns(
     forces = np.stack(own, axis=-1)
     if cutoff is not None:
         for there in (dataset.episode == number for number in dataset.episodes):
-            for k, force in enumerate(own):
-                forces[there, :, k] = LowPass(cutoff)(force[there], dataset.time[there])
+            forces[there] = LowPass(cutoff)(forces[there], dataset.time[there])
     return np.concatenate([torque.cpu().numpy(), forces[chosen]], axis=-1).transpose(1, 0, 2)
 
 
