@@ -268,9 +268,7 @@ def without(values: Float[np.ndarray, "rows nv *k"], span: Float[np.ndarray, "ro
 
 def _span(held: np.ndarray | None, noise: np.ndarray) -> np.ndarray | None:
     """Orthonormal columns for the directions `held` of residuals over this noise."""
-    if held is None:
-        return None
-    return orthonormal_columns(held / noise)
+    return None if held is None else orthonormal_columns(held / noise)
 
 
 def orthonormal_columns(directions: Float[np.ndarray, "rows m nv"]) -> Float[np.ndarray, "rows nv m"]:

@@ -212,11 +212,9 @@ class ParameterSpace:
             if term.joints is None:
                 named[term.name] = value[0]
             else:
-                named[term.name] = named[term.name].index_copy(0, self._places(term), value)
+                places = torch.tensor(term.joints, device=self.model.robot.device)
+                named[term.name] = named[term.name].index_copy(0, places, value)
         return out
-
-    def _places(self, term: Term) -> Tensor:
-        return torch.tensor(term.joints, device=self.model.robot.device)
 
     def model_at(self, x: Float[np.ndarray, " k"]) -> Model:
         """The model with the numbers of these coordinates, all of them known. Raises NonPhysicalInertia."""

@@ -273,9 +273,8 @@ class ConstrainedDynamics:
 
     def off(self) -> Float[Tensor, "*batch m"]:
         """How far the points of the contacts are off their surfaces, in m."""
-        state, found = self.state, list[Tensor]()
-        for each in self.contacts:  # 0 where a switch lets it go
-            found.append(each.acts(state.u, state.inputs) * each.off(state.kinematics))
+        state = self.state  # 0 where a switch lets it go
+        found = [each.acts(state.u, state.inputs) * each.off(state.kinematics) for each in self.contacts]
         return torch.stack(found, dim=-1) if found else self.b
 
     def acceleration_map(self) -> AffineMap:

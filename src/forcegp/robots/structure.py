@@ -104,9 +104,7 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
     fall = np.zeros((3, 4))
     fall[:, 3] = gravity
     coupling = np.zeros((n, len(layout.joints)))
-    for body, drive in enumerate(layout.drives):
-        coupling[body, drive.joint] = drive.multiplier
-
+    coupling[range(n), [drive.joint for drive in layout.drives]] = [drive.multiplier for drive in layout.drives]
     armature = np.array([joint.armature for joint in layout.joints])
     constants: dict[str, Any] = {
         "rest": rest[..., None],
