@@ -70,8 +70,7 @@ def rates(space: ConfigurationSpace, q: Positions, time: Float[np.ndarray, " row
     In the chart of `Robot.difference` about every row, the derivative of the parabola through its neighbours is the
     velocity in body axes. Constant velocities come out exactly.
     """
-    rows = np.arange(len(q))
-    near = np.clip(rows, 1, len(q) - 2)[:, None] + np.array([-1, 0, 1])
+    near = np.clip(np.arange(len(q)), 1, len(q) - 2)[:, None] + np.array([-1, 0, 1])
     steps = time[near] - time[:, None]
     weights = np.empty_like(steps)
     for k in range(3):

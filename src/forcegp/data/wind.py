@@ -97,11 +97,9 @@ def find_wind(dataset: Dataset) -> tuple[AirLaw, Float[np.ndarray, "rows 3"]] | 
 
 def with_wind(dataset: Dataset, wind: Float[np.ndarray, "rows 3"]) -> Dataset:
     """The recording with an `ObservedWind` in its model, whose columns of u hold the wind [m/s, world]."""
-    forces = (*dataset.model.forces, forcegp.forces.ObservedWind())
-    model = replace(dataset.model, forces=forces)
+    model = replace(dataset.model, forces=(*dataset.model.forces, forcegp.forces.ObservedWind()))
     first = model.inputs.index(forcegp.forces.ObservedWind.names[0])
-    u = np.insert(dataset.u, [first] * 3, wind, axis=1)
-    return replace(dataset, u=u, model=model)
+    return replace(dataset, u=np.insert(dataset.u, [first] * 3, wind, axis=1), model=model)
 
 
 @dataclass(frozen=True)

@@ -304,8 +304,7 @@ class MarginalLikelihood:
         """
         kernels = kernels if at_parameters else kernels.at(parameters)
         with torch.no_grad():
-            terms = self.terms(parameters)
-            return (engine or Exact()).condition(kernels, terms)
+            return (engine or Exact()).condition(kernels, self.terms(parameters))
 
     @property
     def noise(self) -> Noise:

@@ -172,8 +172,7 @@ class Thrusters(LinkForce):
 
     def delivered(self, state: State) -> Tensor:
         """Joint forces (..., nv) that they make, known or not."""
-        wrench = self._wrench(self.features(state)[0])
-        return (self.direction(state) @ wrench[..., None])[..., 0]
+        return (self.direction(state) @ self._wrench(self.features(state)[0])[..., None])[..., 0]
 
     def _wrench(self, u: Tensor) -> Tensor:
         s = u if self.power == 1 else u * u.abs()

@@ -184,8 +184,7 @@ class InducingPosterior(LatentPosterior):
     ) -> tuple[Float[Tensor, "S _"], ...]:
         # the values at the points are drawn from their posterior, L_c w_c with w ~ N(mean, B^-1), and what the prior
         # functions have there is taken off
-        samples = len(prior[0])
-        size = (len(self.space.mean), samples)
+        size = len(self.space.mean), len(prior[0])
         draws = torch.randn(size, generator=generator, dtype=torch.float64, device=self.space.mean.device)
         drawn = self.space.mean[:, None] + self.space.precision.solve_upper(draws)
         own = zip(self.space.lowers, prior, strict=True)

@@ -217,8 +217,7 @@ def surface_axes(gradients: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 
     straight down (from -z there, and t2 is -y): I + [w] + [w]^2 / (1 + c) with w = z x n, c = n_z (Rodrigues' formula).
     """
     n = gradients / torch.linalg.vector_norm(gradients, dim=-1, keepdim=True)
-    down = n[..., 2] < TURNED_OVER
-    flip = torch.where(down, -1.0, 1.0)
+    flip = torch.where(n[..., 2] < TURNED_OVER, -1.0, 1.0)
     x, y, z = n[..., 0], n[..., 1], n[..., 2] * flip  # turned over: mirrored at z = 0, then t2 is mirrored back
     shrink = 1.0 / (1.0 + z)
     t1 = torch.stack([1.0 - x * x * shrink, -x * y * shrink, -x * flip], dim=-1)

@@ -295,9 +295,7 @@ def simulate_kuka_surface(config: KukaSurfaceConfig) -> Dataset:
         with part(episode, config.episodes):
             motions.append(simulate_episode(config, robot, plant, episode))
     columns = {name: np.concatenate([motion[name] for motion in motions]) for name in motions[0]}
-    contacts = ()
-    if config.surface != "none":
-        contacts = (Contact(TOOL_LINK, config.tool_point, table_of(config)),)
+    contacts = () if config.surface == "none" else (Contact(TOOL_LINK, config.tool_point, table_of(config)),)
     baumgarte = Baumgarte(config.baumgarte_omega, config.baumgarte_zeta) if contacts else None
     model = Model(robot, contacts, (Actuation(), RigidBodies()), baumgarte=baumgarte)
     signals = {name: columns[name] for name in ("q", "v", "u", "a", "time")}
