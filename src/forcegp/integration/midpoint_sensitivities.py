@@ -104,13 +104,6 @@ def _step_by_step(
     return torch.stack(positions, dim=1), torch.stack(velocities, dim=1), ended
 
 
-def _at(accelerations: Accelerations, q: Tensor, v: Tensor, u: Tensor, parameters: bool) -> Linear:
-    """With dimensions (K, T, ...)."""
-    found = accelerations.linear(q.flatten(0, 1), v.flatten(0, 1), u.flatten(0, 1), parameters)
-    a, a_q, a_v = (x.unflatten(0, q.shape[:2]) for x in (found.a, found.a_q, found.a_v))
-    return Linear(a, a_q, a_v, None if found.a_p is None else found.a_p.unflatten(0, q.shape[:2]))
-
-
 def _pass(
     accelerations: Accelerations,
     q0: Tensor,
@@ -124,19 +117,20 @@ def _pass(
     nv, half = v0.shape[-1], 0.5 * h
     identity = torch.eye(nv, dtype=q0.dtype, device=q0.device)
     middle_q, middle_v = middles
-    at = _at(accelerations, middle_q, middle_v, u, parameters)
-    constant = half * (at.a - (at.a_q @ middle_q[..., None] + at.a_v @ middle_v[..., None])[..., 0])
-    inverse = torch.linalg.inv(identity - half * (at.a_v + half * at.a_q))
+    at = accelerations.linear(middle_q.flatten(0, 1), middle_v.flatten(0, 1), u.flatten(0, 1), parameters)
+    a, a_q, a_v = (x.unflatten(0, u.shape[:2]) for x in (at.a, at.a_q, at.a_v))
+    constant = half * (a - (a_q @ middle_q[..., None] + a_v @ middle_v[..., None])[..., 0])
+    inverse = torch.linalg.inv(identity - half * (a_v + half * a_q))
     # columns: the state, and where parameters are asked for its derivatives in q0, v0 and p
     q, v, inputs = q0[..., None], v0[..., None], constant[..., None]
     if at.a_p is not None:
         nothing = q0.new_zeros(len(q0), nv, at.a_p.shape[-1])
         eye, zero = identity.expand(len(q0), nv, nv), q0.new_zeros(len(q0), nv, nv)
         q, v = torch.cat([q, eye, zero, nothing], dim=-1), torch.cat([v, zero, eye, nothing], dim=-1)
-        wide = at.a.new_zeros(*at.a.shape, 2 * nv)
-        inputs = torch.cat([inputs, wide, half * at.a_p], dim=-1)
+        wide = a.new_zeros(*a.shape, 2 * nv)
+        inputs = torch.cat([inputs, wide, half * at.a_p.unflatten(0, u.shape[:2])], dim=-1)
     # v_m = Z (v + h/2 a_q q + inputs): products that do not depend on the state first, for all steps at once
-    of_q, of_inputs = half * inverse @ at.a_q, inverse @ inputs
+    of_q, of_inputs = half * inverse @ a_q, inverse @ inputs
     rows_q, rows_v = [q], [v[..., 0]]
     for Z, Z_q, given in zip(inverse.unbind(1), of_q.unbind(1), of_inputs.unbind(1), strict=True):
         middle = Z @ v + Z_q @ q + given

@@ -4,7 +4,6 @@ import ast
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
@@ -322,7 +321,9 @@ def _signals(
                 f"unit of {signal} of joint {name!r} is {unit.name}, but the joint {kind}: give a unit of {si}, or one "
                 "per joint."
             )
-        sign = _at(f"sign of {signal}", signs, index, names)
+        if len(signs) not in (1, len(names)):
+            raise InvalidInput(f"sign of {signal} has {len(signs)} entries; give one, or {len(names)}, one per joint.")
+        sign = signs[index if len(signs) > 1 else 0]
         yield JointSignal(signal, name, expressions[index], unit, -sign if name in turned and signal != "u" else sign)
 
 
@@ -340,12 +341,6 @@ def _unit(signal: str, given: Sequence[LogUnit], index: int, columns: Mapping[st
             f"or one for each of the {len(kinds)} columns."
         )
     return fitting[index][0] if fitting[index] else log_unit(signal, kinds[index] or "1")
-
-
-def _at(what: str, values: Sequence[Any], index: int, joints: Sequence[str]) -> Any:
-    if len(values) not in (1, len(joints)):
-        raise InvalidInput(f"{what} has {len(values)} entries; give one, or {len(joints)}, one per joint.")
-    return values[index if len(values) > 1 else 0]
 
 
 def position_columns(robot: Robot, joints: Sequence[str], orientation: str) -> tuple[str, ...]:
