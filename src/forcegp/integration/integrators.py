@@ -188,6 +188,12 @@ def check_time_step(dt: Any) -> None:
     require_number("dt", dt, "give the time step as a positive number of seconds")
 
 
+def steps_by(name: str, model: Model, dt: Any) -> Integrator:
+    """The integrator of that name for steps of `dt` s. Raises InvalidInput for another, and no positive number."""
+    check_time_step(dt)
+    return integrator_named(name, model)
+
+
 def _all(q: Tensor) -> Tensor:
     device = getattr(q, "device", None)  # expressions of CasADi, which take explicit steps, have none
     return torch.ones(q.shape[0], dtype=torch.bool, device=device)

@@ -19,7 +19,7 @@ from forcegp.errors import DataWarning, InvalidInput, NumericalError, require_kn
 from forcegp.forces import Force
 from forcegp.inference.memory import blas_threads
 from forcegp.inference.prepared_kernels import CompressedCovariance
-from forcegp.integration.integrators import Feedback, check_time_step, integrator_named
+from forcegp.integration.integrators import Feedback, steps_by
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact
 from forcegp.model import Model
 from forcegp.noise import ACCELERATION, FORCE, PUSHES, Noise
@@ -262,11 +262,10 @@ class Posterior(Fitted):
         if baumgarte is not None and not self.model.contacts:
             raise InvalidInput("baumgarte was given, but the model has no contacts; give baumgarte=None.")
         model = replace(self.model, baumgarte=baumgarte)
-        check_time_step(dt)
+        method = steps_by(integrator, model, dt)
         if self.model.held_inputs:
             u = self.model.foreseen(state_tensor("u", u, self.model.sizes[2], self.model.robot.device))
         samples, seed = whole_number("samples", samples, 0), whole_number("seed", seed, 0)
-        method = integrator_named(integrator, model)
         q, v, forces, batch = checked_start(model.sizes, model.robot.device, q0, v0, u)
         time = dt * torch.arange(len(forces) + 1, dtype=q.dtype, device=q.device)
 

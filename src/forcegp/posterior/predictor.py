@@ -15,7 +15,7 @@ from typing_extensions import override
 from forcegp.codegen.library import NOT_FINITE, RowFunction, are_plain, as_plain, require_plain
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
 from forcegp.inference.prepared_kernels import CompressedCovariance
-from forcegp.integration.integrators import Trajectory, check_time_step, integrator_named, rows_jacobian
+from forcegp.integration.integrators import Trajectory, rows_jacobian, steps_by
 from forcegp.posterior.prediction import Gaussian, JointForces, Linearization, inverse_dynamics, joint_force
 from forcegp.posterior.programs import Programs, steps_of
 from forcegp.posterior.rollout import (
@@ -192,8 +192,7 @@ class Predictor(Summary):
         functions, seed = whole_number("functions", functions, 0), whole_number("seed", seed, 0)
         start, v, forces, batch = checked_start(self.sizes, self.device, q0, v0, u)
         model = self.posterior.model
-        method = integrator_named(integrator, model)
-        check_time_step(dt)
+        method = steps_by(integrator, model, dt)
         loops, acceleration = None, self.mean
         if integrator in steps_of(self.space):
             loops = self._of_code((integrator, functions, seed), lambda code: code.loops(integrator, functions, seed))

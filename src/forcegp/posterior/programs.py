@@ -23,7 +23,7 @@ from forcegp.forces import Actuation, Law, RigidBodies, UnknownForces
 from forcegp.inference.one_input import drawn_calls, latent_calls
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import PADDING, CompressedCovariance, KernelSum
-from forcegp.integration.integrators import SPEED_LIMIT, check_time_step, integrator_named
+from forcegp.integration.integrators import SPEED_LIMIT, steps_by
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.model import Model
 from forcegp.robots.manifold import ConfigurationSpace
@@ -42,8 +42,7 @@ def steps_of(space: ConfigurationSpace) -> dict[str, str]:
 
 def require_step(seconds: object, integrator: str, model: Model) -> None:
     """Raise InvalidInput for anything but a positive number of seconds, and an integrator that has no step in C."""
-    check_time_step(seconds)
-    integrator_named(integrator, model)
+    steps_by(integrator, model, seconds)
     there = steps_of(model.robot.space)
     if integrator not in there:
         raise InvalidInput(

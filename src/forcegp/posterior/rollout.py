@@ -19,10 +19,9 @@ from forcegp.integration.integrators import (
     Integrator,
     Trajectory,
     check_start,
-    check_time_step,
     integrate,
-    integrator_named,
     rows_jacobian,
+    steps_by,
     warn_of_divergence,
 )
 from forcegp.model import Model
@@ -299,7 +298,7 @@ def stepped(
     mean: AccelerationFunction, model: Model, x: Float[Tensor, "n rows"], dt: Any, integrator: Any
 ) -> Float[Tensor, "n state"]:
     """[q, v] one step after the rows x = [q, v, u], as `Predictor.step` documents it."""
-    method = _method(model, dt, integrator)
+    method = steps_by(integrator, model, dt)
     q, v, u = x.split(model.sizes, dim=-1)
     step = method(lambda q, v: mean(q, v, u), q, v, dt)
     if not bool(step.found.all()):
@@ -320,7 +319,7 @@ def linearized_step(
 
     `step` gives [q, v] after it from the rows x, `linearize` gives a (n, nv), da/dq, da/dv and da/du (n, nv, nv).
     """
-    method, (q, v, u) = _method(model, dt, integrator), x.detach().split(model.sizes, dim=-1)
+    method, (q, v, u) = steps_by(integrator, model, dt), x.detach().split(model.sizes, dim=-1)
     nv, unit = q.shape[-1], torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
 
     def joined(value: Tensor, slopes: Tensor) -> Tensor:
@@ -366,8 +365,3 @@ def linearized_on_manifold(
     A, B = slopes.split([2 * nv, slopes.shape[-1] - 2 * nv], dim=-1)
     c = end - (A[..., nv:] @ rest[:, :nv, None] + B @ rest[:, nv:, None])[..., 0]
     return StepLinearization(there, end[:, nv:], A, B, c)
-
-
-def _method(model: Model, dt: Any, integrator: Any) -> Integrator:
-    check_time_step(dt)
-    return integrator_named(integrator, model)
