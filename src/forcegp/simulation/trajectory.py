@@ -181,12 +181,6 @@ def recorded(
     noise = np.concatenate([stream.standard_normal((steps, nv)) for stream in streams])
     about = {"scenario": scenario, "config": dataclasses.asdict(config), "versions": {"forcegp": __version__}}
     rows: dict[str, Any] = {"time": np.tile(np.arange(steps) / RATE, config.episodes), **motion}
-    rows["a"] = motion["a"] + config.noise * noise
-    return Dataset(
-        **rows,
-        episode=np.repeat(np.arange(config.episodes), steps),
-        model=model,
-        noise_std=np.full(nv, config.noise) if config.noise > 0 else None,
-        truth={"a": motion["a"], **truth},
-        metadata=about | dict(metadata or {}),
-    )
+    rows |= {"a": motion["a"] + config.noise * noise, "episode": np.repeat(np.arange(config.episodes), steps)}
+    rows |= {"truth": {"a": motion["a"], **truth}, "metadata": about | dict(metadata or {})}
+    return Dataset(**rows, model=model, noise_std=np.full(nv, config.noise) if config.noise > 0 else None)
