@@ -9,8 +9,9 @@ from importlib import import_module
 from inspect import Parameter, signature
 from typing import Any
 
-from forcegp.errors import FileFormatError, InvalidInput, require_known, usable_arguments
+from forcegp.errors import InvalidInput, require_known, usable_arguments
 from forcegp.forces.force import Body, Force, Law, LogNormal, Normal
+from forcegp.mechanics.surfaces import from_stored
 
 FORCES: dict[str, str | type[Force]] = {
     "actuation": "actuation.Actuation",
@@ -87,18 +88,8 @@ def force_to_dict(force: Force) -> dict[str, Any]:
 
 def force_from_dict(stored: object) -> Force:
     """The force that `force_to_dict` stored. Raises FileFormatError for an unknown type or wrong fields."""
-    if not isinstance(stored, Mapping):
-        raise FileFormatError(f"a stored force is {stored!r}; expected an object with a type")
-    values = {key: _read(value) for key, value in stored.items()}
-    name = values.pop("type", None)
-    if not isinstance(name, str) or name not in FORCES:
-        raise FileFormatError(
-            f"unknown force {name!r}; import the module of a force of your own first. Known: {', '.join(FORCES)}"
-        )
-    try:
-        return force_class(name)(**values)
-    except TypeError as error:
-        raise FileFormatError(f"force {name!r} has wrong fields {sorted(map(str, values))}: {error}") from None
+    fields = {key: _read(x) for key, x in stored.items()} if isinstance(stored, Mapping) else stored
+    return from_stored("force", fields, FORCES, force_class, "import the module of a force of your own first. Known")
 
 
 PRIORS = {kind.__name__: kind for kind in (Normal, LogNormal, Body)}

@@ -5,7 +5,7 @@ The built-in ones are signed distances: a multiplier is the normal force in N. O
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -157,16 +157,21 @@ def surface_to_dict(surface: Surface) -> dict[str, Any]:
 
 def surface_from_dict(stored: object) -> Surface:
     """The surface that `surface_to_dict` stored; FileFormatError for anything else."""
+    return from_stored("surface", stored, SURFACES, SURFACES.__getitem__, "known")
+
+
+def from_stored(what: str, stored: object, known: Collection[str], kind: Callable[[str], Any], remedy: str) -> Any:
+    """The `kind` of a stored type that is `known`, with its stored fields; lists become tuples. FileFormatError."""
     if not isinstance(stored, Mapping):
-        raise FileFormatError(f"a stored surface is {stored!r}; expected an object with a type")
+        raise FileFormatError(f"a stored {what} is {stored!r}; expected an object with a type")
     values = {key: tuple(value) if isinstance(value, list) else value for key, value in stored.items()}
     name = values.pop("type", None)
-    if not isinstance(name, str) or name not in SURFACES:
-        raise FileFormatError(f"unknown surface {name!r}; known: {', '.join(SURFACES)}")
+    if not isinstance(name, str) or name not in known:
+        raise FileFormatError(f"unknown {what} {name!r}; {remedy}: {', '.join(known)}")
     try:
-        return SURFACES[name](**values)
+        return kind(name)(**values)
     except TypeError as error:
-        raise FileFormatError(f"surface {name!r} has wrong fields {sorted(map(str, values))}: {error}") from None
+        raise FileFormatError(f"{what} {name!r} has wrong fields {sorted(map(str, values))}: {error}") from None
 
 
 def _tensor(values: Sequence[float], like: Tensor) -> Tensor:
