@@ -32,10 +32,9 @@ def in_blocks(
     rows: Dataset, of: Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, ...]], device: torch.device | str
 ) -> list[np.ndarray]:
     """What `of(q, v, u, a)` gives for blocks of rows, joined; without gradients, and with little memory."""
-    states, parts = tensors(rows, device), []
+    blocks = zip(*(x.split(BLOCK) for x in tensors(rows, device)), strict=True)
     with torch.no_grad():
-        for start in range(0, len(rows), BLOCK):
-            parts.append(of(*(x[start : start + BLOCK] for x in states)))
+        parts = [of(*block) for block in blocks]
     return [torch.cat(own).cpu().numpy() for own in zip(*parts, strict=True)]
 
 
