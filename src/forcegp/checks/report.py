@@ -8,7 +8,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from forcegp.checks.check_input import CheckInput
+from forcegp.checks.check_input import QUICK_ROWS, CheckInput
 from forcegp.checks.moving_base import base_doubts, carried_doubts, stance_doubts, unmeasured_base_doubts
 from forcegp.checks.search import UNKNOWN, Explanation, search
 from forcegp.checks.signals import motion_doubts, sampling_doubts, signal_doubts, target_doubts, without_registers
@@ -18,7 +18,7 @@ from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
 from forcegp.data.imu import imu_doubts
 from forcegp.doubts import LEVELS, Doubt, Doubts, listed, look
-from forcegp.errors import InvalidInput, require_type
+from forcegp.errors import DatasetError, InvalidInput, require_type
 from forcegp.fit.sensors import torque_sensor_doubts
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -137,11 +137,13 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
             sharp, heard = search(replace(inputs, compared=inputs.sharper))
             if not heard or heard[-1].about != UNKNOWN:
                 found, said = sharp, heard
-        if said[-1].about == UNKNOWN if said else inputs.sharper is not None:  # a filter may hide a resonance
+        hidden = said[-1].about == UNKNOWN if said else inputs.sharper is not None  # a filter may hide a resonance
+        if hidden and inputs.most_rows != QUICK_ROWS:
             elastic = elastic_doubts(inputs, found.log)
             if said and elastic:  # below the resonance other causes are sought
-                inputs = inputs.below(elastic[0].numbers["cutoff"])
-                found, said = search(inputs)
+                with contextlib.suppress(DatasetError):  # too short for that
+                    inputs = inputs.below(elastic[0].numbers["cutoff"])
+                    found, said = search(inputs)
             said = [*elastic, *said]
         doubts, comparison = [*doubts, *said, *torque_doubts(inputs, found)], found
     return doubts, comparison
