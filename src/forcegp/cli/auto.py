@@ -76,6 +76,8 @@ class Auto(Command):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Do all of it. Raises DatasetError for mistakes that nobody has corrected yet."""
+        from forcegp.fit.friction_choice import FrictionChoice, with_choice  # PyTorch is not needed for a page of help
+
         if not self.logs:
             raise InvalidInput("give at least one log.")
         begin = time.process_time()
@@ -114,7 +116,10 @@ class Auto(Command):
         payload: dict[str, Any] = {}
         with terminal.progress("looking for a payload"):
             try:
-                loaded = with_payload(forcegp.scores.named_model(recording.model, laws), recording, self.link)
+                given = forcegp.scores.named_model(recording.model, laws)
+                if choice := identified.settings.get("gear_friction"):  # these parts, whatever it carries
+                    given = with_choice(given, FrictionChoice.from_dict(choice))
+                loaded = with_payload(given, recording, self.link)
                 payload, held = payload_dict(loaded, False), payload_text(loaded)
             except DatasetError as error:
                 held = f"not estimated: {error}"
@@ -189,7 +194,10 @@ class Auto(Command):
     ) -> tuple[forcegp.Dataset, forcegp.Dataset]:
         """Rows to learn from, and the same at the full rate."""
         wanted, elastic = self.filter.preparation(), report.doubts.of("elastic joint")
-        if wanted.cutoff == "auto" and elastic:
+        if wanted.cutoff == "auto" and wanted.differentiate == "q" and report.inputs.prepared is not None:
+            found = forcegp.data.preparation_report(report.inputs.prepared.metadata)  # not to be sought again
+            wanted = replace(wanted, cutoff=found["cutoff"], why={"cutoff": found["why"]["cutoff"]})
+        if self.filter.cutoff == "auto" and elastic:
             slow = min(elastic[0].numbers["cutoff"], report.inputs.cutoff or math.inf)
             wanted = replace(wanted, cutoff=slow, why={"cutoff": "below the resonance of an elastic joint"})
         numbers = resolved(terminal, replace(wanted, every=1, stance="log"), raw)

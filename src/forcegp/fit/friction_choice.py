@@ -1,6 +1,6 @@
 """Which parts of gear friction a log shows, joint by joint, by stretches held out: memory, load, speed, breakaway."""
 
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -71,7 +71,16 @@ class FrictionChoice:
         """For the settings of a fit."""
         found = {name: list(parts) for name, parts in zip(self.joints, self.parts, strict=True)}
         coupled = {} if self.transmission is None else {"transmission": self.transmission.tolist()}
-        return {"parts": found, "left": list(self.ratios), "few_reversals": list(self.few_reversals)} | coupled
+        numbers = {"few_reversals": list(self.few_reversals), "sigma": list(self.sigma), "falls": list(self.falls)}
+        return {"parts": found, "left": list(self.ratios)} | numbers | coupled
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> "FrictionChoice":
+        """Of the settings of a fit."""
+        joints, parts = tuple(content["parts"]), tuple(map(tuple, content["parts"].values()))
+        ratios, few, sigma, falls = (tuple(content[x]) for x in ("left", "few_reversals", "sigma", "falls"))
+        coupled = np.array(content["transmission"]) if "transmission" in content else None
+        return cls(joints, parts, ratios, few, sigma, falls, coupled)
 
     def has(self, part: str) -> Bool[np.ndarray, " nv"]:
         """By joint."""

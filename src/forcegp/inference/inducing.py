@@ -154,9 +154,9 @@ class InducingPosterior(LatentPosterior):
     def features(self) -> tuple[Float[Tensor, "_ _"], ...]:  # type: ignore[override]  # a field there, read only
         return self.space.points
 
-    @property
+    @cached_property
     @override
-    def weights(self) -> tuple[Float[Tensor, " _"], ...]:
+    def weights(self) -> tuple[Float[Tensor, " _"], ...]:  # type: ignore[override]  # a property there, read only
         return tuple(w[:, 0] for w in self.space.center_weights(self.space.mean[:, None]))
 
     @override
