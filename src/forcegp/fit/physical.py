@@ -97,7 +97,7 @@ def fit_physical(
     noise, x, changes = None, space.start if near is None else near.x, None
     torque = partial(equations.in_torque, motions=equations.measured)
     if evidence.noisy_in_both:
-        fit, noise = _with_noise_in_both(equations, search, x, note)
+        fit, noise = _with_noise_in_both(equations, search, x, note, rough=near is None)
     elif evidence.of_torque:
         fit = search(torque, start=x, held=held, progress=note)
         if options["sizes"] is not None and held is None and equations.rests:
@@ -150,10 +150,10 @@ def _with_accelerations_weighted(
 
 
 def _with_noise_in_both(
-    equations: Equations, search: Callable[..., Fit], x: np.ndarray, note: Callable[[int, float], None]
+    equations: Equations, search: Callable[..., Fit], x: np.ndarray, note: Callable[[int, float], None], *, rough: bool
 ) -> tuple[Fit, NoiseLevels]:
-    """Searches about likely accelerations, whose levels of noise are found along."""
-    noise, least, number, evaluations, steps, rough = None, None, 0, 0, STEPS, True
+    """Searches about likely accelerations, whose levels of noise are found along; `rough` where x may be far off."""
+    noise, least, number, evaluations, steps = None, None, 0, 0, STEPS
     while True:
         number += 1
         levels = equations.levels(x, noise, least, rough)
