@@ -270,7 +270,7 @@ def test_a_drone_without_joints(walker):
     a = weak.dynamics(q, v, u).acceleration_map().offset
     values = {name: x.numpy() for name, x in zip("qvua", (q, v, u, a + 0.1 * torch.randn_like(a)), strict=True)}
     log = Dataset(**values, time=0.01 * np.arange(2000), model=model)
-    with pytest.warns(DataWarning, match=r"times 0\.8 \(rotor_3\) would do as well as any payload"):
+    with pytest.warns(DataWarning, match=r"times 0\.(799|8|801) \(rotor_3\) would do as well as any payload"):
         carried = fit(model.with_forces(Payload()), log, Torques("both", mean=0.4)).parameters["payload.mass"]
     assert carried.interval[0] < 0.0
 

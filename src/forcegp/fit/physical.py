@@ -150,7 +150,12 @@ def _with_accelerations_weighted(
 
 
 def _with_noise_in_both(
-    equations: Equations, search: Callable[..., Fit], x: np.ndarray, note: Callable[[int, float], None], *, rough: bool
+    equations: Equations,
+    search: Callable[..., Fit],
+    x: np.ndarray,
+    note: Callable[[int, float], None],
+    *,
+    rough: bool = True,
 ) -> tuple[Fit, NoiseLevels]:
     """Searches about likely accelerations, whose levels of noise are found along; `rough` where x may be far off."""
     noise, least, number, evaluations, steps = None, None, 0, 0, STEPS
