@@ -15,6 +15,7 @@ from forcegp.errors import ContactError, DatasetError, InvalidInput
 from forcegp.evidence import motion_residuals
 from forcegp.forces import Viscous
 from forcegp.mechanics import fixed_point
+from forcegp.scores import learn, named_model
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
 
 SWITCHES = slice(-4, None)
@@ -128,6 +129,9 @@ def test_open_rows_show_torques_beside_what_feet_may_bear_and_nothing_else():
         posterior = fit(model.with_forces(Viscous()), rows, evidence)
         assert len(posterior.training) == len(used)
     assert score(posterior, rows).runs["model"][0]["test_rows"] == len(there) < len(rows)
+    few = rows.rows(slice(None, None, 3))
+    learned, _ = learn(named_model(model, ["gp:joint-friction"]), few, iterations=1)
+    assert len(learned.training) == len(decided(few)) < len(few)
 
 
 def test_open_rows_are_filled_by_the_nearest_decided_one():

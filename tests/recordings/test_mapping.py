@@ -168,6 +168,7 @@ def test_names_are_guessed_only_where_nothing_else_can_be_meant(tmp_path):
     columns = table(motion(10))
     source = open_source(write_text(tmp_path / "log.csv", columns))
     assert guessed_columns("q", JOINTS, source) == ("q_shoulder", "q_elbow")
+    assert guessed_columns("q", ("shoulder_joint", "elbow_joint"), source) == ("q_shoulder", "q_elbow")
     assert guessed_columns("a", JOINTS, source) is None
     assert guessed_columns("q", ("shoulder", "wrist"), source) is None
     assert guessed_time(source, []) == "time"

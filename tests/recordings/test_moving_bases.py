@@ -159,9 +159,9 @@ def test_a_spline_passes_signs_that_flip(tmp_path):
 
     q = motion(time)
     q[:, 3:] *= random.choice([-1.0, 1.0], rows)[:, None]
-    table = {"time": time} | {f"q{k}": q[:, k] for k in range(7)}
+    table = {"time": time} | dict(zip(("body_x", "body_y", "body_z", "qx", "qy", "qz", "qw"), q.T, strict=True))
     path = write_text(tmp_path / "log.csv", table)
-    found = import_recordings([path], ColumnMapping(time="time", q=("q{0..6}",)), model=model)
+    found = import_recordings([path], ColumnMapping(), model=model)
     assert found.u.shape == (len(found), 0)
     expected = motion(found.time + time[0])
     same = np.sign((found.q[:, 3:] * expected[:, 3:]).sum(axis=1))

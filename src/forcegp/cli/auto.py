@@ -76,7 +76,7 @@ class Auto(Command):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Do all of it. Raises DatasetError for mistakes that nobody has corrected yet."""
-        from forcegp.fit.friction_choice import FrictionChoice, with_choice  # PyTorch is not needed for a page of help
+        from forcegp.fit.friction_choice import with_choice_of  # PyTorch is not needed for a page of help
 
         if not self.logs:
             raise InvalidInput("give at least one log.")
@@ -117,8 +117,7 @@ class Auto(Command):
         with terminal.progress("looking for a payload"):
             try:
                 given = forcegp.scores.named_model(recording.model, laws)
-                if choice := identified.settings.get("gear_friction"):  # these parts, whatever it carries
-                    given = with_choice(given, FrictionChoice.from_dict(choice))
+                given = with_choice_of(given, identified)  # these parts, whatever it carries
                 loaded = with_payload(given, recording, self.link)
                 payload, held = payload_dict(loaded, False), payload_text(loaded)
             except DatasetError as error:
@@ -229,7 +228,7 @@ class Auto(Command):
         for failure in scores.failures:
             terminal.warn(failure)
         with terminal.progress("learning from all rows"):
-            posterior = scores.fitted_on_all_rows()
+            posterior = scores.fitted_on_all_rows({expression: identified})
         with terminal.progress("intervals of motions"):
             posterior, why_not = forcegp.scores.with_intervals_of_motions(posterior, recording)
         if why_not is not None:

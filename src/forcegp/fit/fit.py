@@ -132,6 +132,7 @@ def fit(
     require_type("model", model, Model, ", for example dataset.model")
     require_type("dataset", dataset, Dataset, "; the model comes first, as in fit(model, dataset)")
     rest, refinement, sensors = _chosen(evidence, model, dataset, start)
+    everything = points is not None and points == len(dataset)
     dataset = _checked(model, dataset, rest, refinement)
     dataset, model = with_sensors(dataset, model, rest, sensors)
     model = without_idle_offsets(model, dataset)
@@ -140,7 +141,7 @@ def fit(
     known = past_known(dataset, model)
     doubts = list(doubts_of_past(model, dataset, known))
     known = known | (known.mean() < 1.0 - LEFT_OUT)
-    points = int(known.sum()) if points == len(dataset) else points  # all of them are all that are left
+    points = int(known.sum()) if everything else points  # all of them are all that are left
     dataset = dataset if known.all() else dataset.rows(np.flatnonzero(known))
     touches = (model.contacts or dataset.measured) and not model.carries_known_forces
     unseen = Unseen.of(model, dataset, typical_sizes(model, [dataset])["force"]) if touches else None

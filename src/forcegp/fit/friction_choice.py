@@ -22,6 +22,7 @@ from forcegp.forces.presliding import after_strokes
 from forcegp.mechanics import State
 from forcegp.model import Model
 from forcegp.noise import Noise
+from forcegp.posterior import Posterior
 
 PARTS = "memory", "factor", "root", "direction", "breakaway"
 """Of `GearFriction`, and of the law beside it."""
@@ -43,7 +44,7 @@ WIDTHS = tuple(np.geomspace(0.003, 1.0, 11).tolist())
 """Of the smooth sign, over the root mean square velocity."""
 SEEN, RIDGE = 0.003, 1e-7
 """Of the torque of bodies, the least that counts over the largest; and what is added to the normal equations."""
-MOST_ROWS = 10_000
+MOST_ROWS, MOST_EQUATIONS = 10_000, 70_000
 """Of the log that are asked, evenly spread: each knows its past."""
 FIRST_ROWS = 2000
 """Rows of the first fit."""
@@ -100,7 +101,7 @@ def choose_friction(
     """
     law = next((law for law in model.laws if isinstance(law, DryFriction)), Coulomb())
     log = with_strokes(log, law.transmission)  # type: ignore[arg-type]  # a model binds it
-    log = log.rows(evenly(log, MOST_ROWS))
+    log = log.rows(evenly(log, min(MOST_ROWS, MOST_EQUATIONS // model.robot.nv)))
     bare = _without(model, Viscous, DryFriction, DirectionalFriction)
     torque = motion_residuals(replace(log, strokes=None), bare)[0]
     state = bare.state(*(torch.as_tensor(np.array(x), device=bare.robot.device) for x in (log.q, log.v, log.u)))
@@ -391,6 +392,12 @@ def with_choice(model: Model, choice: FrictionChoice) -> Model:
             force = replace(force, difference=only("direction", 0.0))
         made.append(force)
     return _with_transmission(replace(model, forces=tuple(made)), choice.transmission)
+
+
+def with_choice_of(model: Model, posterior: Posterior) -> Model:
+    """The model whose friction has the parts that were chosen when this posterior was learned, if any were."""
+    choice = posterior.settings.get("gear_friction")
+    return with_choice(model, FrictionChoice.from_dict(choice)) if choice else model
 
 
 def _with_transmission(model: Model, transmission: Any) -> Model:

@@ -25,6 +25,7 @@ from forcegp.recordings.mapping import (
     LogUnit,
     expanded,
     guessed_columns,
+    guessed_pose,
     guessed_time,
     log_unit,
     named_after,
@@ -162,6 +163,12 @@ def signal_plan(
         if patterns is None and log[signal]:
             names = tuple(log[signal])
             patterns = guessed_columns(signal, names, source)
+            if patterns is None and signal == "q" and len(bases(robot)) == 1:
+                own = [name for name in names if name not in joints]
+                pose = guessed_pose([name.rpartition(".")[2] for name in own], source)
+                rest = guessed_columns(signal, joints, source) if joints else ()
+                found_by = {**dict(zip(own, pose or (), strict=False)), **dict(zip(joints, rest or (), strict=False))}
+                patterns = tuple(found_by[name] for name in names) if len(found_by) == len(names) else None
             if patterns is None and signal == "u" and may_lack_switches and model.actuators:
                 patterns = guessed_columns(signal, names[: len(model.actuators)], source)
             if patterns is not None:

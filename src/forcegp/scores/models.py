@@ -14,12 +14,13 @@ import torch
 
 from forcegp.checks.residuals import pushed_where_they_are
 from forcegp.data import Dataset, thruster_columns, with_memory
+from forcegp.data.views import decided
 from forcegp.errors import FitError, InvalidInput
 from forcegp.evidence import Accelerations, Evidence, Motions, Sensor, Torques, parse_evidence
 from forcegp.evidence.least_squares import correlation_time
 from forcegp.evidence.recorded_rows import slides
 from forcegp.fit import calibrated, default_options, fit, held_out_noise
-from forcegp.fit.friction_choice import with_friction_chosen
+from forcegp.fit.friction_choice import with_choice_of, with_friction_chosen
 from forcegp.fit.search import MOST_POINTS_FOR_RESTARTS
 from forcegp.fit.sensors import usual_evidence
 from forcegp.forces import IndependentAccelerations, JointAccelerations, has_few_inputs, parse_forces, split_outside
@@ -113,6 +114,7 @@ def learn(
     if not model.unknown_forces and (isinstance(first, Torques) or model.is_open):
         posterior = fit(model, dataset, others, baseline=baseline)
     else:
+        dataset = decided(dataset)
         few = bool(model.unknown_forces) and has_few_inputs(model.unknown, model.robot)
         everything = few and points is None and engine in ("auto", "inducing")
         count = len(dataset)
@@ -369,9 +371,14 @@ def checked_identification(name: str, model: Model) -> tuple[Model, Acceleration
     return opened, chosen
 
 
-def identified_model(name: str, model: Model, rows: Dataset) -> Model:
-    """The model that laws and bodies of this name make of these rows, with the noise of rows that are held out."""
+def identified_model(name: str, model: Model, rows: Dataset, before: Posterior | None = None) -> Model:
+    """The model that laws and bodies of this name make of these rows, with the noise of rows that are held out.
+
+    `before`: what they made of the same rows already, or of more of the same recording.
+    """
     opened, evidence = checked_identification(name, model)
-    opened, _ = with_friction_chosen(opened, rows, evidence)  # once, for all parts of the rows
-    found: Any = fit(opened, rows, evidence)
+    if before is None:
+        opened, _ = with_friction_chosen(opened, rows, evidence)  # once, for all parts of the rows
+    found: Any = fit(opened, rows, evidence) if before is None else before
+    opened = with_choice_of(opened, found)
     return replace(found.model, noise=held_out_noise(opened, replace(rows, measured={}), evidence))

@@ -103,7 +103,7 @@ def score(
         motions = held_out_motions(recording, np.ones(len(recording), dtype=bool), horizons or (), starts)
         runs = _runs_of(before, log, motions, integrator)
         about |= {"splits": [], "seeds": [0], "notes": list(motions.notes)}
-        scores = _scores(log, runs, known, about, before.__getitem__)
+        scores = _scores(log, runs, known, about, lambda name, _: before[name])
         if folder is not None:
             write(scores, Path(folder))
         return scores
@@ -134,9 +134,11 @@ def score(
     return scores
 
 
-def _on_all_rows(experiment: Experiment, chosen: Mapping[str, Candidate], name: str) -> Posterior:
+def _on_all_rows(
+    experiment: Experiment, chosen: Mapping[str, Candidate], name: str, before: Mapping[str, Posterior]
+) -> Posterior:
     work, of = chosen[name], chosen[name].identification
-    identified = None if of is None else identified_model(of, experiment.model, experiment.rows)
+    identified = None if of is None else identified_model(of, experiment.model, experiment.rows, before.get(of))
     return experiment.fitted(work, experiment.rows_for(identified), experiment.recording, identified)
 
 
@@ -167,7 +169,7 @@ def _scores(
     runs: Mapping[str, Sequence[Mapping[str, Any]]],
     models: Mapping[str, Candidate],
     about: Mapping[str, Any],
-    fit: Callable[[str], Posterior],
+    fit: Callable[[str, Mapping[str, Posterior]], Posterior],
 ) -> Scores:
     units = {name: log.units[name] for name in ("q", "v", "u", "a")}
     return Scores(

@@ -169,7 +169,7 @@ class Scores(Summary):
         "stretches" and "motions" for differences, "warnings", and "error" where it failed.
     joint_names, units: of the log.
     about: what was done, for the page.
-    fit: how a model by this name is fitted to all rows.
+    fit: how a model by this name is fitted to all rows, beside identifications that were made from these before.
     """
 
     models: Mapping[str, Mapping[str, str]]
@@ -177,7 +177,7 @@ class Scores(Summary):
     joint_names: tuple[str, ...]
     units: Mapping[str, Any]
     about: Mapping[str, Any] = field(default_factory=dict)
-    fit: Callable[[str], Posterior] | None = field(default=None, compare=False)
+    fit: Callable[[str, Mapping[str, Posterior]], Posterior] | None = field(default=None, compare=False)
 
     # ------------------------------------------------------------------ numbers
 
@@ -317,13 +317,13 @@ class Scores(Summary):
         """The model to take, by motions, else forces; None where no model was scored."""
         return None if self.winner is None else self.winner.model
 
-    def fitted_on_all_rows(self) -> Posterior:
-        """The recommended model from all rows. Raises FitError if there is none."""
+    def fitted_on_all_rows(self, identified: Mapping[str, Posterior] | None = None) -> Posterior:
+        """The recommended model from all rows; `identified` are made from them already. Raises FitError if none is."""
         if self.recommended is None:
             raise FitError(f"no model was fitted: {'; '.join(self.failures)}.")
         if self.fit is None:
             raise FitError("these scores came without their models.")
-        return self.fit(self.recommended)
+        return self.fit(self.recommended, identified or {})
 
     # ------------------------------------------------------------------ to show
 
