@@ -106,7 +106,7 @@ def test_noise_of_forces_is_learned_where_rows_show_it():
     np.testing.assert_allclose(model.noise.force, lacking.std(axis=0, ddof=1), rtol=1e-8)
 
 
-def test_laws_are_refined_on_motions_and_a_short_log_says_why_intervals_are_not_calibrated():
+def test_laws_are_refined_on_motions_and_a_short_log_says_how_far_intervals_are_calibrated():
     recorded = recording(line, 1, seconds=3.0)
     model = replace(slide(1.0, 1.0), forces=(Actuation(), RigidBodies()))
     told = []
@@ -115,8 +115,7 @@ def test_laws_are_refined_on_motions_and_a_short_log_says_why_intervals_are_not_
     assert posterior.settings["motions"]["seconds"] == 0.5
     assert posterior.parameters["viscous.x"].value == pytest.approx(3.0, rel=0.2)
     assert told
-    (note,) = notes
-    assert note.startswith("intervals of motions are not calibrated: ")
+    assert notes == ["intervals of motions are measured up to 0.5 s"]
     same, why = with_intervals_of_motions(posterior, recorded.rows(slice(20)))
     assert same is posterior
     assert why.startswith("intervals of motions are not calibrated: ")

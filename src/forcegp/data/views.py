@@ -244,14 +244,19 @@ class RecordedMotions:
     u: Float[np.ndarray, "motions steps nu"]
 
 
+def require_order_of_time(dataset: Dataset) -> None:
+    """Raises InvalidInput for rows out of it."""
+    if not dataset.time_ordered:
+        raise InvalidInput("the rows of the dataset are not in the order of time; give a whole recording.")
+
+
 def recorded_motions(dataset: Dataset, starts: int | Sequence[int], seconds: float) -> RecordedMotions:
     """The motions of that length that begin at the given rows, or at so many rows spread evenly over the recording.
 
     A number of starts takes motions without a gap, where there are any. Raises InvalidInput for rows at which no motion
     of that length begins, for steps of time that are not equal, and for a length of less than one step.
     """
-    if not dataset.time_ordered:
-        raise InvalidInput("the rows of the dataset are not in the order of time; give a whole recording.")
+    require_order_of_time(dataset)
     dt, before = _even_steps(dataset)
     if not (np.isfinite(seconds) and seconds > 0 and round(seconds / dt) >= 1):
         raise InvalidInput(f"the length is {seconds} s; it must be at least one step of the recording, {dt:.4g} s.")
@@ -284,6 +289,23 @@ def recorded_motions(dataset: Dataset, starts: int | Sequence[int], seconds: flo
         )
     index = chosen[:, None] + np.arange(steps + 1)
     return RecordedMotions(tuple(chosen.tolist()), dt, dataset.q[index], dataset.v[index], dataset.u[index[:, :-1]])
+
+
+GAP = 1.5  # a pause of more than this many median steps is a gap, over which no motion goes
+
+
+def median_step(recording: Dataset) -> float:
+    """Of time, in s; infinite where every episode has one row."""
+    pauses = np.diff(recording.time)[consecutive(recording)[:-1]]
+    return float(np.median(pauses)) if pauses.size else float("inf")
+
+
+def stretches_without_gap(recording: Dataset, part: Bool[np.ndarray, " rows"]) -> list[Int[np.ndarray, " rows"]]:
+    """Numbers of rows of a part that follow each other in one episode without a gap."""
+    rows = np.flatnonzero(part)
+    apart = (np.diff(rows) > 1) | (np.diff(recording.episode[rows]) != 0)
+    apart |= np.diff(recording.time[rows]) > GAP * median_step(recording)
+    return [each for each in np.split(rows, np.flatnonzero(apart) + 1) if len(each) > 1]
 
 
 def all_motions(dataset: Dataset, seconds: float, longest_step: float) -> tuple[RecordedMotions, int]:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from forcegp.data import Dataset, farthest_rows, with_memory
-from forcegp.data.views import RecordedMotions, decided, recorded_motions
+from forcegp.data.views import RecordedMotions, decided, recorded_motions, require_order_of_time, stretches_without_gap
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence.likelihood import TrainingData
 from forcegp.fit.motion_fit import refine_on_motions
@@ -29,7 +29,7 @@ LEVEL = 0.95
 
 
 def calibrated(
-    posterior: Posterior, dataset: Dataset, horizons: Sequence[float] = HORIZONS, *, integrator: str = "rk4"
+    posterior: Posterior, dataset: Dataset, horizons: Sequence[float] | None = None, *, integrator: str = "rk4"
 ) -> Posterior:
     """The same model with intervals of motions that hold: of records left out in turn, or of stretches of the only one.
 
@@ -37,19 +37,28 @@ def calibrated(
     are wider by what another level of dry friction would change. `rollout(...).interval()` uses them.
 
     dataset: the recording that the model learned from, in equal steps of time.
-    horizons: lengths of the motions in s, at which widths are found; integrator: of these motions.
+    horizons: lengths of the motions in s, at which widths are found; None: .1, .25, .5 and 1 s, if stretches without a
+        gap last so long. Beyond, widths go on as they grew.
+    integrator: of these motions.
 
     Raises InvalidInput for models without physics, and where fewer than two stretches last for the longest horizon.
     """
     require_type("posterior", posterior, Posterior, ", as in calibrated(posterior, log)")
     require_type("dataset", dataset, Dataset)
     require_unobserved(posterior, "intervals of motions")
+    require_order_of_time(dataset)
     dataset = decided(with_memory(dataset, posterior.model))
-    wanted = tuple(sorted(set(horizons)))
+    wanted = sorted(set(HORIZONS if horizons is None else horizons))
     if not wanted or not all(math.isfinite(h) and h > 0.0 for h in wanted):
-        raise InvalidInput(f"horizons are {list(horizons)}; give one or more positive numbers of seconds.")
-    parts = _folds(dataset, wanted[-1])
-    errors, spreads, shifts, kept, inputs = [], [], [], wanted, posterior.model.inputs
+        raise InvalidInput(f"horizons are {wanted}; give one or more positive numbers of seconds.")
+    while len(parts := _folds(dataset, wanted[-1])) < 2 and horizons is None and len(wanted) > 1:
+        wanted = wanted[:-1]
+    if len(parts) < 2:
+        raise InvalidInput(
+            f"intervals need two stretches of {wanted[-1]:g} s at least, of which one is left out in turn; give "
+            "shorter horizons, or a longer recording."
+        )
+    errors, spreads, shifts, kept, inputs = [], [], [], tuple(wanted), posterior.model.inputs
     drift = posterior.settings.get("drift") if _records(dataset, wanted[-1]) == 1 else None
     for number, inside in enumerate(parts):
         with part(number, len(parts)):
@@ -104,21 +113,11 @@ def _folds(dataset: Dataset, seconds: float) -> list[np.ndarray]:
         else:
             numbers[rows], long = long % FOLDS, long + (lasting >= seconds)
     parts = [numbers == fold for fold in range(FOLDS)]
-    used = [part for part in parts if _lasts(dataset, part, seconds)]
-    if len(used) < 2:
-        raise InvalidInput(
-            f"intervals need two stretches of {seconds:g} s at least, of which one is left out in turn; give shorter "
-            "horizons, or a longer recording."
-        )
-    return used
+    return [part for part in parts if _lasts(dataset, part, seconds)]
 
 
 def _lasts(dataset: Dataset, part: np.ndarray, seconds: float) -> bool:
-    return any(
-        float(np.ptp(dataset.time[rows])) >= seconds
-        for episode in dataset.episodes
-        if len(rows := np.flatnonzero(part & (dataset.episode == episode)))
-    )
+    return any(np.ptp(dataset.time[rows]) >= seconds for rows in stretches_without_gap(dataset, part))
 
 
 def _motions(part: Dataset, seconds: float) -> RecordedMotions:

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool
 
 from forcegp.data import Dataset, repeated_rows
-from forcegp.data.views import EVEN_STEPS, RecordedMotions, recorded_motions
+from forcegp.data.views import EVEN_STEPS, RecordedMotions, median_step, recorded_motions, stretches_without_gap
 from forcegp.doubts import listed
 from forcegp.errors import DatasetError, InvalidInput, require_type, usable_arguments
 from forcegp.posterior import Posterior, observing
@@ -167,7 +167,6 @@ def _blocks_apart(dataset: Dataset, blocks: int, numbers: Sequence[int], guard: 
 
 HORIZONS = (0.1, 0.2, 0.5, 1.0)
 STARTS = 10
-GAP = 1.5  # a pause of more than this many median steps is a gap, over which no motion goes
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +215,7 @@ def held_out_motions(
         return HeldOutMotions()
     if not recording.time_ordered:
         return HeldOutMotions(notes=("no motion was predicted: the rows are not in the order of time.",))
-    stretches, step = _stretches(recording, held_out), _step(recording)
+    stretches, step = stretches_without_gap(recording, held_out), median_step(recording)
     longest = max((float(np.ptp(recording.time[rows])) for rows in stretches), default=0.0)
     possible, notes = tuple(h for h in wanted if step <= h <= longest * (1.0 + EVEN_STEPS)), list[str]()
     if len(possible) < len(wanted):
@@ -266,16 +265,3 @@ def motion_scores(
         facts["diverged"].append(int((~lasting).sum()))
         facts["squared"].append(plain(off[:, row].square().mean(-1).cpu().numpy()))
     return table, facts
-
-
-def _step(recording: Dataset) -> float:
-    pauses = np.diff(recording.time)[np.diff(recording.episode) == 0]
-    return float(np.median(pauses)) if pauses.size else float("inf")
-
-
-def _stretches(recording: Dataset, held_out: Bool[np.ndarray, " rows"]) -> list[np.ndarray]:
-    """Numbers of held-out rows that follow each other in one episode without a gap."""
-    rows = np.flatnonzero(held_out)
-    apart = (np.diff(rows) > 1) | (np.diff(recording.episode[rows]) != 0)
-    apart |= np.diff(recording.time[rows]) > GAP * _step(recording)
-    return [part for part in np.split(rows, np.flatnonzero(apart) + 1) if len(part) > 1]

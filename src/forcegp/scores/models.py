@@ -28,6 +28,7 @@ from forcegp.inference import Inducing
 from forcegp.model import Model
 from forcegp.noise import Noise
 from forcegp.posterior import Posterior
+from forcegp.posterior.fitted import HORIZONS
 from forcegp.scores.scores import Kind
 from forcegp.summary import listed
 
@@ -141,11 +142,13 @@ def learn(
 
 
 def with_intervals_of_motions(posterior: Posterior, recording: Dataset) -> tuple[Posterior, str | None]:
-    """`calibrated`; the posterior itself, and why, where the recording is too short for it."""
+    """`calibrated`, and up to when; the posterior itself, and why, where the recording is too short for it."""
     try:
-        return calibrated(posterior, recording), None
+        found = calibrated(posterior, recording)
     except InvalidInput as error:
         return posterior, f"intervals of motions are not calibrated: {error}"
+    last = found.motion_intervals.horizons[-1] if found.motion_intervals else HORIZONS[-1]
+    return found, None if last == HORIZONS[-1] else f"intervals of motions are measured up to {last:g} s"
 
 
 EQUATIONS = 1_400
