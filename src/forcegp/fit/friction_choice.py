@@ -425,13 +425,16 @@ def friction_in_words(model: Model, log: Dataset, unit: str, still: Container[st
         each = zip(names, numbers.tolist(), strict=True)
         return ", ".join("–" if name in still else f"{number:.3g}" for name, number in each)
 
-    text = f"{listed(moving)} {unit}, near rest {listed(rest - moving)} more"
+    text = f"{listed(moving)} {unit}"
+    text += f", near rest {listed(rest - moving)} more" if bool((rest != moving).any()) else ""
     for name, row in zip(log.joint_names, law.turning(torch.eye(log.nv).to(v)).mT.tolist(), strict=True):
         terms = [f"{x:+.3g} {other}" for other, x in zip(log.joint_names, row, strict=True) if x]
         text += f"; the motor of {name} turns with {' '.join(terms)}" if len(terms) > 1 else ""
     if not (remember := law.memory_joints(model.robot)):
         return text
+    slides = {model.robot.joint(log.joint_names[j]).type == "prismatic" for j in remember}
+    length = " or ".join(("mrad", "mm")[slide] for slide in sorted(slides))
     ways = 1e3 / law.values["sigma"].expand(v.shape)[remember]
     names = [log.joint_names[j] for j in remember]
     who = "all joints" if len(remember) == len(joints) else ", ".join(names)
-    return f"{text}; {who} remember reversals, over {listed(ways, names)} mrad or mm"
+    return f"{text}; {who} remember reversals, over {listed(ways, names)} {length}"
