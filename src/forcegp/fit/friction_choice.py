@@ -426,7 +426,7 @@ def friction_in_words(model: Model, log: Dataset, unit: str, still: Container[st
         return ", ".join("–" if name in still else f"{number:.3g}" for name, number in each)
 
     text = f"{listed(moving)} {unit}"
-    text += f", near rest {listed(rest - moving)} more" if bool((rest != moving).any()) else ""
+    text += f", near rest {listed(rest)}" if bool((rest != moving).any()) else ""
     for name, row in zip(log.joint_names, law.turning(torch.eye(log.nv).to(v)).mT.tolist(), strict=True):
         terms = [f"{x:+.3g} {other}" for other, x in zip(log.joint_names, row, strict=True) if x]
         text += f"; the motor of {name} turns with {' '.join(terms)}" if len(terms) > 1 else ""
