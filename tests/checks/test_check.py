@@ -151,20 +151,23 @@ def test_a_model_whose_friction_remembers_is_compared_as_if_its_joints_had_slid_
     assert reports[0] == reports[1]
 
 
-@pytest.mark.parametrize(("stiffness", "at_motor"), [(300.0, False), (4e4, False), (300.0, True)])
-def test_a_chirp_across_the_resonance_of_a_gear_is_named(stiffness, at_motor):
-    """Two masses, friction at the motor, by small steps; the stiff one is as good as rigid."""
+@pytest.mark.parametrize(
+    ("stiffness", "at_motor", "shake"), [(300.0, False, 0.0), (4e4, False, 0.0), (300.0, True, 0.0), (4e4, True, 1e-4)]
+)
+def test_a_chirp_across_the_resonance_of_a_gear_is_named(stiffness, at_motor, shake):
+    """Two masses, friction at the motor, by small steps; the stiff one is as good as rigid, beside a shaking encoder too."""
     robot = Robot.from_urdf_text(PENDULUM, locked={"elbow": 0.0})
     link = float(robot.mass_matrix(torch.zeros(1).double()))
     weight = float(robot.gravity_forces(torch.full((1,), np.pi / 2).double()))
-    rng, dt, rotor, seconds = np.random.default_rng(0), 2.5e-4, 0.08, 16.0
+    rng, dt, rotor, seconds, sweep = np.random.default_rng(0), 2.5e-4, 0.08, 16.0, 1.0 if shake else 10.0
+    places, phases = np.linspace(100.0, 400.0, 14), np.arange(14) ** 2
     q = v = motor = speed = 0.0
     rows = []
     for k in range(int(seconds / dt)):
         t = k * dt
-        u = 4.0 * np.sin(2.0 * np.pi * (0.3 + 10.0 * t / seconds) * t) + 1.5 * np.sin(1.3 * t) - 0.4 * speed
+        u = 4.0 * np.sin(2.0 * np.pi * (0.3 + sweep * t / seconds) * t) + 1.5 * np.sin(1.3 * t) - 0.4 * speed
         if k % 10 == 0:
-            seen = motor if at_motor else q
+            seen = (motor if at_motor else q) + shake * np.sin(places * t + phases).sum()
             rows.append((t, seen + 2e-5 * rng.standard_normal(), u + 0.02 * rng.standard_normal()))
         spring = stiffness * (motor - q) + 0.3 * (speed - v)
         v += dt * (spring - weight * np.sin(q) - 0.05 * v) / link

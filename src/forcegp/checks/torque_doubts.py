@@ -72,6 +72,7 @@ def elastic_doubts(inputs: CheckInput, log: Comparison) -> list[Doubt]:
         bends[own] = np.gradient(slopes[own], rows.time[own], axis=0)
     some = slice(None, None, max(1, len(rows) // MOST_ROWS))
     passed = {(f, d): _behind_spring(log.tau, rows, f, d)[some] for f in SPRINGS for d in DAMPING}
+    smooth = [_behind_spring(log.tau, rows, f, both_ways=True)[some] for f in SPRINGS]  # of less noise, and rigid
     tau, slopes, bends, friction, every = log.tau[some], slopes[some], bends[some], log.friction[some], rows.u[some]
     fitted = np.arange(len(tau)) * BLOCKS // len(tau) % 2 == 0
 
@@ -86,7 +87,7 @@ def elastic_doubts(inputs: CheckInput, log: Comparison) -> list[Doubt]:
 
     for j, name in enumerate(inputs.names):
         u, rigid = every[:, j], (tau[:, j], slopes[:, j], friction[:, j])
-        least = MUCH * left(u, *rigid)[0]
+        least = MUCH * min(left(u, *rigid)[0], *(left(u, x[:, j], friction[:, j])[0] for x in smooth))
         if least <= MUCH * DOUBTFUL * np.square(u - u.mean()).sum():
             continue
         missed, number = left(u, bends[:, j], *rigid)
@@ -113,14 +114,22 @@ def elastic_doubts(inputs: CheckInput, log: Comparison) -> list[Doubt]:
     ]
 
 
-def _behind_spring(tau: np.ndarray, rows: Dataset, hertz: float, damping: float) -> np.ndarray:
-    """What reaches the motor of the torque that its motion asks for: x'' + 2 d w x' + w^2 x = w^2 tau, by Tustin."""
-    from scipy.signal import bilinear, lfilter, lfilter_zi  # half a second, which only few logs should cost
+def _behind_spring(
+    tau: np.ndarray, rows: Dataset, hertz: float, damping: float = 0.7, both_ways: bool = False
+) -> np.ndarray:
+    """What reaches the motor of the torque that its motion asks for: x'' + 2 d w x' + w^2 x = w^2 tau, by Tustin.
+
+    `both_ways` it is no spring, but a filter without delay.
+    """
+    from scipy.signal import bilinear, filtfilt, lfilter, lfilter_zi  # half a second, which only few logs should cost
 
     passed, rate = tau.copy(), 1.0 / float(np.median(np.diff(rows.time)))
     w = 2.0 * rate * np.tan(np.pi * min(hertz / rate, 0.4))
     b, a = bilinear([w * w], [1.0, 2.0 * damping * w, w * w], rate)
     for own in (rows.episode == number for number in rows.episodes):
+        if both_ways:
+            passed[own] = filtfilt(b, a, tau[own], axis=0)
+            continue
         passed[own] = lfilter(b, a, tau[own], axis=0, zi=lfilter_zi(b, a)[:, None] * tau[own][:1])[0]
     return passed
 
