@@ -155,7 +155,7 @@ def test_a_model_whose_friction_remembers_is_compared_as_if_its_joints_had_slid_
     ("stiffness", "at_motor", "shake"), [(300.0, False, 0.0), (4e4, False, 0.0), (300.0, True, 0.0), (4e4, True, 1e-4)]
 )
 def test_a_chirp_across_the_resonance_of_a_gear_is_named(stiffness, at_motor, shake):
-    """Two masses, friction at the motor, by small steps; the stiff one is as good as rigid, beside a shaking encoder too."""
+    """Two masses, friction at the motor, by small steps; a stiff one is as good as rigid, also if an encoder shakes."""
     robot = Robot.from_urdf_text(PENDULUM, locked={"elbow": 0.0})
     link = float(robot.mass_matrix(torch.zeros(1).double()))
     weight = float(robot.gravity_forces(torch.full((1,), np.pi / 2).double()))
