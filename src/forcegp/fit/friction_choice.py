@@ -18,6 +18,7 @@ from forcegp.fit.transmission_choice import choose_transmission
 from forcegp.forces import Coulomb, DirectionalFriction, DryFriction, GearFriction, LogNormal, Normal, Rotor, Viscous
 from forcegp.forces.force import Force
 from forcegp.forces.joint_law import JointLaw
+from forcegp.forces.joint_laws import HIGHEST
 from forcegp.forces.presliding import after_strokes
 from forcegp.mechanics import State
 from forcegp.model import Model
@@ -36,8 +37,6 @@ FALLS = tuple(np.geomspace(0.04, 0.6, 7).tolist())
 """Of the root mean square velocity, what a breakaway may fall over here; a fit finds the rest."""
 SIGNED = np.array([0, 1, 1, 1, 0, 0] + [1] * len(FALLS), dtype=bool)
 """Of each joint's columns: viscous, dry, load, root of speed, direction, a constant, and breakaways."""
-HIGHEST = 0.5
-"""Largest share of the load that friction takes: beyond it something else is explained."""
 REVERSALS = 6
 """Fewest reversals of a joint that can show memory."""
 WIDTHS = tuple(np.geomspace(0.003, 1.0, 11).tolist())

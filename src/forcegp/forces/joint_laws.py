@@ -184,6 +184,10 @@ class Stribeck(DryFriction):
         return c + b * torch.exp(-((features[0] / v_s) ** 2))
 
 
+HIGHEST = 0.5
+"""Largest share of the load that friction takes: beyond it something else is explained."""
+
+
 @dataclass(frozen=True, eq=False)
 class LoadFriction(DryFriction):
     """-(c + mu |u|) s: dry friction of a gear, which grows with the torque of the actuator.
@@ -196,7 +200,7 @@ class LoadFriction(DryFriction):
     velocity_scale: Number = None
     coefficients: ClassVar[Mapping[str, Coefficient]] = {
         "level": Coefficient(),
-        "factor": Coefficient("1", highest=0.9),
+        "factor": Coefficient("1", highest=HIGHEST),
         **DryFriction.sign,
     }
     under_load: ClassVar[bool] = True
@@ -221,7 +225,7 @@ class GearFriction(LoadFriction):
     memory: Memory | None = field(default=None, kw_only=True)  # type: ignore[assignment]  # open until a fit decides
     coefficients: ClassVar[Mapping[str, Coefficient]] = {
         "level": Coefficient(),
-        "factor": Coefficient("1", highest=0.9),
+        "factor": Coefficient("1", highest=HIGHEST),
         "root": Coefficient("force/velocity^.5", lowest=-np.inf),
         **{name: Stribeck.coefficients[name] for name in ("breakaway", "stribeck_velocity")},
         **DryFriction.sign,
