@@ -15,7 +15,7 @@ from tests.goldens.compare import assert_unchanged
 from tests.simulation.pendulum import double_pendulum
 
 from forcegp import Coulomb, Dataset, Noise, Robot, Viscous, fit, load_posterior
-from forcegp.cli.answer import verdict
+from forcegp.cli.answer import is_explained, verdict
 from forcegp.cli.auto import default_models
 from forcegp.cli.logs import prepared_rows
 from forcegp.cli.main import parse_arguments
@@ -165,7 +165,8 @@ def _stopped(*_):
 
 @pytest.mark.usefixtures("unchecked")  # its dataset is none
 def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
-    dataset, numbers = SimpleNamespace(units={"q": "rad"}), list[list[str]]()
+    dataset, numbers, explained = SimpleNamespace(units={"q": "rad"}), list[list[str]](), list[bool]()
+    doubts = [{"about": "unknown cause", "joints": ["hip", "knee"], "numbers": x} for x in ({}, {"seconds": [1, 2]})]
 
     def told(errors, moved=0.01, shares=None, covered=0.94, still=()):
         table = {"acceleration": {"nrmse": errors, "coverage_95": [covered] * 3}}
@@ -177,6 +178,7 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
         about = {"given": {"kind": "given", "summary": ""}}
         scores = Scores(models=about, runs={"given": [run]}, joint_names=names, units={})
         numbers.append(scores.not_known("given", still))
+        explained.extend(is_explained(doubt, scores, "given") for doubt in doubts)
         return verdict(scores, dataset, still)
 
     lost = told([328.2, 0.9, None], None)
@@ -192,10 +194,10 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
         "but it is for torques: do not predict motions, positions 1 s ahead are wrong by 0.01 rad."
     )
     assert "do not predict" not in told([0.1, 0.16, 2.8], shares=[0.02, 0.03, 0.05], still=["wrist"])
-    whole = told([0.1, 0.16, 2.6], shares=[0.02, 0.03, 0.05])
-    assert whole.endswith("of each torque, and positions 1 s ahead are wrong by 0.01 rad.")
-    assert "wrist 51 %" in told([0.1] * 3, shares=[0.02, 0.03, 0.51])
+    assert told([0.1, 0.16, 2.6], shares=[0.02, 0.03, 0.05]).endswith(", and positions 1 s ahead are wrong by 0.01 rad.")
+    assert "wrist 51 %" in told([0.1] * 3, shares=[0.4, 0.03, 0.51])
     assert numbers[-3:] == [["wrist"], [], ["wrist"]]
+    assert explained == [False] * 4 + [True, False] * 3 + [False] * 2, "of torques, by a tenth of their power"
     assert told([0.1] * 3, None).endswith("but its motions diverge: do not simulate with it.")
     assert told([0.1] * 3, covered=0.57).endswith("Do not trust its intervals: those of 95 % hold 57 %.")
     assert "intervals" not in told([0.1] * 3, covered=0.81)

@@ -370,10 +370,12 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     if not len(bad):
         return
     rows, shares = root.log.rows, ", ".join(f"{inputs.names[k]} {100.0 * root.rough[k]:.0f} %" for k in bad)
+    numbers: dict[str, object] = {"unexplained": root.rough[bad].tolist(), "rows": len(rows)}
     do = "Look at these joints there: contacts, brakes, cables, another robot, or a channel that is not a torque."
     where, seconds, others = _where(root, int(bad[np.argmax(root.rough[bad])]), inputs)
     if others is not None and (left := replace(root, log=replace(root.log, rows=others)).rough.max()) <= EXPLAINED:
         where += f", and elsewhere at most {100.0 * left:.2g} % stays: a contact, or a load, in these seconds"
+        numbers["seconds"] = [float(x) for x in seconds.split(",")]
         do = f"Leave them out by forcegp import --without {seconds}, or forcegp auto with the same."
     yield look(
         about=UNKNOWN,
@@ -381,7 +383,7 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         f"masses, payload, springs, delay): unexplained stay of the torque of {shares}{where}.",
         do=do,
         joints=inputs.named(bad),
-        numbers={"unexplained": root.rough[bad].tolist(), "rows": len(rows)},
+        numbers=numbers,
     )
 
 

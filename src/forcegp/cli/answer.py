@@ -44,7 +44,7 @@ def answer_lines(
     done, prepared, seconds, out = content["import"], content["preparation"], content["seconds"], content["out"]
     deviation = max(each["largest_deviation_of_a_step"] for each in done["recordings"])
     jitter = f", steps up to {deviation:.0%} off (evened out)" if done["resampled_to_step"] is not None else ""
-    doubts = (*done["stops"], *content["check"]["doubts"])
+    doubts = [*done["stops"], *(x for x in content["check"]["doubts"] if not is_explained(x, scores, best))]
     seen = [(x["about"], f"{x['what']} {x['do']}") for x in doubts if x["about"] in TOLD]
     flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
     mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
@@ -110,6 +110,16 @@ def answer_lines(
         ("record next", command + (f" (least is known of {weak})" if weak else "")),
         ("wrote", f"{out}/report.html, {out}/model, {out}/identified.urdf, {out}/validation/report.md"),
     ]  # fmt: skip
+
+
+def is_explained(doubt: Mapping[str, Any], scores: forcegp.scores.Scores, best: str) -> bool:
+    """Whether the best model explains on unseen time what no cause did all over the log."""
+    from forcegp.checks.search import EXPLAINED, UNKNOWN  # PyTorch, too
+
+    quantity, left = scores.left(best)
+    shares = [left.get(name) for name in doubt["joints"]]
+    everywhere = doubt["about"] == UNKNOWN and "seconds" not in doubt["numbers"]
+    return everywhere and quantity == TORQUE and all(x is not None and x * x <= EXPLAINED for x in shares)
 
 
 def left_of_torques(scores: forcegp.scores.Scores, best: str) -> list[tuple[str, str]]:
