@@ -194,7 +194,7 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
         "but it is for torques: do not predict motions, positions 1 s ahead are wrong by 0.01 rad."
     )
     assert "do not predict" not in told([0.1, 0.16, 2.8], shares=[0.02, 0.03, 0.05], still=["wrist"])
-    assert told([0.1, 0.16, 2.6], shares=[0.02, 0.03, 0.05]).endswith(", and positions 1 s ahead are wrong by 0.01 rad.")
+    assert told([0.1, 0.16, 2.6], shares=[0.02, 0.03, 0.05]).endswith("and positions 1 s ahead are wrong by 0.01 rad.")
     assert "wrist 51 %" in told([0.1] * 3, shares=[0.4, 0.03, 0.51])
     assert numbers[-3:] == [["wrist"], [], ["wrist"]]
     assert explained == [False] * 4 + [True, False] * 3 + [False] * 2, "of torques, by a tenth of their power"
