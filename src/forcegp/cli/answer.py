@@ -83,9 +83,10 @@ def answer_lines(
     if "gains" in causes:  # what it changes of a payload, it changes of all
         error = math.hypot(error, content["payload"]["parameters"]["payload.mass"]["std"])
     weight = f"{mass:.4g} ± {1.96 * error:.1g} kg, if {drives_of(identified.model)} are right"
+    shares = {name: _known(scores, "nrmse", ACCELERATION, name) for name in scores.models}
     errors = "; ".join(
-        f"{short_name(name)} {number(_motion(scores, name))} / {number(_known(scores, 'nrmse', ACCELERATION, name))}"
-        for name in scores.models
+        f"{short_name(name)} {number(_motion(scores, name))} / {'> 1' if (share or 0.0) > 1.0 else number(share)}"
+        for name, share in shares.items()
     )
     ahead = (f" after {scores.horizons[-1]:g} s" if scores.horizons else "") + f" [{'rad or m' if moving else q}]"
     covered = scores.value("coverage_95", model=best)
@@ -104,7 +105,7 @@ def answer_lines(
         *([("whole mass", weight)] if moving else []),
         ("payload", held),
         *causes.items(),
-        ("models", f"error of q{ahead} / nRMSE of the acceleration, on unseen time: {errors}"),
+        ("models", f"error of q{ahead} / nRMSE of the acceleration (1: that of its mean), on unseen time: {errors}"),
         *left_of_torques(scores, best),
         ("best", f"{short_name(best)}{intervals}"),
         ("record next", command + (f" (least is known of {weak})" if weak else "")),

@@ -103,6 +103,8 @@ class Auto(Command):
         if bad and not self.accept:
             terminal.show(doubts_table(bad, terminal.worded))
             raise DatasetError(f"something is wrong with the log ({bad.subjects}); correct it, or add --accept.")
+        for doubt in report.doubts.at("look"):  # what is known already, while the rest takes minutes
+            terminal.note(f"{doubt.about}: {doubt.what}")
         self.out.mkdir(parents=True, exist_ok=True)
         with atomic_file(self.out / "log.h5", overwrite=True) as temporary:
             dataset.save(temporary)
@@ -122,6 +124,7 @@ class Auto(Command):
                 payload, held = payload_dict(loaded, False), payload_text(loaded)
             except DatasetError as error:
                 held = f"not estimated: {error}"
+        terminal.note(f"payload: {held}")
         scores, posterior = self._scored(terminal, rows, recording, expression, identified, still)
         content: dict[str, Any] = {
             "out": str(self.out),
