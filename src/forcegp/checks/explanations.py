@@ -255,7 +255,9 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
             f"the torques fit positions of {names[joint]} that are {x:+.3g} rad ({x / DEGREE:+.0f} degrees) from the "
             "logged ones: its zero is elsewhere"
         )
-        cause = number("joint zero", what, joint, x, NUMBER + 0.3)
+        do = f"Add it to the column, as in forcegp import --q 'COLUMN {x:+.3g}', or correct the URDF; "
+        do += "about the axis of a first joint it may be the base that is turned."
+        cause = number("joint zero", what, joint, x, NUMBER + 0.3, do=do)
         if abs(x) > 0.05:
             found.append(
                 (left, cause, lambda x=x, one=one: now.after(lambda rows: replace(changed()(rows), q=rows.q + x * one)))

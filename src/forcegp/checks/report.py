@@ -12,7 +12,7 @@ from forcegp.checks.check_input import QUICK_ROWS, CheckInput
 from forcegp.checks.moving_base import base_doubts, carried_doubts, stance_doubts, unmeasured_base_doubts
 from forcegp.checks.search import UNKNOWN, Explanation, search
 from forcegp.checks.signals import motion_doubts, sampling_doubts, signal_doubts, target_doubts, without_registers
-from forcegp.checks.torque_doubts import TOUCHES, elastic_doubts, held_points, torque_doubts, without_stops
+from forcegp.checks.torque_doubts import TOUCHES, elastic_doubts, held_points, push, torque_doubts, without_stops
 from forcegp.data import Dataset, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
@@ -145,6 +145,8 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
                     inputs = inputs.below(elastic[0].numbers["cutoff"])
                     found, said = search(inputs)
             said = [*elastic, *said]
+        if inputs.most_rows != QUICK_ROWS and not any(each.about == UNKNOWN or each.level == "wrong" for each in said):
+            said = [*said, *push(found, inputs)]
         doubts, comparison = [*doubts, *said, *torque_doubts(inputs, found)], found
     return doubts, comparison
 

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from forcegp.checks.check_input import CheckInput
 from forcegp.checks.explanations import NUMBER, SIGN, Cause, candidates, changed
-from forcegp.checks.torques import WIDTHS, Comparison, positive_fit, positive_solution, torque_noise
+from forcegp.checks.torques import LEAST, WIDTHS, Comparison, positive_fit, positive_solution, stretch, torque_noise
 from forcegp.data import Dataset
 from forcegp.data.views import white_noise
 from forcegp.doubts import Doubt, listed, look, wrong
@@ -24,7 +24,6 @@ UNKNOWN = "unknown cause"
 FEWEST_ROWS = 30
 AT_REST = 0.1  # of the root mean square velocity of a joint
 GAIN = np.log(4.0)  # by which the product over all joints of what remains must fall at least
-LEAST = 1e-4  # shares of a torque's power below this are all the same
 NOISE = 3.0  # how much of the power of the noise is left to every explanation
 BEAM, DEPTH = 3, 3  # explanations that are continued, and causes of one
 WORSE = 1.05  # share from which on predicting nothing is better
@@ -35,7 +34,7 @@ DOUBTFUL = 2e-3  # share above which causes are tried
 EXPLAINED = 0.1  # share that a robot with rough masses leaves
 HELD = 3.0  # of the dry friction and of what remains in motion, from which on no gear holds the joint
 RESTS = 0.5  # share of what friction leaves that a torque must explain, for a factor of it to mean something
-MOSTLY, EDGES = 0.75, 25  # share of what is left that sits somewhere; rows between which that is sought first
+MOSTLY = 0.75  # share of what is left that sits somewhere
 ROUGH = 2.5  # factor either way that wrong masses make of a torque
 CHOICES = np.array([0.0, SIGN, NUMBER, SIGN + NUMBER])
 """Cost of a torque as it is, turned, times a factor, and both."""
@@ -175,8 +174,8 @@ class Explanation:
         return float(left / power)
 
     @cached_property
-    def free(self) -> Float[np.ndarray, " nv"]:
-        """Share that is left of each torque by a robot with any masses and friction."""
+    def of_any_masses(self) -> Float[np.ndarray, "rows nv"]:
+        """What is left of each torque by a robot with any masses and friction."""
         rows, robot = self.log.rows, self.log.robot
         q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
         with torch.no_grad():
@@ -187,8 +186,13 @@ class Explanation:
             size = np.linalg.norm(columns, axis=0)
             basis, values, _ = np.linalg.svd(columns[:, size > 0.0] / size[size > 0.0], full_matrices=False)
             basis = basis[:, values > 1e-8 * values[0]]
-            left.append(np.square(u - basis @ (basis.T @ u)).sum() / max(np.square(u - u.mean()).sum(), 1e-300))
-        return np.array(left)
+            left.append(u - basis @ (basis.T @ u))
+        return np.stack(left, axis=1)
+
+    @property
+    def free(self) -> Float[np.ndarray, " nv"]:
+        """The share that this is."""
+        return np.square(self.of_any_masses).sum(0) / np.maximum(len(self.log.rows) * self.log.rows.u.var(0), 1e-300)
 
     @property
     def good(self) -> np.ndarray:
@@ -410,36 +414,10 @@ def _where(root: Explanation, joint: int, inputs: CheckInput) -> tuple[str, str,
     for name, values, unit in (("q", rows.q[:, joint], inputs.unit_of_each("q")[joint]), ("time", rows.time, "s"),
                                ("v", rows.v[:, joint], inputs.unit_of_each("v")[joint])):  # fmt: skip
         order = np.argsort(values, kind="stable")
-        gain, share, first, last = _stretch(signals[order])
+        gain, share, first, last = stretch(signals[order])
         if gain > best and share > MOSTLY:
             ends = values[order[[max(first - 1, 0), min(last, len(rows) - 1)]]]
             text = f"; {100.0 * share:.0f} % of it at {inputs.names[joint]} for {name} between {ends[0]:.3g} and "
             others = rows.rows(np.sort(np.r_[order[:first], order[last:]])) if name == "time" else None
             best, found = gain, (f"{text}{ends[1]:.3g} {unit}", f"{ends[0]:.4g},{ends[1]:.4g}", others)
     return found
-
-
-def _stretch(signals: Float[np.ndarray, "rows k"]) -> tuple[float, float, int, int]:
-    """Successive rows, half of all at most, of whose last signal the others on the other rows tell less than there.
-
-    What two levels of what is left explain [nats], the share in these rows, the first of them and the end.
-    """
-    count = len(signals)
-    sums = np.cumsum(np.einsum("ri,rj->rij", signals, signals), axis=0)
-    sums = np.concatenate([np.zeros_like(sums[:1]), sums])
-    whole = positive_solution(sums[-1])[1]
-
-    def told(first: int, last: int) -> tuple[float, float, int, int]:
-        own, inside = last - first, sums[last] - sums[first]
-        number, left = positive_solution(sums[-1] - inside)
-        number = np.append(-number, 1.0)
-        each = np.array([left / (count - own), number @ inside @ number / own]) / (whole / count + 1e-300)
-        gain = float(-np.log(np.maximum(each, LEAST)) @ (count - own, own))
-        return (gain if each[1] > each[0] else 0.0), each[1] * own / (each @ (count - own, own)), first, last
-
-    edges = np.linspace(0, count, EDGES, dtype=int).tolist()
-    best = max(told(a, b) for a in edges for b in edges if 0 < b - a <= count // 2)
-    for _ in range(2):  # to the row
-        best = max(told(a, best[3]) for a in range(max(best[3] - count // 2, 0), best[3]))
-        best = max(told(best[2], b) for b in range(best[2] + 1, min(best[2] + count // 2, count) + 1))
-    return best

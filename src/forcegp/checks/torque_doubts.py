@@ -7,8 +7,8 @@ import numpy as np
 import torch
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
-from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, Explanation
-from forcegp.checks.torques import WIDTHS, Comparison, with_gravity
+from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, UNKNOWN, Explanation
+from forcegp.checks.torques import WIDTHS, Comparison, stretch, with_gravity
 from forcegp.data import Dataset, estimate_delay
 from forcegp.data.views import consecutive, rests
 from forcegp.doubts import Doubt, listed, look, ok, wrong
@@ -25,6 +25,7 @@ SPRINGS, DAMPING = tuple(np.geomspace(1.0, 40.0, 24).tolist()), (0.02, 0.1, 0.3)
 """Resonances that are tried [Hz], and shares of critical damping."""
 BELOW = 1.0 / 3.0  # of a resonance, where a robot is as good as rigid
 MOST_ROWS = 2000  # on which that is judged
+SURE, APART = 150.0, 4.0  # nats that a stretch of time explains, and times what is left elsewhere, of a contact
 RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
 
 
@@ -127,10 +128,8 @@ def _behind_spring(
     w = 2.0 * rate * np.tan(np.pi * min(hertz / rate, 0.4))
     b, a = bilinear([w * w], [1.0, 2.0 * damping * w, w * w], rate)
     for own in (rows.episode == number for number in rows.episodes):
-        if both_ways:
-            passed[own] = filtfilt(b, a, tau[own], axis=0)
-            continue
-        passed[own] = lfilter(b, a, tau[own], axis=0, zi=lfilter_zi(b, a)[:, None] * tau[own][:1])[0]
+        x, start = tau[own], lfilter_zi(b, a)[:, None] * tau[own][:1]
+        passed[own] = filtfilt(b, a, x, axis=0) if both_ways else lfilter(b, a, x, axis=0, zi=start)[0]
     return passed
 
 
@@ -154,6 +153,28 @@ def _delays(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
             do="forcegp import --delay auto; a filter of the robot's own, of the torque or of the motion, does this.",
             joints=inputs.names,
             numbers={"delay": seconds, "std": delay.common_std, "remains": remains, "per_joint": plain(delay.seconds)},
+        )
+
+
+def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
+    """A stretch of time in which several torques are far from any robot of these lengths, unlike elsewhere."""
+    left, rows, ones = found.of_any_masses, found.log.rows, np.ones((len(found.log.rows), 1))
+    alive = [np.hstack([ones, -ones, x[:, None]]) for x in left.T if x.any()]
+    if len(rows) < FEWEST_ROWS or not alive:
+        return
+    gain, _, first, last = max(map(stretch, alive))
+    inside = np.isin(np.arange(len(rows)), np.arange(first, last))
+    times = np.sqrt(np.square(left[inside]).mean(0) / (np.square(left[~inside]).mean(0) + 1e-300))
+    names, smeared = inputs.named(np.flatnonzero(times > APART)), 1.0 / inputs.compared_cutoff
+    begin, end = rows.time[first] - smeared, rows.time[last - 1] + smeared
+    if gain > SURE and len(names) > 1 and end - begin > 3.0 * smeared:
+        yield look(
+            about=UNKNOWN,
+            what=f"from {begin:.4g} to {end:.4g} s the torques of {listed(names)} are up to {times.max():.2g} times as "
+            "far from any masses and friction as elsewhere: a contact, or a load, in these seconds.",
+            do=f"Leave them out by forcegp import --without {begin:.4g},{end:.4g}, or forcegp auto with the same.",
+            joints=names,
+            numbers={"seconds": [float(begin), float(end)], "gain": gain},
         )
 
 

@@ -127,3 +127,33 @@ def torque_noise(robot: Robot, rows: Dataset, noise: Float[np.ndarray, " nv"]) -
     with torch.no_grad():
         M = robot.mass_matrix(torch.tensor(rows.q, device=robot.device)).cpu().numpy()
     return np.sqrt(np.square(M).mean(axis=0) @ np.square(noise))
+
+
+EDGES = 25  # rows between which a stretch is sought first
+LEAST = 1e-4  # shares of a power below this are all the same
+
+
+def stretch(signals: Float[np.ndarray, "rows k"]) -> tuple[float, float, int, int]:
+    """Successive rows, half of all at most, of whose last signal the others on the other rows tell less than there.
+
+    What two levels of what is left explain [nats], the share in these rows, the first of them and the end.
+    """
+    count = len(signals)
+    sums = np.cumsum(np.einsum("ri,rj->rij", signals, signals), axis=0)
+    sums = np.concatenate([np.zeros_like(sums[:1]), sums])
+    whole = positive_solution(sums[-1])[1]
+
+    def told(first: int, last: int) -> tuple[float, float, int, int]:
+        own, inside = last - first, sums[last] - sums[first]
+        number, left = positive_solution(sums[-1] - inside)
+        number = np.append(-number, 1.0)
+        each = np.array([left / (count - own), number @ inside @ number / own]) / (whole / count + 1e-300)
+        gain = float(-np.log(np.maximum(each, LEAST)) @ (count - own, own))
+        return (gain if each[1] > each[0] else 0.0), each[1] * own / (each @ (count - own, own)), first, last
+
+    edges = np.linspace(0, count, EDGES, dtype=int).tolist()
+    best = max(told(a, b) for a in edges for b in edges if 0 < b - a <= count // 2)
+    for _ in range(2):  # to the row
+        best = max(told(a, best[3]) for a in range(max(best[3] - count // 2, 0), best[3]))
+        best = max(told(best[2], b) for b in range(best[2] + 1, min(best[2] + count // 2, count) + 1))
+    return best

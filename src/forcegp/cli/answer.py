@@ -23,7 +23,7 @@ def short_name(name: str) -> str:
     return f"{learned} learned" if learned else plain.get(name, name)
 
 
-TOLD = {"stop", "spring", "drift", "elastic joint", "unknown cause"}
+TOLD = {"stop", "spring", "drift", "elastic joint", "unknown cause", "joint zero", "torque constant", "torque unit"}
 """Subjects of doubts that the answer repeats."""
 
 

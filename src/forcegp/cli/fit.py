@@ -126,12 +126,7 @@ class Fit(Command):
         model = forcegp.scores.named_model(given, words, noise).to(self.device)
         with terminal.progress("fitting"):
             posterior, found = forcegp.scores.learn(
-                model,
-                dataset,
-                evidence,
-                recording=recording,
-                **vars(self.search),
-                engine=self.engine,
+                model, dataset, evidence, recording=recording, **vars(self.search), engine=self.engine
             )
         summary = fit_summary(posterior, time.monotonic() - start)
         tables = fit_report(self.out, posterior, summary)

@@ -78,11 +78,7 @@ class ImportOptions:
 
 
 def import_recordings(
-    paths: Sequence[str | Path],
-    mapping: ColumnMapping,
-    *,
-    model: forcegp.Model,
-    options: ImportOptions | None = None,
+    paths: Sequence[str | Path], mapping: ColumnMapping, *, model: forcegp.Model, options: ImportOptions | None = None
 ) -> Dataset:
     """The dataset of this robot that these logs hold; `metadata["import"]` is what was done.
 

@@ -337,9 +337,9 @@ def guessed_pose(parts: Sequence[str], source: Source) -> tuple[str, ...] | None
     known = {column.lower(): column for column in source.columns()}
 
     def before(ends: Sequence[str], words: Collection[str]) -> str | None:
-        found = [column.removesuffix(ends[0]) for column in known if column.endswith(ends[0])]
-        found = [each for each in found if all(each + end in known for end in ends)]
-        fitting = [each for each in found if re.split(r"[^a-z]+", each.rstrip("_.:/ -["))[-1] in words]
+        stems = [column.removesuffix(ends[0]) for column in known if column.endswith(ends[0])]
+        stems = [each for each in stems if re.split(r"[^a-z]+", each.rstrip("_.:/ -["))[-1] in words]
+        fitting = [each for each in stems if all(each + end in known for end in ends)]
         return fitting[0] if len(fitting) == 1 else None
 
     ends = [part.removeprefix("q") for part in parts]

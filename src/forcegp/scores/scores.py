@@ -27,10 +27,7 @@ CLEAR, MOSTLY = 0.67, 0.8  # ratio and share of stretches that decide where a lo
 MOST_LOG = 700.0  # of a ratio that is still a finite number
 USABLE = 0.5  # largest share of a torque's deviation, or of an acceleration's, that a model may leave in a joint
 
-CRITERIA: Mapping[str, str] = {
-    "motion": "error of predicted motions",
-    "force": "force-space error",
-}
+CRITERIA: Mapping[str, str] = {"motion": "error of predicted motions", "force": "force-space error"}
 """What decides, the first that there is, motions over all horizons: where a robot goes is what simulators need."""
 
 Errors = Float[np.ndarray, "seeds horizons stretches"]
