@@ -25,7 +25,7 @@ SPRINGS, DAMPING = tuple(np.geomspace(1.0, 40.0, 24).tolist()), (0.02, 0.1, 0.3)
 """Resonances that are tried [Hz], and shares of critical damping."""
 BELOW = 1.0 / 3.0  # of a resonance, where a robot is as good as rigid
 MOST_ROWS = 2000  # on which that is judged
-SURE, APART = 150.0, 4.0  # nats that a stretch of time explains, and times what is left elsewhere, of a contact
+SURE, TELLS = 200.0, 30.0  # nats that a stretch of time in which something is touched explains: in all, and of a joint
 RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
 
 
@@ -157,24 +157,27 @@ def _delays(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
 
 
 def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
-    """A stretch of time in which several torques are far from any robot of these lengths, unlike elsewhere."""
+    """A stretch of time in which several torques are far from any robot of these lengths, unlike before and after."""
     left, rows, ones = found.of_any_masses, found.log.rows, np.ones((len(found.log.rows), 1))
     alive = [np.hstack([ones, -ones, x[:, None]]) for x in left.T if x.any()]
     if len(rows) < FEWEST_ROWS or not alive:
         return
-    gain, _, first, last = max(map(stretch, alive))
+    _, _, first, last = max(map(stretch, alive))
     inside = np.isin(np.arange(len(rows)), np.arange(first, last))
-    times = np.sqrt(np.square(left[inside]).mean(0) / (np.square(left[~inside]).mean(0) + 1e-300))
-    names, smeared = inputs.named(np.flatnonzero(times > APART)), 1.0 / inputs.compared_cutoff
+    power = [np.square(left[each]).mean(0) + 1e-300 for each in (inside, ~inside, inside | True)]
+    told = inside.sum() * np.log(power[2] / power[0]) + (~inside).sum() * np.log(power[2] / power[1])
+    gains = told * (power[0] > power[1])
+    joints, smeared = np.flatnonzero(gains > TELLS), 2.0 / inputs.compared_cutoff
     begin, end = rows.time[first] - smeared, rows.time[last - 1] + smeared
-    if gain > SURE and len(names) > 1 and end - begin > 3.0 * smeared:
+    if gains.sum() > SURE and len(joints) > 1 and end - begin > 2.5 * smeared and first > 0 and last < len(rows):
+        times = np.sqrt(power[0] / power[1])[joints].max()
         yield look(
             about=UNKNOWN,
-            what=f"from {begin:.4g} to {end:.4g} s the torques of {listed(names)} are up to {times.max():.2g} times as "
-            "far from any masses and friction as elsewhere: a contact, or a load, in these seconds.",
+            what=f"from {begin:.4g} to {end:.4g} s the torques of {listed(inputs.named(joints))} are up to {times:.2g} "
+            "times as far from any masses and friction as elsewhere: a contact, or a load, in these seconds.",
             do=f"Leave them out by forcegp import --without {begin:.4g},{end:.4g}, or forcegp auto with the same.",
-            joints=names,
-            numbers={"seconds": [float(begin), float(end)], "gain": gain},
+            joints=inputs.named(joints),
+            numbers={"seconds": [float(begin), float(end)], "gains": gains[joints].tolist()},
         )
 
 
