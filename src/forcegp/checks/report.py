@@ -116,7 +116,9 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
     """What is looked for in every log, and the comparison of torques, where there is one."""
     doubts = [*registers, *signal_doubts(inputs)]
     if inputs.log.time_ordered:
-        doubts = [*sampling_doubts(inputs), *doubts, *motion_doubts(inputs)]
+        frozen = {name for doubt in doubts if doubt.about == "frozen channel" for name in doubt.joints}
+        moving = (doubt for doubt in motion_doubts(inputs) if not frozen.issuperset(doubt.joints or {"all"}))
+        doubts = [*sampling_doubts(inputs), *doubts, *moving]
     moved = Doubts(doubts).of("velocity").level != "wrong"
     contacts = contact_doubts(inputs.mended, model)
     if moved and inputs.prepared is not None:

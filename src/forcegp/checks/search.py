@@ -338,7 +338,7 @@ def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -
 
     Friction may hide those of the others, as where u is a current.
     """
-    off = np.flatnonzero(best.chosen >= 2)
+    off = np.flatnonzero((best.chosen >= 2) & np.isfinite(best.factors))
     if not explained:
         off = off[(best.exact[off] <= EXPLAINED) & (best.shares[off] > RESTS)]
     if len(off) < (1 if explained else 2):

@@ -190,14 +190,14 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
     if name != "u":
         others &= np.diff(log.u[:, joint]) != 0  # at rest q and v stand still together, while u is noisy or not
     start = length = 0
-    for begin, end in runs(held & others & follows).tolist():
+    for begin, end in runs(held & follows).tolist():
         if end - begin <= max(length, FROZEN_ROWS - 1) or (end - begin) * step < FROZEN_SECONDS:
             continue
         gone = np.cumsum(speed[begin:end]) * step
         jump = abs(values[end + 1] - values[begin]) if end < len(held) else np.inf
         sticks = jump < 0.5 * abs(gone[-1]) if name == "q" else jump < STEPS * resolution(values)
         far = np.ptp(gone) > 0.25 * np.abs(speed[begin:end]).sum() * step
-        if moves[begin:end].mean() > 0.5 and far and not sticks:
+        if min(moves[begin:end].mean(), others[begin:end].mean()) > 0.5 and far and not sticks:
             start, length = begin, end - begin
     if not length or values[start] in (values.min(), values.max()):
         return
@@ -208,7 +208,8 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
         about="saturation" if limit else "frozen channel",
         what=f"the {QUANTITY[name]} of {inputs.names[joint]} stands still at {values[start]:.6g} for "
         f"{length * step:.3g} s from row {start} at {log.time[start]:.3f} s, while its other signals change.",
-        do=f"Leave such stretches out, and look at the {'limits of the drive' if limit else 'logger'}.",
+        do=f"Leave such stretches out, here by forcegp import --without {log.time[start]:.4g},"
+        f"{log.time[start] + length * step:.4g}, and look at the {'limits of the drive' if limit else 'logger'}.",
         joints=(inputs.names[joint],),
         numbers={"quantity": name, "row": start, "seconds": length * step},
     )
@@ -306,11 +307,12 @@ def motion_doubts(inputs: CheckInput, joints: Sequence[int] | None = None) -> li
     if inputs.cutoff is not None:  # all three signals by one filter: what it takes from one it takes from the others
         even = low_pass(even, float(inputs.cutoff), signals=("q", "v", "a"))
     joints = range(even.nv) if joints is None else joints
+    made = inputs.log.metadata.get("import", {}).get("signals", {})
     pieces = [even.select_episodes([number]) for number in even.episodes]
     found: list[Doubt] = []
     for name, source in (("v", "q"), ("a", "v")):
-        if name == "a" and any(doubt.level != "ok" for doubt in found):
-            break  # of wrong velocities nothing better can come
+        if name == "a" and (any(doubt.level != "ok" for doubt in found) or "central" in made.get("a", "")):
+            break  # of wrong velocities nothing better can come, and what was derived says nothing
         slopes = np.concatenate([differentiate(getattr(rows, source), rows.time) for rows in pieces])
         size = np.sqrt([np.square(x).mean(axis=0) for x in (getattr(even, name), slopes)]).max(axis=0)
         kinds = (max(size[k] for k in joints if inputs.rotates[k] == inputs.rotates[joint]) for joint in joints)
