@@ -338,12 +338,14 @@ def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -
 
     Friction may hide those of the others, as where u is a current.
     """
-    off = np.flatnonzero((best.chosen >= 2) & np.isfinite(best.factors))
+    # far less than bodies need is wrong, whatever rotors and friction may hide of it
+    factors = np.where(best.shares > WORSE, best._fits[1].max(axis=1), best.factors)
+    off = np.flatnonzero((best.chosen >= 2) & np.isfinite(factors))
     if not explained:
         off = off[(best.exact[off] <= EXPLAINED) & (best.shares[off] > RESTS)]
     if len(off) < (1 if explained else 2):
         return
-    joints, factors = inputs.named(off), best.factors[off]
+    joints, factors = inputs.named(off), factors[off]
     each = ", ".join(f"{name} {value:.4g}" for name, value in zip(joints, factors, strict=True))
     yield Doubt(
         level="wrong" if not explained or factors.min() < 1.0 / FAR or factors.max() > MUCH_MORE else "look",
