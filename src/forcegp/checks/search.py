@@ -305,8 +305,9 @@ def _root(inputs: CheckInput) -> Explanation:
 
 def _said(best: Explanation, root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     """A doubt for every cause, in the order in which they are to be corrected."""
-    before, after = (100.0 * float(np.nanmax(each.exact)) for each in (root, best))
-    then = f"; then at most {after:.2g} % of a torque remains unexplained, instead of {before:.3g} %."
+    most = int(np.nanargmax(root.exact - best.exact))  # where they explain most
+    before, after = (100.0 * float(each.exact[most]) for each in (root, best))
+    then = f"; then {after:.2g} % of the torque of {inputs.names[most]} remain unexplained, instead of {before:.3g} %."
     for cause in best.causes:
         if cause.about != "delay":
             told = {"joints": inputs.named(cause.joints), "numbers": cause.numbers, "correction": cause.correction}

@@ -25,6 +25,8 @@ def short_name(name: str) -> str:
 
 TOLD = {"stop", "spring", "drift", "elastic joint", "unknown cause", "joint zero", "torque constant", "torque unit"}
 """Subjects of doubts that the answer repeats."""
+FIRST = {"unknown cause", "joint zero", "torque constant", "torque unit"}
+"""Those that change all that follows."""
 
 
 def answer_lines(
@@ -46,6 +48,7 @@ def answer_lines(
     jitter = f", steps up to {deviation:.0%} off (evened out)" if done["resampled_to_step"] is not None else ""
     doubts = [*done["stops"], *(x for x in content["check"]["doubts"] if not is_explained(x, scores, best))]
     seen = [(x["about"], f"{x['what']} {x['do']}") for x in doubts if x["about"] in TOLD]
+    held += "; settle what is said above first" if FIRST & {about for about, _ in seen} else ""
     flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
     mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
     late, lag, rate = prepared["delay"], prepared["lag"], (len(dataset) - len(dataset.episodes)) / seconds

@@ -21,7 +21,7 @@ import forcegp.recordings
 import forcegp.report
 import forcegp.scores
 from forcegp.atomic_files import atomic_file, atomic_folder, write_json
-from forcegp.cli.answer import answer_lines, short_name, verdict
+from forcegp.cli.answer import FIRST, answer_lines, short_name, verdict
 from forcegp.cli.command import CONFIG, LOG, Command, options_of, unless_given
 from forcegp.cli.fit import write_estimates
 from forcegp.cli.logs import ColumnOptions, FilterOptions, prepared_rows, resolved
@@ -112,7 +112,8 @@ class Auto(Command):
             rows, recording = self._prepared_rows(terminal, dataset, bool(done["open_switches"]), report)
         settings = dict(rows.metadata["preparation"])
         with terminal.progress("identifying"):
-            expression, found = forcegp.scores.identify(recording, identification(model))
+            wanted = identification(model, "+spring" if report.doubts.of("spring") else "")
+            expression, found = forcegp.scores.identify(recording, wanted)
         identified: Any = found
         laws = forcegp.scores.summands(expression.partition("@")[0])[1:]
         payload: dict[str, Any] = {}
@@ -140,7 +141,8 @@ class Auto(Command):
             "code": self._code(terminal, posterior),
         }
         answer = answer_lines(content, dataset, recording, identified, held, scores, still)
-        best = verdict(scores, dataset, still)
+        first = next((f"Settle the {about} first. Until then: " for about, _ in answer if about in FIRST), "")
+        best = first + verdict(scores, dataset, still)
         content |= {"answer": [": ".join(line) for line in answer], "best": best}
         self._write_report(terminal, posterior, recording, content, answer, scores)
         content |= {"cpu_seconds": time.process_time() - begin}
@@ -278,9 +280,9 @@ class Auto(Command):
         return str(self.out / "c")
 
 
-def identification(model: forcegp.Model) -> str:
-    """What is found of the robot by itself, as `forcegp score --identification` takes it."""
-    laws = f"+{'+'.join(LAWS)}" if model.robot.single_joint_names else ""
+def identification(model: forcegp.Model, more: str = "") -> str:
+    """What is found of the robot by itself, as `forcegp score --identification` takes it, and `more` laws of joints."""
+    laws = f"+{'+'.join(LAWS)}{more}" if model.robot.single_joint_names else ""
     return f"bodies{laws}@{'torques' if model.robot.space.is_vector_space else 'torques:both'}"
 
 

@@ -165,7 +165,8 @@ def payload_text(found: Any) -> str:
     mass, *center = parts.values()
     error = 0.5 * (mass.interval[1] - mass.interval[0])
     if mass.value < max(SURE * mass.std, LEAST_PAYLOAD):
-        return f"none ({mass.value:.2g} ± {error:.1g} kg)"
+        size = f"{mass.value:.2g} ± {error:.1g} kg"
+        return f"none, or {size}" if mass.value > mass.std else f"none ({size})"
     place = ", ".join(f"{1e3 * each.value:.0f}" for each in center)
     [held] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
     links = f"if the URDF's links{' and ' * bool(drives := drives_of(found.model))}{drives} are right"
@@ -182,7 +183,9 @@ MOST_FACTORS = 3  # of one cause that a person can look for
 
 
 def other_causes(payload: Mapping[str, Any]) -> dict[str, str]:
-    """What would explain more than this payload, by cause."""
+    """What would explain more than this payload, by cause; beside none, what drives alone do."""
+    mass = payload.get("parameters", {}).get("payload.mass", {"value": 1.0, "std": 0.0})
     doubts = [each for each in payload.get("doubts", ()) if each["about"] == "payload"]
     causes = ((cause, len(own), each["what"]) for each in doubts for cause, own in each["numbers"].items())
-    return {cause: what for cause, factors, what in causes if factors <= MOST_FACTORS}
+    some = mass["value"] > mass["std"]
+    return {cause: what for cause, factors, what in causes if factors <= MOST_FACTORS and (some or cause == "gains")}

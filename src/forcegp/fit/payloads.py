@@ -173,7 +173,8 @@ def misfit(
         clearly = instead is not None or (worth > best and more > least)
         if clearly and off.any() and abs(change).max() < NO_STEP:
             told = ", ".join(f"{factors[k]:.3g} ({names[0][k]})" for k in np.flatnonzero(off))
-            less = f"leave {more / cost:.0%} less unexplained" if instead is None else "do as well as any payload"
+            less = f"leave {more / cost:.0%} less unexplained" if more < cost else "explain nearly all of it"
+            less = less if instead is None else "do as well as any payload"
             doubt = look(
                 about="payload",
                 what=f"{said} {told} would {less}. The intervals hold what that would change.",

@@ -68,7 +68,8 @@ def identify(recording: Dataset, expression: str) -> tuple[str, Posterior]:
     forces, _, evidence = expression.partition("@")
     given = parse_evidence(evidence)
     identified = learn(named_model(recording.model, summands(forces)), recording, given)[0]
-    if not recording.model.robot.space.is_vector_space or not pushed_where_they_are(recording, identified.model):
+    pushed = recording.model.robot.space.is_vector_space and "spring" not in summands(forces)
+    if not pushed or not pushed_where_they_are(recording, identified.model):
         return expression, identified
     forces = f"{forces}+spring"
     return f"{forces}@{evidence}", learn(named_model(recording.model, summands(forces)), recording, given)[0]
