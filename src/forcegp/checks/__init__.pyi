@@ -1,4 +1,4 @@
 from .report import (
     CheckReport as CheckReport, check as check, quick_check as quick_check,
 )
-from .torque_doubts import without_stops as without_stops
+from .torque_doubts import without_pushes as without_pushes, without_stops as without_stops

@@ -1,13 +1,13 @@
 """Doubts of torques beside those of the search: drift, elastic joints, delay, stops."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
-from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, UNKNOWN, Explanation
+from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, Explanation
 from forcegp.checks.torques import WIDTHS, Comparison, stretch, with_gravity
 from forcegp.data import Dataset, estimate_delay
 from forcegp.data.views import consecutive, rests
@@ -172,10 +172,10 @@ def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     if gains.sum() > SURE and len(joints) > 1 and end - begin > 2.5 * smeared and first > 0 and last < len(rows):
         times = np.sqrt(power[0] / power[1])[joints].max()
         yield look(
-            about=UNKNOWN,
+            about="push",
             what=f"from {begin:.4g} to {end:.4g} s the torques of {listed(inputs.named(joints))} are up to {times:.2g} "
             "times as far from any masses and friction as elsewhere: a contact, or a load, in these seconds.",
-            do=f"Leave them out by forcegp import --without {begin:.4g},{end:.4g}, or forcegp auto with the same.",
+            do=f"Leave them out by forcegp import --without {begin:.4g},{end:.4g}, as forcegp auto does.",
             joints=inputs.named(joints),
             numbers={"seconds": [float(begin), float(end)], "gains": gains[joints].tolist()},
         )
@@ -257,6 +257,13 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
         numbers={"seconds": spans},
     )
     return _cut(log, out), [doubt]
+
+
+def without_pushes(log: Dataset, doubts: Sequence[Doubt]) -> Dataset:
+    """The log without the seconds in which something is touched; of several episodes, whose times repeat, as it is."""
+    spans = [doubt.numbers["seconds"] for doubt in doubts if doubt.about == "push" and len(log.episodes) == 1]
+    touched = [np.flatnonzero((log.time >= begin) & (log.time <= end)) for begin, end in spans]
+    return _cut(log, np.concatenate(touched)) if touched else log
 
 
 def _cut(log: Dataset, rows: np.ndarray) -> Dataset:

@@ -23,10 +23,10 @@ def short_name(name: str) -> str:
     return f"{learned} learned" if learned else plain.get(name, name)
 
 
-TOLD = {"stop", "spring", "drift", "elastic joint", "unknown cause", "joint zero", "torque constant", "torque unit"}
-"""Subjects of doubts that the answer repeats."""
 FIRST = {"unknown cause", "joint zero", "torque constant", "torque unit"}
-"""Those that change all that follows."""
+"""Subjects of doubts that change all that follows."""
+TOLD = FIRST | {"stop", "push", "spring", "drift", "elastic joint"}
+"""Those that the answer repeats."""
 
 
 def answer_lines(

@@ -105,6 +105,7 @@ class Auto(Command):
             raise DatasetError(f"something is wrong with the log ({bad.subjects}); correct it, or add --accept.")
         for doubt in report.doubts.at("look"):  # what is known already, while the rest takes minutes
             terminal.note(f"{doubt.about}: {doubt.what}")
+        dataset = forcegp.checks.without_pushes(dataset, report.doubts)
         self.out.mkdir(parents=True, exist_ok=True)
         with atomic_file(self.out / "log.h5", overwrite=True) as temporary:
             dataset.save(temporary)
