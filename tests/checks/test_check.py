@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from tests.checks.logs import PENDULUM, RATE, arm, clean, column, pendulum
 from tests.robots.robot_models import with_link
 
-from forcegp.checks import CheckReport, check, quick_check, without_stops
+from forcegp.checks import CheckReport, check, quick_check, without_pushes, without_stops
 from forcegp.checks.residuals import pushed_where_they_are
 from forcegp.checks.search import UNKNOWN, moving
 from forcegp.checks.torques import with_gravity
@@ -185,6 +185,21 @@ def test_a_chirp_across_the_resonance_of_a_gear_is_named(stiffness, at_motor, sh
         assert 0.7 * resonance < numbers["resonance"]["shoulder"] < 1.1 * resonance
         assert 0.2 * resonance < numbers["cutoff"] < 0.4 * resonance
         assert not found.of(UNKNOWN)
+
+
+def test_the_seconds_of_a_push_are_named_and_left_out():
+    log = clean(4, seconds=12.0)
+    J = log.model.robot.kinematics(torch.tensor(log.q)).frame_jacobian("hand")[:, :3].numpy()
+    there = np.clip(10.0 * np.minimum(log.time - 4.0, 6.0 - log.time), 0.0, 1.0)
+    touched = replace(log, u=log.u - there[:, None] * np.einsum("rij,i->rj", J, [-2.0, 4.0, 1.0]))
+    assert not check(log).doubts.of("push")
+    doubts = check(touched).doubts
+    [push] = doubts.of("push")
+    assert push.joints == ("pan", "lift")
+    assert push.numbers["seconds"] == pytest.approx([4.0, 6.0], abs=0.4)
+    kept = without_pushes(touched, doubts)
+    assert len(kept.episodes) == 2
+    assert 1900 < len(kept) < 2100
 
 
 def test_nothing_is_differentiated_across_postures():

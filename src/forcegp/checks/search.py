@@ -383,7 +383,7 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     if others is not None and (left := replace(root, log=replace(root.log, rows=others)).rough.max()) <= EXPLAINED:
         where += f", and elsewhere at most {100.0 * left:.2g} % stays: a contact, or a load, in these seconds"
         numbers["seconds"] = [float(x) for x in seconds.split(",")]
-        do = f"Leave them out by forcegp import --without {seconds}, or forcegp auto with the same."
+        do = f"Leave them out by forcegp import --without {seconds}, as forcegp auto does."
     yield look(
         about=UNKNOWN,
         what="something is wrong that is none of the causes that were tried (signs, units, orders, zeros, gravity, "

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
-from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, Explanation
+from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, UNKNOWN, Explanation
 from forcegp.checks.torques import WIDTHS, Comparison, stretch, with_gravity
 from forcegp.data import Dataset, estimate_delay
 from forcegp.data.views import consecutive, rests
@@ -261,7 +261,8 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
 
 def without_pushes(log: Dataset, doubts: Sequence[Doubt]) -> Dataset:
     """The log without the seconds in which something is touched; of several episodes, whose times repeat, as it is."""
-    spans = [doubt.numbers["seconds"] for doubt in doubts if doubt.about == "push" and len(log.episodes) == 1]
+    seen = [doubt for doubt in doubts if doubt.about in ("push", UNKNOWN) and "seconds" in doubt.numbers]
+    spans = [doubt.numbers["seconds"] for doubt in seen if len(log.episodes) == 1]
     touched = [np.flatnonzero((log.time >= begin) & (log.time <= end)) for begin, end in spans]
     return _cut(log, np.concatenate(touched)) if touched else log
 

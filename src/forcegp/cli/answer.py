@@ -47,7 +47,8 @@ def answer_lines(
     deviation = max(each["largest_deviation_of_a_step"] for each in done["recordings"])
     jitter = f", steps up to {deviation:.0%} off (evened out)" if done["resampled_to_step"] is not None else ""
     doubts = [*done["stops"], *(x for x in content["check"]["doubts"] if not is_explained(x, scores, best))]
-    seen = [(x["about"], f"{x['what']} {x['do']}") for x in doubts if x["about"] in TOLD]
+    told = [x if "seconds" not in x["numbers"] or x["about"] not in FIRST else {**x, "about": "push"} for x in doubts]
+    seen = [(x["about"], f"{x['what']} {x['do']}") for x in told if x["about"] in TOLD]
     held += "; settle what is said above first" if FIRST & {about for about, _ in seen} else ""
     flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
     mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
