@@ -17,13 +17,9 @@ rollout = pytest.importorskip("mujoco.rollout")
 __all__ = ["posterior"]  # a fixture
 
 
-def unbalanced(urdf):
-    """With the inertias that it states."""
-    return urdf.replace("</robot>", '<mujoco><compiler balanceinertia="false"/></mujoco></robot>')
-
-
 def model_of(urdf=URDF):
-    model = mujoco.MjModel.from_xml_string(unbalanced(urdf))
+    as_stated = '<mujoco><compiler balanceinertia="false"/></mujoco></robot>'
+    model = mujoco.MjModel.from_xml_string(urdf.replace("</robot>", as_stated))
     model.jnt_limited[:] = 0
     return model
 

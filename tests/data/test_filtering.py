@@ -31,10 +31,6 @@ def motion(time: np.ndarray = TIME, **changes: object) -> Dataset:
 # ---------------------------------------------------------------- low-pass
 
 
-def at_rate(rows, rate=RATE):
-    return np.arange(rows) / rate
-
-
 LAG = 0.02
 
 
@@ -64,7 +60,7 @@ def test_the_memory_of_noise_is_where_its_autocorrelation_is_one_half():
 @pytest.mark.parametrize("cutoff", [50.0, 0.0, np.nan])
 def test_a_cutoff_beyond_half_the_sample_rate_is_refused(cutoff):
     with pytest.raises(InvalidInput, match=r"below 50 Hz, half the sample rate"):
-        LowPass(cutoff)(np.zeros((100, 1)), at_rate(100, 100.0))
+        LowPass(cutoff)(np.zeros((100, 1)), np.arange(100) / 100.0)
 
 
 def test_episodes_are_filtered_apart():

@@ -37,10 +37,7 @@ def with_joint(name: str, parent: str, child: str, links: str = "") -> str:
     return SMALL.replace("</robot>", links + JOINT.format(name, parent, child))
 
 
-def without_inertial(text: str) -> str:
-    return re.sub("<inertial>.*</inertial>", "", text, flags=re.DOTALL)
-
-
+WITHOUT = re.sub("<inertial>.*</inertial>", "", SMALL, flags=re.DOTALL)
 ENTITIES = '<!DOCTYPE robot [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]>' + SMALL.replace("small", "&b;")
 IXX = 'ixx="0.1"'
 ROD = '<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0"/>'  # along z, the axis of the hinge
@@ -80,7 +77,7 @@ WRONG = {
     "NaN limit": (changed('upper="1"', 'upper="nan"'), ["<limit> upper", "NaN"]),
     "infinite origin": (changed("<axis", '<origin xyz="0 inf 0"/><axis'), ["joint 'hinge'", "<origin> xyz", "finite"]),
     "no mass element": (changed('<mass value="2"/>', ""), ["link 'arm'", "has no mass"]),
-    "moving link without inertia": (without_inertial(SMALL), ["link 'arm'", "joint 'hinge'", "add an <inertial>"]),
+    "moving link without inertia": (WITHOUT, ["link 'arm'", "joint 'hinge'", "add an <inertial>"]),
     "massless but inert": (changed('"2"', '"0"'), ["link 'arm'", "mass is zero", "has no mass"]),
     "infinite damping": (
         changed("<limit ", '<dynamics damping="inf"/><limit '),
