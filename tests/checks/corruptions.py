@@ -251,7 +251,7 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "length .4 -> .6": (lambda d: scaled(d, length=1.5), "length"),
     "3 % of all rows zero": (lambda d: dropped(d, "qvau", 0.03), "zero|drop"),
     "3 % of q zero": (lambda d: dropped(d, "q", 0.03), "zero|drop|velocity"),
-    "frozen position": (lambda d: column(d, "q", 1, held), "frozen"),
+    "frozen position": (lambda d: column(replace(d, u=np.round(d.u, 2)), "q", 1, held), "frozen"),
     "saturation": (lambda d: column(d, "u", 0, lambda x: np.clip(x, *np.quantile(x, [0.1, 0.9]))), "saturation"),
     "saturation of a warm drive": (
         lambda d: column(d, "u", 0, lambda x: np.r_[x[:300], limited(x[300:], 0.8)]),

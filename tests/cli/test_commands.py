@@ -1,6 +1,7 @@
 """The commands from end to end on real files."""
 
 import contextlib
+import functools
 import hashlib
 import json
 import os
@@ -102,16 +103,12 @@ def test_the_demo_tells_the_whole_story(forcegp, tmp_path, monkeypatch):
     assert [entry.name for entry in tmp_path.iterdir()] == ["demo"]
 
 
-def interruptible():
-    """Hear Ctrl-C even where the tests run in the background, whose processes inherit that it is ignored."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
 @pytest.mark.nightly
 def test_ctrl_c_ends_in_one_line_and_leaves_nothing_behind(executable, tmp_path):
     screen, terminal = pty.openpty()
     command = [executable, "simulate", "kuka-surface", "--seconds", "5000", "--out", "long.h5"]
-    to = {"stdout": subprocess.DEVNULL, "stderr": terminal, "preexec_fn": interruptible}
+    heard = functools.partial(signal.signal, signal.SIGINT, signal.default_int_handler)  # also in the background
+    to = {"stdout": subprocess.DEVNULL, "stderr": terminal, "preexec_fn": heard}
     with subprocess.Popen(command, cwd=tmp_path, **to) as process:
         os.close(terminal)
         seen = b""

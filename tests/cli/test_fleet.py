@@ -60,7 +60,9 @@ def test_each_log_is_a_row_and_one_that_fails_says_so(listed, capsys):
 
     # what is finished stays, what is mended is run
     written = Path("out/robot1/model.json").stat().st_mtime_ns
-    broken.write_bytes(bytes_of_the_first(listed))
+    first = listed.read_text().split()[3]
+    assert len(Dataset.load(first)) == 60
+    broken.write_bytes(Path(first).read_bytes())
     assert main(words("out")) == 0
     assert "5 of 5 logs are done" in capsys.readouterr().out
     assert Path("out/robot1/model.json").stat().st_mtime_ns == written
@@ -72,12 +74,6 @@ def test_an_estimate_is_one_column():
     content["settings"] = {"a": 1}
     found = {"estimates.viscous.elbow": 0.4, "value.interval": 3, "value.value": 2}
     assert numbers_of(content) == found
-
-
-def bytes_of_the_first(listed: Path) -> bytes:
-    first = listed.read_text().split()[3]
-    assert len(Dataset.load(first)) == 60
-    return Path(first).read_bytes()
 
 
 @pytest.mark.parametrize(

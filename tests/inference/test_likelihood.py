@@ -10,16 +10,11 @@ from tests.inference.dense import dense_covariance, dense_negative_log_likelihoo
 from tests.inference.problems import SHAPES, Problem, constrained_inverse_mass, normal, problem
 
 from forcegp.errors import NumericalError
-from forcegp.inference import LatentKernels, likelihood, negative_log_likelihood
+from forcegp.inference import likelihood, negative_log_likelihood
 
 ABSOLUTE, RELATIVE = 1e-6, 1e-7
 
 PANELS = ("one panel", "some panels", "one row per panel")
-
-
-def plain_matrices(kernels: LatentKernels, features) -> list[torch.Tensor]:
-    """GPyTorch itself, dense, under plain autograd."""
-    return [kernel(z, z).to_dense() for kernel, z in zip(kernels.kernels, features, strict=True)]
 
 
 def assert_same_value_and_gradients(given_problem: Problem, noise_of=lambda problem: (problem.noise, [problem.noise])):
@@ -32,7 +27,9 @@ def assert_same_value_and_gradients(given_problem: Problem, noise_of=lambda prob
     data |= {f"features {c}": z for c, z in enumerate(given_problem.features)}
     data |= dict(given_problem.kernels.named_parameters())
     arguments = given_problem.W, given_problem.residual, noise
-    expected = dense_negative_log_likelihood(*arguments, plain_matrices(given_problem.kernels, given_problem.features))
+    each = zip(given_problem.kernels.kernels, given_problem.features, strict=True)
+    dense = [kernel(z, z).to_dense() for kernel, z in each]  # GPyTorch itself, under plain autograd
+    expected = dense_negative_log_likelihood(*arguments, dense)
     result = negative_log_likelihood(*arguments, given_problem.kernels(given_problem.features))
     assert abs(float((result - expected).detach())) < ABSOLUTE
     gradients, expected_gradients = (
