@@ -104,7 +104,8 @@ class Auto(Command):
             terminal.show(doubts_table(bad, terminal.worded))
             raise DatasetError(f"something is wrong with the log ({bad.subjects}); correct it, or add --accept.")
         for doubt in report.doubts.at("look"):  # what is known already, while the rest takes minutes
-            terminal.note(f"{doubt.about}: {doubt.what}")
+            if doubt.about != "unknown cause":  # which a model may explain
+                terminal.note(f"{doubt.about}: {doubt.what}")
         dataset = forcegp.checks.without_pushes(dataset, report.doubts)
         self.out.mkdir(parents=True, exist_ok=True)
         with atomic_file(self.out / "log.h5", overwrite=True) as temporary:
