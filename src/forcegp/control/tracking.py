@@ -261,8 +261,7 @@ class HybridForce(TrackingController):
         self.past = Past(self.model, position_noise)
         self._free: ComputedTorque | None = None
         if off_surface == "release":
-            free = predictor.posterior.with_contacts([]).predictor(covariance="none")
-            self._free = ComputedTorque(free, **settings)
+            self._free = ComputedTorque(predictor.posterior.with_contacts([]).predictor(covariance="none"), **settings)
             self._free.past = self.past
 
     @override

@@ -120,8 +120,7 @@ def shifted(dataset: Dataset, delay: float, lag: float = 0.0, lagging: Sequence[
         u = rows.u.copy()
         u[:, columns] = lagged(u[:, columns], rows.time, lag)
         if delay:  # values at the ends hold beyond them
-            later = np.clip(rows.time + delay, rows.time[0], rows.time[-1])
-            u[:, :count] = CubicSpline(rows.time, u[:, :count])(later)
+            u[:, :count] = CubicSpline(rows.time, u[:, :count])(np.clip(rows.time + delay, rows.time[0], rows.time[-1]))
         return {"u": u}
 
     return replace(dataset, **by_episode(dataset, acting), truth={})

@@ -89,8 +89,7 @@ def find_wind(dataset: Dataset) -> tuple[AirLaw, Float[np.ndarray, "rows 3"]] | 
     if means is None:
         return None
     forces, start = _Forces.of(dataset), means[episode]
-    law = forces.law(start)
-    wind = law._smoothed(forces, dataset, start, SECONDS, after=True)
+    wind = forces.law(start)._smoothed(forces, dataset, start, SECONDS, after=True)
     wind = forces.law(wind)._smoothed(forces, dataset, start, SECONDS, after=True)
     return forces.law(wind), wind
 

@@ -246,8 +246,7 @@ def _drawn(server: Any, recorded: RecordedScene) -> Callable[[int], None]:
     arrows = []
     for place, group in enumerate(recorded.arrows):  # of the mean, and thinner pale ones to the end of the interval
         color = np.array(COLORS[place % len(COLORS)])
-        pale = color + PALE * (255 - color)
-        looks = ("mean", color, 0.014), ("interval", pale, 0.008)
+        looks = ("mean", color, 0.014), ("interval", color + PALE * (255 - color), 0.008)
         for points, (kind, shade, width) in zip(group.tips(0, length), looks, strict=True):
             radii = {"shaft_radius": width * size, "head_radius": 2.0 * width * size, "head_length": 2.5 * width * size}
             name = f"/forces/{place}/{kind}"

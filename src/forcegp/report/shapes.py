@@ -74,8 +74,7 @@ def reach(robot: Robot) -> float:
     """The length of the robot in m: the farthest that a chain of joints stretches."""
     lengths: dict[str, float] = {}
     for joint in robot.all_joints:
-        step = float(np.linalg.norm(joint.origin[:3, 3]))
-        lengths[joint.child] = lengths.get(joint.parent, 0.0) + step
+        lengths[joint.child] = lengths.get(joint.parent, 0.0) + float(np.linalg.norm(joint.origin[:3, 3]))
     longest = max(lengths.values(), default=0.0)
     centers = [np.linalg.norm(robot.link(name).center_of_mass) for name in robot.link_names]
     return max(longest, float(max(centers, default=0.0)), 0.1)

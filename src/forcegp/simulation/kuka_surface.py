@@ -84,8 +84,7 @@ def kuka_urdf(config: KukaSurfaceConfig) -> str:
 
 def kuka_robot(config: KukaSurfaceConfig) -> Robot:
     """The arm on its base, with the tool of a scenario."""
-    down = (0.0, 0.0, -config.gravity)
-    return Robot.from_urdf_text(kuka_urdf(config), source="kuka-surface", gravity=down)
+    return Robot.from_urdf_text(kuka_urdf(config), source="kuka-surface", gravity=(0.0, 0.0, -config.gravity))
 
 
 @dataclass(frozen=True)
