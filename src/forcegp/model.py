@@ -347,8 +347,7 @@ class Model(Summary):
     @staticmethod
     def _contradiction(dynamics: ConstrainedDynamics) -> tuple[Tensor, Tensor]:
         """|A a - b| (..., m) of the constrained acceleration, in m/s^2 and relative to 1 + |b|."""
-        a = dynamics.acceleration_map().offset
-        violation = ((dynamics.A @ a[..., None])[..., 0] - dynamics.b).abs()
+        violation = ((dynamics.A @ dynamics.acceleration_map().offset[..., None])[..., 0] - dynamics.b).abs()
         return violation, violation / (1.0 + dynamics.b.abs())
 
     def to(self, device: torch.device | str) -> "Model":

@@ -86,8 +86,7 @@ class Noise:
         forces = [(2.0 * parameters[name]).exp() for name in (FORCE, PUSHES) if name in parameters]
         if not forces:
             return acceleration
-        force = torch.stack(forces).sum(0)
-        return torch.diag_embed(acceleration) + (H * force) @ H.mT
+        return torch.diag_embed(acceleration) + (H * torch.stack(forces).sum(0)) @ H.mT
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """Log density (up to a constant) of the noise among `parameters` under its hyperprior; 0 where it is fixed.

@@ -144,8 +144,7 @@ def _lower_and_orthonormal(matrix: Tensor) -> tuple[Tensor, Tensor]:
             row, along = row - (share[..., None, :] @ basis)[..., 0, :], along + share
         unit, length = _unit(row, torch.zeros_like(row[..., 0]))
         basis = torch.cat([basis, unit[..., None, :]], dim=-2)
-        rest = torch.zeros_like(matrix[..., : count - k - 1, 0])
-        lower.append(torch.cat([along, length[..., None], rest], dim=-1))
+        lower.append(torch.cat([along, length[..., None], torch.zeros_like(matrix[..., : count - k - 1, 0])], dim=-1))
     return torch.stack(lower, dim=-2), basis
 
 
@@ -376,8 +375,7 @@ def _product(graph: Graph, x: Any, y: Any) -> _Numbers:
     count = math.prod(left.shape[:-2])
     if left.numel() and bool((left[..., -1, 0] == ZERO).all()):  # sums of what follows share terms from the end on
         left, right = left.flip(-1), right.flip(-2)
-    stacks = (x.reshape(count, *x.shape[-2:]).tolist() for x in (left, right.mT))
-    pairs = zip(*stacks, strict=True)
+    pairs = zip(*(x.reshape(count, *x.shape[-2:]).tolist() for x in (left, right.mT)), strict=True)
     results = [graph.dot(row, column) for rows, columns in pairs for row in rows for column in columns]
     return _Numbers(torch.tensor(results, dtype=torch.long).view(shape))
 

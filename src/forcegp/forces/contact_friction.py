@@ -180,8 +180,7 @@ class ContactFriction(ExpressedKernels):
     def direction(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
         if self.contact >= len(dynamics.contacts):
             return torch.zeros_like(dynamics.H[..., :1])
-        where = ToolPoint.of_contact(dynamics, self.contact)
-        return where.jacobian[..., :3, :].mT @ self.point_force(dynamics)
+        return ToolPoint.of_contact(dynamics, self.contact).jacobian[..., :3, :].mT @ self.point_force(dynamics)
 
     @override
     def point_force(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch 3 C"]:

@@ -364,8 +364,7 @@ class Memory:
                 signs[:, own], seen_signs[:, own] = here, there
             first += size
         mean = (seen * seen_signs).mean(0)
-        at_rest = signs == 0.0
-        variance = torch.where(at_rest, seen.square().mean(0), (seen * seen_signs - mean).square().mean(0))
+        variance = torch.where(signs == 0.0, seen.square().mean(0), (seen * seen_signs - mean).square().mean(0))
         return mean * signs, variance
 
     def after(self, memory: Float[Tensor, "*batch m"], step: Float[Tensor, "*batch nv"], dt: float | Tensor) -> Tensor:

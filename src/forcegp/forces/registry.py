@@ -72,8 +72,7 @@ def force_name(force: Force) -> str:
     """The name of a force in `FORCES`. Raises InvalidInput for one that has none, which no file can carry."""
     kind = type(force)
     for name, entry in FORCES.items():
-        own = entry is kind or f"{kind.__module__}.{kind.__name__}" == f"forcegp.forces.{entry}"
-        if own:
+        if entry is kind or f"{kind.__module__}.{kind.__name__}" == f"forcegp.forces.{entry}":
             return name
     raise InvalidInput(
         f"a {kind.__name__} cannot be stored: register it first, FORCES['my-force'] = {kind.__name__}; registered: "
@@ -171,8 +170,7 @@ def _refuse(name: str, unknown: bool, expression: Any) -> None:
         other = name if unknown else f"{UNKNOWN}{name}"
         kind = "a law with coefficients" if unknown else "an unknown force"
         raise InvalidInput(f"{name!r} in {whole} is {kind}; write {other}")
-    names = [each for each in (*SHORT, *FORCES) if is_unknown(each) == unknown]
-    require_known("force", name, whole, names)
+    require_known("force", name, whole, [each for each in (*SHORT, *FORCES) if is_unknown(each) == unknown])
 
 
 def _value(what: str, key: str, text: str, make: Callable[..., Any], field: Parameter) -> Any:

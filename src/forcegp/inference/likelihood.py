@@ -265,8 +265,7 @@ def solve_deflated(deflation: Deflation, kernel_matrices: Sequence[Float[Tensor,
     count, rank, _ = deflation.C.shape
     factor = factorize(lambda: deflated_covariance(deflation.C, kernel_matrices))
     alpha = factor.solve(deflation.t.reshape(-1, 1)).reshape(count, rank)
-    beta = torch.einsum("irc,ir->ic", deflation.C, alpha)
-    return DeflatedSystem(deflation, factor, alpha, beta)
+    return DeflatedSystem(deflation, factor, alpha, torch.einsum("irc,ir->ic", deflation.C, alpha))
 
 
 def deflated_covariance(

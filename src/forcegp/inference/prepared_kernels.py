@@ -156,8 +156,7 @@ class KernelSum:
     def root_table(self) -> np.ndarray:
         """The roots of the compressed covariance, of as many centres as there are in the table."""
         assert self.roots is not None, "asked for with a compressed covariance only"
-        filled = -len(self.centers) % PADDING
-        return torch.nn.functional.pad(self.roots, (0, 0, 0, filled)).numpy().ravel()
+        return torch.nn.functional.pad(self.roots, (0, 0, 0, -len(self.centers) % PADDING)).numpy().ravel()
 
     def c_source(self, lanes: int, slopes: bool) -> str:
         """The C function `NAME(table, live, z, f)`, or NAME_slopes, whose derivatives follow the values."""

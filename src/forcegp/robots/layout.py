@@ -245,8 +245,7 @@ def lay_out(
         raise RobotModelError(
             f"{description.source}: {len(bodies)} joints move; forcegp takes up to {MOST_BODIES}, lock the others."
         )
-    names = [joint.name for joint in bodies if joint.name not in drives]
-    places = {name: place for place, name in enumerate(names)}
+    places = {name: place for place, name in enumerate(joint.name for joint in bodies if joint.name not in drives)}
     joints = with_followers({body.name: body for body in bodies if body.name not in drives}, bodies, drives)
     moved = [drives.get(joint.name, (joint.name, 1.0, 0.0)) for joint in bodies]
     drive = tuple(Drive(places[name], multiplier, offset) for name, multiplier, offset in moved)
