@@ -264,8 +264,7 @@ class Curve:
 
 def joint_force(posterior: Any, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv"]:
     """Q_K + Q_U, the mean of what acts on the joints of a Posterior beside the contacts."""
-    Q_U = posterior.latents(dynamics, False).through(posterior.trained.unknown.direction(dynamics)).mean
-    return dynamics.Q_K + Q_U
+    return dynamics.Q_K + posterior.latents(dynamics, False).through(posterior.trained.unknown.direction(dynamics)).mean
 
 
 def require_actuated(posterior: Any) -> None:

@@ -56,8 +56,7 @@ def prepared_predictor(posterior: Any, covariance: str, compile: bool) -> Predic
                 stacklevel=3,
             )
     code = posterior.programs(compressed=compressed) if compile else None
-    where = model.robot.space, model.sizes, training.q.device
-    made = Predictor(posterior, *where, code, covariance, compressed)
+    made = Predictor(posterior, model.robot.space, model.sizes, training.q.device, code, covariance, compressed)
     made.compiled("mean" if compressed is None else "covariance")
     return replace(made, prepare_seconds=time.perf_counter() - begin)
 
@@ -83,8 +82,7 @@ def _compressed(latent: ExactPosterior, training: TrainingData, physics: Physics
 
     def sample(count: int, seed: int, rows: int) -> Sample:
         with torch.no_grad():
-            states = sample_states(training, physics.model.robot.space, count, seed, rows)
-            W, features = physics.mixing(*states)
+            W, features = physics.mixing(*sample_states(training, physics.model.robot.space, count, seed, rows))
         usable = torch.isfinite(W).flatten(1).all(1)  # no state of its own has a surface without a normal
         return Sample([z[usable] for z in features], W[usable])
 
