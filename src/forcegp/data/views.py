@@ -124,8 +124,7 @@ def one_row_per_rest(dataset: Dataset) -> Dataset:
 
     Stiction holds the same share of the load in all rows of a rest, so they are one observation of it.
     """
-    number = rests_alone(dataset)
-    if number is None:
+    if (number := rests_alone(dataset)) is None:
         return dataset
     _, first, label = np.unique(number, return_index=True, return_inverse=True)
 

@@ -266,8 +266,7 @@ def with_bodies(robot: Robot, wanted: Mapping[int, Float[np.ndarray, "4 4"]]) ->
     """
     own, names = carrying(robot), body_names(robot)
     indefinite = [body for body, pseudo in wanted.items() if torch.linalg.cholesky_ex(torch.as_tensor(pseudo)).info]
-    impossible = [names[own.index(body)] for body in indefinite]
-    if impossible:
+    if impossible := [names[own.index(body)] for body in indefinite]:
         raise NonPhysicalInertia(
             f"no body has the inertia that was found for {', '.join(impossible)}, so there is no such robot; give the "
             "log more motion, or a prior."

@@ -220,8 +220,7 @@ class ParameterSpace:
         pseudo, laws = self.bodies.pseudo_inertias(x[: self.bodies.size]), list[Any](self.model.laws)
         for index, named in values.items():
             laws[index] = laws[index].with_values(named)
-        wanted = {each.body: pseudo[k] for k, each in enumerate(self.carried) if each.payload is None}
-        if wanted:
+        if wanted := {each.body: pseudo[k] for k, each in enumerate(self.carried) if each.payload is None}:
             robot = with_bodies(robot, wanted)
         for each, J in zip(self.carried, pseudo, strict=True):
             if each.payload is not None and each.offset is not None:
@@ -250,8 +249,7 @@ class ParameterSpace:
         values, of_terms, column = self.values(x), self.split(x)[1], 0
         for index, law in self._estimated.items():
             terms = [(own, term) for own, term in zip(of_terms, self.terms, strict=True) if term.law == index]
-            basis = law.inertia_basis(self.model.robot)
-            if basis is not None:
+            if (basis := law.inertia_basis(self.model.robot)) is not None:
                 moved = np.einsum("pij,nj->nip", basis.cpu().numpy(), a)
                 total += moved @ values[index][next(iter(law.coefficients))].cpu().numpy()
                 derivatives = [moved[:, :, list(term.joints or ())] for _, term in terms]
@@ -297,8 +295,7 @@ class ParameterSpace:
         total = np.zeros((self.model.robot.nv,) * 2)
         values = self.values(x)
         for index, law in self._estimated.items():
-            basis = law.inertia_basis(self.model.robot)
-            if basis is not None:
+            if (basis := law.inertia_basis(self.model.robot)) is not None:
                 total += np.tensordot(values[index][next(iter(law.coefficients))].cpu().numpy(), basis.cpu().numpy(), 1)
         return total
 

@@ -130,8 +130,7 @@ def learned_forces(posterior: Posterior, dynamics: ConstrainedDynamics) -> list[
     of_joints = torch.zeros(B.shape[-1], dtype=torch.bool)
     groups = []
     for name, term, which in prior.named(robot):
-        point = term.point_force(dynamics)
-        if point is None:
+        if (point := term.point_force(dynamics)) is None:
             of_joints[which] = True
         else:
             force = latents.entries(which).through(point)

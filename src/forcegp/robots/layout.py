@@ -264,8 +264,7 @@ def check_tree(layout: Layout, loops: Sequence[tuple[str, str, str]], problems: 
         return above[:-1]
 
     for name, *links in loops:
-        between = sorted(set(moving(links[0])) ^ set(moving(links[1])))
-        if between:
+        if between := sorted(set(moving(links[0])) ^ set(moving(links[1]))):
             problems.errors.append(
                 RobotModelError(
                     f"{problems.source}: {name} closes a loop, from link {links[0]!r} to {links[1]!r}",
@@ -299,8 +298,7 @@ def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]
     for link in below:
         below += [joint.child for joint in children[link]]
     reached = set(below)
-    stray = next((link for link in description.links if link not in reached), None)
-    if stray is not None:
+    if (stray := next((link for link in description.links if link not in reached), None)) is not None:
         loop, link = [], stray
         while link not in loop:
             loop.append(link)

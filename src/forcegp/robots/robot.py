@@ -197,8 +197,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
 
     def to_stored(self) -> dict[str, Any]:
         """The robot as plain JSON values."""
-        how = {"gravity": self.gravity.tolist(), "locked": self.locked, "base": self.base}
-        return {"urdf": self.urdf_text, **how}
+        return {"urdf": self.urdf_text, "gravity": self.gravity.tolist(), "locked": self.locked, "base": self.base}
 
     def _limp(self) -> set[int]:
         """Coordinates that nothing resists at a position without symmetry."""

@@ -77,9 +77,8 @@ def kuka_urdf(config: KukaSurfaceConfig) -> str:
     )
     root[:0] = [ElementTree.Element("link", name="world"), ElementTree.fromstring(joint)]
     ElementTree.indent(root)
-    head = text[: text.index("<robot")]
     changes = "<!-- Changed by forcegp: base mounted on `world`, tool inertia and damping set, meshes left out. -->\n"
-    return head + changes + ElementTree.tostring(root, encoding="unicode") + "\n"
+    return text[: text.index("<robot")] + changes + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
 def kuka_robot(config: KukaSurfaceConfig) -> Robot:

@@ -146,9 +146,8 @@ def _joint_angles(robot: Robot, base: Tensor, home: Tensor, x: Tensor) -> Tensor
         kinematics = robot.kinematics(q)
         change = []
         for k, leg in enumerate(LEGS):
-            missing = x[:, k] - kinematics.frame_pose(f"{leg}_foot")[:, :3, 3]
             own = kinematics.frame_jacobian(f"{leg}_foot")[:, :3, 6 + 3 * k : 9 + 3 * k]
-            change.append(torch.linalg.solve(own, missing))
+            change.append(torch.linalg.solve(own, x[:, k] - kinematics.frame_pose(f"{leg}_foot")[:, :3, 3]))
         q = torch.cat([base, q[:, 7:] + torch.cat(change, -1)], -1)
         if float(torch.cat(change, -1).abs().max()) < 1e-12:
             return q
