@@ -280,9 +280,7 @@ class Model(Summary):
     def dynamics(self, q: Positions, v: JointValues, u: Float[Tensor, "*#batch nu"]) -> ConstrainedDynamics:
         """A, b, H and Q_K at states (q, v, u), each (..., nv), from one kinematics pass; differentiable."""
         state = self.state(q, v, u)
-        Q_K = torch.zeros_like(state.v)
-        for force in self.laws:
-            Q_K = Q_K + force.force(state)
+        Q_K = sum((force.force(state) for force in self.laws), torch.zeros_like(state.v))
         A, b, normals = self.constraint(state)
         return ConstrainedDynamics(state, self.mass_matrix(state), A, b, normals, Q_K, self.contacts)
 
@@ -296,8 +294,7 @@ class Model(Summary):
 
     def _with_rotors(self, M: Tensor) -> Tensor:
         for force in self.laws:
-            inertia = force.added_inertia(self.robot)
-            if inertia is not None:
+            if (inertia := force.added_inertia(self.robot)) is not None:
                 M = M + inertia
         return M
 

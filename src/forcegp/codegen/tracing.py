@@ -76,9 +76,7 @@ class StraightLineAlgebra(TorchFunctionMode):
         if func is torch.linalg.pinv:
             rows, columns = args[0].shape[-2:]
             tolerance = kwargs.get("rtol", max(rows, columns) * torch.finfo(args[0].dtype).eps)  # torch's own default
-            if rows > columns:
-                return pseudo_inverse(args[0].mT, tolerance).mT
-            return pseudo_inverse(args[0], tolerance)
+            return pseudo_inverse(args[0].mT, tolerance).mT if rows > columns else pseudo_inverse(args[0], tolerance)
         return func(*args, **kwargs)
 
 
@@ -333,9 +331,8 @@ def _sum(graph: Graph, x: _Numbers, dim: Any = None, keepdim: bool = False) -> _
     kept = [d for d in range(nodes.dim()) if d not in dims]
     count, width = (math.prod(nodes.shape[d] for d in which) for which in (kept, dims))
     rows = nodes.permute(*kept, *dims).reshape(count, width)
-    total = torch.tensor([graph.sum(row) for row in rows.tolist()], dtype=torch.long)
     shape = [1 if d in dims else size for d, size in enumerate(nodes.shape) if keepdim or d in kept]
-    return _Numbers(total.view(shape))
+    return _Numbers(torch.tensor([graph.sum(row) for row in rows.tolist()], dtype=torch.long).view(shape))
 
 
 def _mean(graph: Graph, x: _Numbers, dim: Any = None, keepdim: bool = False) -> _Numbers:

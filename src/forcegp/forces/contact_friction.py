@@ -237,8 +237,7 @@ def refined_loads(forces: UnknownForces, robot: Robot, table: Table) -> UnknownF
     """
     names, terms = forces.latent_names(robot), list(forces.terms)
     loaded = {k: term for k, term in enumerate(terms) if isinstance(term, ContactFriction) and term.load}
-    wanting = {k: term for k, term in loaded.items() if term.expected is None}
-    if not wanting:
+    if not (wanting := {k: term for k, term in loaded.items() if term.expected is None}):
         return None
     latents, joints = [names[which] for which in forces.slices(robot)], list[tuple[str, TabulatedCurve]]()
     for term, own in zip(terms, latents, strict=True):

@@ -241,8 +241,7 @@ class Law(Force):
 
     def added_inertia(self, robot: Robot) -> Float[Tensor, "nv nv"] | None:
         """What this adds to the mass matrix, in kg m^2 or kg."""
-        basis = self.inertia_basis(robot)
-        if basis is None:
+        if (basis := self.inertia_basis(robot)) is None:
             return None
         return torch.tensordot(self.values[next(iter(self.coefficients))].expand(len(basis)), basis, 1)
 

@@ -175,12 +175,10 @@ def _refuse(name: str, unknown: bool, expression: Any) -> None:
 
 def _value(what: str, key: str, text: str, make: Callable[..., Any], field: Parameter) -> Any:
     """The text as what the option is by default: truth, number, numbers, names, or text."""
-    default = field.default
-    if key in getattr(make, "coefficients", {}) or field.annotation in (float | None, "float | None"):
-        default = 0.0
     if key == MEMORY and text not in ("true", "false"):
         return tuple(part.strip() for part in text.split("/"))
-    default = False if key == MEMORY else default
+    number_by_default = key in getattr(make, "coefficients", {}) or field.annotation in (float | None, "float | None")
+    default = False if key == MEMORY else 0.0 if number_by_default else field.default
     if isinstance(default, bool):
         if text not in ("true", "false"):
             raise InvalidInput(f"{what} has {key}={text}; give true or false")

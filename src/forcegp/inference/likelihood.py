@@ -246,8 +246,7 @@ def _acts_apart(W: Float[Tensor, "N D C"]) -> bool:
         return False
     size = W.detach().abs()
     own = size.diagonal(dim1=-2, dim2=-1)
-    others = size - torch.diag_embed(own)
-    return bool((others.amax((-2, -1)) <= RANK_TOLERANCE * own.amin(-1)).all())
+    return bool(((size - torch.diag_embed(own)).amax((-2, -1)) <= RANK_TOLERANCE * own.amin(-1)).all())
 
 
 @dataclass(frozen=True, eq=False)

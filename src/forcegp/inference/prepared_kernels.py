@@ -71,9 +71,8 @@ class KernelSum:
 
     def call(self, graph: Graph, z: Sequence[int], slopes: bool) -> list[int]:
         """The nodes of E f_c at features z, as a call of the C function; with `slopes` it can be differentiated."""
-        operands = self.given(graph, z)
         name = self.name + ("_slopes" if slopes else "")
-        called = graph.call(name, operands, len(self.latents), self._slopes if slopes else None)
+        called = graph.call(name, self.given(graph, z), len(self.latents), self._slopes if slopes else None)
         constants = map(graph.constant, self.constants)
         return [graph.apply("add", f, constant) for f, constant in zip(called, constants, strict=True)]
 

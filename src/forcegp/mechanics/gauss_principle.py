@@ -300,8 +300,7 @@ class ConstrainedDynamics:
         Of a surface it is the part along the normal, (..., 1): friction along it is another force. Raises ContactError
         where no contact is.
         """
-        places = [k for k, contact in enumerate(self.contacts) if contact.frame == frame]
-        if not places:
+        if not (places := [k for k, contact in enumerate(self.contacts) if contact.frame == frame]):
             raise ContactError(f"the model has no contact at {frame!r}, where a force was measured; give it one.")
         multiplier, normals = self.multiplier_map(), self.normals[..., places, :].mT
         if any(not isinstance(self.contacts[k].surface, Held) for k in places):
