@@ -337,7 +337,6 @@ class _Functions:
 
     def _with_loads(self, rows: Dataset, dataset: Dataset) -> Posterior:
         """One search, or more under the normal force that friction changes."""
-        first = self._search(rows, dataset)
 
         def again(forces: UnknownForces, last: Posterior) -> Posterior:
             with warnings.catch_warnings():
@@ -346,7 +345,7 @@ class _Functions:
                 model = replace(self.model, forces=(*self.model.laws, *forces.terms))
                 return replace(self, model=model, search=begin)._search(rows, dataset)
 
-        return fit_with_refined_loads(first, again)
+        return fit_with_refined_loads(self._search(rows, dataset), again)
 
     def _search(
         self, rows: Dataset, dataset: Dataset, beside: Callable[[MarginalLikelihood], FreeNumbers] | None = None

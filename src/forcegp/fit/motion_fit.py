@@ -149,9 +149,7 @@ class MotionFit:
     def at(self, x: Tensor, states: Tensor, noise: Tensor, sigma: Tensor, near: WindowMotions | None) -> _Point:
         """The point, its motions sought from those of another; infinitely bad where there are none."""
         q, steps = self.q, self.q.diff(dim=1)
-        guess = q[:, :-1] + 0.5 * steps, steps / self.h
-        if near is not None:
-            guess = near.middle_q, near.middle_v
+        guess = (q[:, :-1] + 0.5 * steps, steps / self.h) if near is None else (near.middle_q, near.middle_v)
         q0, v0 = states.split(steps.shape[-1], dim=-1)
         try:
             accelerations = self.unknowns.accelerations(x)

@@ -249,7 +249,6 @@ class Search:
             causes = "; ".join(f"restart {k}: {error}" for k, error in enumerate(results))
             raise FitError(f"none of {restarts} restarts could be evaluated ({causes})")
         work: Any = {name: sum(getattr(x, name) for x in usable) for name in ("evaluations", "cpu_seconds")}
-        best = replace(best_of(usable), **work)
         settings = {
             "restarts": restarts,
             "warm_start": self.start is not None,
@@ -258,7 +257,7 @@ class Search:
             "restart_objective": [each.value if isinstance(each, OptimizationResult) else None for each in results],
             "restart_status": [each.status if isinstance(each, OptimizationResult) else str(each) for each in results],
         }
-        return best, settings
+        return replace(best_of(usable), **work), settings
 
 
 def _one_start(

@@ -111,8 +111,7 @@ class Unseen:
 
     def doubts(self, model: Model) -> list[Doubt]:
         """One, where something pushes a joint."""
-        names = [model.robot.joint_names[j] for j in self.pushed]
-        if not names:
+        if not (names := [model.robot.joint_names[j] for j in self.pushed]):
             return []
         return [
             look(

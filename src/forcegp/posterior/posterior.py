@@ -160,8 +160,7 @@ class Posterior(Fitted):
         batch = dynamics.state.q.shape[:-1]
         given = self.likelihood.standardization(self.trained.unknown.features(dynamics))
         features = [z.reshape(batch.numel(), z.shape[-1]) for z in given]
-        latents = len(features)
-        if not latents:
+        if not (latents := len(features)):
             nothing = dynamics.state.q.new_zeros(*batch, 0, 0)
             return Gaussian(nothing.flatten(-2), nothing if covariance else None)
         mean, spread = self.latent.mean(features).reshape(*batch, latents), None

@@ -236,8 +236,7 @@ class Predictor(Summary):
     def run(self, kind: str, states: Sequence[Tensor]) -> list[Tensor]:
         """The outputs (n, size) of a program at states (n, nv) that were checked, without a graph."""
         states, count = [x.detach().contiguous() for x in states], len(states[0])
-        compiled = self.compiled(kind)
-        if compiled is None:
+        if (compiled := self.compiled(kind)) is None:
             return self._by_torch(kind, states)
         outputs = [torch.empty(count, size, dtype=torch.float64) for size in compiled.outputs]
         if compiled.rows(count, states, outputs):

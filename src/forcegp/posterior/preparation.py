@@ -67,8 +67,7 @@ def rows_for(training: TrainingData, trained: Model, model: Model) -> TrainingDa
     if model.inputs == had:
         return training
     reported = [name for force in model.forces if isinstance(force, ObservedWrench) for name in force.names]
-    new = [name for name in model.inputs if name not in (*had, *reported)]
-    if new:
+    if new := [name for name in model.inputs if name not in (*had, *reported)]:
         raise InvalidInput(
             f"the training rows lack inputs ({', '.join(new)}), so no predictor can be checked; call predict."
         )
