@@ -79,8 +79,7 @@ def require_writable(path: str | Path) -> None:
     Raises OSError.
     """
     target = _target(path)
-    place = next(folder for folder in target.parents if folder.exists())
-    with _beside(place / target.name) as temporary:
+    with _beside(next(folder for folder in target.parents if folder.exists()) / target.name) as temporary:
         temporary.write_bytes(bytes(TRIAL))
         _flush(temporary)
 

@@ -207,8 +207,7 @@ def run_jobs(store: JobStore, jobs: Sequence[Job], at_once: Jobs = 1) -> int:
         remove_leftovers(store.folder)
         waiting = {job.name: job for job in jobs if not store.has(job.name, wanted[job.name])}
         require_writable(store.place("trial"))
-        old = [name for name in waiting if store.place(name).exists()]
-        if old:
+        if old := [name for name in waiting if store.place(name).exists()]:
             warnings.warn(
                 f"{len(old)} of the results in {store.folder}, {old[0]} for example, were computed by other code or "
                 "with other settings; they are computed anew.",

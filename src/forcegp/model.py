@@ -280,9 +280,7 @@ class Model(Summary):
     def dynamics(self, q: Positions, v: JointValues, u: Float[Tensor, "*#batch nu"]) -> ConstrainedDynamics:
         """A, b, H and Q_K at states (q, v, u), each (..., nv), from one kinematics pass; differentiable."""
         state = self.state(q, v, u)
-        Q_K = torch.zeros_like(state.v)
-        for force in self.laws:
-            Q_K = Q_K + force.force(state)
+        Q_K = sum((force.force(state) for force in self.laws), torch.zeros_like(state.v))
         A, b, normals = self.constraint(state)
         return ConstrainedDynamics(state, self.mass_matrix(state), A, b, normals, Q_K, self.contacts)
 
@@ -296,8 +294,7 @@ class Model(Summary):
 
     def _with_rotors(self, M: Tensor) -> Tensor:
         for force in self.laws:
-            inertia = force.added_inertia(self.robot)
-            if inertia is not None:
+            if (inertia := force.added_inertia(self.robot)) is not None:
                 M = M + inertia
         return M
 
@@ -347,8 +344,7 @@ class Model(Summary):
     @staticmethod
     def _contradiction(dynamics: ConstrainedDynamics) -> tuple[Tensor, Tensor]:
         """|A a - b| (..., m) of the constrained acceleration, in m/s^2 and relative to 1 + |b|."""
-        a = dynamics.acceleration_map().offset
-        violation = ((dynamics.A @ a[..., None])[..., 0] - dynamics.b).abs()
+        violation = ((dynamics.A @ dynamics.acceleration_map().offset[..., None])[..., 0] - dynamics.b).abs()
         return violation, violation / (1.0 + dynamics.b.abs())
 
     def to(self, device: torch.device | str) -> "Model":

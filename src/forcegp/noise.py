@@ -83,11 +83,9 @@ class Noise:
         if (sensed := H.shape[-2] - acceleration.shape[-1]) > 0:
             sensor = (2.0 * parameters[SENSOR]).exp()[None].expand(1, sensed)
             acceleration = torch.cat([acceleration, sensor], dim=-1)
-        forces = [(2.0 * parameters[name]).exp() for name in (FORCE, PUSHES) if name in parameters]
-        if not forces:
+        if not (forces := [(2.0 * parameters[name]).exp() for name in (FORCE, PUSHES) if name in parameters]):
             return acceleration
-        force = torch.stack(forces).sum(0)
-        return torch.diag_embed(acceleration) + (H * force) @ H.mT
+        return torch.diag_embed(acceleration) + (H * torch.stack(forces).sum(0)) @ H.mT
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """Log density (up to a constant) of the noise among `parameters` under its hyperprior; 0 where it is fixed.
@@ -95,8 +93,7 @@ class Noise:
         Without it, maximum likelihood lets flexible kernels explain the noise of a joint away: measured on a 3-joint
         arm with 60 points, one of three standard deviations collapsed from 0.05 to 1e-4.
         """
-        learned = [name for name in (ACCELERATION, FORCE) if name in parameters]
-        if not learned:
+        if not (learned := [name for name in (ACCELERATION, FORCE) if name in parameters]):
             return torch.zeros((), dtype=torch.float64)
         level = parameters[learned[0]]
         starts = self.parameters(len(level), level.device)

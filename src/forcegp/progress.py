@@ -36,6 +36,5 @@ def part(number: int, parts: int, note: str = "") -> Iterator[None]:
 
 def tell(done: int, total: int, note: str = "") -> None:
     """So much of the work is done."""
-    listener = _listener.get()
-    if listener is not None:
+    if (listener := _listener.get()) is not None:
         listener(done, total, note)

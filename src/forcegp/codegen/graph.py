@@ -6,7 +6,7 @@ Derivatives are nodes of the same graph (Griewank & Walther, "Evaluating Derivat
 import math
 import operator
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
@@ -98,17 +98,13 @@ class Graph:
                 return self.constant(float({**UNARY, **BINARY}[operation](*known)))  # type: ignore[arg-type]  # none is None
             except (ValueError, ZeroDivisionError, OverflowError):  # outside its domain NaN, as a processor has it
                 return self.constant(math.nan)
-        simpler = self._simplified(operation, operands, known)
-        if simpler is not None:
+        if (simpler := self._simplified(operation, operands, known)) is not None:
             return simpler
         return self._record((operation, *(sorted(operands) if operation in COMMUTATIVE else operands)))
 
     def sum(self, nodes: Iterable[int]) -> int:
         """The sum of nodes."""
-        total = ZERO
-        for node in nodes:
-            total = self.apply("add", total, node)
-        return total
+        return reduce(partial(self.apply, "add"), nodes, ZERO)
 
     def dot(self, left: Iterable[int], right: Iterable[int]) -> int:
         """sum_k left_k right_k."""
@@ -160,8 +156,7 @@ class Graph:
         return None
 
     def _record(self, entry: tuple) -> int:
-        found = self._found.get(entry)
-        if found is None:
+        if (found := self._found.get(entry)) is None:
             found = self._found[entry] = len(self.nodes)
             self.nodes.append(entry)
         return found
@@ -309,8 +304,7 @@ def partials(graph: Graph, node: int) -> list[tuple[int, Callable[[], int]]]:
 
 def _slopes_of_call(graph: Graph, node: int) -> list[tuple[int, Callable[[], int]]]:
     _, call, position = graph.nodes[node]
-    found = graph.slopes.get(call)
-    if found is None:
+    if (found := graph.slopes.get(call)) is None:
         raise InvalidInput(f"{graph.nodes[call][1]} gives no derivatives; make the program with slopes.")
     operands = ((operand, found.get((position, k))) for k, operand in enumerate(graph.operands(call)))
     return [(operand, partial(graph.output, call, slope)) for operand, slope in operands if slope is not None]

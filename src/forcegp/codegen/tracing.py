@@ -76,9 +76,7 @@ class StraightLineAlgebra(TorchFunctionMode):
         if func is torch.linalg.pinv:
             rows, columns = args[0].shape[-2:]
             tolerance = kwargs.get("rtol", max(rows, columns) * torch.finfo(args[0].dtype).eps)  # torch's own default
-            if rows > columns:
-                return pseudo_inverse(args[0].mT, tolerance).mT
-            return pseudo_inverse(args[0], tolerance)
+            return pseudo_inverse(args[0].mT, tolerance).mT if rows > columns else pseudo_inverse(args[0], tolerance)
         return func(*args, **kwargs)
 
 
@@ -144,8 +142,7 @@ def _lower_and_orthonormal(matrix: Tensor) -> tuple[Tensor, Tensor]:
             row, along = row - (share[..., None, :] @ basis)[..., 0, :], along + share
         unit, length = _unit(row, torch.zeros_like(row[..., 0]))
         basis = torch.cat([basis, unit[..., None, :]], dim=-2)
-        rest = torch.zeros_like(matrix[..., : count - k - 1, 0])
-        lower.append(torch.cat([along, length[..., None], rest], dim=-1))
+        lower.append(torch.cat([along, length[..., None], torch.zeros_like(matrix[..., : count - k - 1, 0])], dim=-1))
     return torch.stack(lower, dim=-2), basis
 
 
@@ -334,9 +331,8 @@ def _sum(graph: Graph, x: _Numbers, dim: Any = None, keepdim: bool = False) -> _
     kept = [d for d in range(nodes.dim()) if d not in dims]
     count, width = (math.prod(nodes.shape[d] for d in which) for which in (kept, dims))
     rows = nodes.permute(*kept, *dims).reshape(count, width)
-    total = torch.tensor([graph.sum(row) for row in rows.tolist()], dtype=torch.long)
     shape = [1 if d in dims else size for d, size in enumerate(nodes.shape) if keepdim or d in kept]
-    return _Numbers(total.view(shape))
+    return _Numbers(torch.tensor([graph.sum(row) for row in rows.tolist()], dtype=torch.long).view(shape))
 
 
 def _mean(graph: Graph, x: _Numbers, dim: Any = None, keepdim: bool = False) -> _Numbers:
@@ -376,8 +372,7 @@ def _product(graph: Graph, x: Any, y: Any) -> _Numbers:
     count = math.prod(left.shape[:-2])
     if left.numel() and bool((left[..., -1, 0] == ZERO).all()):  # sums of what follows share terms from the end on
         left, right = left.flip(-1), right.flip(-2)
-    stacks = (x.reshape(count, *x.shape[-2:]).tolist() for x in (left, right.mT))
-    pairs = zip(*stacks, strict=True)
+    pairs = zip(*(x.reshape(count, *x.shape[-2:]).tolist() for x in (left, right.mT)), strict=True)
     results = [graph.dot(row, column) for rows, columns in pairs for row in rows for column in columns]
     return _Numbers(torch.tensor(results, dtype=torch.long).view(shape))
 

@@ -80,8 +80,7 @@ class LearnedForces:
         q, v, _, u = (x[some] for x in motion[1:])
         a, time = posterior.predict(q, v, u, covariance=False).mean.numpy(), np.arange(float(len(q)))
         noise, model = posterior.noise_std.numpy(), posterior.model
-        rows = Dataset(q=q, v=v, u=u, a=a, time=time, noise_std=noise, model=model)
-        return learn_more_rows(posterior, rows)
+        return learn_more_rows(posterior, Dataset(q=q, v=v, u=u, a=a, time=time, noise_std=noise, model=model))
 
     def spread(self, posterior: Posterior) -> np.ndarray:
         """Standard deviation of each joint's acceleration (nv,), root mean square over the states."""
@@ -253,8 +252,7 @@ def motion_limits(robot: Robot, start: np.ndarray, given: Mapping[str, Any]) -> 
                 f"{low[j]:.4g} and {high[j]:.4g}{' from there' * (name == 'position')}; give limits={{{name!r}: ...}}, "
                 "or another start."
             )
-    endless = np.isinf(limits["position"])
-    limits["position"] = np.where(endless, limits["velocity"], limits["position"])
+    limits["position"] = np.where(np.isinf(limits["position"]), limits["velocity"], limits["position"])
     return limits
 
 

@@ -83,8 +83,7 @@ class ContactMonitor:
             )
         self.open = isinstance(model, Predictor) and model.kind != "none"
         check_time_step(dt)
-        words = f"give Hz above 0 and below {0.5 / dt:g}, half the rate"
-        require_number("bandwidth", bandwidth, words, below=0.5 / dt)
+        require_number("bandwidth", bandwidth, f"give Hz above 0 and below {0.5 / dt:g}, half the rate", below=0.5 / dt)
         self.robot: Robot = self.known.robot
         self.dt, self.bandwidth = float(dt), float(bandwidth)
         self.keep = math.exp(-2.0 * math.pi * bandwidth * dt)
@@ -137,8 +136,7 @@ class ContactMonitor:
         (_, force, at_rest, _), which = np.array(best).T, [each[-1] for each in best]
         self.noise = NoiseLevels(self.noise.acceleration, force)
         self.near_rest = at_rest, np.take(SLOW, which) * speed
-        usual = np.stack(slow)[which, :, range(self.robot.nv)]
-        self.usual = torch.from_numpy(np.sqrt(np.mean(usual**2, axis=1)))
+        self.usual = torch.from_numpy(np.sqrt(np.mean(np.stack(slow)[which, :, range(self.robot.nv)] ** 2, axis=1)))
         distances = [self._distances(*each) for each in found]
         largest = torch.cat([d[: len(d) // block * block].view(-1, block).amax(1) for d in distances])
         self._maxima = gumbel_r.fit(largest.sqrt().numpy())
@@ -175,8 +173,7 @@ class ContactMonitor:
         white = torch.linalg.inv(torch.linalg.cholesky(self._covariance(M, None, self.usual, 0.0 * tau)))
         along = torch.linspace(0.0, 1.0, PLACES, dtype=q.dtype)
         tau, J = white @ tau, (J[:, :1] + along[:, None, None] * (J[:, 1:] - J[:, :1])).flatten(0, 1) @ white.mT
-        seen = J.square().sum((-1, -2)).max().sqrt()
-        inverse = torch.linalg.pinv(J.mT, atol=UNSEEN * seen, rtol=0.0)
+        inverse = torch.linalg.pinv(J.mT, atol=UNSEEN * J.square().sum((-1, -2)).max().sqrt(), rtol=0.0)
         force = inverse @ tau
         misfit = (tau - (force[:, None] @ J)[:, 0]).square().sum(-1)
         newton, alike = force.norm(dim=-1), misfit <= misfit.min() + EXPLAINED

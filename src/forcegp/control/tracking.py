@@ -107,8 +107,7 @@ class TrackingController(Controller):
         """The torques (nv,) in Nm (N) at the state q, v under this reference, in rad, rad/s, rad/s^2 (m, ...)."""
         q, v, q_d, v_d, a_d = self.vectors(q=q, v=v, q_d=q_d, v_d=v_d, a_d=a_d)
         low, high = self._range
-        beyond = torch.nonzero((q_d < low) | (q_d > high))[:, 0].tolist()
-        if beyond:
+        if beyond := torch.nonzero((q_d < low) | (q_d > high))[:, 0].tolist():
             j = beyond[0]
             raise InvalidInput(
                 f"the reference asks {self.robot.joint_names[j]} to be at {float(q_d[j]):.4g}, and it moves "
@@ -261,8 +260,7 @@ class HybridForce(TrackingController):
         self.past = Past(self.model, position_noise)
         self._free: ComputedTorque | None = None
         if off_surface == "release":
-            free = predictor.posterior.with_contacts([]).predictor(covariance="none")
-            self._free = ComputedTorque(free, **settings)
+            self._free = ComputedTorque(predictor.posterior.with_contacts([]).predictor(covariance="none"), **settings)
             self._free.past = self.past
 
     @override

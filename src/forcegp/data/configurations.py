@@ -58,8 +58,7 @@ def through(
         return change(q)
     changed = change(continuous(space, q))
     for group in space.groups:
-        length = np.linalg.norm(changed[:, group.places][:, TURN], axis=1)
-        if float(np.median(length)) < LEAST_LENGTH:
+        if float(np.median(np.linalg.norm(changed[:, group.places][:, TURN], axis=1))) < LEAST_LENGTH:
             raise DatasetError(f"{group.name!r} turns faster than the filter passes; use a higher cut-off.")
     return space.normalized(torch.from_numpy(np.ascontiguousarray(changed))).numpy()
 
@@ -77,8 +76,7 @@ def rates(space: ConfigurationSpace, q: Positions, time: Float[np.ndarray, " row
         one, other = steps[:, (k + 1) % 3], steps[:, (k + 2) % 3]
         weights[:, k] = -(one + other) / ((steps[:, k] - one) * (steps[:, k] - other))
     positions = torch.tensor(q)
-    moved = space.difference(positions[:, None], positions[near]).numpy()
-    return np.einsum("nk,nkj->nj", weights, moved)
+    return np.einsum("nk,nkj->nj", weights, space.difference(positions[:, None], positions[near]).numpy())
 
 
 def in_base(

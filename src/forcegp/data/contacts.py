@@ -46,8 +46,7 @@ def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> Doub
     models without `RigidBodies`.
     """
     model = dataset.model if model is None else model
-    few = len(dataset) < FEWEST_ROWS or not dataset.u.any()
-    if few or not model.contacts or model.carries_known_forces:
+    if len(dataset) < FEWEST_ROWS or not dataset.u.any() or not model.contacts or model.carries_known_forces:
         return Doubts()
     rows = dataset.rows(evenly(dataset, MOST_ROWS))
     with torch.no_grad():

@@ -257,8 +257,7 @@ def _measured(given: Mapping[str, object], rows: int, robot: forcegp.robots.Robo
 def _truth(
     given: Mapping[str, object], joint_names: tuple[str, ...], rows: int, model: forcegp.model.Model
 ) -> dict[str, np.ndarray]:
-    unknown = sorted(name for name in given if not TRUTH.fullmatch(name))
-    if unknown:
+    if unknown := sorted(name for name in given if not TRUTH.fullmatch(name)):
         raise DatasetError(f"truth has no {unknown}; allowed: a, lambda, Q_U, Q_U.<name>, force.<name>.")
     checked = {}
     for name in sorted(given, key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER)):

@@ -195,8 +195,7 @@ def torque_columns(
             torque = robot.kinematics(q, v).torque_regressor(a).flatten(-2)
         else:  # factors of the robot's own torques, of which there are three
             gravity, bias = robot.gravity_forces(q), robot.bias_forces(q, v)
-            parts = (robot.inverse_dynamics(q, v, a) - bias, bias - gravity, gravity)
-            torque = torch.stack(parts, dim=-1)
+            torque = torch.stack((robot.inverse_dynamics(q, v, a) - bias, bias - gravity, gravity), dim=-1)
     rows = dataset.q, dataset.v, dataset.u, dataset.a
     own = [*usual_columns(robot, *rows, FRICTION_WIDTHS), *law_columns(dataset.model.laws, robot, *rows)]
     if dataset.strokes is not None:  # friction that remembers, of several stiffnesses and as it rises with speed
@@ -212,8 +211,7 @@ def torque_columns(
 
 def _unexplained(normal: np.ndarray, right: np.ndarray, square: np.ndarray) -> Float[np.ndarray, " shifts"]:
     """Least sum of squares of every shift, from normal equations."""
-    solution = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
-    return np.maximum(square - (right * solution).sum(axis=0), 0.0)
+    return np.maximum(square - (right * np.linalg.lstsq(normal, right, rcond=1e-9)[0]).sum(axis=0), 0.0)
 
 
 def lowest(values: Float[np.ndarray, " shifts"], shifts: Float[np.ndarray, " shifts"]) -> float:

@@ -45,7 +45,6 @@ class LowPass:
             )
         from scipy.signal import butter, sosfiltfilt  # half a second, which only filtering should cost
 
-        sections = butter(self.order, self.cutoff, fs=rate, output="sos")
         slowest = np.abs(butter(self.order, self.cutoff, fs=rate, output="zpk")[1]).max()
         padding = max(int(np.ceil(np.log(TRANSIENT) / np.log(slowest))), self.order + 1)
         if len(values) <= padding:
@@ -53,7 +52,7 @@ class LowPass:
                 f"{len(values)} rows are too few for a filter of order {self.order} with a cut-off at {self.cutoff} Hz;"
                 f" more than {padding} are needed. Use a higher cut-off, or leave the episode out."
             )
-        return sosfiltfilt(sections, values, axis=0, padlen=padding)
+        return sosfiltfilt(butter(self.order, self.cutoff, fs=rate, output="sos"), values, axis=0, padlen=padding)
 
     def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Float[np.ndarray, " k"]:
         """Of amplitudes at these frequencies [Hz], for rows at this rate [Hz]; 0 at half the rate."""
@@ -120,8 +119,7 @@ def shifted(dataset: Dataset, delay: float, lag: float = 0.0, lagging: Sequence[
         u = rows.u.copy()
         u[:, columns] = lagged(u[:, columns], rows.time, lag)
         if delay:  # values at the ends hold beyond them
-            later = np.clip(rows.time + delay, rows.time[0], rows.time[-1])
-            u[:, :count] = CubicSpline(rows.time, u[:, :count])(later)
+            u[:, :count] = CubicSpline(rows.time, u[:, :count])(np.clip(rows.time + delay, rows.time[0], rows.time[-1]))
         return {"u": u}
 
     return replace(dataset, **by_episode(dataset, acting), truth={})

@@ -39,8 +39,7 @@ def specific_force(kinematics: Kinematics, name: str) -> AffineMap:
     robot = kinematics.robot
     pose, J, bias = kinematics.frame_motion(frame, torch.tensor(point, dtype=torch.float64, device=robot.device))
     R = (pose[..., :3, :3] @ torch.as_tensor(turned).to(pose)).mT
-    falls = bias[..., :3] - robot.tree.gravity
-    return AffineMap((R @ falls[..., None])[..., 0], R @ J[..., :3, :])
+    return AffineMap((R @ (bias[..., :3] - robot.tree.gravity)[..., None])[..., 0], R @ J[..., :3, :])
 
 
 def expected(dataset: Dataset, model: forcegp.model.Model, name: str) -> Float[np.ndarray, "rows 3"]:

@@ -203,8 +203,7 @@ def _judged(dataset: Dataset, cutoff: float, source: Literal["q", "v"]) -> tuple
 
     def judged(values: Float[np.ndarray, "rows columns"]) -> np.ndarray:
         own = [log.episode == number for number in log.episodes]
-        parts = [LowPass(tried[0])(values[rows], log.time[rows]) for rows in own]
-        return np.concatenate(parts)[inner]
+        return np.concatenate([LowPass(tried[0])(values[rows], log.time[rows]) for rows in own])[inner]
 
     measured, shares = judged(log.u), np.empty((len(tried), log.nv))
     seen = [judged(each) for each in sharp]

@@ -60,8 +60,7 @@ class Stance:
 
     def rows(self, index: Int[np.ndarray, " kept"]) -> Stance:
         """The same for some of the rows."""
-        rows = {name: getattr(self, name)[index] for name in ("flags", "speed", "force")}
-        return replace(self, **rows)
+        return replace(self, **{name: getattr(self, name)[index] for name in ("flags", "speed", "force")})
 
     def filled(self, dataset: Dataset) -> Dataset:
         """All rows, where open ones have the flag of the nearest row that is decided. Raises DatasetError for none."""
@@ -183,8 +182,7 @@ def _noise(values: Float[np.ndarray, "rows m"], episodes: list[np.ndarray], stri
     ]
     if not differences:
         return 0.0
-    each = np.quantile(np.abs(np.concatenate(differences)), 0.25, axis=0) / (QUARTER * 20.0**0.5)
-    return float(np.linalg.norm(each))
+    return float(np.linalg.norm(np.quantile(np.abs(np.concatenate(differences)), 0.25, axis=0) / (QUARTER * 20.0**0.5)))
 
 
 def _bearing(force: np.ndarray, moves: np.ndarray, quiet: bool = True) -> Float[np.ndarray, " 2"]:
@@ -195,8 +193,7 @@ def _bearing(force: np.ndarray, moves: np.ndarray, quiet: bool = True) -> Float[
     shares of what feet carry.
     """
     carried = np.sort(force[~moves])  # by what they carry: of a foot that swings most of the time, rest is rare
-    half = np.searchsorted(carried.cumsum(), 0.5 * carried.sum())
-    standing = float(carried[half]) if len(carried) else 0.0
+    standing = float(carried[np.searchsorted(carried.cumsum(), 0.5 * carried.sum())]) if len(carried) else 0.0
     few = moves.sum() < FEW
     usual = np.array([LEAST, BEARS]) * standing if standing > 0.0 else np.full(2, np.nan)
     if few and quiet:
@@ -210,8 +207,7 @@ def _bearing(force: np.ndarray, moves: np.ndarray, quiet: bool = True) -> Float[
         shares = np.array([count, len(logs) - count]) / len(logs)
         means, widths = (np.array([of(part) for part in parts]) for of in (np.mean, lambda part: np.std(part) + 1e-3))
         cost = 2.0 * (shares * np.log(widths / shares)).sum()
-        apart = means[1] - means[0] > APART * widths.sum()
-        if cost < best and apart:
+        if cost < best and means[1] - means[0] > APART * widths.sum():
             between = np.linspace(means[0], means[1], 200)
             density = np.log(shares / widths) - 0.5 * np.square((between[:, None] - means) / widths)
             likelier = density[:, 1] - density[:, 0]

@@ -107,8 +107,7 @@ def rests(dataset: Dataset) -> list[Int[np.ndarray, " _"]]:
         rows = np.flatnonzero(dataset.episode == episode)
         q, time = dataset.q[rows], dataset.time[rows]
         ahead = np.minimum(np.searchsorted(time, time + SHORTEST), len(rows) - 1)
-        still = (np.abs(q[ahead] - q) <= STILL / RESTS * least).all(1)
-        for begin, end in runs(np.asarray(still)):
+        for begin, end in runs(np.asarray((np.abs(q[ahead] - q) <= STILL / RESTS * least).all(1))):
             end = int(ahead[end - 1]) + 1
             if time[end - 1] - time[begin] >= 0.99 * SHORTEST and (np.ptp(q[begin:end], axis=0) <= least).all():
                 found.append(rows[begin:end])
@@ -125,8 +124,7 @@ def one_row_per_rest(dataset: Dataset) -> Dataset:
 
     Stiction holds the same share of the load in all rows of a rest, so they are one observation of it.
     """
-    number = rests_alone(dataset)
-    if number is None:
+    if (number := rests_alone(dataset)) is None:
         return dataset
     _, first, label = np.unique(number, return_index=True, return_inverse=True)
 
@@ -202,8 +200,7 @@ def with_memory(dataset: Dataset, model: Model) -> Dataset:
             f"{', '.join(memory.titles)} remembers, and the rows are not in order of time; give the whole log."
         )
     bare = dataset.u[:, ~np.isin(dataset.model.inputs, own)]
-    past = torch.as_tensor(np.array(dataset.strokes), device=model.robot.device)
-    columns = memory.past_of(past).cpu().numpy()
+    columns = memory.past_of(torch.as_tensor(np.array(dataset.strokes), device=model.robot.device)).cpu().numpy()
     first = model.memory_column
     u = np.concatenate([bare[:, :first], columns, bare[:, first:]], axis=1)
     return replace(dataset, u=u, model=replace(dataset.model, forces=model.laws))
@@ -358,8 +355,7 @@ def white_noise(log: Dataset, width: int = 1, signal: str = "a") -> Float[np.nda
             return None
         first = first[:: max(1, len(first) // MOST_DIFFERENCES)]
         means = np.stack([window_means(getattr(log, signal), first + k * width, width) for k in range(order + 1)])
-        differences = np.diff(means, order, axis=0)[0]
-        noise.append(1.4826 * np.median(np.abs(differences), axis=0) / np.sqrt(variance))
+        noise.append(1.4826 * np.median(np.abs(np.diff(means, order, axis=0)[0]), axis=0) / np.sqrt(variance))
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where((noise[0] < MOTION * noise[1]) & (noise[1] > 0.0), noise[1], np.nan)
 
@@ -409,5 +405,4 @@ def farthest_point_sampling(
 
 def farthest_rows(dataset: Dataset, count: int, *, start: int = 0) -> Dataset:
     """The rows that cover the inputs (q, v, u) best, in order: for fewer points, take the first of them."""
-    inputs = np.hstack([dataset.q, dataset.v, dataset.u])
-    return dataset.rows(farthest_point_sampling(inputs, count, start=start))
+    return dataset.rows(farthest_point_sampling(np.hstack([dataset.q, dataset.v, dataset.u]), count, start=start))

@@ -77,8 +77,7 @@ def find_wind(dataset: Dataset) -> tuple[AirLaw, Float[np.ndarray, "rows 3"]] | 
     the rows nearby. Not for bases that do not fly freely, rows out of order, fewer than 400, drag that explains no more
     than its coefficients would of noise, winds beyond 40 m/s or deviations beyond 2 m/s.
     """
-    flies = bool(dataset.model.robot.layout.groups) and not dataset.model.contacts
-    if not flies or not dataset.time_ordered:
+    if not dataset.model.robot.layout.groups or dataset.model.contacts or not dataset.time_ordered:
         return None
     numbers, episode = np.unique(dataset.episode, return_inverse=True)
     thin = np.arange(0, len(dataset), max(1, len(dataset) // MOST_ROWS))
@@ -89,8 +88,7 @@ def find_wind(dataset: Dataset) -> tuple[AirLaw, Float[np.ndarray, "rows 3"]] | 
     if means is None:
         return None
     forces, start = _Forces.of(dataset), means[episode]
-    law = forces.law(start)
-    wind = law._smoothed(forces, dataset, start, SECONDS, after=True)
+    wind = forces.law(start)._smoothed(forces, dataset, start, SECONDS, after=True)
     wind = forces.law(wind)._smoothed(forces, dataset, start, SECONDS, after=True)
     return forces.law(wind), wind
 
@@ -219,8 +217,7 @@ def _first_winds(forces: _Forces, own: np.ndarray, count: int) -> np.ndarray:
 
 def thruster_columns(model: forcegp.Model) -> dict[int, int]:
     """Columns of u that push a base that floats, and the powers in which they act: `Thrusters`, and such actuators."""
-    groups = model.robot.layout.groups
-    if not groups:
+    if not (groups := model.robot.layout.groups):
         return {}
     matrix, kind = model.actuation.matrix, forcegp.forces.Thrusters
     pushes = [] if matrix is None else np.flatnonzero(torch.as_tensor(matrix)[groups[0].rows].cpu().numpy().any(0))

@@ -139,8 +139,7 @@ class Bodies:
 
     def slopes(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "standard k"]:
         """Derivatives of the standard parameters of all bodies, one after the other, in the coordinates."""
-        own = self._standard(self._congruent(_log_cholesky(x)[1])).swapaxes(-1, -2)
-        return block_diag(np.zeros((0, 0)), *own)
+        return block_diag(np.zeros((0, 0)), *self._standard(self._congruent(_log_cholesky(x)[1])).swapaxes(-1, -2))
 
     def moved(self, x: Float[np.ndarray, " k"], step: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         """x + step to first order: parameters change by exactly their derivatives times the step, if a body can.
@@ -179,8 +178,7 @@ class Bodies:
     def numbers(self, x: Float[np.ndarray, " k"], frames: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " m"]:
         """`QUANTITIES` of every body, in axes with these poses in its frame."""
         told = [physical_of_pseudo_inertia(pseudo) for pseudo in _in_frames(self.pseudo_inertias(x), frames)]
-        each = [[mass, *center, *(inertia[at] for at in _INERTIA)] for mass, center, inertia in told]
-        return np.array(each).ravel()
+        return np.array([[mass, *center, *(inertia[at] for at in _INERTIA)] for mass, center, inertia in told]).ravel()
 
     def number_slopes(self, x: Float[np.ndarray, " k"], frames: Float[np.ndarray, "n 4 4"]) -> np.ndarray:
         """Derivatives of `numbers` in the coordinates."""
@@ -268,8 +266,7 @@ def with_bodies(robot: Robot, wanted: Mapping[int, Float[np.ndarray, "4 4"]]) ->
     """
     own, names = carrying(robot), body_names(robot)
     indefinite = [body for body, pseudo in wanted.items() if torch.linalg.cholesky_ex(torch.as_tensor(pseudo)).info]
-    impossible = [names[own.index(body)] for body in indefinite]
-    if impossible:
+    if impossible := [names[own.index(body)] for body in indefinite]:
         raise NonPhysicalInertia(
             f"no body has the inertia that was found for {', '.join(impossible)}, so there is no such robot; give the "
             "log more motion, or a prior."

@@ -83,8 +83,7 @@ class NoiseLevels:
 
     def whitening(self, H: Float[np.ndarray, "rows equations nv"]) -> Float[np.ndarray, "rows equations equations"]:
         """L_n^-1 with S_n = L_n L_n^T: residuals times this have the identity as covariance. H as in `of`."""
-        inverse = torch.as_tensor(H)
-        S = _covariance(inverse, torch.as_tensor(self.acceleration), torch.as_tensor(self.force))
+        S = _covariance(torch.as_tensor(H), torch.as_tensor(self.acceleration), torch.as_tensor(self.force))
         return np.linalg.inv(torch.linalg.cholesky(S).numpy())
 
 
@@ -146,8 +145,7 @@ class Chained:
         own = np.tensordot(noise**-2.0, self.regressor.squares, 1)
         C, across = self.inner, self.inner.T @ across
         gradient = C.T @ (Y.reshape(white.size, p).T @ (white / noise).ravel())
-        curvature = np.block([[C.T @ own @ C, across], [across.T, squares]])
-        return np.concatenate([gradient, slope]), curvature
+        return np.concatenate([gradient, slope]), np.block([[C.T @ own @ C, across], [across.T, squares]])
 
 
 Jacobian = Float[np.ndarray, "rows nv k"] | Chained

@@ -250,8 +250,7 @@ class MarginalLikelihood:
         if self.training.reference is not None:  # on whose rows kernels were made
             return replace(self, training=self.training.reference).kernels
         features = self.features
-        estimate = (torch.linalg.pinv(self.mixing, rtol=1e-8) @ self.residual[..., None])[..., 0]
-        variances = estimate.square().mean(0)
+        variances = (torch.linalg.pinv(self.mixing, rtol=1e-8) @ self.residual[..., None])[..., 0].square().mean(0)
         largest = float(variances.max()) if variances.numel() else 0.0
         if variances.numel() and not largest > 0.0:
             raise InvalidInput(
@@ -259,8 +258,7 @@ class MarginalLikelihood:
                 "measured and not computed from the model itself"
             )
         variances = variances.clamp_min(RESIDUAL_FLOOR * largest)
-        dimensions = tuple(z.shape[-1] for z in features)
-        kernels = self.model.unknown.kernels(self.model.robot, dimensions, variances)
+        kernels = self.model.unknown.kernels(self.model.robot, tuple(z.shape[-1] for z in features), variances)
         for kernel, z in zip(kernels, features, strict=True):
             for part in kernel.modules():
                 visit: Any = getattr(part, "visit", None)

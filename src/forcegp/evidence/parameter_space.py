@@ -97,8 +97,7 @@ class ParameterSpace:
     def split(self, x: Float[np.ndarray, " k"]) -> tuple[np.ndarray, list[np.ndarray]]:
         """Coordinates of bodies, and of each term."""
         of_bodies, rest = x[: self.bodies.size], x[self.bodies.size :]
-        ends = np.cumsum([len(term.size) for term in self.terms])
-        return of_bodies, np.split(rest, ends[:-1]) if self.terms else []
+        return of_bodies, np.split(rest, np.cumsum([len(term.size) for term in self.terms])[:-1]) if self.terms else []
 
     def _joined(self, of_bodies: np.ndarray, of_terms: Sequence[np.ndarray]) -> np.ndarray:
         return np.concatenate([of_bodies, *of_terms])
@@ -157,8 +156,7 @@ class ParameterSpace:
             law = self.model.laws[term.law]
             own = force_title(law)
             label = own if len(law.coefficients) == 1 else f"{own}.{term.name}"
-            joints = [None] if term.joints is None else [robot.joint_names[j] for j in term.joints]
-            for k, joint in enumerate(joints):
+            for k, joint in enumerate([None] if term.joints is None else [robot.joint_names[j] for j in term.joints]):
                 unit = law.coefficients[term.name].unit if joint is None else law.unit(term.name, joint, robot)
                 kind = LogNormal if term.logarithm else Normal
                 center = term.values(term.center)[k]
@@ -222,8 +220,7 @@ class ParameterSpace:
         pseudo, laws = self.bodies.pseudo_inertias(x[: self.bodies.size]), list[Any](self.model.laws)
         for index, named in values.items():
             laws[index] = laws[index].with_values(named)
-        wanted = {each.body: pseudo[k] for k, each in enumerate(self.carried) if each.payload is None}
-        if wanted:
+        if wanted := {each.body: pseudo[k] for k, each in enumerate(self.carried) if each.payload is None}:
             robot = with_bodies(robot, wanted)
         for each, J in zip(self.carried, pseudo, strict=True):
             if each.payload is not None and each.offset is not None:
@@ -248,13 +245,11 @@ class ParameterSpace:
 
         `cache` holds features and directions of these states, which no coordinate changes.
         """
-        count = self.size - self.bodies.size
-        total, jacobian = np.zeros_like(a), np.zeros((*a.shape, count))
+        total, jacobian = np.zeros_like(a), np.zeros((*a.shape, self.size - self.bodies.size))
         values, of_terms, column = self.values(x), self.split(x)[1], 0
         for index, law in self._estimated.items():
             terms = [(own, term) for own, term in zip(of_terms, self.terms, strict=True) if term.law == index]
-            basis = law.inertia_basis(self.model.robot)
-            if basis is not None:
+            if (basis := law.inertia_basis(self.model.robot)) is not None:
                 moved = np.einsum("pij,nj->nip", basis.cpu().numpy(), a)
                 total += moved @ values[index][next(iter(law.coefficients))].cpu().numpy()
                 derivatives = [moved[:, :, list(term.joints or ())] for _, term in terms]
@@ -300,10 +295,8 @@ class ParameterSpace:
         total = np.zeros((self.model.robot.nv,) * 2)
         values = self.values(x)
         for index, law in self._estimated.items():
-            basis = law.inertia_basis(self.model.robot)
-            if basis is not None:
-                inertia = values[index][next(iter(law.coefficients))]
-                total += np.tensordot(inertia.cpu().numpy(), basis.cpu().numpy(), 1)
+            if (basis := law.inertia_basis(self.model.robot)) is not None:
+                total += np.tensordot(values[index][next(iter(law.coefficients))].cpu().numpy(), basis.cpu().numpy(), 1)
         return total
 
 

@@ -346,8 +346,7 @@ class RecordedRows:
         whitening = np.linalg.inv(np.linalg.cholesky(S))
         whitening = without(whitening, orthonormal_columns(pushed @ whitening.swapaxes(1, 2)))
         at_contact = needed + (M @ moved[..., None])[..., 0]
-        white = whitening @ at_contact[..., None]
-        weighted = whitening.swapaxes(1, 2) @ white
+        weighted = whitening.swapaxes(1, 2) @ (whitening @ at_contact[..., None])
         there = self.moving(a + moved - (e_a @ M.swapaxes(1, 2) @ weighted)[..., 0])
         return LikelyAccelerations(there, at_contact - self.in_torque(x, there)[0], whitening)
 

@@ -31,14 +31,12 @@ def check_forces(likelihood: MarginalLikelihood) -> None:
     """
     dynamics, robot, unknown = likelihood.dynamics, likelihood.model.robot, likelihood.model.unknown
     B, features = checked_values(unknown, dynamics)
-    names = unknown.latent_names(robot)
-    if not names:
+    if not (names := unknown.latent_names(robot)):
         return
     _refuse_constant_features(likelihood, names, features)
-    effect = likelihood.observed.matrix @ B
     terms = [number for number, which in enumerate(unknown.slices(robot)) for _ in range(which.stop - which.start)]
     free = dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B)
-    Doubts(_hidden(names, terms, free, effect)).warn(stacklevel=5)
+    Doubts(_hidden(names, terms, free, likelihood.observed.matrix @ B)).warn(stacklevel=5)
 
 
 def _refuse_constant_features(likelihood: MarginalLikelihood, names: Sequence[str], features: Sequence[Tensor]) -> None:

@@ -227,5 +227,4 @@ class WindowMeans:
 
     def mean(self, values: np.ndarray) -> np.ndarray:
         """(rows, ...) as (windows, ...)."""
-        sums = np.add.reduceat(values, self.starts, axis=0)
-        return sums / self.roots.reshape(-1, *(1,) * (values.ndim - 1))
+        return np.add.reduceat(values, self.starts, axis=0) / self.roots.reshape(-1, *(1,) * (values.ndim - 1))

@@ -302,8 +302,7 @@ class _Functions:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)  # the fit to all rows gives it
             for stage in stages:
-                begin = replace(search, restarts=1, start=start, options=options)
-                closed = replace(self, search=begin)
+                closed = replace(self, search=replace(search, restarts=1, start=start, options=options))
                 start = closed._search(ordered.rows(slice(stage)), dataset).hyperparameters
         return start
 
@@ -313,8 +312,7 @@ class _Functions:
             return self._with_loads(rows, dataset)
         refuse_what_has_no_answer(self.model)
         typical = typical_sizes(self.model, [rows])
-        model = with_payloads_placed(self.model, [dataset])
-        space = ParameterSpace(model, typical)
+        space = ParameterSpace(with_payloads_placed(self.model, [dataset]), typical)
         x = space.start
         again, found, change, rounds = self, None, np.inf, 0
         while rounds < MOST_ROUNDS and change >= CHANGE:
@@ -339,7 +337,6 @@ class _Functions:
 
     def _with_loads(self, rows: Dataset, dataset: Dataset) -> Posterior:
         """One search, or more under the normal force that friction changes."""
-        first = self._search(rows, dataset)
 
         def again(forces: UnknownForces, last: Posterior) -> Posterior:
             with warnings.catch_warnings():
@@ -348,7 +345,7 @@ class _Functions:
                 model = replace(self.model, forces=(*self.model.laws, *forces.terms))
                 return replace(self, model=model, search=begin)._search(rows, dataset)
 
-        return fit_with_refined_loads(first, again)
+        return fit_with_refined_loads(self._search(rows, dataset), again)
 
     def _search(
         self, rows: Dataset, dataset: Dataset, beside: Callable[[MarginalLikelihood], FreeNumbers] | None = None
@@ -371,8 +368,7 @@ class _Functions:
         kernels = likelihood.kernels
         if beside is not None:
             kernels, described["log_variance_spread"] = with_variance_priors(kernels), LOG_VARIANCE_SPREAD
-        searched = likelihood if beside is None else beside(likelihood)
-        objective = FitObjective(searched, kernels, noise, fixed)
+        objective = FitObjective(likelihood if beside is None else beside(likelihood), kernels, noise, fixed)
         starts = self.search.starts(kernels.initial_parameters() | learned_noise, fixed)
         result, of_search = self.search.best(objective, starts)
         found = result.parameters | fixed, result, {**described, **of_search}

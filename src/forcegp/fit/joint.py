@@ -116,8 +116,7 @@ def numbers_beside(
     likelihood, slopes = posterior.likelihood, Slopes(posterior.training, space)
     with torch.no_grad():
         terms = likelihood.terms(posterior.hyperparameters)
-        matrices = posterior.kernels.matrices(posterior.hyperparameters, terms.features)
-        white = Whitening.of(terms, matrices)
+        white = Whitening.of(terms, posterior.kernels.matrices(posterior.hyperparameters, terms.features))
 
         def residual(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             columns = white(slopes.at(x)).cpu().numpy()  # one equation in a row

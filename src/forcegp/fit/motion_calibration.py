@@ -133,8 +133,7 @@ def _motions(part: Dataset, seconds: float) -> RecordedMotions:
 
 def _without(posterior: Posterior, rest: Dataset) -> Posterior:
     """The model from the other rows: as many of them, at the same hyper-parameters; refined on motions if it was."""
-    refined = posterior.settings.get("motions")
-    if refined is not None:
+    if (refined := posterior.settings.get("motions")) is not None:
         return refine_on_motions(posterior, rest, refined["seconds"], refined["bodies"])
     own = posterior.training
     rest = in_own_air(posterior, rest)

@@ -149,15 +149,12 @@ class MotionFit:
     def at(self, x: Tensor, states: Tensor, noise: Tensor, sigma: Tensor, near: WindowMotions | None) -> _Point:
         """The point, its motions sought from those of another; infinitely bad where there are none."""
         q, steps = self.q, self.q.diff(dim=1)
-        guess = q[:, :-1] + 0.5 * steps, steps / self.h
-        if near is not None:
-            guess = near.middle_q, near.middle_v
+        guess = (q[:, :-1] + 0.5 * steps, steps / self.h) if near is None else (near.middle_q, near.middle_v)
         q0, v0 = states.split(steps.shape[-1], dim=-1)
         try:
             accelerations = self.unknowns.accelerations(x)
             # a trial step that leads to motions so far from these is too long, whatever they are
-            patient = near is None
-            motions = window_motions(accelerations, q0, v0, self.u, self.h, guess, patient=patient)
+            motions = window_motions(accelerations, q0, v0, self.u, self.h, guess, patient=near is None)
         except (NumericalError, NonPhysicalInertia):  # a step that went too far
             nowhere = torch.full_like(q, math.nan)
             motions = WindowMotions(nowhere, nowhere, *guess, torch.zeros(len(q), dtype=torch.bool))
@@ -165,8 +162,7 @@ class MotionFit:
         away = (states - self.start) / self.spread(sigma)
         from_prior, _ = self.unknowns.prior(x)
         cost = 0.5 * float(residual.square().sum() + away.square().sum() + from_prior.square().sum())
-        good = bool(motions.found.all()) and math.isfinite(cost)
-        return _Point(x, states, motions, cost if good else math.inf)
+        return _Point(x, states, motions, cost if bool(motions.found.all()) and math.isfinite(cost) else math.inf)
 
     def whitened(self, here: _Point, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Residuals of the windows (K, n) and their Jacobians in states (K, n, 2 nv) and unknowns (K, n, P)."""

@@ -199,8 +199,7 @@ def _estimates(
         G, weak = prior.T @ prior, {}
         for body, each in enumerate(space.carried):
             own = slice(10 * body, 10 * body + 10), slice(10 * body, 10 * body + 10)
-            few = np.linalg.eigvalsh(fit.information[own]) < np.linalg.eigvalsh(G[own]).mean()
-            weak[each.name] = int(few.sum())
+            weak[each.name] = int((np.linalg.eigvalsh(fit.information[own]) < np.linalg.eigvalsh(G[own]).mean()).sum())
         by_body = {name: count for name, count in sorted(weak.items(), key=lambda entry: -entry[1]) if count}
     return Estimates.of_search(
         space.parameters,

@@ -165,8 +165,7 @@ def run_restarts(search: Callable[..., Outcome], restarts: int, patience: int, j
     while len(outcomes) < restarts:
         last = min(restarts, len(outcomes) + AT_ONCE) if patience else restarts
         one = partial(search, before=tuple(outcomes))
-        at_once = 1 if restarts == 1 and isinstance(jobs, int) else jobs
-        outcomes += mapped(one, range(len(outcomes), last), at_once)
+        outcomes += mapped(one, range(len(outcomes), last), 1 if restarts == 1 and isinstance(jobs, int) else jobs)
     return outcomes
 
 
@@ -250,7 +249,6 @@ class Search:
             causes = "; ".join(f"restart {k}: {error}" for k, error in enumerate(results))
             raise FitError(f"none of {restarts} restarts could be evaluated ({causes})")
         work: Any = {name: sum(getattr(x, name) for x in usable) for name in ("evaluations", "cpu_seconds")}
-        best = replace(best_of(usable), **work)
         settings = {
             "restarts": restarts,
             "warm_start": self.start is not None,
@@ -259,7 +257,7 @@ class Search:
             "restart_objective": [each.value if isinstance(each, OptimizationResult) else None for each in results],
             "restart_status": [each.status if isinstance(each, OptimizationResult) else str(each) for each in results],
         }
-        return best, settings
+        return replace(best_of(usable), **work), settings
 
 
 def _one_start(
@@ -329,8 +327,7 @@ class _States:
         """What makes `CONTENT` of the states lie inside, in `CONFIDENCE` of the functions; at least 1."""
         n, nv, latents = self.W.shape
         # every state has latents of its own: (n nv) accelerations from (C n) values
-        apart = torch.diag_embed(self.W.permute(1, 2, 0)).permute(2, 0, 1, 3)
-        linear = apart.reshape(n * nv, latents * n)
+        linear = torch.diag_embed(self.W.permute(1, 2, 0)).permute(2, 0, 1, 3).reshape(n * nv, latents * n)
         covariance = linear @ latent.joint_covariance(self.features) @ linear.mT
         std = covariance.diagonal().clamp_min(0.0).sqrt()
         open_ones = std > NEGLIGIBLE * std.max()
@@ -403,8 +400,7 @@ class _States:
         own = (self.rows[:, None] * rank + torch.arange(rank, device=self.rows.device)).reshape(-1)
         columns = torch.zeros(count * rank, n * rank, dtype=C.dtype, device=C.device)
         columns[own, torch.arange(n * rank, device=own.device)] = 1.0
-        inverse = system.factor.solve(columns)[own].reshape(n, rank, n, rank)
-        B = inverse.diagonal(dim1=0, dim2=2).permute(2, 0, 1)
+        B = system.factor.solve(columns)[own].reshape(n, rank, n, rank).diagonal(dim1=0, dim2=2).permute(2, 0, 1)
         S = latent.covariance(self.features)
         gain = torch.linalg.solve(B, C @ S).mT
         f = latent.mean(self.features) - (gain @ alpha[..., None])[..., 0]

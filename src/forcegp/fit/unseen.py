@@ -111,8 +111,7 @@ class Unseen:
 
     def doubts(self, model: Model) -> list[Doubt]:
         """One, where something pushes a joint."""
-        names = [model.robot.joint_names[j] for j in self.pushed]
-        if not names:
+        if not (names := [model.robot.joint_names[j] for j in self.pushed]):
             return []
         return [
             look(
@@ -129,8 +128,7 @@ def rows_of_known_physics(model: Model, log: Dataset) -> RecordedRows:
     """Rows of the model without what is to be learned."""
     stated = (law for law in model.laws if not law.learned and not (isinstance(law, Payload) and not law.known))
     closed = tuple(replace(law, learn=()) if isinstance(law, RigidBodies) else law for law in stated)
-    plain = tuple(law for law in closed if not law.memory_names(model.robot))
-    alone = replace(model, forces=plain)
+    alone = replace(model, forces=tuple(law for law in closed if not law.memory_names(model.robot)))
     u = log.u[:, [k for k, name in enumerate(model.inputs) if name in alone.inputs]]
     return RecordedRows(ParameterSpace(alone, {}), log.q, log.v, u, any_contact=True, sensed=log.measured)
 

@@ -62,8 +62,7 @@ class Actuation(PerJointLaw):
         return self._of(robot, matrix, names)
 
     def _of(self, robot: Robot, matrix: Tensor | None, names: tuple[str, ...]) -> "Actuation":
-        gain = self.gain if self.is_exact else self._bound("gain", robot)
-        return Actuation(matrix, names, self.known, gain)
+        return Actuation(matrix, names, self.known, self.gain if self.is_exact else self._bound("gain", robot))
 
     @property
     def is_exact(self) -> bool:
@@ -113,8 +112,7 @@ class LinkForce(Law):
     def features(self, state: State) -> tuple[Tensor, ...]:
         """Columns of u, and the axes of the link."""
         first = state.inputs.index(self.names[0])
-        axes = state.kinematics.frame_pose(self.frame)[..., :3, :3]
-        return state.u[..., first : first + len(self.names)], axes
+        return state.u[..., first : first + len(self.names)], state.kinematics.frame_pose(self.frame)[..., :3, :3]
 
 
 @dataclass(frozen=True, eq=False)

@@ -180,8 +180,7 @@ class ContactFriction(ExpressedKernels):
     def direction(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:
         if self.contact >= len(dynamics.contacts):
             return torch.zeros_like(dynamics.H[..., :1])
-        where = ToolPoint.of_contact(dynamics, self.contact)
-        return where.jacobian[..., :3, :].mT @ self.point_force(dynamics)
+        return ToolPoint.of_contact(dynamics, self.contact).jacobian[..., :3, :].mT @ self.point_force(dynamics)
 
     @override
     def point_force(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch 3 C"]:
@@ -238,8 +237,7 @@ def refined_loads(forces: UnknownForces, robot: Robot, table: Table) -> UnknownF
     """
     names, terms = forces.latent_names(robot), list(forces.terms)
     loaded = {k: term for k, term in enumerate(terms) if isinstance(term, ContactFriction) and term.load}
-    wanting = {k: term for k, term in loaded.items() if term.expected is None}
-    if not wanting:
+    if not (wanting := {k: term for k, term in loaded.items() if term.expected is None}):
         return None
     latents, joints = [names[which] for which in forces.slices(robot)], list[tuple[str, TabulatedCurve]]()
     for term, own in zip(terms, latents, strict=True):

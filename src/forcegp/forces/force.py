@@ -241,8 +241,7 @@ class Law(Force):
 
     def added_inertia(self, robot: Robot) -> Float[Tensor, "nv nv"] | None:
         """What this adds to the mass matrix, in kg m^2 or kg."""
-        basis = self.inertia_basis(robot)
-        if basis is None:
+        if (basis := self.inertia_basis(robot)) is None:
             return None
         return torch.tensordot(self.values[next(iter(self.coefficients))].expand(len(basis)), basis, 1)
 
@@ -364,8 +363,7 @@ class Memory:
                 signs[:, own], seen_signs[:, own] = here, there
             first += size
         mean = (seen * seen_signs).mean(0)
-        at_rest = signs == 0.0
-        variance = torch.where(at_rest, seen.square().mean(0), (seen * seen_signs - mean).square().mean(0))
+        variance = torch.where(signs == 0.0, seen.square().mean(0), (seen * seen_signs - mean).square().mean(0))
         return mean * signs, variance
 
     def after(self, memory: Float[Tensor, "*batch m"], step: Float[Tensor, "*batch nv"], dt: float | Tensor) -> Tensor:

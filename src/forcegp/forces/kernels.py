@@ -73,8 +73,7 @@ def matern(dimension: int, variance: float | Tensor, *, smoothness: float) -> Sc
 
     Source: Rasmussen & Williams (2006), eq. 4.17. Length scales and their prior are those of the squared exponential.
     """
-    base = MaternKernel(smoothness, ard_num_dims=dimension, lengthscale_constraint=log_scale())
-    return _scaled(base, variance)
+    return _scaled(MaternKernel(smoothness, ard_num_dims=dimension, lengthscale_constraint=log_scale()), variance)
 
 
 def _scaled(base: Kernel, variance: float | Tensor) -> ScaleKernel:
@@ -279,6 +278,5 @@ def checked_kernel(expression: object) -> list[str]:
         raise InvalidInput(f"the kernel is {expression!r}; give an expression such as 'linear + squared-exponential'.")
     names = [name.strip() for name in expression.split("+")]
     for name in names:
-        where = "the registry" if len(names) == 1 else repr(expression)
-        require_known("kernel", name, where, KERNELS)
+        require_known("kernel", name, "the registry" if len(names) == 1 else repr(expression), KERNELS)
     return names

@@ -72,8 +72,7 @@ def force_name(force: Force) -> str:
     """The name of a force in `FORCES`. Raises InvalidInput for one that has none, which no file can carry."""
     kind = type(force)
     for name, entry in FORCES.items():
-        own = entry is kind or f"{kind.__module__}.{kind.__name__}" == f"forcegp.forces.{entry}"
-        if own:
+        if entry is kind or f"{kind.__module__}.{kind.__name__}" == f"forcegp.forces.{entry}":
             return name
     raise InvalidInput(
         f"a {kind.__name__} cannot be stored: register it first, FORCES['my-force'] = {kind.__name__}; registered: "
@@ -171,18 +170,15 @@ def _refuse(name: str, unknown: bool, expression: Any) -> None:
         other = name if unknown else f"{UNKNOWN}{name}"
         kind = "a law with coefficients" if unknown else "an unknown force"
         raise InvalidInput(f"{name!r} in {whole} is {kind}; write {other}")
-    names = [each for each in (*SHORT, *FORCES) if is_unknown(each) == unknown]
-    require_known("force", name, whole, names)
+    require_known("force", name, whole, [each for each in (*SHORT, *FORCES) if is_unknown(each) == unknown])
 
 
 def _value(what: str, key: str, text: str, make: Callable[..., Any], field: Parameter) -> Any:
     """The text as what the option is by default: truth, number, numbers, names, or text."""
-    default = field.default
-    if key in getattr(make, "coefficients", {}) or field.annotation in (float | None, "float | None"):
-        default = 0.0
     if key == MEMORY and text not in ("true", "false"):
         return tuple(part.strip() for part in text.split("/"))
-    default = False if key == MEMORY else default
+    number_by_default = key in getattr(make, "coefficients", {}) or field.annotation in (float | None, "float | None")
+    default = False if key == MEMORY else 0.0 if number_by_default else field.default
     if isinstance(default, bool):
         if text not in ("true", "false"):
             raise InvalidInput(f"{what} has {key}={text}; give true or false")

@@ -35,8 +35,7 @@ PointMap = Callable[[Tensor], Tensor]
 def embedding(kernel: Kernel) -> tuple[PointMap, float] | None:
     """e(z) and nu of k(|e(z) - e(z')|), inf for the squared exponential; None where k is not known to be so."""
     if type(kernel) in (RBFKernel, MaternKernel):
-        smoothness = kernel.nu if isinstance(kernel, MaternKernel) else math.inf
-        return partial(scaled, kernel), float(smoothness)
+        return partial(scaled, kernel), float(kernel.nu if isinstance(kernel, MaternKernel) else math.inf)
     matern = getattr(kernel, "matern_embedding", None)
     return None if matern is None else (matern, float(cast(float, kernel.nu)))
 

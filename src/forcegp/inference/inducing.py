@@ -173,8 +173,7 @@ class InducingPosterior(LatentPosterior):
         remainders = []
         for c, (part, phi) in enumerate(zip(space.slices, space.columns(features), strict=True)):
             wide[part, c] = phi
-            diagonal = self.kernels.dense[c].diagonal(features[c])
-            remainders.append((diagonal - phi.square().sum(0)).clamp_min(0.0))
+            remainders.append((self.kernels.dense[c].diagonal(features[c]) - phi.square().sum(0)).clamp_min(0.0))
         V = space.precision.solve_lower(wide.flatten(1)).unflatten(1, (latents, count)).permute(2, 1, 0)
         return torch.diag_embed(torch.stack(remainders, dim=-1)) + V @ V.mT
 

@@ -246,8 +246,7 @@ def _acts_apart(W: Float[Tensor, "N D C"]) -> bool:
         return False
     size = W.detach().abs()
     own = size.diagonal(dim1=-2, dim2=-1)
-    others = size - torch.diag_embed(own)
-    return bool((others.amax((-2, -1)) <= RANK_TOLERANCE * own.amin(-1)).all())
+    return bool(((size - torch.diag_embed(own)).amax((-2, -1)) <= RANK_TOLERANCE * own.amin(-1)).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,8 +264,7 @@ def solve_deflated(deflation: Deflation, kernel_matrices: Sequence[Float[Tensor,
     count, rank, _ = deflation.C.shape
     factor = factorize(lambda: deflated_covariance(deflation.C, kernel_matrices))
     alpha = factor.solve(deflation.t.reshape(-1, 1)).reshape(count, rank)
-    beta = torch.einsum("irc,ir->ic", deflation.C, alpha)
-    return DeflatedSystem(deflation, factor, alpha, beta)
+    return DeflatedSystem(deflation, factor, alpha, torch.einsum("irc,ir->ic", deflation.C, alpha))
 
 
 def deflated_covariance(

@@ -121,8 +121,7 @@ class _Search:
 
     def __call__(self, point: np.ndarray) -> tuple[float, np.ndarray]:
         """Objective and gradient; where there are none, a parabola about the best point, as steep as that falls."""
-        evaluated = self.evaluate(point)
-        if evaluated is not None:
+        if (evaluated := self.evaluate(point)) is not None:
             return evaluated
         step = point - self.best_point
         rise = max(abs(float(self.best_slope @ step)), np.finfo(np.float64).eps * max(1.0, abs(self.best_value)))

@@ -76,11 +76,9 @@ def kernel_terms(kernel: Kernel) -> list[KernelTerm]:
             for part in kernel.kernels:
                 terms = [left.times(right) for left, right in product(terms, kernel_terms(cast(Kernel, part)))]
             return terms
-        found = embedding(kernel)
-        if found is not None:
+        if (found := embedding(kernel)) is not None:
             return [KernelTerm(one.scale, factors=(SpectralFactor(*found),))]
-        features = weight_features(kernel)
-        if features is not None:
+        if (features := weight_features(kernel)) is not None:
             return [KernelTerm(one.scale, features=(features,))]
     kind = f"{type(kernel).__name__}{'' if whole else ' with active_dims or a batch'}"
     raise InvalidInput(

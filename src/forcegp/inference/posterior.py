@@ -166,8 +166,7 @@ def with_rows(latent: ExactPosterior, terms: Terms) -> ExactPosterior:
         cross = added.t.new_zeros(added.t.numel(), old.t.numel())
         for c, (kernel, z, at) in enumerate(zip(latent.kernels.dense, features, latent.features, strict=True)):
             cross += added.through(c, old.through(c, kernel.cross(z, at).mT).mT)
-        own = deflated_covariance(added.C, latent.kernels(features))
-        factor = appended(factor, cross, own)
+        factor = appended(factor, cross, deflated_covariance(added.C, latent.kernels(features)))
         joined = Deflation(*(torch.cat([getattr(part, name) for part in (old, added)]) for name in _PARTS))
         joint = tuple(torch.cat([z, new.detach()]) for z, new in zip(latent.features, features, strict=True))
         return ExactPosterior(latent.kernels, joint, _solved(joined, factor))

@@ -71,9 +71,8 @@ class KernelSum:
 
     def call(self, graph: Graph, z: Sequence[int], slopes: bool) -> list[int]:
         """The nodes of E f_c at features z, as a call of the C function; with `slopes` it can be differentiated."""
-        operands = self.given(graph, z)
         name = self.name + ("_slopes" if slopes else "")
-        called = graph.call(name, operands, len(self.latents), self._slopes if slopes else None)
+        called = graph.call(name, self.given(graph, z), len(self.latents), self._slopes if slopes else None)
         constants = map(graph.constant, self.constants)
         return [graph.apply("add", f, constant) for f, constant in zip(called, constants, strict=True)]
 
@@ -156,8 +155,7 @@ class KernelSum:
     def root_table(self) -> np.ndarray:
         """The roots of the compressed covariance, of as many centres as there are in the table."""
         assert self.roots is not None, "asked for with a compressed covariance only"
-        filled = -len(self.centers) % PADDING
-        return torch.nn.functional.pad(self.roots, (0, 0, 0, filled)).numpy().ravel()
+        return torch.nn.functional.pad(self.roots, (0, 0, 0, -len(self.centers) % PADDING)).numpy().ravel()
 
     def c_source(self, lanes: int, slopes: bool) -> str:
         """The C function `NAME(table, live, z, f)`, or NAME_slopes, whose derivatives follow the values."""

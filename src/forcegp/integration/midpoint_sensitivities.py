@@ -127,8 +127,7 @@ def _pass(
         nothing = q0.new_zeros(len(q0), nv, at.a_p.shape[-1])
         eye, zero = identity.expand(len(q0), nv, nv), q0.new_zeros(len(q0), nv, nv)
         q, v = torch.cat([q, eye, zero, nothing], dim=-1), torch.cat([v, zero, eye, nothing], dim=-1)
-        wide = a.new_zeros(*a.shape, 2 * nv)
-        inputs = torch.cat([inputs, wide, half * at.a_p.unflatten(0, u.shape[:2])], dim=-1)
+        inputs = torch.cat([inputs, a.new_zeros(*a.shape, 2 * nv), half * at.a_p.unflatten(0, u.shape[:2])], dim=-1)
     # v_m = Z (v + h/2 a_q q + inputs): products that do not depend on the state first, for all steps at once
     of_q, of_inputs = half * inverse @ a_q, inverse @ inputs
     rows_q, rows_v = [q], [v[..., 0]]

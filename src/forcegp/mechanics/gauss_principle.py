@@ -292,8 +292,7 @@ class ConstrainedDynamics:
         """World force on the robot at each contact in turn, s_p^T lambda, stacked to (..., 3 m), in N."""
         multiplier = self.multiplier_map()
         offset = (self.normals * multiplier.offset[..., None]).flatten(-2)
-        matrix = (self.normals[..., None] * multiplier.matrix[..., None, :]).flatten(-3, -2)
-        return AffineMap(offset, matrix)
+        return AffineMap(offset, (self.normals[..., None] * multiplier.matrix[..., None, :]).flatten(-3, -2))
 
     def force_at(self, frame: str) -> AffineMap:
         """World force on the robot (..., 3) at the contacts of a frame together, in N.
@@ -301,8 +300,7 @@ class ConstrainedDynamics:
         Of a surface it is the part along the normal, (..., 1): friction along it is another force. Raises ContactError
         where no contact is.
         """
-        places = [k for k, contact in enumerate(self.contacts) if contact.frame == frame]
-        if not places:
+        if not (places := [k for k, contact in enumerate(self.contacts) if contact.frame == frame]):
             raise ContactError(f"the model has no contact at {frame!r}, where a force was measured; give it one.")
         multiplier, normals = self.multiplier_map(), self.normals[..., places, :].mT
         if any(not isinstance(self.contacts[k].surface, Held) for k in places):
@@ -325,8 +323,7 @@ class ConstrainedDynamics:
     def acceleration_under(self, Q: Float[Tensor, "*#batch nv"]) -> Float[Tensor, "*batch nv"]:
         """a = M^-1 Q_b + H Q for all joint forces Q, without H: a few products of a matrix and a vector."""
         white = self.inverse_lower @ Q[..., None]
-        rows = self.A @ self.inverse_lower.mT
-        change = self.pseudo_inverse @ (self.b[..., None] - rows @ white)
+        change = self.pseudo_inverse @ (self.b[..., None] - self.A @ self.inverse_lower.mT @ white)
         return (self.inverse_lower.mT @ (white + change))[..., 0]
 
     def multiplier(self, Q_U: Float[Tensor, "*#batch nv"]) -> Float[Tensor, "*batch m"]:

@@ -125,8 +125,7 @@ def export_casadi(
 
 def _of_space(casadi: Any, function: Callable[[Tensor, Tensor], Tensor], sizes: Sequence[int]) -> Any:
     """A function of two vectors that torch computes, such as positions and a step, as one of scalars."""
-    examples = [torch.zeros(size, dtype=torch.float64) for size in sizes]
-    graph, (found,) = trace(lambda x, y: [function(x, y)], examples)
+    graph, (found,) = trace(lambda x, y: [function(x, y)], [torch.zeros(size, dtype=torch.float64) for size in sizes])
     return _function(casadi, "moved", graph, found.tolist(), sizes)
 
 

@@ -123,8 +123,7 @@ def with_drift(posterior: Posterior, log: Dataset) -> Posterior:
     starts = np.flatnonzero(np.r_[True, (np.diff(keys) != 0).any(axis=0)])
     covariance = missed.T @ missed / len(missed)
     weight = np.linalg.pinv(covariance, hermitian=True)
-    squares = np.einsum("ni,ij,nj->nij", friction, weight, friction)
-    information = dt * np.add.reduceat(squares, starts, axis=0)
+    information = dt * np.add.reduceat(np.einsum("ni,ij,nj->nij", friction, weight, friction), starts, axis=0)
     shown = dt * np.add.reduceat(friction * (missed @ weight), starts, axis=0)
     lasting = float(np.mean([since[log.episode == k].max() for k in log.episodes]))
     spread = np.linalg.pinv(information, hermitian=True)
@@ -180,8 +179,7 @@ def random_walk(
         if at not in found:
             rate, between, lasting, seconds = at
             of_record = same * (between + lasting * np.exp(-lag / seconds))
-            covariance = np.diag(1.0 / information) + rate * walked + of_record
-            found[at] = restricted_likelihood(y, covariance)
+            found[at] = restricted_likelihood(y, np.diag(1.0 / information) + rate * walked + of_record)
         return found[at][0]
 
     def best(at: tuple[float, ...], places: Sequence[int]) -> tuple[float, ...]:
@@ -243,8 +241,7 @@ def followed(posterior: Posterior, rows: Dataset) -> Posterior:
     until = float(rows.time[rows.episode == rows.episodes[-1]].max())
     drift = replace(drift, level=level.tolist(), std=std.tolist(), until=until, here=here)
     louder = scaled(posterior.model, torch.as_tensor(1.0 + moved))
-    there = replace(posterior, target=louder, estimates=_moved(posterior, moved, std))
-    return there.with_settings(drift=asdict(drift))
+    return replace(posterior, target=louder, estimates=_moved(posterior, moved, std)).with_settings(drift=asdict(drift))
 
 
 def _moved(posterior: Posterior, d: np.ndarray, std: np.ndarray) -> Any:

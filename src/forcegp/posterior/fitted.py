@@ -112,9 +112,8 @@ class Estimates(Summary, Mapping[str, Estimate]):
     @override
     def facts(self) -> dict[str, object]:
         """The first estimates, and what the log leaves open."""
-        values = [f"{each.name} {each}" for each in self.entries]
         return {
-            "estimated": listed(values, most=6),
+            "estimated": listed([f"{each.name} {each}" for each in self.entries], most=6),
             "from": f"{self.rows} rows, {self.evidence}",
             "decided by the prior": listed(each.name for each in self.entries if each.decided_by == "prior"),
             "converged": self.settled,
@@ -167,8 +166,7 @@ class Estimates(Summary, Mapping[str, Estimate]):
         covariance is F^-1.
         """
         J, r, G = white[:, :-1], white[:, -1], prior.T @ prior
-        information = J.T @ J
-        whole, root = information + G, np.linalg.inv(np.linalg.cholesky(G)).T
+        whole, root = J.T @ J + G, np.linalg.inv(np.linalg.cholesky(G)).T
         moved = [] if changes is None else list(changes)
         for at in stretches if changes is None else ():
             own = J[at]
@@ -201,8 +199,7 @@ class Estimates(Summary, Mapping[str, Estimate]):
         information = np.linalg.inv(inverse) - G
         spread = slopes @ (inverse if covariance is None else covariance) @ slopes.T
         std = np.sqrt(np.maximum(spread.diagonal(), 0.0))
-        a_priori = slopes @ np.linalg.solve(G, slopes.T)
-        prior_std = np.sqrt(np.maximum(a_priori.diagonal(), 0.0))
+        prior_std = np.sqrt(np.maximum((slopes @ np.linalg.solve(G, slopes.T)).diagonal(), 0.0))
         posterior = slopes @ inverse @ slopes.T
         size = np.sqrt(np.maximum(posterior.diagonal(), 1e-300))
         alike = abs(posterior / np.outer(size, size))

@@ -58,8 +58,7 @@ def observing(
         return a - posterior.predict(q, v, u, covariance=False).mean, effect
 
     missed, effect = in_blocks(dataset, unexplained, posterior.model.robot.device)
-    wrench = np.einsum("nij,nj->ni", np.linalg.pinv(effect, rcond=1e-9), missed)
-    observed = _observed(wrench, dataset, times)
+    observed = _observed(np.einsum("nij,nj->ni", np.linalg.pinv(effect, rcond=1e-9), missed), dataset, times)
     model = replace(posterior.model, forces=(*posterior.model.forces, ObservedWrench(frame)))
     truth = {name: values for name, values in dataset.truth.items() if not name.startswith("Q_U")}
     seen = replace(dataset, u=np.concatenate([dataset.u, observed], axis=1), model=model, truth=truth)

@@ -88,8 +88,7 @@ class Posterior(Fitted):
             rows = state_tensor("a", a, self.model.robot.nv, self.model.robot.device)
             states = [*states, rows.expand(*batch, -1).reshape(batch.numel(), -1)]
         parts = zip(*(x.split(ROWS_PER_BLOCK) for x in states), strict=True)
-        blocks = [predict(q, v, u, covariance, *seen) for q, v, u, *seen in parts]
-        predicted = join_predictions(blocks, batch)
+        predicted = join_predictions([predict(q, v, u, covariance, *seen) for q, v, u, *seen in parts], batch)
         # lost where a state is so large, or a system so singular, that nothing is left of the numbers
         variance = predicted.mean if predicted.covariance is None else predicted.variance
         finite = torch.isfinite(predicted.mean.detach() + variance.detach()).reshape(-1, variance.shape[-1]).all(-1)
@@ -161,8 +160,7 @@ class Posterior(Fitted):
         batch = dynamics.state.q.shape[:-1]
         given = self.likelihood.standardization(self.trained.unknown.features(dynamics))
         features = [z.reshape(batch.numel(), z.shape[-1]) for z in given]
-        latents = len(features)
-        if not latents:
+        if not (latents := len(features)):
             nothing = dynamics.state.q.new_zeros(*batch, 0, 0)
             return Gaussian(nothing.flatten(-2), nothing if covariance else None)
         mean, spread = self.latent.mean(features).reshape(*batch, latents), None

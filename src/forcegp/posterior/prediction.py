@@ -136,8 +136,7 @@ def without_past(
     """
     model, training = posterior.model, posterior.training
     memory, first = model.memory, model.memory_column
-    columns = slice(first, first + len(memory.names))
-    mean, variance = memory.likely(v, training.u[:, columns], training.v)
+    mean, variance = memory.likely(v, training.u[:, first : first + len(memory.names)], training.v)
 
     def at(z: Float[Tensor, "rows m"], covariance: bool) -> Prediction:
         return posterior.predict_rows(q, v, torch.cat([u[:, :first], z, u[:, first:]], dim=1), covariance, a)
@@ -264,8 +263,7 @@ class Curve:
 
 def joint_force(posterior: Any, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv"]:
     """Q_K + Q_U, the mean of what acts on the joints of a Posterior beside the contacts."""
-    Q_U = posterior.latents(dynamics, False).through(posterior.trained.unknown.direction(dynamics)).mean
-    return dynamics.Q_K + Q_U
+    return dynamics.Q_K + posterior.latents(dynamics, False).through(posterior.trained.unknown.direction(dynamics)).mean
 
 
 def require_actuated(posterior: Any) -> None:

@@ -236,8 +236,7 @@ class Predictor(Summary):
     def run(self, kind: str, states: Sequence[Tensor]) -> list[Tensor]:
         """The outputs (n, size) of a program at states (n, nv) that were checked, without a graph."""
         states, count = [x.detach().contiguous() for x in states], len(states[0])
-        compiled = self.compiled(kind)
-        if compiled is None:
+        if (compiled := self.compiled(kind)) is None:
             return self._by_torch(kind, states)
         outputs = [torch.empty(count, size, dtype=torch.float64) for size in compiled.outputs]
         if compiled.rows(count, states, outputs):
@@ -266,7 +265,7 @@ class Predictor(Summary):
                 q, v, u = states
                 Q, slope = rows_jacobian(lambda u: joint_force(self.posterior, self.posterior.dynamics(q, v, u)), u)
                 at = self.posterior.dynamics(q, v, u)
-                around = slope.flatten(1), at.M.flatten(1), at.A.flatten(1), at.b, at.off()
+                around = [slope.flatten(1), at.M.flatten(1), at.A.flatten(1), at.b, at.off()]
                 return Q, torch.cat(around, dim=-1).detach()
         nq, nv, nu = self.sizes
         a, slopes = rows_jacobian(lambda x: self.by_torch(*x.split(self.sizes, dim=-1)), torch.cat([*states], dim=-1))
@@ -282,8 +281,7 @@ class Predictor(Summary):
         latents = posterior.latents(dynamics, self.compressed is None)
         if self.compressed is not None:
             features = posterior.likelihood.standardization(prior.features(dynamics))
-            spread = posterior.widening**2 * self.compressed.at(posterior.latent, features)
-            latents = Gaussian(latents.mean, spread)
+            latents = Gaussian(latents.mean, posterior.widening**2 * self.compressed.at(posterior.latent, features))
         affine = dynamics.acceleration_map()
         found = latents.through(affine.matrix @ prior.direction(dynamics), affine.offset)
         return found.mean, found.covariance  # type: ignore[return-value]  # it was asked for

@@ -56,8 +56,7 @@ def prepared_predictor(posterior: Any, covariance: str, compile: bool) -> Predic
                 stacklevel=3,
             )
     code = posterior.programs(compressed=compressed) if compile else None
-    where = model.robot.space, model.sizes, training.q.device
-    made = Predictor(posterior, *where, code, covariance, compressed)
+    made = Predictor(posterior, model.robot.space, model.sizes, training.q.device, code, covariance, compressed)
     made.compiled("mean" if compressed is None else "covariance")
     return replace(made, prepare_seconds=time.perf_counter() - begin)
 
@@ -68,8 +67,7 @@ def rows_for(training: TrainingData, trained: Model, model: Model) -> TrainingDa
     if model.inputs == had:
         return training
     reported = [name for force in model.forces if isinstance(force, ObservedWrench) for name in force.names]
-    new = [name for name in model.inputs if name not in (*had, *reported)]
-    if new:
+    if new := [name for name in model.inputs if name not in (*had, *reported)]:
         raise InvalidInput(
             f"the training rows lack inputs ({', '.join(new)}), so no predictor can be checked; call predict."
         )
@@ -83,8 +81,7 @@ def _compressed(latent: ExactPosterior, training: TrainingData, physics: Physics
 
     def sample(count: int, seed: int, rows: int) -> Sample:
         with torch.no_grad():
-            states = sample_states(training, physics.model.robot.space, count, seed, rows)
-            W, features = physics.mixing(*states)
+            W, features = physics.mixing(*sample_states(training, physics.model.robot.space, count, seed, rows))
         usable = torch.isfinite(W).flatten(1).all(1)  # no state of its own has a surface without a normal
         return Sample([z[usable] for z in features], W[usable])
 

@@ -115,8 +115,7 @@ class Physics:
         kinematics = dynamics.state.kinematics
         inertial = kinematics.inverse_dynamics(a) - kinematics.bias_forces()
         for force in self.model.laws:
-            added = force.added_inertia(self.model.robot)
-            if added is not None:
+            if (added := force.added_inertia(self.model.robot)) is not None:
                 inertial = inertial + (added @ a[..., None])[..., 0]
         r = Q - inertial + (A.mT @ multiplier[..., None])[..., 0]
         s, t = dynamics.b - (A @ a[..., None])[..., 0], (A.mT @ left[..., None])[..., 0]
@@ -351,8 +350,7 @@ class Programs:
         """Those of each drawn function, whose texts are equal; None where one has no form in pieces."""
         if not samples or not self.sums:
             return [self] * max(1, samples)
-        drawn = drawn_calls(self.latent, self.sums, samples, seed, self.widening)
-        if drawn is None:
+        if (drawn := drawn_calls(self.latent, self.sums, samples, seed, self.widening)) is None:
             return None
         return [replace(self, compressed=None, given=(self.traced, calls)) for calls in drawn]
 
@@ -365,10 +363,9 @@ class Programs:
             "forces": [nv, nv * nu + nv**2 + m * nv + 2 * m],
             "mean": [nv],
         }.get(kind, [0] * 4)  # a loop gives as much as it is asked for
-        inputs = 3 + (kind in steps_of(self.space))
         text = self.c_source(kind, vector_unit()[0])
         library = load_library(f"predictor-{kind}", text, lambda _: text)
-        return RowFunction(library, inputs, outputs, self.tables(kind))
+        return RowFunction(library, 3 + (kind in steps_of(self.space)), outputs, self.tables(kind))
 
     def loops(self, integrator: str, samples: int = 0, seed: int = 0) -> list[RowFunction] | None:
         """Over the mean or each drawn function; None without such a step or form. Raises CompilerError."""

@@ -298,9 +298,8 @@ def stepped(
     mean: AccelerationFunction, model: Model, x: Float[Tensor, "n rows"], dt: Any, integrator: Any
 ) -> Float[Tensor, "n state"]:
     """[q, v] one step after the rows x = [q, v, u], as `Predictor.step` documents it."""
-    method = steps_by(integrator, model, dt)
     q, v, u = x.split(model.sizes, dim=-1)
-    step = method(lambda q, v: mean(q, v, u), q, v, dt)
+    step = steps_by(integrator, model, dt)(lambda q, v: mean(q, v, u), q, v, dt)
     if not bool(step.found.all()):
         row = int((~step.found).nonzero()[0])
         raise NumericalError(f"{NO_ROOT} from state {row}; give a dt below {dt:g} s, or check that state.")
@@ -357,8 +356,7 @@ def linearized_on_manifold(
     there = stepped(mean, model, x.detach(), dt, integrator)[:, :nq]
 
     def moved(z: Tensor) -> Tensor:
-        start = torch.cat([space.integrate(q, z[:, :nv]), z[:, nv:]], dim=-1)
-        end = stepped(mean, model, start, dt, integrator)
+        end = stepped(mean, model, torch.cat([space.integrate(q, z[:, :nv]), z[:, nv:]], dim=-1), dt, integrator)
         return torch.cat([space.difference(there, end[:, :nq]), end[:, nq:]], dim=-1)
 
     end, slopes = rows_jacobian(moved, torch.cat([torch.zeros_like(rest[:, :nv]), rest], dim=-1))

@@ -110,8 +110,7 @@ def load_posterior(path: str | Path) -> Posterior:
         _require_numbers(settings, model.robot.nv)
         engine = None if stored is None else engine_from_dict(stored)
         learned = training, parameters, OptimizationResult(parameters, **found)
-        estimates = Estimates.from_dict(document["estimates"])
-        posterior = Posterior.conditioned(model, *learned, settings, engine, estimates)
+        posterior = Posterior.conditioned(model, *learned, settings, engine, Estimates.from_dict(document["estimates"]))
         of_rows = posterior.likelihood
         needed = of_rows.kernels.initial_parameters() | of_rows.noise.parameters(model.robot.nv)
         wanted, there = ({name: x.shape for name, x in each.items()} for each in (needed, parameters))

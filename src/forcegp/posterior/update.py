@@ -23,8 +23,7 @@ def learn_more_rows(posterior: Structured, rows: Dataset) -> Structured:
     count, rank, latents = latent.system.deflation.C.shape
     size, new = rank * (count + len(rows)), rank * len(rows)
     needed = 8 * (size**2 + 2 * new * size + latents * len(rows) ** 2)  # the factor, blocks of new rows, their copies
-    what = f"a posterior of {count} + {len(rows)} rows"
-    require_memory(needed, what, "give fewer rows", latent.system.alpha.device)
+    require_memory(needed, f"a posterior of {count} + {len(rows)} rows", "give fewer rows", latent.system.alpha.device)
     # with the standardization at hand instead of one that is computed again
     reference = training if training.reference is None else training.reference
     added = TrainingData.of(rows, training.q.device, training.sensed)
@@ -35,8 +34,7 @@ def learn_more_rows(posterior: Structured, rows: Dataset) -> Structured:
     more = replace(known, training=added, fixed_standardization=known.standardization)
     with torch.no_grad(), blas_threads(training.q.numel()):
         terms = more.terms(posterior.hyperparameters)
-        variance = terms.noise.expand(len(terms.W), *terms.noise.shape[1:])
-        latent = with_rows(latent, terms._replace(noise=variance))
+        latent = with_rows(latent, terms._replace(noise=terms.noise.expand(len(terms.W), *terms.noise.shape[1:])))
     both = training, more.training
     sensed = {name: torch.cat([x.sensed[name] for x in both]) for name in training.sensed}
     pairs = {name: [getattr(x, name) for x in both] for name in (*"qvua", "strokes")}

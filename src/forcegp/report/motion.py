@@ -130,8 +130,7 @@ def learned_forces(posterior: Posterior, dynamics: ConstrainedDynamics) -> list[
     of_joints = torch.zeros(B.shape[-1], dtype=torch.bool)
     groups = []
     for name, term, which in prior.named(robot):
-        point = term.point_force(dynamics)
-        if point is None:
+        if (point := term.point_force(dynamics)) is None:
             of_joints[which] = True
         else:
             force = latents.entries(which).through(point)
@@ -246,8 +245,7 @@ def _drawn(server: Any, recorded: RecordedScene) -> Callable[[int], None]:
     arrows = []
     for place, group in enumerate(recorded.arrows):  # of the mean, and thinner pale ones to the end of the interval
         color = np.array(COLORS[place % len(COLORS)])
-        pale = color + PALE * (255 - color)
-        looks = ("mean", color, 0.014), ("interval", pale, 0.008)
+        looks = ("mean", color, 0.014), ("interval", color + PALE * (255 - color), 0.008)
         for points, (kind, shade, width) in zip(group.tips(0, length), looks, strict=True):
             radii = {"shaft_radius": width * size, "head_radius": 2.0 * width * size, "head_length": 2.5 * width * size}
             name = f"/forces/{place}/{kind}"

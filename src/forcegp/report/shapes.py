@@ -60,8 +60,7 @@ def link_shapes(robot: Robot, urdf: str | Path | None = None) -> tuple[list[Link
         name = link.get("name", "")
         if name in robot.link_names:
             meshes = [_visual(element, None if urdf is None else Path(urdf), doubts) for element in link.iter("visual")]
-            present = [mesh for mesh in meshes if mesh is not None]
-            if present:
+            if present := [mesh for mesh in meshes if mesh is not None]:
                 drawn[name] = _few_faces(trimesh_module().util.concatenate(present))
     shaped = bool(drawn)
     for name, mesh in _capsules(robot).items():
@@ -74,11 +73,9 @@ def reach(robot: Robot) -> float:
     """The length of the robot in m: the farthest that a chain of joints stretches."""
     lengths: dict[str, float] = {}
     for joint in robot.all_joints:
-        step = float(np.linalg.norm(joint.origin[:3, 3]))
-        lengths[joint.child] = lengths.get(joint.parent, 0.0) + step
-    longest = max(lengths.values(), default=0.0)
+        lengths[joint.child] = lengths.get(joint.parent, 0.0) + float(np.linalg.norm(joint.origin[:3, 3]))
     centers = [np.linalg.norm(robot.link(name).center_of_mass) for name in robot.link_names]
-    return max(longest, float(max(centers, default=0.0)), 0.1)
+    return max(max(lengths.values(), default=0.0), float(max(centers, default=0.0)), 0.1)
 
 
 def _visual(element: Element, urdf: Path | None, doubts: list[str]) -> Any:
@@ -128,8 +125,7 @@ def _loaded(element: Element, urdf: Path | None, doubts: list[str]) -> Any:
     if not len(mesh.faces):
         doubts.append(f"{name} could not be read (it holds no faces); its link is drawn as a capsule.")
         return None
-    scale = _numbers(element, "scale")
-    if scale:
+    if scale := _numbers(element, "scale"):
         mesh.apply_scale(scale)
     return mesh
 

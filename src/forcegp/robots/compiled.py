@@ -51,8 +51,7 @@ def trace_dynamics(robot: RobotStructure, function: str, *place: Any) -> Program
         found = at.inverse_dynamics(others[1]) if len(others) > 1 else getattr(at, function)(*place)
         return [*found] if isinstance(found, tuple) else [found]
 
-    examples = [torch.full((1, size), 0.5, dtype=torch.float64) for size in sizes.values()]
-    graph, found = trace(results, examples)
+    graph, found = trace(results, [torch.full((1, size), 0.5, dtype=torch.float64) for size in sizes.values()])
     made = [nodes.flatten().tolist() for nodes in found]
     positive = made.pop() if function == "forward_dynamics" else []
     return Program(graph, sizes, {f"result {k}": nodes for k, nodes in enumerate(made)}, positive)

@@ -97,8 +97,7 @@ def _replaced(tree: Tree, values: Tensor, of_group: Callable[[Group], Tensor]) -
 def _group_pose(group: Group, q: Float[Tensor, "nq batch"]) -> Float[Tensor, "1 4 4 batch"]:
     rotation, origin = pose(q[group.places].mT)
     upper = torch.cat([rotation, origin[..., None]], -1).movedim(0, -1)
-    last = q.new_tensor([0.0, 0.0, 0.0, 1.0])[None, :, None].expand(1, 4, q.shape[-1])
-    return torch.cat([upper, last])[None]
+    return torch.cat([upper, q.new_tensor([0.0, 0.0, 0.0, 1.0])[None, :, None].expand(1, 4, q.shape[-1])])[None]
 
 
 def _group_vectors(group: Group, body: Float[Tensor, "4 4 batch"]) -> Float[Tensor, "rows 6 batch"]:
@@ -106,8 +105,7 @@ def _group_vectors(group: Group, body: Float[Tensor, "4 4 batch"]) -> Float[Tens
     rotation, origin = body[:3, :3], body[:3, 3]
     axes = rotation.movedim(1, 0)  # (3, 3, batch), one axis in the world each
     moments = torch.linalg.cross(origin.expand_as(axes), axes, dim=1)
-    linear = torch.cat([torch.zeros_like(axes), axes], dim=1)
-    return torch.cat([linear, torch.cat([axes, moments], dim=1)])
+    return torch.cat([torch.cat([torch.zeros_like(axes), axes], dim=1), torch.cat([axes, moments], dim=1)])
 
 
 def body_accelerations(
@@ -211,8 +209,7 @@ class Kinematics:
     ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
         """Mass matrix and bias forces for standard parameters of the bodies, which no body need have."""
         frames = self._child_frames()
-        pseudo = frames @ pseudo_inertia_of_standard(parameters) @ frames.mT
-        inertias = world_inertias(self.poses, pseudo[..., None])
+        inertias = world_inertias(self.poses, (frames @ pseudo_inertia_of_standard(parameters) @ frames.mT)[..., None])
         return self._rows(self._mass_matrix(inertias)), self._rows(self._bias_forces(inertias))
 
     def frame_pose(self, frame: str) -> Float[Tensor, "... 4 4"]:

@@ -245,8 +245,7 @@ def lay_out(
         raise RobotModelError(
             f"{description.source}: {len(bodies)} joints move; forcegp takes up to {MOST_BODIES}, lock the others."
         )
-    names = [joint.name for joint in bodies if joint.name not in drives]
-    places = {name: place for place, name in enumerate(names)}
+    places = {name: place for place, name in enumerate(joint.name for joint in bodies if joint.name not in drives)}
     joints = with_followers({body.name: body for body in bodies if body.name not in drives}, bodies, drives)
     moved = [drives.get(joint.name, (joint.name, 1.0, 0.0)) for joint in bodies]
     drive = tuple(Drive(places[name], multiplier, offset) for name, multiplier, offset in moved)
@@ -265,8 +264,7 @@ def check_tree(layout: Layout, loops: Sequence[tuple[str, str, str]], problems: 
         return above[:-1]
 
     for name, *links in loops:
-        between = sorted(set(moving(links[0])) ^ set(moving(links[1])))
-        if between:
+        if between := sorted(set(moving(links[0])) ^ set(moving(links[1]))):
             problems.errors.append(
                 RobotModelError(
                     f"{problems.source}: {name} closes a loop, from link {links[0]!r} to {links[1]!r}",
@@ -300,8 +298,7 @@ def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]
     for link in below:
         below += [joint.child for joint in children[link]]
     reached = set(below)
-    stray = next((link for link in description.links if link not in reached), None)
-    if stray is not None:
+    if (stray := next((link for link in description.links if link not in reached), None)) is not None:
         loop, link = [], stray
         while link not in loop:
             loop.append(link)

@@ -123,8 +123,7 @@ class MjcfWriter:
     def text(self) -> str:
         """The whole file."""
         robot, root = self.robot, next(iter(self.robot.layout.links))
-        named = {joint.name for joint in robot.description.joints}
-        if BASE in self.groups and BASE not in named:
+        if BASE in self.groups and BASE not in {joint.name for joint in robot.description.joints}:
             self._chain(free_joint(BASE, OUTSIDE, root), np.eye(4), 2)
         elif root == "world" and not robot.link(root).mass:
             self._below(root, 2)
@@ -179,8 +178,7 @@ class MjcfWriter:
             step, joint = below[0]
             joints = [*((each, inverse(step) @ at) for each, at in joints), (joint, np.eye(4))]
             pose = pose @ step
-        free = joint.type == "floating"
-        if free and (depth != 2 or not np.array_equal(pose, np.eye(4))):
+        if joint.type == "floating" and (depth != 2 or not np.array_equal(pose, np.eye(4))):
             raise RobotModelError(
                 f"{self.robot.source}: joint {joint.name!r} floats beside the origin of the world, which MuJoCo does "
                 "not take; move its origin there."

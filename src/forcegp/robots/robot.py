@@ -132,8 +132,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         for_system: bool = False,
     ) -> "tuple[Robot, Translation]":
         """The robot of MJCF text, and what a model takes from it, which is noted as left out unless ``for_system``."""
-        given = {"locked": locked, "inertias": inertias, "base": base}
-        problems = Problems(source, given, "Robot.from_mjcf")
+        problems = Problems(source, {"locked": locked, "inertias": inertias, "base": base}, "Robot.from_mjcf")
         found = translate(text, path, for_system, problems)
         problems.given["locked"] = found.locked | dict(locked or {})
         gravity = found.gravity if gravity is None else gravity
@@ -198,8 +197,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
 
     def to_stored(self) -> dict[str, Any]:
         """The robot as plain JSON values."""
-        how = {"gravity": self.gravity.tolist(), "locked": self.locked, "base": self.base}
-        return {"urdf": self.urdf_text, **how}
+        return {"urdf": self.urdf_text, "gravity": self.gravity.tolist(), "locked": self.locked, "base": self.base}
 
     def _limp(self) -> set[int]:
         """Coordinates that nothing resists at a position without symmetry."""

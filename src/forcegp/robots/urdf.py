@@ -202,8 +202,7 @@ class _Part:
         return None if self.element is None else self.element.get(attribute)
 
     def text(self, attribute: str) -> str:
-        value = self.get(attribute)
-        if value is None:
+        if (value := self.get(attribute)) is None:
             tag = "" if self.element is None else self.element.tag
             raise RobotModelError(f"{self}: <{tag}> has no attribute {attribute!r}; add it.")
         return value

@@ -67,8 +67,7 @@ def replace_dynamics(text: str, joints: Mapping[str, Mapping[str, float]], *, so
     document = _document(text)
     for joint, values in joints.items():
         owner = _found(document, "joint", joint, source)
-        dynamics = _child(owner, "dynamics")
-        if dynamics is None:
+        if (dynamics := _child(owner, "dynamics")) is None:
             if not any(values.values()):
                 continue
             dynamics = owner.appendChild(document.createElement("dynamics"))
@@ -196,9 +195,8 @@ def with_chosen_inertias(
         nearest = nearest_inertia(given) if inertial.mass > 0.0 else np.zeros((3, 3))
         links[name] = replace(inertial, inertia=nearest)
         if choice == "strict":
-            advice = f"{IN_THE_FILE}, or take the nearest inertia that a body has."
-            if objection is None:
-                advice = "; add it, or take the mass as a point at its centre."
+            lacks = "; add it, or take the mass as a point at its centre."
+            advice = lacks if objection is None else f"{IN_THE_FILE}, or take the nearest inertia that a body has."
             problems.errors.append(NonPhysicalInertia(seen, advice, {"inertias": "nearest"}))
             continue
         changed = True

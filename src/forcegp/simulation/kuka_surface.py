@@ -77,15 +77,13 @@ def kuka_urdf(config: KukaSurfaceConfig) -> str:
     )
     root[:0] = [ElementTree.Element("link", name="world"), ElementTree.fromstring(joint)]
     ElementTree.indent(root)
-    head = text[: text.index("<robot")]
     changes = "<!-- Changed by forcegp: base mounted on `world`, tool inertia and damping set, meshes left out. -->\n"
-    return head + changes + ElementTree.tostring(root, encoding="unicode") + "\n"
+    return text[: text.index("<robot")] + changes + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
 def kuka_robot(config: KukaSurfaceConfig) -> Robot:
     """The arm on its base, with the tool of a scenario."""
-    down = (0.0, 0.0, -config.gravity)
-    return Robot.from_urdf_text(kuka_urdf(config), source="kuka-surface", gravity=down)
+    return Robot.from_urdf_text(kuka_urdf(config), source="kuka-surface", gravity=(0.0, 0.0, -config.gravity))
 
 
 @dataclass(frozen=True)

@@ -80,8 +80,7 @@ def _episode(robot: Robot, model: Model, config: QuadrupedConfig, episode: int, 
     kinematics = robot.kinematics(q, v)
     drift = torch.stack([kinematics.frame_bias_acceleration(f"{leg}_foot")[:, :3] for leg in LEGS], 1)
     a = torch.cat([dV, joints(dV, ddx - drift)], -1)
-    friction = laws_of_joints(str(config.joint_friction), robot, FRICTION)
-    Q_U = torch.as_tensor(friction(v.numpy()))
+    Q_U = torch.as_tensor(laws_of_joints(str(config.joint_friction), robot, FRICTION)(v.numpy()))
     needed = robot.inverse_dynamics(q, v, a) - Q_U
     A = (J * stands[..., None, None]).flatten(1, 2)
     weight = -float(robot.gravity[2]) * robot.mass
@@ -147,9 +146,8 @@ def _joint_angles(robot: Robot, base: Tensor, home: Tensor, x: Tensor) -> Tensor
         kinematics = robot.kinematics(q)
         change = []
         for k, leg in enumerate(LEGS):
-            missing = x[:, k] - kinematics.frame_pose(f"{leg}_foot")[:, :3, 3]
             own = kinematics.frame_jacobian(f"{leg}_foot")[:, :3, 6 + 3 * k : 9 + 3 * k]
-            change.append(torch.linalg.solve(own, missing))
+            change.append(torch.linalg.solve(own, x[:, k] - kinematics.frame_pose(f"{leg}_foot")[:, :3, 3]))
         q = torch.cat([base, q[:, 7:] + torch.cat(change, -1)], -1)
         if float(torch.cat(change, -1).abs().max()) < 1e-12:
             return q
@@ -188,8 +186,7 @@ def simulate_quadrotor(config: QuadrotorConfig) -> Dataset:
     dynamics = model.dynamics(torch.from_numpy(q), torch.from_numpy(v), torch.from_numpy(u))
     Q_U = (dynamics.M @ torch.from_numpy(a)[..., None])[..., 0] - dynamics.Q_K
     mean = wind.reshape(config.episodes, steps, 3).mean(1).tolist()
-    motion = {"q": q, "v": v, "u": u, "a": a}
-    return recorded("quadrotor", config, model, motion, {"Q_U": Q_U.numpy()}, {"wind": mean})
+    return recorded("quadrotor", config, model, {"q": q, "v": v, "u": u, "a": a}, {"Q_U": Q_U.numpy()}, {"wind": mean})
 
 
 def _flight(robot: Robot, config: QuadrotorConfig, episode: int, steps: int) -> tuple[np.ndarray, ...]:

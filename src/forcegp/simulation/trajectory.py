@@ -130,8 +130,7 @@ def random_path(
         points.append(np.array([x, y, config.waypoint_height]))
     corners, times = np.array(points), np.array(durations)
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
-    accelerations = np.maximum(config.least_acceleration, 4.0 * lengths / times**2)
-    return SegmentPath(corners, times, accelerations)
+    return SegmentPath(corners, times, np.maximum(config.least_acceleration, 4.0 * lengths / times**2))
 
 
 TOOL_ORIENTATION = np.diag([-1.0, 1.0, -1.0])  # the tool points straight down
