@@ -303,9 +303,6 @@ WORDS = {
     "time": {"t", "time", "timestamp", "stamp", "time_s", "seconds"},
 }
 """What the rest of a column's name, beside that of the joint, must mean."""
-PLACE = {"", "p", "pos", "position", "base", "body", "trunk", "torso", "root", "pelvis"}
-TURN = {"q", "quat", "quaternion", "orientation", "rotation", "rot"}
-"""The last word before x, y, z, and before the parts of a turn, in columns of the pose of a base."""
 
 
 def named_after(joint: str) -> re.Pattern[str]:
@@ -330,21 +327,6 @@ def guessed_columns(signal: str, joints: Sequence[str], source: Source) -> tuple
         raise InvalidInput(f"{source.path}: {signal} could be {candidates}; choose with --{signal}.")
     bare = tuple(joint.removesuffix("_joint") for joint in joints)
     return fitting[0] if fitting else None if bare == tuple(joints) else guessed_columns(signal, bare, source)
-
-
-def guessed_pose(parts: Sequence[str], source: Source) -> tuple[str, ...] | None:
-    """Columns of a base by `parts`: x, y, z and qx, ..., or roll, ...; None where none or several may be meant."""
-    known = {column.lower(): column for column in source.columns()}
-
-    def before(ends: Sequence[str], words: Collection[str]) -> str | None:
-        stems = [column.removesuffix(ends[0]) for column in known if column.endswith(ends[0])]
-        stems = [each for each in stems if re.split(r"[^a-z]+", each.rstrip("_.:/ -["))[-1] in words]
-        fitting = [each for each in stems if all(each + end in known for end in ends)]
-        return fitting[0] if len(fitting) == 1 else None
-
-    ends = [part.removeprefix("q") for part in parts]
-    stems = before(ends[:3], PLACE), before(ends[3:], TURN if "w" in ends else TURN | PLACE)
-    return None if None in stems else tuple(known[f"{stems[k > 2]}{end}"] for k, end in enumerate(ends))
 
 
 def guessed_time(source: Source, used: Sequence[str]) -> str | None:

@@ -25,7 +25,6 @@ from forcegp.recordings.mapping import (
     LogUnit,
     expanded,
     guessed_columns,
-    guessed_pose,
     guessed_time,
     log_unit,
     named_after,
@@ -234,6 +233,26 @@ def signal_plan(
         episode=episode,
         guessed=tuple(guessed),
     )
+
+
+PLACE_WORDS = {"", "p", "pos", "position", "base", "body", "trunk", "torso", "root", "pelvis"}
+TURN_WORDS = {"q", "quat", "quaternion", "orientation", "rotation", "rot"}
+"""The last word before x, y, z, and before the parts of a turn, in columns of the pose of a base."""
+
+
+def guessed_pose(parts: Sequence[str], source: Source) -> tuple[str, ...] | None:
+    """Columns of a base by `parts`: x, y, z and qx, ..., or roll, ...; None where none or several may be meant."""
+    known = {column.lower(): column for column in source.columns()}
+
+    def before(ends: Sequence[str], words: Collection[str]) -> str | None:
+        stems = [column.removesuffix(ends[0]) for column in known if column.endswith(ends[0])]
+        stems = [each for each in stems if re.split(r"[^a-z]+", each.rstrip("_.:/ -["))[-1] in words]
+        fitting = [each for each in stems if all(each + end in known for end in ends)]
+        return fitting[0] if len(fitting) == 1 else None
+
+    ends = [part.removeprefix("q") for part in parts]
+    stems = before(ends[:3], PLACE_WORDS), before(ends[3:], TURN_WORDS if "w" in ends else TURN_WORDS | PLACE_WORDS)
+    return None if None in stems else tuple(known[f"{stems[k > 2]}{end}"] for k, end in enumerate(ends))
 
 
 def _joints(mapping: ColumnMapping, robot: Robot) -> tuple[str, ...]:
