@@ -307,11 +307,13 @@ def motion_doubts(inputs: CheckInput, joints: Sequence[int] | None = None) -> li
     if inputs.cutoff is not None:  # all three signals by one filter: what it takes from one it takes from the others
         even = low_pass(even, float(inputs.cutoff), signals=("q", "v", "a"))
     joints = range(even.nv) if joints is None else joints
-    made = inputs.log.metadata.get("import", {}).get("signals", {})
+    imported = inputs.log.metadata.get("import")  # others may have put anything there
+    made = imported.get("signals") if isinstance(imported, Mapping) else None
+    derived = isinstance(made, Mapping) and str(made.get("a")).startswith("central")
     pieces = [even.select_episodes([number]) for number in even.episodes]
     found: list[Doubt] = []
     for name, source in (("v", "q"), ("a", "v")):
-        if name == "a" and (any(doubt.level != "ok" for doubt in found) or "central" in made.get("a", "")):
+        if name == "a" and (derived or any(doubt.level != "ok" for doubt in found)):
             break  # of wrong velocities nothing better can come, and what was derived says nothing
         slopes = np.concatenate([differentiate(getattr(rows, source), rows.time) for rows in pieces])
         size = np.sqrt([np.square(x).mean(axis=0) for x in (getattr(even, name), slopes)]).max(axis=0)

@@ -26,6 +26,7 @@ SPRINGS, DAMPING = tuple(np.geomspace(1.0, 40.0, 24).tolist()), (0.02, 0.1, 0.3)
 BELOW = 1.0 / 3.0  # of a resonance, where a robot is as good as rigid
 MOST_ROWS = 2000  # on which that is judged
 SURE, TELLS = 200.0, 30.0  # nats that a stretch of time in which something is touched explains: in all, and of a joint
+SEEN, WARMER = 1e-3, 0.1  # share of the largest direction of columns; logarithm of a ratio of friction that is told
 RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
 
 
@@ -35,25 +36,44 @@ def torque_doubts(inputs: CheckInput, found: Explanation) -> list[Doubt]:
 
 
 def _drift(found: Explanation) -> Iterator[Doubt]:
-    """Friction that is another at the end of the log than at its beginning."""
-    rows, changed = found.log.rows, dict[str, float]()
+    """Friction that is another at the end of the log than at its beginning, in a robot of any masses.
+
+    Blocks of time that are left out decide, of all joints together, and the change in the median joint.
+    """
+    rows, robot, count = found.log.rows, found.log.robot, len(found.log.rows)
+    if count < FEWEST_ROWS:
+        return
+    q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
+    bodies = robot.kinematics(q, v).torque_regressor(a).flatten(-2).cpu().numpy()
     time = (rows.time - rows.time.mean()) / max(float(np.ptp(rows.time)), 1e-300)
-    for joint in np.flatnonzero((found.chosen == 0) & (found.shares > DOUBTFUL)) if len(time) >= FEWEST_ROWS else ():
-        u, friction = rows.u[:, joint], found.log.friction[:, joint, 1:]
-        target, both = u - found.log.tau[:, joint], np.c_[friction, friction * time[:, None]]
-        target = target - target.mean()
-        left = [np.square(target - x @ np.linalg.lstsq(x, target)[0]).sum() for x in (friction, both)]
-        steady, slope = np.split(np.linalg.lstsq(both, target)[0], 2)
-        begin, end = (float(np.std(friction @ (steady + x * slope))) for x in (-0.5, 0.5))
-        if left[1] < MUCH * left[0] and left[0] > DOUBTFUL * np.square(u - u.mean()).sum():
-            changed[rows.joint_names[joint]] = end / max(begin, 1e-300)
-    if changed:
+    block, changed, told = np.arange(count) * BLOCKS // count, dict[str, float](), 0.0
+    for joint in np.flatnonzero((found.chosen == 0) & (found.shares > DOUBTFUL)):
+        u, friction = rows.u[:, joint], found.log.friction[:, joint]
+        steady, moved = np.c_[bodies[:, joint], np.ones(count)], np.c_[friction, friction * time[:, None]]
+        left = []
+        for columns in (np.c_[steady, friction], np.c_[steady, moved]):
+            basis = _basis(columns)
+            numbers = [np.linalg.lstsq(basis[block != k], u[block != k])[0] for k in range(BLOCKS)]
+            left.append(sum(np.square((u - basis @ x)[block == k]).sum() for k, x in enumerate(numbers)))
+        told += float(np.log(left[1] / max(left[0], 1e-300)))
+        basis, size = _basis(steady), np.linalg.norm(moved, axis=0) + 1e-300
+        rest = (moved - basis @ (basis.T @ moved)) / size
+        level, slope = np.split(np.linalg.lstsq(rest, u - basis @ (basis.T @ u), rcond=SEEN)[0] / size, 2)
+        begin, end = (float(np.std(friction @ (level + x * slope))) for x in (-0.5, 0.5))
+        changed[rows.joint_names[joint]] = end / max(begin, 1e-300)
+    if told < -np.log(1.0 / MUCH) and abs(np.log(np.median([*changed.values()]))) > WARMER:
         each = ", ".join(f"{name} {ratio:.2g}" for name, ratio in changed.items())
         what = (
             f"friction changes with time, with temperature perhaps: at the end it is so many times the first: {each}."
         )
         do = "Record the warm robot; updates of a posterior follow the level of friction."
         yield look(about="drift", what=what, do=do, joints=tuple(changed), numbers={"ratio": changed})
+
+
+def _basis(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal, of the directions that show."""
+    u, s, _ = np.linalg.svd(columns / (np.linalg.norm(columns, axis=0) + 1e-300), full_matrices=False)
+    return u[:, s > SEEN * s[0]]
 
 
 def elastic_doubts(inputs: CheckInput, log: Comparison) -> list[Doubt]:
