@@ -49,7 +49,8 @@ def answer_lines(
     doubts = [*done["stops"], *(x for x in content["check"]["doubts"] if not is_explained(x, scores, best))]
     told = [x if "seconds" not in x["numbers"] or x["about"] not in FIRST else {**x, "about": "push"} for x in doubts]
     seen = [(x["about"], f"{x['what']} {x['do']}") for x in told if x["about"] in TOLD]
-    held += "; settle what is said above first" if FIRST & {about for about, _ in seen} else ""
+    unsettled = FIRST & {about for about, _ in seen}
+    held += "; settle what is said above first" if unsettled else ""
     flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
     mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
     late, lag, rate = prepared["delay"], prepared["lag"], (len(dataset) - len(dataset.episodes)) / seconds
@@ -83,7 +84,7 @@ def answer_lines(
         ("viscous", each("viscous", f"{force} per {q}/s")),
         ("rotors", each("rotor", inertia)),
     ] if joints else []  # fmt: skip
-    (mass, error), causes = values.total_mass, other_causes(content["payload"] or {})
+    (mass, error), causes = values.total_mass, {} if unsettled else other_causes(content["payload"] or {})
     if "gains" in causes:  # what it changes of a payload, it changes of all
         error = math.hypot(error, content["payload"]["parameters"]["payload.mass"]["std"])
     weight = f"{mass:.4g} ± {1.96 * error:.1g} kg, if {drives_of(identified.model)} are right"
