@@ -16,10 +16,11 @@ from forcegp.data import Dataset
 from forcegp.data.dataset import FORCE
 from forcegp.errors import InvalidInput
 from forcegp.fit import fit
-from forcegp.forces import ContactFriction, JointForces, JointFriction, JointPositionForces
+from forcegp.forces import ContactFriction, GearFriction, JointForces, JointFriction, JointPositionForces
 from forcegp.mechanics import fixed_point
 from forcegp.scores import friction_curves_figure, normal_force_figure
 from forcegp.scores.accuracy import metrics, poor_scores, predict_rows, row_scores, rows_outside, unfinished_search
+from forcegp.scores.figures.model import law_forces
 
 
 @pytest.fixture(scope="module")
@@ -75,27 +76,26 @@ def test_a_panel_shows_the_curve_its_band_the_training_velocities_and_the_truth(
     drawn = corners[np.isclose(corners[:, 0], at)][:, 1]
     assert [drawn.min(), drawn.max()] == pytest.approx([lower[len(lower) // 3], upper[len(upper) // 3]], abs=1e-8)
     everywhere, _ = line(axes, "beyond the training data")
-    assert everywhere.min() < trained.min()
-    assert everywhere.max() > trained.max()
+    assert everywhere.min() < trained.min() < trained.max() < everywhere.max()
     assert line(friction_curves_figure(friction).axes[3], "beyond the training data")[0].min() >= 0.0  # a speed
     at, truth = line(axes, "true")
     np.testing.assert_allclose(truth, joint_law(at), atol=1e-12)
     assert len(at) > 60
+    gears = data.model.with_forces(Viscous(0.2), GearFriction(level=0.5, factor=0.1, sigma=300.0, memory=True))
+    np.testing.assert_allclose(law_forces(gears, 1, np.array([-2.0, 2.0])), [-0.9, 0.9], rtol=1e-9)
 
 
 def test_large_models_say_how_many_curves_are_shown(monkeypatch):
     model = fitted(JointFriction(), JointPositionForces(), iterations=1)
     monkeypatch.setattr("forcegp.scores.figures.model.LARGEST_GRID", 2)
     figure = friction_curves_figure(model)
-    assert len(figure.axes) == 2
-    assert "2 of 6 curves" in figure.get_suptitle()
+    assert (len(figure.axes), "2 of 6 curves" in figure.get_suptitle()) == (2, True)
 
 
 def test_models_without_normal_force_are_refused(without_contact, data):
-    with pytest.raises(InvalidInput, match="no normal force"):
-        normal_force_figure(without_contact, data)
-    with pytest.raises(InvalidInput, match="no normal force"):
-        normal_force_figure(fit(data.model.black_box(), friction_data(10, 0)), data)
+    for model in (without_contact, fit(data.model.black_box(), friction_data(10, 0))):
+        with pytest.raises(InvalidInput, match="no normal force"):
+            normal_force_figure(model, data)
 
 
 def test_figures_and_scores_are_what_they_were(friction, data):

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from forcegp.data import Dataset, evenly
 from forcegp.errors import ForceGPError, InvalidInput
 from forcegp.evidence.recorded_rows import sensed_of
-from forcegp.forces import Actuation, JointFriction, LoadFriction, Offset, RigidBodies, Rotor, Unknown
+from forcegp.forces import Actuation, JointFriction, Offset, RigidBodies, Rotor, Unknown
 from forcegp.mechanics import Held
 from forcegp.model import Model
 from forcegp.posterior.posterior import Posterior
@@ -25,8 +25,9 @@ from forcegp.scores.figures import style
 LARGEST_GRID = 12
 BEYOND = 0.18  # part of the visited range that is drawn on either side of it
 POINTS = 241
-NOT_OF_VELOCITY = (Actuation, RigidBodies, Rotor, Offset, LoadFriction)
+NOT_OF_VELOCITY = (Actuation, RigidBodies, Rotor, Offset)
 """Known forces that are no curve over the velocity of one joint."""
+FAR = 1e9  # rad or m, after which no friction remembers what was before
 LAWS = "friction laws"  # the component of a joint that has laws alone
 TRUE_POINTS = 200
 
@@ -59,11 +60,16 @@ def curve_panels(posterior: Posterior) -> list[CurvePanel]:
 
 
 def law_forces(model: Model, joint: int, velocities: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """What the friction laws of the system resist with, in Nm or N, where this joint moves alone; 0 without laws."""
+    """What the friction laws of the system resist with, in Nm or N, where this joint moves alone; 0 without laws.
+
+    No load is on it, and friction that remembers has slid on.
+    """
     robot = model.robot
     v = torch.zeros(len(velocities), robot.nv, dtype=torch.float64, device=robot.device)
     v[:, joint] = torch.tensor(velocities, dtype=v.dtype, device=v.device)
-    u = v.new_zeros(len(v), len(model.inputs))
+    u, first = v.new_zeros(len(v), len(model.inputs)), model.memory_column
+    if count := len(model.memory.names):
+        u[:, first : first + count] = model.memory.past_of(FAR * v.sign()[..., None])
     state = model.state(robot.neutral().expand(len(v), -1), v, u)
     laws = [law for law in model.laws if not isinstance(law, NOT_OF_VELOCITY)]
     return -sum((law.force(state).expand_as(v) for law in laws), torch.zeros_like(v))[:, joint].detach().cpu().numpy()
@@ -224,8 +230,8 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
 PICTURES: dict[str, tuple[Callable[[Posterior, Dataset], Figure], str]] = {
     "forces": (
         friction_curves_figure,
-        "Forces over velocity, with 95 % bands: the friction laws of the model and what was learned beside them. "
-        "Ticks are the velocities of the training data.",
+        "Forces over velocity, with 95 % bands: the friction laws of the model, without load and far from reversals, "
+        "and what was learned beside them. Ticks are the velocities of the training data.",
     ),
     "normal_force": (normal_force_figure, "The forces of contacts, and what sensors measured of them."),
 }
