@@ -422,5 +422,5 @@ def _where(root: Explanation, joint: int, inputs: CheckInput) -> tuple[str, str,
             ends = values[order[[max(first - 1, 0), min(last, len(rows) - 1)]]]
             text = f"; {100.0 * share:.0f} % of it at {inputs.names[joint]} for {name} between {ends[0]:.3g} and "
             others = rows.rows(np.sort(np.r_[order[:first], order[last:]])) if name == "time" else None
-            best, found = gain, (f"{text}{ends[1]:.3g} {unit}", f"{ends[0]:.4g},{ends[1]:.4g}", others)
+            best, found = gain, (f"{text}{ends[1]:.3g} {unit}", f"{ends[0]:.2f},{ends[1]:.2f}", others)
     return found

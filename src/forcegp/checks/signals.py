@@ -208,8 +208,8 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
         about="saturation" if limit else "frozen channel",
         what=f"the {QUANTITY[name]} of {inputs.names[joint]} stands still at {values[start]:.6g} for "
         f"{length * step:.3g} s from row {start} at {log.time[start]:.3f} s, while its other signals change.",
-        do=f"Leave such stretches out, here by forcegp import --without {log.time[start]:.4g},"
-        f"{log.time[start] + length * step:.4g}, and look at the {'limits of the drive' if limit else 'logger'}.",
+        do=f"Leave such stretches out, here by forcegp import --without {log.time[start]:.2f},"
+        f"{log.time[start] + length * step:.2f}, and look at the {'limits of the drive' if limit else 'logger'}.",
         joints=(inputs.names[joint],),
         numbers={"quantity": name, "row": start, "seconds": length * step},
     )

@@ -195,7 +195,7 @@ def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
             about="push",
             what=f"from {begin:.4g} to {end:.4g} s the torques of {listed(inputs.named(joints))} are up to {times:.2g} "
             "times as far from any masses and friction as elsewhere: a contact, or a load, in these seconds.",
-            do=f"Leave them out by forcegp import --without {begin:.4g},{end:.4g}, as forcegp auto does.",
+            do=f"Leave them out by forcegp import --without {begin:.2f},{end:.2f}, as forcegp auto does.",
             joints=inputs.named(joints),
             numbers={"seconds": [float(begin), float(end)], "gains": gains[joints].tolist()},
         )
