@@ -185,6 +185,17 @@ def tilted(degrees: float) -> Fault:
     return state(gravity=lambda _: 9.81 * np.array([np.sin(angle) * 0.6, np.sin(angle) * 0.8, -np.cos(angle)]))
 
 
+def touched(case: Case, x: Arrays) -> None:
+    """A force on the last link for one or two seconds, of .3 to 1 deviation of a torque."""
+    model = pin.buildModelFromXML(case.urdf())
+    data, last = model.createData(), model.getFrameId(f"l{case.n - 1}")
+    J = [pin.computeFrameJacobian(model, data, q, last, pin.LOCAL_WORLD_ALIGNED)[:3] for q in x["q"]]
+    begin, lasts = case.rng.uniform(2.0, 8.0), case.rng.uniform(0.8, 2.5)
+    there = np.clip(np.minimum(x["time"] - begin, begin + lasts - x["time"]) / 0.15, 0.0, 1.0)
+    push = np.einsum("rij,i->rj", np.array(J), case.rng.normal(size=3)) * there[:, None]
+    x["u"] = x["u"] - case.rng.uniform(0.3, 1.0) * push / (np.abs(push).max(0) / x["u"].std(0)).max()
+
+
 SIGN, MNM, ORDER = times("u", one(-1.0)), times("u", lambda _: 1000.0), ordered("u", pair)
 LATE, ZERO, TILT, DEG = shifted("u", 6), state(zero=one(0.5, 0.0)), tilted(40.0), times("qv", turns(DEGREES))
 LOAD = state(payload=lambda case: 0.6 * case.masses[-1])
@@ -245,6 +256,7 @@ FAULTS: dict[str, tuple[str, tuple[Fault, ...]]] = {
     "zero, sign": ("torque sign|joint zero", (ZERO, SIGN)),
     "degrees, mNm": ("degrees|torque unit", (DEG, MNM)),
     "zero, exchanged": ("joint zero|joints exchanged", (ZERO, ORDER)),
+    "touched": ("push|unknown cause", (later(touched),)),
     "none: pushed": ("none", strange(pushes, rest=1.0)),
     "none: another log": ("none", strange(smooth, keep=0.0)),
     "none: all other": ("none", strange(smooth, keep=0.0, rest=1.0)),
@@ -279,7 +291,7 @@ def planted(fault: str, robot: str, seed: int) -> tuple[Case, Dataset] | None:
         log, bare = case.log(), Case(robot, seed)
         bare.time = log.time
         off = np.abs(log.u - bare.needed(log.q, log.v, log.a)).mean(0)
-        if not FAULTS[fault][0] or (off > 0.35 * np.abs(log.u - log.u.mean(0)).mean(0)).any():
+        if not FAULTS[fault][0] or fault == "touched" or (off > 0.35 * np.abs(log.u - log.u.mean(0)).mean(0)).any():
             return case, log
     return None
 

@@ -266,11 +266,11 @@ def test_a_drone_without_joints(walker):
     weak = replace(model, forces=(Actuation(), weak, RigidBodies()))
     q, v, u = rows_of(model, 2000, switches=0)
     q[:, 3:] = torch.nn.functional.normalize(0.1 * q[:, 3:] + torch.eye(4)[3], dim=-1)
-    u = 2.5 * locked.mass * (1.0 + 0.1 * u)  # hovering, roughly
-    a = weak.dynamics(q, v, u).acceleration_map().offset
-    values = {name: x.numpy() for name, x in zip("qvua", (q, v, u, a + 0.1 * torch.randn_like(a)), strict=True)}
+    u, noise = 2.5 * locked.mass * (1.0 + 0.1 * u), np.random.default_rng(0).normal(0.0, 0.1, v.shape)  # it hovers
+    a = weak.dynamics(q, v, u).acceleration_map().offset + torch.tensor(noise)
+    values = dict(zip("qvua", map(np.asarray, (q, v, u, a)), strict=True))
     log = Dataset(**values, time=0.01 * np.arange(2000), model=model)
-    with pytest.warns(DataWarning, match=r"times 0\.(799|8|801) \(rotor_3\) would do as well as any payload"):
+    with pytest.warns(DataWarning, match=r"times 0\.8 \(rotor_3\) would do as well as any payload"):
         carried = fit(model.with_forces(Payload()), log, Torques("both", mean=0.4)).parameters["payload.mass"]
     assert carried.interval[0] < 0.0
 

@@ -340,7 +340,7 @@ def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -
     Friction may hide those of the others, as where u is a current.
     """
     # far less than bodies need is wrong, whatever rotors and friction may hide of it
-    factors = np.where(best.shares > WORSE, best._fits[1].max(axis=1), best.factors)
+    factors = np.where(best.shares > WORSE, best._fits[1][np.arange(len(best.chosen)), best.chosen % 2], best.factors)
     off = np.flatnonzero((best.chosen >= 2) & np.isfinite(factors))
     if not explained:
         off = off[(best.exact[off] <= EXPLAINED) & (best.shares[off] > RESTS)]

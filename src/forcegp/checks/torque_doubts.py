@@ -61,7 +61,7 @@ def _drift(found: Explanation) -> Iterator[Doubt]:
         level, slope = np.split(np.linalg.lstsq(rest, u - basis @ (basis.T @ u), rcond=SEEN)[0] / size, 2)
         begin, end = (float(np.std(friction @ (level + x * slope))) for x in (-0.5, 0.5))
         changed[rows.joint_names[joint]] = end / max(begin, 1e-300)
-    if told < -np.log(1.0 / MUCH) and abs(np.log(np.median([*changed.values()]))) > WARMER:
+    if told < np.log(MUCH) and abs(np.log(np.median([*changed.values()]))) > WARMER:
         each = ", ".join(f"{name} {ratio:.2g}" for name, ratio in changed.items())
         what = (
             f"friction changes with time, with temperature perhaps: at the end it is so many times the first: {each}."
@@ -184,12 +184,13 @@ def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         return
     _, _, first, last = max(map(stretch, alive))
     inside = np.isin(np.arange(len(rows)), np.arange(first, last))
-    power = [np.square(left[each]).mean(0) + 1e-300 for each in (inside, ~inside, inside | True)]
+    power = [np.square(left[each]).mean(0) + 1e-300 for each in (inside, ~inside, slice(None))]
     told = inside.sum() * np.log(power[2] / power[0]) + (~inside).sum() * np.log(power[2] / power[1])
     gains = told * (power[0] > power[1])
     joints, smeared = np.flatnonzero(gains > TELLS), 2.0 / inputs.compared_cutoff
     begin, end = rows.time[first] - smeared, rows.time[last - 1] + smeared
-    if gains.sum() > SURE and len(joints) > 1 and end - begin > 2.5 * smeared and first > 0 and last < len(rows):
+    lasts = end - begin > 2.5 * smeared  # longer than a period of the cut-off, unlike what a filter makes of a turn
+    if gains.sum() > SURE and len(joints) > 1 and lasts and first > 0 and last < len(rows):
         times = np.sqrt(power[0] / power[1])[joints].max()
         yield look(
             about="push",
