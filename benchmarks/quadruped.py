@@ -1,13 +1,14 @@
-"""A quadruped of MuJoCo that stands, shifts its weight and lifts its feet, with 2 kg on its trunk that no file states.
+"""A quadruped of MuJoCo that lifts its feet in turn, or trots, with 2 kg on its trunk that no file states.
 
 Feet are balls with MuJoCo's own contacts and friction; joints have dry and viscous friction and rotors. Poses have
 .5 mm and 1 mrad of white noise, joints .1 mrad, torques .05 Nm. No sensor tells which foot stands. Reported: rows that
 stay, flags that are right, the load by `fit` and by `payload` with 95 % intervals, and forces of the feet predicted on
 another motion from q, v and u, beside MuJoCo's. For docs/how-to/moving-bases.md.
 
-    python -m benchmarks.quadruped
+    python -m benchmarks.quadruped [trot]
 """
 
+import sys
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -54,17 +55,29 @@ def scene(load: str = "", joints: str = "") -> str:
     <actuator>{motors}</actuator></mujoco>"""
 
 
-def pose(time: float, rates: np.ndarray, phases: np.ndarray) -> np.ndarray:
-    """Joint positions: the trunk sways, and each foot in turn is lifted while the others carry more."""
-    slowly = min(time, 1.0)
-    size = slowly * np.array([0.02, 0.02, 0.02, 0.06, 0.05, 0.05])
-    height, x0, y0, pitch, roll, yaw = size * np.sin(2.0 * np.pi * rates * time + phases)
-    phase, out = (time - 1.0) % 6.0 if time > 1.0 else 0.0, list[float]()
+def walker() -> Model:
+    feet = (fixed_point(f"{name}_calf", (0.0, 0.0, -LENGTH), f"{name}_stands", radius=0.02) for name in LEGS)
+    return Model(Robot.from_mjcf_text(scene(), base="floating"), tuple(contact for foot in feet for contact in foot))
+
+
+def lifted(time: float, gait: str) -> tuple[np.ndarray, np.ndarray]:
+    """Of each foot [m], and where the trunk leans: each foot in turn, or diagonal pairs at 1.6 Hz."""
+    places = np.array([*LEGS.values()])
+    if gait == "trot":
+        phase = (1.6 * time + 0.5 * (places.prod(1) < 0.0)) % 1.0
+        return 0.035 * np.sin(np.pi * np.minimum(phase / 0.4, 1.0)) ** 2 * min(max(time - 1.0, 0.0), 1.0), np.zeros(2)
+    phase = (time - 1.0) % 6.0 if time > 1.0 else 0.0
     turn, part = int(phase // 1.5), phase % 1.5
-    lean = np.array([*LEGS.values()][turn]) * 0.05 * np.sin(np.pi * part / 1.5) ** 2
-    for number, (sx, sy) in enumerate(LEGS.values()):
-        lifted = number == turn and 0.5 < part < 1.0
-        lift = 0.03 * np.sin(np.pi * (part - 0.5) / 0.5) ** 2 if lifted else 0.0
+    lift = 0.03 * np.sin(np.pi * (part - 0.5) / 0.5) ** 2 if 0.5 < part < 1.0 else 0.0
+    return lift * np.eye(4)[turn], places[turn] * 0.05 * np.sin(np.pi * part / 1.5) ** 2
+
+
+def pose(time: float, rates: np.ndarray, phases: np.ndarray, gait: str) -> np.ndarray:
+    """Joint positions: the trunk sways, and feet are lifted while the others carry more."""
+    size, out = min(time, 1.0) * np.array([0.02, 0.02, 0.02, 0.06, 0.05, 0.05]), list[float]()
+    height, x0, y0, pitch, roll, yaw = size * np.sin(2.0 * np.pi * rates * time + phases)
+    lifts, lean = lifted(time, gait)
+    for lift, (sx, sy) in zip(lifts, LEGS.values(), strict=True):
         x, y = x0 - 0.13 * yaw * sy + lean[0], y0 + 0.19 * yaw * sx + lean[1]
         z = -(0.29 + height - lift) + 0.19 * sx * pitch - 0.13 * sy * roll
         down = np.hypot(y, z)
@@ -73,16 +86,16 @@ def pose(time: float, rates: np.ndarray, phases: np.ndarray) -> np.ndarray:
     return np.array(out)
 
 
-def recorded(model: Model, seed: int, seconds: float = 24.0) -> tuple[Dataset, np.ndarray]:
+def recorded(model: Model, seed: int, gait: str = "step", seconds: float = 24.0) -> tuple[Dataset, np.ndarray]:
     """The noisy log, whose flags of stance are 0, and the forces on the feet [N] at each row."""
     rng = np.random.default_rng(seed)
     rates, phases = rng.uniform(0.25, 0.6, 6), rng.uniform(0.0, 2.0 * np.pi, 6)
     plant = mujoco.MjModel.from_xml_string(scene(LOAD, UNKNOWN))
     data = mujoco.MjData(plant)
-    data.qpos[7:] = before = pose(0.0, rates, phases)
+    data.qpos[7:] = before = pose(0.0, rates, phases, gait)
     feet, rows, forces = [plant.geom(name).id for name in LEGS], [], []
     for count in range(int(seconds / STEP)):
-        wanted = pose(count * STEP, rates, phases)
+        wanted = pose(count * STEP, rates, phases, gait)
         rate, before = (wanted - before) / STEP, wanted
         data.ctrl[:] = np.clip(120.0 * (wanted - data.qpos[7:]) + 0.9 * (rate - data.qvel[6:]), -40.0, 40.0)
         if count % EVERY == 0 and count * STEP > 0.5:
@@ -118,12 +131,12 @@ def found(folder: Path, dataset: Dataset) -> dict[str, list[float]]:
     return {"fit": [x - TRUNK for x in plain], "payload": [load["value"], *load["interval_95"]]}
 
 
-def main(runs: int) -> None:
-    robot = Robot.from_mjcf_text(scene(), base="floating")
-    feet = (fixed_point(f"{name}_calf", (0.0, 0.0, -LENGTH), f"{name}_stands", radius=0.02) for name in LEGS)
-    model = Model(robot, tuple(contact for foot in feet for contact in foot))
-    prepare = Preparation(cutoff="auto", stance="auto")
-    logs = [(log, prepare.apply(log), forces) for log, forces in (recorded(model, seed) for seed in range(1, runs + 1))]
+def main(gait: str, runs: int = 4) -> None:
+    model, prepare = walker(), Preparation(cutoff="auto", stance="auto")
+    logs = [
+        (log, prepare.apply(log), forces)
+        for log, forces in (recorded(model, seed, gait) for seed in range(1, runs + 1))
+    ]
     for seed, (log, rows, _) in enumerate(logs, start=1):
         kept = np.searchsorted(log.time, rows.time - 0.5 * STEP)
         with TemporaryDirectory() as folder, redirect_stdout(None), redirect_stderr(None):
@@ -147,4 +160,4 @@ def main(runs: int) -> None:
 
 
 if __name__ == "__main__":
-    main(runs=4)
+    main(*sys.argv[1:] or ["step"])

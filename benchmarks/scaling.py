@@ -36,10 +36,7 @@ CASES: dict[str, tuple[int, ...]] = {
     "exact": (100, 200, 400, 800, 1500, 2500),
     "inducing": (100, 1000, 10_000, 100_000),
 }
-LABELS = {
-    "exact": "exact, joint prior",
-    "inducing": "inducing points, tool-friction prior",
-}
+LABELS = {"exact": "exact, joint prior", "inducing": "inducing points, tool-friction prior"}
 PRIORS = {"inducing": ToolForces()}
 
 

@@ -118,14 +118,7 @@ def rows_of(motion: dict[str, np.ndarray], model: Model, seed: int, count: int =
 
 def fits(data: Dataset, given: Model, seed: int) -> dict[str, Posterior]:
     """Name -> model; all but the first learn from the same rows."""
-    laws = replace(
-        given,
-        forces=(
-            *given.forces,
-            Viscous(),
-            Coulomb(None, CONFIG.joint_smoothing),
-        ),
-    )
+    laws = replace(given, forces=(*given.forces, Viscous(), Coulomb(None, CONFIG.joint_smoothing)))
     return {
         "URDF": fit(given, data, restarts=1, seed=seed),
         "Coulomb's and viscous friction": fit(laws, data, Accelerations(), seed=seed),

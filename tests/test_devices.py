@@ -134,8 +134,7 @@ def condition_number(model, data) -> float:
     parameters = kernels.initial_parameters() | Noise(0.05).parameters(3, torch.device("cpu"))
     terms = likelihood.terms(parameters)
     matrices = kernels.matrices(parameters, terms.features)
-    covariance = dense_covariance(terms.W, terms.noise, matrices)
-    return float(torch.linalg.cond(covariance.detach()))
+    return float(torch.linalg.cond(dense_covariance(terms.W, terms.noise, matrices).detach()))
 
 
 def likelihood_and_gradients(model, data, device, trips=None):

@@ -21,8 +21,7 @@ from forcegp.scores.models import candidates, usual_identification
 def test_the_page_on_ones_own_robot_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "your-robot.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    printed = run_example(example, tmp_path)
-    noise, error, *_, any_force, friction = printed.splitlines()
+    noise, error, *_, any_force, friction = run_example(example, tmp_path).splitlines()
     assert f"{float(any_force):.2f} and {float(friction):.2f}" == "0.80 and 0.10"  # the comment on the page
     assert all(0.05 < float(std) < 0.2 for std in re.findall(r"\d\.\d+", noise))
     assert float(error) < 0.3
@@ -90,8 +89,7 @@ def test_the_page_on_motions_runs(repository: Path, tmp_path: Path):
 def test_the_page_on_identification_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "identification.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    printed = run_example(example, tmp_path)
-    mass, decided = printed.splitlines()[-2:]
+    mass, decided = run_example(example, tmp_path).splitlines()[-2:]
     found, error = (float(number) for number in re.fullmatch(r"(\S+) \+- (\S+) kg", mass).groups())
     assert abs(found - 2.0) < 0.1
     assert 0.0 < error < 0.05
@@ -131,8 +129,7 @@ def test_the_page_on_learning_while_working_runs(repository: Path, tmp_path: Pat
 def test_the_page_on_large_data_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "large-data.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    printed = run_example(example, tmp_path)
-    engine, left_out = printed.splitlines()
+    engine, left_out = run_example(example, tmp_path).splitlines()
     assert engine == "inducing: as asked for"
     assert float(left_out.split()[2]) <= 1.0
 
@@ -140,8 +137,7 @@ def test_the_page_on_large_data_runs(repository: Path, tmp_path: Path):
 def test_the_page_on_gpus_runs_on_the_cpu(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "gpu.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    printed = run_example(example, tmp_path)
-    assert printed.splitlines()[-1] == "cpu"
+    assert run_example(example, tmp_path).splitlines()[-1] == "cpu"
 
 
 @pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")

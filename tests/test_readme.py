@@ -111,8 +111,7 @@ def test_the_times_of_the_features_are_those_of_the_benchmarks(repository: Path)
 def test_the_page_on_forces_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "forces.md").read_text(encoding="utf-8")
     example, *_ = re.findall(r"^```python\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)  # others have own tests
-    printed = run_example(example, tmp_path)
-    tool, total, curve, error, free = printed.splitlines()
+    tool, total, curve, error, free = run_example(example, tmp_path).splitlines()
     assert tool == "torch.Size([2400, 1]) torch.Size([2400, 7, 7]) torch.Size([2400, 3])"
     assert total == "torch.Size([2400, 7]) torch.Size([2400, 1])"
     assert re.fullmatch(r"sliding speed \[m/s\] from \S+ to \S+, 200 values in N", curve)

@@ -103,10 +103,7 @@ def prediction_window_figure(arrays: Mapping[str, Mapping[str, np.ndarray]]) -> 
     return figure
 
 
-TITLES = {
-    "baumgarte": "with Baumgarte (black boxes: none)",
-    "none": "not stabilised",
-}
+TITLES = {"baumgarte": "with Baumgarte (black boxes: none)", "none": "not stabilised"}
 MOST_DRAWN = 300  # points of a curve, about: more than the eye sees would make megabytes of vector graphics
 
 

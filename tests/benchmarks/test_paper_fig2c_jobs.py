@@ -16,8 +16,7 @@ def bodies(model) -> dict[str, pin.Inertia]:
 
 
 def test_the_wrong_tool_is_too_heavy_and_off_centre_and_nothing_else(motion):
-    wrong = wrong_model(motion.model)
-    before, after = bodies(motion.model), bodies(wrong)
+    before, after = bodies(motion.model), bodies(wrong_model(motion.model))
     assert list(before) == list(after)
     tool = Tool(motion.model).oracle.model
     own = tool.names[tool.frames[tool.getFrameId(TOOL_LINK)].parentJoint]

@@ -16,8 +16,7 @@ SETTINGS = FitSettings(restarts={"0": 4, "200": 2, "1000": 1}, iterations=50, to
 )
 def test_the_largest_key_that_does_not_exceed_the_points_counts(points, restarts, tolerance):
     assert SETTINGS.of(points) == {"restarts": restarts, "iterations": 50, "tolerance": tolerance}
-    stored = json.loads(json.dumps(SETTINGS.of(points)))
-    assert stored == SETTINGS.of(points)
+    assert json.loads(json.dumps(SETTINGS.of(points))) == SETTINGS.of(points)
 
 
 def test_a_series_begins_where_the_fit_with_fewer_points_ended():

@@ -97,8 +97,7 @@ def on_a_line(seed: int, *, rate: float = 250.0, seconds: float = 8, noise: floa
     dz = (size * omega * np.cos(omega * time + phase)).sum(0)
     ddz = (-size * omega**2 * np.sin(omega * time + phase)).sum(0)
     # the tip lies at -(l1 sin q1 + l2 sin(q1 + q2)), -(l1 cos q1 + l2 cos(q1 + q2)) in x and z
-    reach = np.hypot(0.35, z)
-    bend = np.arccos((reach**2 - 0.4**2 - 0.3**2) / (2 * 0.4 * 0.3))
+    bend = np.arccos((np.hypot(0.35, z) ** 2 - 0.4**2 - 0.3**2) / (2 * 0.4 * 0.3))
     first = np.arctan2(-0.35, -z) - np.arctan2(0.3 * np.sin(bend), 0.4 + 0.3 * np.cos(bend))
     q = np.stack([first, bend], axis=1)
     tensors = torch.tensor(q)

@@ -76,8 +76,7 @@ def test_a_rest_on_brakes_is_left_out(lacking):
 def test_a_prepared_log_is_not_filtered_twice():
     noisy = clean(3)
     noisy = replace(noisy, q=noisy.q + 1e-4 * np.random.default_rng(0).normal(size=noisy.q.shape))
-    prepared = Preparation(cutoff=8.0, every=4, trim=0.2).apply(noisy)
-    report = check(prepared)
+    report = check(Preparation(cutoff=8.0, every=4, trim=0.2).apply(noisy))
     assert report.doubts.level == "ok", told(report)
     assert report.inputs.prepared is not None
     assert report.inputs.prepared.metadata["preparation"]["cutoff"] is None

@@ -107,8 +107,7 @@ def test_two_mistakes_are_both_named():
 def test_the_gravity_of_a_tilted_base_is_right(degrees):
     angle = np.deg2rad(degrees)
     true = 9.81 * np.array([np.sin(angle) * 0.6, np.sin(angle) * 0.8, -np.cos(angle)])
-    data = recorded_under(clean(ROBOTS["spatial"](), 3, noise="qvu"), tuple(true))
-    found = said(data)[0]
+    found = said(recorded_under(clean(ROBOTS["spatial"](), 3, noise="qvu"), tuple(true)))[0]
     gravity = np.array(found.numbers["gravity"])
     stated = found.command.removeprefix("forcegp import --gravity=").split(",")
     np.testing.assert_allclose(np.array(stated, float), gravity, atol=1e-3)

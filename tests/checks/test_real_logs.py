@@ -44,8 +44,7 @@ def test_a_double_pendulum_whose_elbow_sticks_in_one_run(shared, tmp_path):
     mapping = ColumnMapping(time="time", q=("pos_meas{1..2}",), v=("vel_meas{1..2}",), u=("tau_meas{1..2}",))
     model = Model(Robot.from_urdf(folder / "model" / "double_pendulum_C1.urdf"))
     runs = [folder / "raw" / f"20230629-{name}.csv.gz" for name in ("143339", "143601", "143906")]
-    found = import_recordings(runs, mapping, model=model)
-    report = check(found)
+    report = check(import_recordings(runs, mapping, model=model))
     assert report.doubts.level == "look"
     (held,) = report.doubts.of("held joint")
     assert (held.joints, held.numbers["stretches"]) == (("joint2",), [2])

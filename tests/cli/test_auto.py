@@ -33,8 +33,7 @@ def folder(tmp_path_factory):
     place = tmp_path_factory.mktemp("auto")
     data = double_pendulum(8.0, seed=1, noise=0.0)
     (place / "arm.urdf").write_text(data.model.robot.urdf_text)
-    rng = np.random.default_rng(0)
-    q = data.q + 1e-5 * rng.standard_normal(data.q.shape)
+    q = data.q + 1e-5 * np.random.default_rng(0).standard_normal(data.q.shape)
     table = np.column_stack([1e3 * data.time, np.rad2deg(q), np.rad2deg(data.v), data.u * [1.0, -1.0]])
     names = ("Zeit", *(f"{what}_{k}" for what in ("Winkel", "Tempo", "Moment") for k in (1, 2)))
     np.savetxt(place / "log.csv", table, delimiter=";", header=";".join(names), comments="", fmt="%.9g")
@@ -124,8 +123,7 @@ def test_the_printed_command_keeps_every_option():
     words = ["auto", "a.txt", "b.txt", *columns.split(), *others.split()]
     command = parse_arguments(words)
     mapping = command.columns.mapped([], Terminal(json=False))
-    again = parse_arguments(shlex.split(command._command(mapping, command.robot))[1:])
-    assert again == command
+    assert parse_arguments(shlex.split(command._command(mapping, command.robot))[1:]) == command
 
 
 def test_a_log_that_needs_no_filter_says_so():

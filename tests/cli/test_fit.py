@@ -76,8 +76,7 @@ def test_the_table_of_estimates_is_for_people(identified):
     pattern = r"\s+(level\.)?upper_hinge\s+-?\d+\.\d+\s+(-?\d+\.\d+)\s+-?\d+\.\d+ … -?\d+\.\d+\s+\S.*(log|prior)\s*"
     values = [float(found[2]) for row in rows if (found := re.fullmatch(pattern, row))]
     assert any(value == pytest.approx(0.4, rel=0.2) for value in values), identified.stdout
-    text = " ".join(identified.stdout.split())
-    assert "Next: forcegp score found TEST.h5" in text
+    assert "Next: forcegp score found TEST.h5" in " ".join(identified.stdout.split())
 
 
 def test_functions_beside_what_was_identified(forcegp, folder, identified):

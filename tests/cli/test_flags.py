@@ -105,5 +105,4 @@ def test_a_box_becomes_a_sentence():
         " Required options", " ----- ", "  Missing from forcegp fit:", "      --out FOLDER", "          Where.",
         "  ---",
     )  # fmt: skip
-    plain = "\n".join(lines)
-    assert one_line(plain) == "Missing from forcegp fit: --out FOLDER."
+    assert one_line("\n".join(lines)) == "Missing from forcegp fit: --out FOLDER."

@@ -64,8 +64,7 @@ def test_the_next_step_shows_what_the_fit_found(forcegp, folder):
 
 
 def test_the_table_of_a_search_that_stopped_names_the_option(forcegp, folder):
-    done = forcegp("fit", "clean.h5", *FIT, folder=folder)
-    shown = " ".join(done.stdout.split())
+    shown = " ".join(forcegp("fit", "clean.h5", *FIT, folder=folder).stdout.split())
     assert "not converged" in shown
     assert "raise --iterations" in shown
     assert "`" not in shown

@@ -86,8 +86,7 @@ def test_auto_goes_from_a_flight_to_a_page(folder, forcegp):
     masses = [each["value"] for name, each in content["identified"]["parameters"].items() if name.endswith(".mass")]
     assert sum(masses) == pytest.approx(1.2 * 1.02 / 1.1, rel=0.05)  # by thrust
     assert content["models"]["given"]["scores"]["position after 1 s"]["rmse"]["all"]["median"] > 0.0
-    page = (folder / "answer" / "report.html").read_text()
-    assert "whole mass" in page
+    assert "whole mass" in (folder / "answer" / "report.html").read_text()
     flight = Dataset.load(folder / "answer" / "prepared.h5")
     a = load_posterior(folder / "answer" / "model").predict(flight.q, flight.v, flight.u).mean.numpy()
     assert np.abs(a - flight.a)[:, 2].mean() < np.abs(flight.a)[:, 2].std()

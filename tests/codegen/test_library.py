@@ -30,8 +30,7 @@ SOURCE = "double twice(double x) { return x + x; }"
 def test_a_text_becomes_a_library(tmp_path):
     path = tmp_path / "code.so"
     options = ("-fPIC", "-shared")
-    loaded = compile_library(SOURCE, options, path, "twice")
-    twice = loaded.twice
+    twice = compile_library(SOURCE, options, path, "twice").twice
     twice.restype, twice.argtypes = ctypes.c_double, [ctypes.c_double]
     assert twice(1.25) == 2.5
     with pytest.raises(CompilerError, match=r"the C compiler failed: .*or do without"):

@@ -25,8 +25,7 @@ SLIDER = """<robot name="slider"><link name="base"/>
 def predictor():
     """A cart of 2 kg whose friction is nothing: what was learned is a double integrator."""
     model = Model(Robot.from_urdf_text(SLIDER))
-    rng = np.random.default_rng(0)
-    q, v, u = rng.uniform(-2.0, 2.0, (3, 20, 1))
+    q, v, u = np.random.default_rng(0).uniform(-2.0, 2.0, (3, 20, 1))
     rows = Dataset(q=q, v=v, u=u, a=u / MASS, time=np.arange(20) * 0.1, model=model)
     return fit(model.with_forces(JointFriction(), noise=Noise(0.01, learn=False)), rows, restarts=1).predictor()
 
@@ -93,8 +92,7 @@ def test_without_a_finite_cost_it_raises(predictor):
 def test_motions_are_implicit_where_a_step_is_long_beside_the_rates(damping, wanted):
     """The rate of viscous friction, near .75 and 1.35 per step of .1 s."""
     model = Model(Robot.from_urdf_text(SLIDER))
-    rng = np.random.default_rng(0)
-    q, v, u = rng.uniform(-2.0, 2.0, (3, 20, 1))
+    q, v, u = np.random.default_rng(0).uniform(-2.0, 2.0, (3, 20, 1))
     v[0] = 0.0
     rows = Dataset(q=q, v=v, u=u, a=(u - damping * v) / MASS, time=np.arange(20) * 0.1, model=model)
     forces = (Viscous(damping), JointFriction())

@@ -45,8 +45,7 @@ def test_the_torque_is_that_of_inverse_dynamics_with_friction():
 
 def test_torques_keep_their_limits():
     control = ComputedTorque(URDF_ALONE, **GAINS, torque_limits=[500.0, 1.0])
-    u = control(*STILL, [2.0, 2.0], [0.0, 0.0], [0.0, 0.0])
-    assert float(u[1].abs()) == 1.0
+    assert float(control(*STILL, [2.0, 2.0], [0.0, 0.0], [0.0, 0.0])[1].abs()) == 1.0
     assert control.saturated.tolist() == [False, True]
     assert float(ComputedTorque(URDF_ALONE, **GAINS).torque_limits.max()) == 60.0  # of the URDF
 
@@ -85,8 +84,7 @@ def test_motion_and_force_are_those_of_the_dense_equations(touching):
     q, v = state(touching)
     control = HybridForce(touching.predictor(covariance="none"), **GAINS, torque_limits=1e6)
     wanted = np.array([5.0, -3.0, 2.0])
-    u = control(q, v, q, v, wanted, [7.0])
-    found = touching.predict(q, v, u)
+    found = touching.predict(q, v, control(q, v, q, v, wanted, [7.0]))
     assert float(found.multiplier.mean) == pytest.approx(7.0, rel=1e-8)
     at = touching.model.dynamics(*(torch.tensor(x) for x in (q, v)), torch.zeros(3).double())
     M, A, b = (x.numpy() for x in (at.M, at.A, at.b))

@@ -32,8 +32,7 @@ def test_a_model_without_physics_has_nothing_to_compare(sliding):
 
 
 def test_few_rows_are_enough_and_never_too_many(sliding):
-    chosen = np.random.default_rng(0).choice(len(sliding), 20, replace=False)
-    few = sliding.rows(chosen)
+    few = sliding.rows(np.random.default_rng(0).choice(len(sliding), 20, replace=False))
     assert wrong(few) == wrong(few.rows(slice(0, 6))) == []
     below = sliding.model.with_contacts([replace(sliding.model.contacts[0], surface=Plane((0.0, 0.0, 1.0), 0.03))])
     assert wrong(few, below) == [0]

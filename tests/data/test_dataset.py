@@ -88,8 +88,7 @@ def test_time_increases_within_an_episode_but_may_start_again_in_the_next():
         broken[5] = wrong
         with pytest.raises(DatasetError, match=r"time does not increase at row 5 \(episode 0"):
             dataset(time=broken)
-    interleaved = np.tile([0, 1], 20)
-    assert dataset(time=np.repeat(time[:20], 2), episode=interleaved).episodes == (0, 1)
+    assert dataset(time=np.repeat(time[:20], 2), episode=np.tile([0, 1], 20)).episodes == (0, 1)
 
 
 # ---------------------------------------------------------------- units and model
@@ -123,8 +122,7 @@ def test_rows_by_slice_mask_and_numbers():
 
 
 def test_rows_out_of_order_are_marked_and_may_be_sorted_again():
-    data = dataset()
-    sample = data.rows([11, 2, 30])
+    sample = dataset().rows([11, 2, 30])
     assert not sample.time_ordered
     assert sample.rows(np.argsort(sample.time)).time_ordered
     with pytest.raises(DatasetError, match="does not increase"):

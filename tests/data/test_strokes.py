@@ -78,8 +78,7 @@ def test_hysteresis_is_no_delay(delay, lugre_log):  # noqa: F811  # the fixture
     """With friction of velocity alone the same logs show 20 ms more."""
     few = lugre_log.rows(slice(0, 6000, 2))
     late = replace(few, u=CubicSpline(few.time, few.u)(few.time - delay))
-    found = estimate_delay(late)
-    assert abs(found.significant - delay) < 0.004
+    assert abs(estimate_delay(late).significant - delay) < 0.004
     alone = estimate_delay(replace(late, time_ordered=True, strokes=np.zeros((len(late), 3, 1))))  # nothing remembered
     assert alone.significant > delay + 0.01
 

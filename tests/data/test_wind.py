@@ -50,8 +50,7 @@ def flight(wind, *, drag=1.0, episodes=1, rows=800, seed=0, noise=0.0):
 
 @pytest.mark.parametrize("wind", [(0.0, 0.0, 0.0), (3.0, -2.0, 0.0), (-9.0, 7.0, 0.0)])
 def test_the_wind_of_an_exact_law_is_found(wind):
-    dataset = flight([wind])
-    law, found = find_wind(dataset)
+    law, found = find_wind(flight([wind]))
     np.testing.assert_allclose(law.wind, wind, atol=1e-5)
     np.testing.assert_allclose(found, np.broadcast_to(wind, found.shape), atol=1e-5)
     assert max(law.deviations) < 1e-5

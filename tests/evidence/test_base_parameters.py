@@ -28,7 +28,6 @@ def test_an_arm_of_three_turning_joints_has_fifteen():
 
     A joint about the direction of gravity shows one inertia, each joint that is not parallel to the one before seven.
     """
-    robot = Robot.from_urdf_text(URDF)
-    base = base_parameters(robot)
+    base = base_parameters(Robot.from_urdf_text(URDF))
     assert len(base) == 15
     assert 0 not in base  # it is never lifted

@@ -104,8 +104,7 @@ def test_stacked_rows_have_the_density_of_one_large_gaussian():
     for c, matrix in enumerate(kernels.matrices(parameters, features)):
         K[:, c, :, c] = matrix.detach()
     level = torch.diag(torch.tensor([0.05, 0.05, 0.05, 0.3, 0.2, 0.2, 0.2], dtype=torch.float64).square())
-    R = torch.block_diag(*(level + 0.02**2 * G @ G.mT))
-    S = W @ K.reshape(n * C, n * C) @ W.T + R
+    S = W @ K.reshape(n * C, n * C) @ W.T + torch.block_diag(*(level + 0.02**2 * G @ G.mT))
     dense = torch.distributions.MultivariateNormal(torch.zeros(len(r), dtype=torch.float64), S)
     assert float(likelihood(kernels, parameters).detach()) == pytest.approx(-float(dense.log_prob(r)), rel=1e-9)
 
@@ -126,8 +125,7 @@ def test_slopes_of_stacked_residuals_are_those_of_finite_differences(contact):
 
 
 def test_gains_are_found_beside_a_sensor_and_not_without():
-    truth = held(Actuation(gain=[0.8, 0.9, 1.2]), Viscous(0.5))
-    log = measured(truth, held())
+    log = measured(held(Actuation(gain=[0.8, 0.9, 1.2]), Viscous(0.5)), held())
     model = held(Actuation(gain=LogNormal(1.0, 0.3)), Viscous())
     gains = dict(zip(("pan", "lift", "bend"), (0.8, 0.9, 1.2), strict=True))
     behind = {f"{TORQUE}{name}": (gain * log.u - 0.5 * log.v)[:, [j]] for j, (name, gain) in enumerate(gains.items())}
@@ -178,8 +176,7 @@ def test_a_sensor_shows_forces_along_the_normal(tmp_path, monkeypatch):
     save_posterior(posterior, tmp_path / "run")
     again = load_posterior(tmp_path / "run")
     assert torch.equal(again.predict(*states).multiplier.mean, found.mean)
-    updated = again.update(test)
-    assert len(updated.training.sensed[SENSOR]) == 160
+    assert len(again.update(test).training.sensed[SENSOR]) == 160
     with pytest.raises(InvalidInput, match=r"the sensor 'force.hand', which these rows do not have"):
         again.update(replace(test, measured={}))
 

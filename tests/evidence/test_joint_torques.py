@@ -152,8 +152,7 @@ def test_from_columns_that_are_clipped_to_a_fit(tmp_path):
     assert check(rows).doubts.of("saturation").level == "ok"
     done = run_here("fit", "log.h5", "--forces", "gain,viscous,coulomb,rotor", "--out", "run", folder=tmp_path)
     assert "evidence: torques, and joint-torques" in done.stderr
-    found = load_posterior(tmp_path / "run").parameters["gain.lift"]
-    assert abs(found.value - GAIN[1]) < 0.02
+    assert abs(load_posterior(tmp_path / "run").parameters["gain.lift"].value - GAIN[1]) < 0.02
     done = run_here("payload", "log.h5", "--forces", "gain,viscous,coulomb,rotor", folder=tmp_path)
     assert "as right as the torques of the log" in done.stderr
     two = {name: x for name, x in rows.measured.items() if "lift" not in name}

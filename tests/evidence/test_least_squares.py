@@ -70,8 +70,7 @@ def test_steps_within_bounds_are_nearly_those_of_lsq_linear(seed):
 def test_the_noise_of_every_column_is_found_and_decides_the_weights():
     fit = weighted_least_squares(problem(2000), no_prior, np.zeros(3), FREE)
     np.testing.assert_allclose(fit.noise, [0.01, 0.5], rtol=0.1)
-    errors = np.sqrt(np.diag(np.linalg.inv(fit.information)))
-    assert (abs(fit.x - TRUTH) < 4.0 * errors).all()
+    assert (abs(fit.x - TRUTH) < 4.0 * np.sqrt(np.diag(np.linalg.inv(fit.information)))).all()
 
 
 @pytest.mark.parametrize("bodies", [0, 2])
@@ -101,9 +100,7 @@ def test_the_prior_decides_what_the_data_do_not():
 
 def test_correlation_time_of_an_autoregressive_process():
     """(1 + rho) / (1 - rho) for r_n = rho r_(n-1) + e; 1 for independent residuals, episodes kept apart."""
-    generator = np.random.default_rng(1)
-    noise = generator.normal(size=(20_000, 2))
-    series = noise.copy()
+    series = np.random.default_rng(1).normal(size=(20_000, 2))
     for row in range(1, len(series)):
         series[row, 0] += 0.8 * series[row - 1, 0]
     times = correlation_time(series, np.zeros(len(series), dtype=int))

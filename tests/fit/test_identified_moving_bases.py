@@ -6,13 +6,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
+from benchmarks import quadruped
 from numpy.testing import assert_allclose
 from scipy.linalg import eigh, null_space
 from tests.forces.test_thrusters import DRONE
 from tests.robots.random_positions import random_positions
 from tests.robots.test_moving_bases import LIMBS, ROOTS, Pair
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, Preparation
 from forcegp.errors import DataWarning, InvalidInput
 from forcegp.evidence import (
     Accelerations,
@@ -252,8 +253,7 @@ def test_a_drone_without_joints(walker):
     places = ((0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (-0.2, 0.0, 0.0), (0.0, -0.2, 0.1))
     robot = Robot.from_urdf_text(DRONE, base="floating")
     locked = Robot.from_urdf_text(DRONE, base="floating", locked=dict.fromkeys(robot.single_joint_names, 0.0))
-    frame = locked.layout.moving[0]
-    rotors = Thrusters(frame, places, torque=(0.02, -0.02, 0.02, -0.02))
+    rotors = Thrusters(locked.layout.moving[0], places, torque=(0.02, -0.02, 0.02, -0.02))
     model = Model(locked, (), (Actuation(), rotors, RigidBodies()))
     heavier = replace(model, robot=scaled(locked, [1.3]))
     log = recorded(heavier, 200, switches=0)
@@ -344,8 +344,7 @@ def test_masses_of_links_that_motions_do_not_show_stay_those_of_the_file():
         robot = Robot.from_urdf_text(f'<robot name="r">{"".join(links)}{last}{hinges}</robot>', base="floating")
         return Model(robot, (), (Actuation(np.eye(8), tuple("xyzabcse")), RigidBodies()))
 
-    log = recorded(flying(2.0), 2000, noise=1e-3, switches=0)
-    found = identified(log, flying(0.0))
+    found = identified(recorded(flying(2.0), 2000, noise=1e-3, switches=0), flying(0.0))
     assert found.parameters.settled
     assert_allclose([found.parameters[f"{name}.mass"].value for name in ("body", "upper")], [2.5, 0.3], atol=0.1)
     at, reference = (body_pseudo_inertias(model.robot).numpy() for model in (found.model, flying(0.0)))
@@ -370,3 +369,15 @@ def test_noise_under_constraints_stays_within_doubles(seed):
     found = NoiseLevels.of(residual, np.broadcast_to(np.diag([1e-2, 1.0, 20.0]), H.shape), H)
     assert np.isfinite([found.acceleration, found.force]).all()
     assert np.isfinite(found.whitening(H)).all()
+
+
+def test_masses_of_a_noisy_trot():
+    """MuJoCo's own contacts: noise of accelerations must not lower the mass, nor windows hide the rotors."""
+    model = quadruped.walker()
+    with pytest.warns(DataWarning, match="leave the stance open"):
+        log = Preparation(cutoff="auto", stance="auto").apply(quadruped.recorded(model, 1, "trot", 5.0)[0])
+    opened = model.with_forces(RigidBodies(["trunk"]), Viscous(), Coulomb(), Rotor())
+    found = fit(opened, log, rows=600).parameters
+    rotors = np.array([each.value for name, each in found.items() if name.startswith("rotor")])
+    assert found["trunk.mass"].value == pytest.approx(8.0, abs=0.06)
+    assert np.sqrt(np.square(rotors - 0.008).mean()) < 0.004

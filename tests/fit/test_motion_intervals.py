@@ -124,8 +124,7 @@ def test_where_the_base_moves_samples_spread_as_steps(floating):
     steps = 0.1 * torch.randn(6, *plain.v.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     others = ("v", "a", "diverged_at")
     same = {name: getattr(plain, name).expand(6, *getattr(plain, name).shape) for name in others}
-    samples = replace(plain, q=robot.integrate(plain.q, steps), **same)
-    drawn = replace(plain, samples=samples)
+    drawn = replace(plain, samples=replace(plain, q=robot.integrate(plain.q, steps), **same))
     assert_close(drawn.std(), steps.std(0))
     assert_close(torch.stack(drawn.interval()), steps.quantile(torch.tensor([0.025, 0.975]).double(), dim=0))
     low, high = replace(drawn, intervals=widths).interval()

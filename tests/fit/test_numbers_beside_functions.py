@@ -66,8 +66,7 @@ def likelihood_of(model, data, points=12):
     """With the noise of the data, and a space about a hand that is wrong."""
     rows = data.rows(slice(points))
     model = replace(model, noise=Noise(tuple(data.noise_std)))
-    typical = typical_sizes(model, [data])
-    space = ParameterSpace(model, typical)
+    space = ParameterSpace(model, typical_sizes(model, [data]))
     closed = replace(space.model_at(space.start), noise=model.noise)
     return MarginalLikelihood(closed, TrainingData.of(rows, model.robot.device)), space
 

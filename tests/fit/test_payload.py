@@ -309,8 +309,7 @@ def test_intervals_hold():
         rng = np.random.default_rng(seed)
         mass, center = rng.uniform(0.3, 3.0), rng.uniform(-0.08, 0.08, 3)
         text = replace_inertial(TEXT, "tool0", mass, center, INERTIA, source="a test")
-        estimate = Found(log(text, seed, noise=0.3), rows=800)
-        ends = estimate.intervals
+        ends = Found(log(text, seed, noise=0.3), rows=800).intervals
         held += sum(low <= true <= high for (low, high), true in zip(ends, [mass, *center], strict=True))
     assert held >= 17
 

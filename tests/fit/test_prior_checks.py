@@ -185,8 +185,7 @@ def test_a_joint_that_something_pushes_teaches_nothing(force, found):
     push[:, 1] = force * PUSHED * np.sqrt((needed[:, 1] ** 2).mean())
     at = truth.dynamics(*tensors(log, "q", "v", "u"))
     log = replace(log, a=at.acceleration(torch.tensor(push)).numpy())
-    typical = typical_sizes(held(), [log])["force"]
-    unseen = Unseen.of(held(), log, typical)
+    unseen = Unseen.of(held(), log, typical_sizes(held(), [log])["force"])
     assert tuple(log.joint_names[j] for j in unseen.pushed) == found
     if found:
         with pytest.warns(DataWarning, match="nothing drives lift, u is 0 there"):

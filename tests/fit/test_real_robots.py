@@ -47,8 +47,7 @@ def test_least_squares_of_a_manipulator_on_held_out_blocks(shared):
     found = fit(model.with_forces(*laws), train)
     assert len(base_parameters(model.robot)) == 43
     force, _ = motion_residuals(test, found.model)
-    rms = np.sqrt((force**2).mean(0))
-    assert (rms < [0.16, 0.25, 0.22, 0.22, 0.09, 0.06, 0.06]).all()
+    assert (np.sqrt((force**2).mean(0)) < [0.16, 0.25, 0.22, 0.22, 0.09, 0.06, 0.06]).all()
 
 
 def test_an_elbow_that_stuck_is_a_holonomic_constraint(shared):

@@ -9,9 +9,6 @@ from forcegp.fit.search import AT_ONCE, best_value, run_restarts
 from forcegp.forces import JointForces
 from forcegp.inference import OptimizerOptions, minimize_objective
 
-UNTIL_CONVERGED = OptimizerOptions()
-"""The search as it was: few steps remembered, and all starts to the end."""
-
 
 @pytest.fixture(scope="module")
 def train():

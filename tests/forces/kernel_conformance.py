@@ -96,8 +96,7 @@ class KernelConformance:
                 )
 
     def test_values_and_gradients_are_finite_at_zero_features(self, dimension):
-        kernel = kernel_of(self.expression, dimension, VARIANCE)
-        latent = LatentKernels([kernel])
+        latent = LatentKernels([kernel_of(self.expression, dimension, VARIANCE)])
         parameters = {name: value.requires_grad_() for name, value in latent.initial_parameters().items()}
         z = torch.zeros(3, dimension, dtype=torch.float64, requires_grad=True)
         K = latent.matrices(parameters, [z])[0]

@@ -137,8 +137,7 @@ class LawConformance:
     def test_plants_have_it_and_motions_are_predicted(self, model, log):
         posterior = fit(model.with_forces(noise=STILL), log)
         q, v = log.q[0], 0.2 * log.v[0]
-        u = np.zeros((40, 3))
-        moved = posterior.rollout(q, v, u, 0.005, integrator="rk4")
+        moved = posterior.rollout(q, v, np.zeros((40, 3)), 0.005, integrator="rk4")
         at_q, at_v = torch.tensor(q), torch.tensor(v)
         for _ in range(40):  # Runge and Kutta's rule, written out
             ks = []
@@ -167,8 +166,7 @@ class LawConformance:
         assert (tmp_path / "made" / "arm.c").exists()
 
     def test_what_mujoco_has_of_it_is_written_down(self, model):
-        text = model.to_mjcf()
-        assert "<mujoco" in text
+        assert "<mujoco" in model.to_mjcf()
 
     def test_a_log_that_does_not_show_it_is_named(self, opened, log):
         if not isinstance(self.law, JointLaw) or not set(self.law.coefficients) - set(self.shows_at_rest):

@@ -38,8 +38,7 @@ def test_accelerations_are_mixed_by_the_projection_onto_the_constraint(train):
 
 
 def test_without_forces_the_prediction_is_the_analytical_model(train, test):
-    posterior = fit(train.model, train)
-    prediction = posterior.predict(test.q, test.v, test.u)
+    prediction = fit(train.model, train).predict(test.q, test.v, test.u)
     dynamics = train.model.dynamics(*(torch.tensor(x) for x in (test.q, test.v, test.u)))
     assert torch.allclose(prediction.mean, dynamics.acceleration_map().offset, atol=1e-12)
     assert prediction.covariance is not None

@@ -181,8 +181,7 @@ def test_controllers_and_monitors_see_the_past(lugre_log):
     torch.testing.assert_close(posterior.predict(q, v, np.append(u, z)).mean, torch.tensor(a), rtol=1e-7, atol=1e-7)
     with pytest.raises(InvalidInput, match=r"this model remembers: give memory=\(presliding of pan"):
         predictor.inverse_dynamics(q, v, a)
-    noisy = ComputedTorque(predictor, stiffness=100.0, position_noise=1e-3)
-    assert noisy.past.least == 1e-3
+    assert ComputedTorque(predictor, stiffness=100.0, position_noise=1e-3).past.least == 1e-3
     controller, seen = ComputedTorque(predictor, stiffness=100.0), with_memory(test, posterior.model)
     for k in range(300):
         asked = controller(test.q[k], test.v[k], test.q[k], test.v[k], test.a[k])

@@ -82,8 +82,7 @@ def search(target: Target, folder: Path, count: int) -> None:
         except Exception as error:
             key, text = _place(error), repr(case)
             if key not in defects or len(text) < len(defects[key][0]):
-                told = "".join(traceback.format_exception(error)[-4:])
-                defects[key] = text, told
+                defects[key] = text, "".join(traceback.format_exception(error)[-4:])
         finally:
             shutil.rmtree(top, ignore_errors=True)
 

@@ -84,8 +84,7 @@ def check(case: RobotFile, folder: Path) -> None:
             if not bool(torch.isfinite(M).all()):
                 raise DefectError("a mass matrix that is not finite")
             model.dynamics(q, torch.zeros(robot.nv).double(), torch.zeros(len(model.inputs)).double())
-        text = robot.to_urdf()
-        again = Robot.from_urdf_text(text, base=robot.base, locked=robot.locked)
+        again = Robot.from_urdf_text(robot.to_urdf(), base=robot.base, locked=robot.locked)
         if again.nv != robot.nv:
             raise DefectError("another robot is read from what was written")
         Model.from_json(model.to_json())

@@ -14,8 +14,7 @@ def dense_covariance(W, noise, kernel_matrices):
         S = S + torch.einsum("id,ij,je->idje", W[..., c], K, W[..., c])
     R = torch.diag_embed(noise) if noise.ndim == 2 else noise
     R = R.expand(count, outputs, outputs)
-    eye = torch.eye(count, dtype=torch.float64)
-    S = S + torch.einsum("ide,ij->idje", R, eye)
+    S = S + torch.einsum("ide,ij->idje", R, torch.eye(count, dtype=torch.float64))
     return S.reshape(count * outputs, count * outputs)
 
 

@@ -48,8 +48,7 @@ def test_order_on_a_damped_oscillator_with_its_closed_form(integrator, order):
 
 def implicit_step(friction, joints: int, states: int):
     """The equation of an implicit step of 40 ms with coupled masses from .003 to 3 kg m^2, and where it begins."""
-    generator = torch.Generator().manual_seed(0)
-    like = {"dtype": torch.float64, "generator": generator}
+    like = {"dtype": torch.float64, "generator": torch.Generator().manual_seed(0)}
     Q, _ = torch.linalg.qr(torch.randn(states, joints, joints, **like))
     M = (Q * torch.logspace(-2.5, 0.5, joints, dtype=torch.float64)) @ Q.mT
     v, u = torch.randn(2, states, joints, **like).unbind()

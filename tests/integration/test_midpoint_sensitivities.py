@@ -37,8 +37,7 @@ def given():
     q0 += torch.tensor([0.2, 0.7, 0.8])
     v0 = 0.4 * torch.randn(WINDOWS, nv, generator=generator, dtype=torch.float64)
     u = 3.0 * torch.randn(WINDOWS, STEPS, model.sizes[2], generator=generator, dtype=torch.float64)
-    rest = tuple(x[:, None].expand(WINDOWS, STEPS, -1) for x in (q0, v0))
-    return model, q0, v0, u, rest
+    return model, q0, v0, u, tuple(x[:, None].expand(WINDOWS, STEPS, -1) for x in (q0, v0))
 
 
 LEVELS = torch.tensor([0.8, 0.5, 0.3], dtype=torch.float64)

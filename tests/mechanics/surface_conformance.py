@@ -72,8 +72,7 @@ class SurfaceConformance:
 
     def test_it_survives_a_file_exactly_or_says_that_it_cannot(self):
         if self.storable:
-            stored = json.loads(json.dumps(surface_to_dict(self.surface)))
-            again = surface_from_dict(stored)
+            again = surface_from_dict(json.loads(json.dumps(surface_to_dict(self.surface))))
             assert again == self.surface
             assert type(again) is type(self.surface)
             assert surface_to_dict(again) == surface_to_dict(self.surface)

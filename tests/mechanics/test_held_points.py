@@ -48,8 +48,7 @@ def test_accelerations_and_foot_forces_are_those_of_the_equations_of_motion(walk
     u[:, 3:] = torch.tensor([[1, 1], [1, 0], [0, 1], [0, 0], [1, 1], [0, 1]])
     found = walker.dynamics(q, v, u)
     a, forces = found.acceleration(torch.zeros_like(v)), found.multiplier(torch.zeros_like(v))
-    model = pin.buildModelFromXML(LIMBS, pin.JointModelFreeFlyer())
-    assert model.nv == robot.nv
+    assert pin.buildModelFromXML(LIMBS, pin.JointModelFreeFlyer()).nv == robot.nv
     for k in range(len(q)):
         M, bias = robot.mass_matrix_and_bias(q[k], v[k])
         tau = torch.cat([torch.zeros(6), u[k, :3]]).double()
@@ -100,8 +99,7 @@ def test_the_point_of_a_ball_that_touches_level_ground_rests(robot):
         -radius * kinematics.frame_pose("a_foot")[..., 2, :3]
     ).tolist()  # of the world's z, in the axes of the foot
     for k, offset in enumerate(below):
-        point = tuple(np.add(POINT, offset))
-        velocity = robot.frame_jacobian(q[k], "a_foot", point)[:3] @ v[k]
+        velocity = robot.frame_jacobian(q[k], "a_foot", tuple(np.add(POINT, offset)))[:3] @ v[k]
         assert_close(touching[k], velocity, rtol=1e-12, atol=1e-12)
     step = 1e-6
     change = (rates(robot.integrate(q, step * v)) - rates(robot.integrate(q, -step * v)))[..., 0] / (2.0 * step)

@@ -246,8 +246,7 @@ def test_the_self_test_the_example_and_the_commands_of_the_readme_work(complete,
         assert done.returncode == 0, done.stderr
     assert all(ran(folder, program, "arm.c", *options).returncode == 0 for program in ("example.c", "self_test.c"))
     text = (folder / "arm.c").read_text()
-    first = text.index("table0[]")
-    place = text.index("0x1.", first)
+    place = text.index("0x1.", text.index("table0[]"))
     (folder / "arm.c").write_text(f"{text[:place]}-{text[place:]}")  # one weight or centre of the model
     broken = ran(folder, "self_test.c", "arm.c")
     assert broken.returncode == 1
@@ -295,8 +294,7 @@ def test_sums_that_cancel_may_differ_by_their_rounding(tmp_path, states):
     largest = (W.abs() @ torch.stack(terms, dim=-1)[..., None]).max() / smooth.predict(q, v, u).mean.abs().max()
     assert rounding(smooth, q, v, u) == pytest.approx(2.0**-52 * float(largest), rel=1e-6)
     assert 5e-12 < rounding(smooth, q, v, u) < 1e-6
-    made = export_c(smooth, tmp_path / "arm")
-    assert made.differences["arm_mean"] < 1e-7
+    assert export_c(smooth, tmp_path / "arm").differences["arm_mean"] < 1e-7
 
 
 def test_a_program_that_differs_is_not_written(posterior, tmp_path, monkeypatch):
@@ -307,8 +305,7 @@ def test_a_program_that_differs_is_not_written(posterior, tmp_path, monkeypatch)
     with pytest.raises(NumericalError, match=r"arm_mean of the compiled program and forcegp differ by .* nothing was"):
         export_c(posterior, tmp_path / "arm")
     assert list(tmp_path.iterdir()) == []
-    made = export_c(posterior, tmp_path / "arm", unchecked=True)
-    assert made.differences == {}
+    assert export_c(posterior, tmp_path / "arm", unchecked=True).differences == {}
     assert "was not compared with forcegp" in (tmp_path / "arm" / "arm.h").read_text()
 
 

@@ -250,8 +250,7 @@ def test_a_joint_that_hardly_moves_has_no_level():
 
 
 def test_many_rows_are_thinned():
-    log = recording(2, seconds=150.0)
-    noise = drift_of(fitted(log)).noise[0][0]
+    noise = drift_of(fitted(recording(2, seconds=150.0))).noise[0][0]
     assert noise == pytest.approx((5.0 * NOISE) ** 2 * 2.0 * DT, rel=0.3), "white noise of every second row"
 
 

@@ -105,8 +105,7 @@ def test_means_and_covariances_are_those_of_predict(floating, covariance, monkey
 def test_derivatives_are_those_in_a_step_from_q(case):
     posterior, q, v, u = case
     space, size = posterior.model.robot.space, 1e-5
-    predictor = posterior.predictor(covariance="none")
-    found = assert_slopes_of_torch(predictor, posterior, (q, v, u))
+    found = assert_slopes_of_torch(posterior.predictor(covariance="none"), posterior, (q, v, u))
     for j in range(space.nv):
         step = torch.zeros(ROWS, space.nv, dtype=torch.float64)
         step[:, j] = size

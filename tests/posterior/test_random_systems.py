@@ -85,8 +85,7 @@ def test_every_path_computes_the_same(seed, tmp_path):
     stepped = predictor.step(*states, 1e-3)
     np.testing.assert_allclose(motion.v[:, 1], stepped[1], rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(stepped[1], states[1] + 1e-3 * found.mean, rtol=1e-10, atol=1e-10)
-    again = posterior.update(rows.rows(slice(0, 1)))
-    assert len(again.training) == len(posterior.training) + 1
+    assert len(posterior.update(rows.rows(slice(0, 1))).training) == len(posterior.training) + 1
     spread = 1.96 * found.std.numpy()
     least = 0.8 if seed == 14 else 0.9  # there one search takes the function of a joint for noise
     assert (np.abs(found.mean.numpy() - truth) <= spread + 1e-9).mean() >= least

@@ -97,8 +97,7 @@ def test_equals_dense_gaussian_conditioning(posterior, train, test):
         prior += torch.einsum("id,ie->ide", w_new, w_new) * kernel.outputscale
     S = S.reshape(180, 180) + NOISE**2 * torch.eye(180).double()
     cross = cross.reshape(5, 3, 180)
-    solved = torch.linalg.solve(S, (torch.tensor(train.a) - m).reshape(-1))
-    mean = m_new + cross @ solved
+    mean = m_new + cross @ torch.linalg.solve(S, (torch.tensor(train.a) - m).reshape(-1))
     covariance = prior - cross @ torch.linalg.solve(S, cross.mT)
 
     prediction = posterior.predict(*(x[:5] for x in (test.q, test.v, test.u)))

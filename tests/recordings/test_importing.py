@@ -81,8 +81,7 @@ def test_gaps_split_and_repeated_stamps_are_dropped(tmp_path):
     kept = np.r_[0:11, 12:197]
     np.testing.assert_array_equal(found.q, data["q"][kept])
     np.testing.assert_array_equal(found.episode, np.where(kept < 100, 0, 1))
-    joined = imported(tmp_path / "log.csv", NAMES, rate="log", gap=2.0)
-    assert joined.episodes == (0,)
+    assert imported(tmp_path / "log.csv", NAMES, rate="log", gap=2.0).episodes == (0,)
 
 
 def test_a_single_gap_of_ten_steps_is_bridged_and_one_more_is_not(tmp_path):

@@ -17,8 +17,7 @@ def page(repository):
 def test_the_example_runs(page, tmp_path):
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     (tmp_path / "arm.urdf").write_text(model("continuous").robot.urdf_text)
-    printed = run_example(example, tmp_path)
-    described, _, error = printed.rstrip().rpartition("\n")
+    described, _, error = run_example(example, tmp_path).rstrip().rpartition("\n")
     assert described.splitlines()[:4] == ["Dataset(", "  rows: 375", "  joints: shoulder, elbow", "  episodes: 0"]
     assert float(error.split()[0]) < 1e-14
 

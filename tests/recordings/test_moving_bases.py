@@ -177,8 +177,7 @@ BODY = """<robot name="box"><link name="body"><inertial><mass value="1"/>
 
 
 def test_lengths_are_mended_or_refused(tmp_path, flight):
-    rounded = np.round(flight.q, 4)
-    found = imported(tmp_path, flight, {"q": rounded})
+    found = imported(tmp_path, flight, {"q": np.round(flight.q, 4)})
     assert_allclose(np.linalg.norm(found.q[:, 3:], axis=1), 1.0, rtol=0, atol=1e-15)
     (note,) = found.metadata["import"]["recordings"][0]["notes"]
     assert note.startswith("orientations divided by their length")

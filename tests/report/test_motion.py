@@ -76,8 +76,7 @@ def test_arrows_are_drawn_to_scale(swinging, friction):
 
 def test_a_foot_that_stands_has_one_arrow():
     """Its three constraints are one force, that of the multipliers in world axes; a foot that swings has none."""
-    walker = Model(Robot.from_urdf_text(LIMBS, base="floating"), FEET)
-    rows = recorded(walker, 40)
+    rows = recorded(Model(Robot.from_urdf_text(LIMBS, base="floating"), FEET), 40)
     model = fit(rows.model.with_forces(JointFriction(), noise=0.1), rows, points=20, restarts=1)
     scene = recorded_scene(rows, model)
     feet = {arrows.title: arrows for arrows in scene.arrows if arrows.title.startswith("contact force")}

@@ -49,8 +49,7 @@ class MujocoOracle:
             R = self.data.xmat[model.jnt_bodyid[joint]].reshape(3, 3)
             self.T[rows] = R @ self.T[rows]
             own = self.G @ v
-            turning = own[rows.stop : rows.stop + 3]
-            self.drift[rows] = R @ np.cross(turning, own[rows])
+            self.drift[rows] = R @ np.cross(own[rows.stop : rows.stop + 3], own[rows])
         self.data.qvel[:] = self.T @ v
         mujoco.mj_forward(model, self.data)
 

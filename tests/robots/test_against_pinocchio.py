@@ -87,8 +87,7 @@ def at_one_state(request):
     text = MODELS[request.param]()
     armature = 0.1 * np.arange(1, 1 + Robot.from_urdf_text(text).nv)
     robot = Robot.from_urdf_text(text, armature=armature)
-    states = np.random.default_rng(11).normal(size=(3, robot.nv))
-    return robot, Oracle(text, robot), *states
+    return robot, Oracle(text, robot), *np.random.default_rng(11).normal(size=(3, robot.nv))
 
 
 @pytest.mark.parametrize("jacobian", [jacrev, jacfwd])
@@ -102,8 +101,7 @@ def test_forward_dynamics_with_respect_to_state_and_force(at_one_state, jacobian
 @pytest.fixture(scope="module")
 def chain():
     robot = Robot.from_urdf_text(CHAIN)
-    states = torch.tensor(np.random.default_rng(5).normal(size=(3, 2, robot.nv)))
-    return robot, *states
+    return robot, *torch.tensor(np.random.default_rng(5).normal(size=(3, 2, robot.nv)))
 
 
 def test_first_and_second_derivatives_by_finite_differences(chain):

@@ -62,8 +62,7 @@ def test_a_model_that_is_worse_than_its_known_forces_is_named(friction):
     data = arm_data(60, 1)
     states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
     a = data.model.dynamics(*states).acceleration_map().offset.numpy()
-    there = dataclasses.replace(data, a=a, truth={"a": a})
-    found = scored(friction, there)
+    found = scored(friction, dataclasses.replace(data, a=a, truth={"a": a}))
     (sentence,) = about(found.warnings, "worse here than its known forces alone")
     assert f"noise-free MAE {found.value('mae', TRUE):.3g} against 0" in sentence
 
@@ -94,8 +93,7 @@ def test_a_joint_that_hides_in_the_mean_is_named(friction):
 
 def test_a_larger_noise_of_the_data_counts(posterior, test_data):
     std = NOISE * np.array([1.0, 1.4, 3.0])  # the model's is NOISE
-    noisier = dataclasses.replace(test_data, noise_std=std)
-    predicted = predict_rows(posterior, noisier)
+    predicted = predict_rows(posterior, dataclasses.replace(test_data, noise_std=std))
     assert_allclose(predicted["measurement_variance"] - predicted["variance"], np.tile(std**2, (60, 1)), rtol=1e-9)
     prediction = posterior.predict(test_data.q[7], test_data.v[7], test_data.u[7])
     joint = multivariate_normal(prediction.mean.numpy(), prediction.covariance.numpy() + np.diag(std**2))
@@ -175,8 +173,7 @@ def test_rows_are_outside_beyond_a_quarter_of_the_range_and_a_tenth_of_the_wides
     posterior = SimpleNamespace(joint_names=("a", "b"), training=SimpleNamespace(q=trained, v=torch.zeros(2, 2)))
     given = np.zeros((200, 2))
     given[:3, 0] = q
-    found = list(rows_outside(posterior, Rows(given)))
-    assert len(found) == beyond
+    assert len(list(rows_outside(posterior, Rows(given)))) == beyond
     one = np.zeros((200, 2))
     one[:1, 0] = q
     assert list(rows_outside(posterior, Rows(one))) == [], "one row of 200 is a chance"

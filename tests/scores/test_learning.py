@@ -48,8 +48,7 @@ def test_robots_that_fly_have_air_and_feet_that_stand_do_not_slide():
     drones = [Model(robot, (), rotors) for robot in robots]
     limbs = Robot.from_urdf_text(LIMBS, base="floating")
     walker = Model(limbs, fixed_point("a_foot", switch="a_stands"))
-    rock = Model(robots[0], (), (RigidBodies(),))
-    models = *drones, walker, rock
+    models = *drones, walker, Model(robots[0], (), (RigidBodies(),))
     assert usual_forces(arm_model(contacts=1)) == "gp:tool-friction"
     found = [usual_forces(model) for model in models]
     assert found == ["gp:aerodynamic", "gp:joint-friction+gp:aerodynamic", "gp:joint-friction", "gp:joint"]

@@ -180,8 +180,7 @@ def test_motions_begin_with_what_was_observed_before_them(airborne, log):
     held_out = held_out_motions(log, np.ones(len(log), dtype=bool), (0.1, 0.3), starts=4)
     seeing, motions = held_out.of(airborne)
     assert len(motions.q) == 8
-    part = log.select_episodes([1])
-    _, seen = observing(airborne, part, whole=True)
+    _, seen = observing(airborne, log.select_episodes([1]), whole=True)
     np.testing.assert_allclose(motions.u[4:, 0], seen.u[list(motions.rows[4:])], rtol=1e-12, atol=1e-12)
     assert seeing.model.inputs == seen.model.inputs
     assert held_out.of(unobserved(airborne))[1].u.shape[-1] == log.u.shape[-1]

@@ -63,8 +63,7 @@ class LuGreArm:
             spec.delete(geom)
         for mesh in list(spec.meshes):
             spec.delete(mesh)
-        last = spec.bodies[-1]
-        load = last.add_body(pos=self.center)
+        load = spec.bodies[-1].add_body(pos=self.center)
         load.mass, load.inertia, load.ipos = self.mass, np.full(3, 6.4e-4 * self.mass), np.zeros(3)
         load.explicitinertial, spec.compiler.fusestatic = True, False
         spec.option.timestep = STEP / SUBSTEPS

@@ -49,8 +49,7 @@ def test_rows_follow_each_other_by_symplectic_euler(data):
 
 
 def test_limits_of_torque_are_kept(data):
-    limits = np.array([320, 320, 176, 176, 110, 40, 40])
-    assert (np.abs(data.u + 0.5 * data.v) <= limits).all()
+    assert (np.abs(data.u + 0.5 * data.v) <= np.array([320, 320, 176, 176, 110, 40, 40])).all()
 
 
 def test_a_step_is_the_acceleration_of_pinocchio(data):

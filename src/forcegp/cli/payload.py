@@ -24,6 +24,8 @@ from forcegp.errors import InvalidInput
 
 WINDOW = 0.4
 """Seconds that torques are averaged over: it takes noise of the acceleration, and leaves friction as sharp as it is."""
+WIDER = 2.3
+"""Where a base moves, times the windows of a fit: a mass needs less of what is fast than rotors do."""
 LAWS = "viscous", "gear", "offset", "rotor"
 
 
@@ -131,11 +133,13 @@ def with_payload(
     mass: float | None = None,
 ) -> Any:
     """The posterior of a model that carries something, of this `mass`; with a baseline links are estimated, too."""
+    from forcegp.fit.sensors import usual_evidence  # PyTorch is not needed for a page of help
+
     bodies = () if baseline is None else (forcegp.RigidBodies("all"),)
-    noisy = "u" if model.robot.space.is_vector_space else "both"
-    sensors = forcegp.JointTorques()
-    evidence = (forcegp.Torques(noisy, mean=WINDOW), *[sensors] * bool(sensors.names(rows)))
     loaded = model.with_forces(*bodies, forcegp.Payload(link, mass, None))
+    torques: Any
+    torques, *sensors = usual_evidence(loaded, rows)
+    evidence = (replace(torques, mean=WIDER * torques.mean if torques.mean else WINDOW), *sensors)
     return forcegp.scores.learn(loaded, rows, evidence, baseline=baseline)[0]
 
 

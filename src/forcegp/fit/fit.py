@@ -196,7 +196,7 @@ def _chosen(
         refinement.refuse(start.trained.unknown_forces if isinstance(start, Posterior) else model.unknown_forces)
     if isinstance(start, Posterior) and (refinement is None or others):
         raise InvalidInput("start is a posterior; it is refined by Motions() alone: give that as the evidence.")
-    usual = usual_evidence(model, dataset.measured)
+    usual = usual_evidence(model, dataset)
     own = tuple(each for each in usual if isinstance(each, Sensor) and not given)
     return (others or usual)[0], refinement, sensors or own
 

@@ -1,11 +1,11 @@
 """Sensors of a log as evidence: which of them teach, with which noise, and how IMUs are mounted."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, preparation_report
 from forcegp.data.dataset import FORCE, IMU, TORQUE
 from forcegp.data.imu import SMALL, BesideMotion, delay_doubts, short_means
 from forcegp.doubts import Doubt, look, ok, wrong
@@ -16,16 +16,22 @@ from forcegp.fit.unseen import rows_of_known_physics
 from forcegp.model import Model
 from forcegp.noise import Noise
 
+PERIODS = 1.3
+"""Of the cut-off, over which equations are averaged where a base moves: its noisy accelerations would lower masses."""
 
-def usual_evidence(model: Model, measured: Collection[str] = ()) -> tuple[Evidence, ...]:
-    """That of a fit where none is named, beside sensors of these names: force sensors at contacts, and all IMUs."""
+
+def usual_evidence(model: Model, dataset: Dataset) -> tuple[Evidence, ...]:
+    """That of a fit where none is named, beside sensors of the log: force sensors at contacts, and all IMUs."""
+    measured = dataset.measured
     touched = dict.fromkeys(contact.frame for contact in model.contacts)
     felt = [FrameAcceleration()] if any(name.startswith(IMU) for name in measured) else []
     sensors = [*(ContactForces(frame) for frame in touched if f"{FORCE}{frame}" in measured), *felt]
     if model.unknown_forces or not model.is_open:
         return Accelerations(), *sensors
     sensors += [JointTorques()] if any(name.startswith(TORQUE) for name in measured) else []
-    return Torques("both" if felt or not model.robot.space.is_vector_space else "u"), *sensors
+    moves = not model.robot.space.is_vector_space
+    cutoff = preparation_report(dataset.metadata).get("cutoff") if moves and dataset.time_ordered else None
+    return Torques("both" if felt or moves else "u", PERIODS / cutoff if cutoff else None), *sensors
 
 
 def with_sensors(dataset: Dataset, model: Model, rest: Evidence, sensors: Sequence[Sensor]) -> tuple[Dataset, Model]:

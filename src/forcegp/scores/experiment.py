@@ -89,7 +89,7 @@ class Experiment:
 
     def __post_init__(self) -> None:
         require_type("model", self.model, Model)
-        checked_identification(self.identifies, self.model)
+        checked_identification(self.identifies, self.model, self.rows)
         for what, dataset in (("log", self.rows), ("recording", self.recording)):
             require_rows(what, dataset, tuple(self.model.robot.joint_names), "the robot")
         for name in ("restarts", "iterations"):

@@ -104,7 +104,7 @@ def learn(
     have more rows, and intervals of motions are calibrated then. `search` is restarts, seed, jobs.
     """
     motions = [each for each in evidence if isinstance(each, Motions)]
-    usual = usual_evidence(model, dataset.measured)
+    usual = usual_evidence(model, dataset)
     sensors = [each for each in evidence or usual if isinstance(each, Sensor)]
     others = [each for each in evidence if each not in (*motions, *sensors)] or [usual[0]]
     first, notes = others[0], []
@@ -363,13 +363,13 @@ def _parts(name: str) -> tuple[tuple[str, ...], tuple[Evidence, ...], tuple[Evid
     return summands(forces), motions, tuple(each for each in evidence if each not in motions), others
 
 
-def checked_identification(name: str, model: Model) -> tuple[Model, Accelerations | Torques]:
+def checked_identification(name: str, model: Model, rows: Dataset) -> tuple[Model, Accelerations | Torques]:
     """The model that is open where laws and bodies of this name are, and the evidence. Raises InvalidInput."""
     words, _, evidence, _ = _parts(name)
     opened = named_model(model, words)
     if opened.unknown_forces or not opened.is_open:
         raise InvalidInput(f"identification {name!r} has nothing to identify, or unknown forces; name laws and bodies.")
-    chosen = (evidence or usual_evidence(opened))[0]
+    chosen = (evidence or usual_evidence(opened, rows))[0]
     if not isinstance(chosen, Accelerations | Torques):
         raise InvalidInput(f"identification {name!r} is from {chosen.name}; give accelerations or torques.")
     return opened, chosen
@@ -380,7 +380,7 @@ def identified_model(name: str, model: Model, rows: Dataset, before: Posterior |
 
     `before`: what they made of the same rows already, or of more of the same recording.
     """
-    opened, evidence = checked_identification(name, model)
+    opened, evidence = checked_identification(name, model, rows)
     if before is None:
         opened, _ = with_friction_chosen(opened, rows, evidence)  # once, for all parts of the rows
     found: Any = fit(opened, rows, evidence) if before is None else before
