@@ -264,6 +264,7 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "no torque": (lambda d: replace(d, u=0.0 * d.u), "no torque was measured"),
     "turns": (lambda d: at(d, "qva", [0.5 / np.pi] * 2), "turns"),
     "time in ms": (lambda d: replace(d, time=1000 * d.time), "velocity|acceleration|sampling"),
+    "gear ratio of 1.6": (lambda d: at(d, "qva", [1.0, 0.625]), "gear ratio"),
 }
 
 

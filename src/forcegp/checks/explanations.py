@@ -28,6 +28,7 @@ SCANNED = 3  # best of the numbers that are scanned, which are looked at in full
 TILTED = np.deg2rad(6.0)  # angle from which a direction of gravity is another
 HEAVIEST = 1.3  # times the assumed gravity, beyond which it is something else
 FACTORS = np.exp(np.linspace(-2.5, 2.5, 251))  # of lengths, its ends left out
+RATIOS = np.exp(np.linspace(-1.2, 1.2, 25))  # of gears: the steps are then divided by ten
 ALL_TRIED = 8  # joints up to which every pair is exchanged; of more, those that fit badly
 
 
@@ -236,7 +237,7 @@ def _waves(x: np.ndarray) -> np.ndarray:
 
 
 def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
-    """A joint zero, or a length, that leaves least; the best of all."""
+    """A joint zero, a gear ratio or a length that leaves least; the best of all."""
     robot, rows, names = now.robot, now.rows, now.robot.joint_names
     zeros, turns = 2.0 * np.pi * np.arange(5) / 5.0, np.linspace(-np.pi, np.pi, 181)
     waves, parts = _waves(turns) @ np.linalg.inv(_waves(zeros)), np.array([0.5, 1.0, 2.0])
@@ -262,6 +263,20 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
             found.append(
                 (left, cause, lambda x=x, one=one: now.after(lambda rows: replace(changed()(rows), q=rows.q + x * one)))
             )
+    for joint in range(rows.nv):
+
+        def geared(y: float, joint: int = joint) -> Change:
+            return changed("qva", factor=np.where(np.arange(rows.nv) == joint, y, 1.0))
+
+        left, x = np.inf, 1.0
+        for step in (1.0, 0.1) if np.ptp(rows.q[:, joint]) > 0.0 else ():
+            every = (x or 1.0) * RATIOS**step
+            left, x = best([needed_torques(robot, geared(y)(rows)) for y in every], np.eye(len(every)), every)
+        what = f"the torques fit positions and velocities of {names[joint]} that are {x:.4g} times the logged ones"
+        do = f"Correct its gear ratio, or the columns, as in forcegp import --q 'COLUMN * {x:.4g}'."
+        cause = number("gear ratio", what, joint, x, NUMBER + 0.4, do=do)
+        if x > 0.0 and abs(np.log(x)) > 0.05:
+            found.append((left, cause, lambda geared=geared, x=x: now.after(geared(x))))
     for body, drive in enumerate(robot.layout.drives):
         length = float(torch.linalg.vector_norm(robot.tree.rest[body, :3, 3, 0]))
         if length == 0.0 or robot.layout.parents[body] < 0:

@@ -386,8 +386,8 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         do = f"Leave them out by forcegp import --without {seconds}, as forcegp auto does."
     yield look(
         about=UNKNOWN,
-        what="something is wrong that is none of the causes that were tried (signs, units, orders, zeros, gravity, "
-        f"masses, payload, springs, delay): unexplained stay of the torque of {shares}{where}.",
+        what="something is wrong that is none of the causes that were tried (signs, units, orders, zeros, gears, "
+        f"gravity, masses, payload, springs, delay): unexplained stay of the torque of {shares}{where}.",
         do=do,
         joints=inputs.named(bad),
         numbers=numbers,

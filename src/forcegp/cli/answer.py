@@ -23,7 +23,7 @@ def short_name(name: str) -> str:
     return f"{learned} learned" if learned else plain.get(name, name)
 
 
-FIRST = {"unknown cause", "joint zero", "torque constant", "torque unit"}
+FIRST = {"unknown cause", "joint zero", "gear ratio", "torque constant", "torque unit"}
 """Subjects of doubts that change all that follows."""
 TOLD = FIRST | {"stop", "push", "spring", "drift", "elastic joint"}
 """Those that the answer repeats."""
