@@ -69,8 +69,7 @@ def mutated(source: str, place: int) -> tuple[str, str]:
     elif isinstance(node, ast.If | ast.IfExp):
         node.test = ast.UnaryOp(ast.Not(), copy.copy(node.test))
     elif isinstance(node, ast.Compare):
-        counted = any(map(_counts, (node.left, *node.comparators)))
-        exchanged = EXCHANGED | COUNTED if counted else EXCHANGED
+        exchanged = EXCHANGED | COUNTED if any(map(_counts, (node.left, *node.comparators))) else EXCHANGED
         node.ops[0] = exchanged[type(node.ops[0])]()  # type: ignore[call-overload]  # of comparisons
     elif isinstance(node, ast.BinOp | ast.BoolOp):
         node.op = EXCHANGED.get(type(node.op), ast.Add)()  # type: ignore[assignment]  # of the same kind

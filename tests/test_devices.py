@@ -171,12 +171,10 @@ def test_structured_models_on_the_pretended_device(prior, integrators, tmp_path)
         for integrator in integrators:
             motion = there.rollout(test.q[0], test.v[0], test.u[:1], 0.001, integrator=integrator, samples=2)
             assert isinstance(motion.q, PretendTensor)
-        updated = there.update(data.rows(slice(10, 14)))
-        assert isinstance(updated.latent.system.factor.lower, PretendTensor)
+        assert isinstance(there.update(data.rows(slice(10, 14))).latent.system.factor.lower, PretendTensor)
         assert there.negative_log_likelihood == pytest.approx(posterior.negative_log_likelihood)
         save_posterior(there, tmp_path / "model")
-    loaded = load_posterior(tmp_path / "model")
-    assert torch.equal(loaded.predict(test.q, test.v, test.u).mean, expected.mean)
+    assert torch.equal(load_posterior(tmp_path / "model").predict(test.q, test.v, test.u).mean, expected.mean)
 
 
 def test_inducing_points_on_the_pretended_device():

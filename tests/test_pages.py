@@ -73,8 +73,7 @@ def test_the_page_on_scoring_runs(repository: Path, tmp_path: Path):
 def test_the_page_on_reports_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "reports.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    printed = run_example(example, tmp_path).splitlines()
-    assert printed == re.findall(r"print\(.*\)  # (.*)", example)
+    assert run_example(example, tmp_path).splitlines() == re.findall(r"print\(.*\)  # (.*)", example)
 
 
 def test_the_page_on_motions_runs(repository: Path, tmp_path: Path):
@@ -213,8 +212,7 @@ def test_the_page_on_robots_runs_from_files_to_learned_forces(repository: Path, 
 def test_the_page_on_control_rates_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "control-rate.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    printed = run_example(example, tmp_path)
-    rank, one, linear, many, step, inverse, gradient = printed.splitlines()
+    rank, one, linear, many, step, inverse, gradient = run_example(example, tmp_path).splitlines()
     found, excess = re.fullmatch(r"rank (\d+), standard deviations at most (\S+)% too large", rank).groups()
     assert 1 < int(found) <= 300
     assert 0.0 < float(excess) <= 1.0

@@ -1,7 +1,6 @@
 """Probabilistic forward dynamics of robots: Gaussian processes on the forces that nobody modelled.
 
-The whole public API is listed, by theme, in `__init__.pyi`. Each name is imported at its first use, so `import forcegp`
-costs nothing.
+The public API is listed, by theme, in `__init__.pyi`. Names are imported at first use: `import forcegp` costs nothing.
 """
 
 import lazy_loader as lazy

@@ -28,8 +28,7 @@ TRIAL = 2**16
 def atomic_file(path: str | Path, *, overwrite: bool = True) -> Iterator[Path]:
     """A temporary path at which to write a file, which replaces `path` when the context ends without error.
 
-    Raises InvalidInput if the folder of `path` does not exist, if `path` is a folder, a device or a pipe, and without
-    `overwrite` if it is there by then.
+    Raises InvalidInput if the folder of `path` does not exist, if `path` is no plain file, and if it is there by then.
     """
     target = _target(path)
     if not target.parent.is_dir():

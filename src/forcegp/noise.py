@@ -81,8 +81,7 @@ class Noise:
         """
         acceleration = (2.0 * parameters[ACCELERATION]).exp()[None]
         if (sensed := H.shape[-2] - acceleration.shape[-1]) > 0:
-            sensor = (2.0 * parameters[SENSOR]).exp()[None].expand(1, sensed)
-            acceleration = torch.cat([acceleration, sensor], dim=-1)
+            acceleration = torch.cat([acceleration, (2.0 * parameters[SENSOR]).exp()[None].expand(1, sensed)], dim=-1)
         if not (forces := [(2.0 * parameters[name]).exp() for name in (FORCE, PUSHES) if name in parameters]):
             return acceleration
         return torch.diag_embed(acceleration) + (H * torch.stack(forces).sum(0)) @ H.mT

@@ -54,8 +54,7 @@ def test_displaced_starts_are_exactly_off_the_surface_and_as_near_as_can_be(moti
 
 def test_the_feedback_is_that_of_its_formula_and_nothing_on_the_recording(recorded, motion):
     feedback, oracle = recorded.feedback(), Tool(motion.model).oracle
-    generator = torch.Generator().manual_seed(0)
-    dq, dv = torch.randn(2, STARTS, 7, generator=generator, dtype=torch.float64)
+    dq, dv = torch.randn(2, STARTS, 7, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     for k in (0, 17):
         q, v = recorded.q[:, k], recorded.v[:, k]
         assert torch.equal(feedback(k, q, v), torch.zeros_like(q))

@@ -125,8 +125,7 @@ def test_an_angle_that_wraps_is_told():
 
 
 def test_the_report_is_json_and_sorted_by_severity():
-    report = check(column(clean(2), "u", 1, np.negative))
-    content = json.loads(json.dumps(report.to_dict(), allow_nan=False))
+    content = json.loads(json.dumps(check(column(clean(2), "u", 1, np.negative)).to_dict(), allow_nan=False))
     assert content["level"] == "wrong"
     assert content["doubts"][0]["about"] == "torque sign"
     assert sum(content["counts"].values()) == len(content["doubts"])

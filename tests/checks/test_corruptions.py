@@ -103,6 +103,13 @@ def test_two_mistakes_are_both_named():
     assert found.of("torque unit")[0].correction == {"unit": {"u": ("mNm",)}}
 
 
+def test_the_factor_of_a_torque_has_an_interval():
+    data = clean(two_links(), 1, noise="qvu")
+    [found] = said(replace(data, u=data.u * np.array([1.0, 1.6])))
+    assert found.numbers["factor"]["joint2"] == pytest.approx(1.6, abs=found.numbers["error_95"][0])
+    assert found.numbers["error_95"][0] < 0.03
+
+
 @pytest.mark.parametrize("degrees", [10.0, 40.0])
 def test_the_gravity_of_a_tilted_base_is_right(degrees):
     angle = np.deg2rad(degrees)

@@ -178,8 +178,7 @@ def flight(seed: int = 0, noise: bool = True) -> tuple[Dataset, np.ndarray]:
     turning[1:-1] = (turned[:-2].inv() * turned[2:]).as_rotvec() * FLYING / 2.0
     speeds = np.sqrt(2.0 * length / 4.0 / 1e-5) * np.ones(4)  # of rotors whose thrusts are equal, rad/s
     rotors = Thrusters("body", [(0.1, 0.1, 0), (-0.1, 0.1, 0), (0.1, -0.1, 0), (-0.1, -0.1, 0)], thrust=1e-5, power=2)
-    robot = Robot.from_urdf_text(BODY, base="floating")
-    model = Model(robot, (), (Actuation(), rotors, RigidBodies()))
+    model = Model(Robot.from_urdf_text(BODY, base="floating"), (), (Actuation(), rotors, RigidBodies()))
     jitter = Rotation.from_rotvec(np.deg2rad(0.2) * noise * draw(size=(2400, 3)))
     q = np.hstack([position + 0.001 * noise * draw(size=(2400, 3)), (turned * jitter).as_quat()])
     world = velocity + 0.02 * noise * draw(size=(2400, 3))

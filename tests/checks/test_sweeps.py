@@ -226,6 +226,5 @@ def test_what_every_cause_explains(name):
 def test_factors_of_torques_are_looked_at_or_wrong():
     log, found = clean(ROBOTS["planar"](), 1, noise="qvu"), {}
     for factors in ([1.0, 0.3], [1.0, 0.36], [1.4, 1.0], [1.0, 28.0], [1.0, 33.0], [0.5, 0.6]):
-        inputs = CheckInput.quick(replace(log, u=log.u * factors), log.model)
-        found[f"{factors}"] = numbers(search(inputs)[1])
+        found[f"{factors}"] = numbers(search(CheckInput.quick(replace(log, u=log.u * factors), log.model))[1])
     assert_unchanged("checks/factors", found, rtol=1e-4)

@@ -69,8 +69,7 @@ def test_the_corrected_command_gives_a_model_that_works(folder, answered):
     error = np.abs(model.predict(test.q, test.v, test.u).mean.numpy() - test.a).mean()
     assert error < 0.1 * np.abs(motion_residuals(test, test.model)[1]).mean()  # of the URDF
     assert len(Dataset.load(folder / "answer" / "log.h5")) == 1920
-    identified = Robot.from_urdf(folder / "answer" / "identified.urdf")
-    assert identified.joint_names == test.joint_names
+    assert Robot.from_urdf(folder / "answer" / "identified.urdf").joint_names == test.joint_names
     assert (folder / "answer" / "validation" / "report.md").is_file()
 
 
@@ -110,8 +109,7 @@ def test_a_base_on_a_wall_is_corrected(tmp_path, forcegp, monkeypatch):
     told = forcegp(*words, folder=tmp_path).stdout
     assert "--gravity=0,9.81,0" in told[told.index("Run:") :]
     assert "reached" in forcegp(*words, "--correct", folder=tmp_path).stderr
-    kept = Dataset.load(tmp_path / "answer" / "log.h5").model.robot.gravity
-    assert kept.tolist() == [0.0, 9.81, 0.0]
+    assert Dataset.load(tmp_path / "answer" / "log.h5").model.robot.gravity.tolist() == [0.0, 9.81, 0.0]
 
 
 def test_the_printed_command_keeps_every_option():

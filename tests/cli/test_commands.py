@@ -94,8 +94,7 @@ def test_the_demo_tells_the_whole_story(forcegp, tmp_path, monkeypatch):
     warnings = results["scores"]["warnings"]
     assert not any("of the data" in warning for warning in warnings)
     for name, model in models.items():
-        scores = results["scores"]["models"][name]["scores"]
-        assert scores["constraint"]["mae"]["all"]["median"] < 1e-10
+        assert results["scores"]["models"][name]["scores"]["constraint"]["mae"]["all"]["median"] < 1e-10
         assert any(warning.startswith(f"{name}: the search") for warning in warnings)
         assert 0 < model["fit"]["wall_seconds"] < results["wall_seconds"]
         assert len(load_posterior(tmp_path / model["run"]).likelihood.training.q) == 12

@@ -64,8 +64,7 @@ def test_every_option_is_on_the_page_once_with_its_text(forcegp, command):
 
 @EVERY
 def test_examples_are_commands_that_exist(forcegp, command):
-    page = forcegp(command, "--help").stdout
-    section = page.partition("\nFor example:\n")[2].partition("\n\n")[0]
+    section = forcegp(command, "--help").stdout.partition("\nFor example:\n")[2].partition("\n\n")[0]
     examples = [shlex.split(line) for line in section.splitlines()]
     assert examples
     assert all(words[:2] == ["forcegp", command] for words in examples)

@@ -44,8 +44,7 @@ def test_the_payload_is_printed_and_written(folder, forcegp, held):
     assert "mean nothing" not in " ".join(held.stderr.split())
     written = folder / "held"
     assert json.loads((written / "payload.json").read_text())["link"] == "tool0"
-    robot = Robot.from_urdf(written / "loaded.urdf")
-    assert robot.link("tool0").mass == pytest.approx(MASS, rel=0.01)
+    assert Robot.from_urdf(written / "loaded.urdf").link("tool0").mass == pytest.approx(MASS, rel=0.01)
     assert forcegp(*WORDS, "--out", "held", folder=folder).returncode == 2  # the folder exists
     checked = forcegp("check", "loaded.h5", "--identified", written, "--json", folder=folder)
     assert "payload" not in {each["about"] for each in json.loads(checked.stdout)["doubts"]}

@@ -113,8 +113,7 @@ def test_a_point_stays_away_from_surfaces():
     low = height(excitation(FREE, **FEW)).min()
     floor = Contact("hand", (0.0, 0.0, 0.2), Plane((0.0, 0.0, 1.0), low + 0.1))
     for model, surfaces in ((FREE, [floor]), (FREE.with_contacts([floor]), None)):
-        found = excitation(model, **FEW, surfaces=surfaces, clearance=0.05)
-        assert height(found).min() >= low + 0.15
+        assert height(excitation(model, **FEW, surfaces=surfaces, clearance=0.05)).min() >= low + 0.15
     with pytest.raises(InvalidInput, match=r"frame 'hand' is .* m from its surface, not 2, at the start"):
         excitation(FREE, **FEW, surfaces=[floor], clearance=2.0)
 
@@ -129,8 +128,7 @@ def test_models_without_learned_forces_move_for_parameters():
 def test_the_file_has_the_motion(chosen, tmp_path):
     chosen.save_csv(tmp_path / "next.csv", rate=50.0)
     header, *rows = (tmp_path / "next.csv").read_text().splitlines()
-    names = header.split(",")
-    assert names == ["t", *(f"{x}_{joint}" for x in "qvau" for joint in ("pan", "lift", "bend"))]
+    assert header.split(",") == ["t", *(f"{x}_{joint}" for x in "qvau" for joint in ("pan", "lift", "bend"))]
     table = np.array([row.split(",") for row in rows], float)
     assert table.shape == (201, 13)
     np.testing.assert_allclose(table[:, 1:10], np.hstack(chosen.trajectory(table[:, 0])), atol=1e-7)

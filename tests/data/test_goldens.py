@@ -104,8 +104,7 @@ def test_stance(noise):
 
 
 def test_contacts():
-    line = on_a_line(4)
-    logs = {"moved": moved(line, (0.02, 0.0, 0.0)), "invented": invented(clean(two_links(), 4))}
+    logs = {"moved": moved(on_a_line(4), (0.02, 0.0, 0.0)), "invented": invented(clean(two_links(), 4))}
     assert_unchanged("data/contacts", {name: contact_doubts(log)[0].numbers for name, log in logs.items()})
 
 

@@ -109,7 +109,6 @@ def test_what_no_filter_can_follow_is_refused():
     fast = replace(log, q=log.model.robot.integrate(torch.tensor(log.q[:1]), spin).numpy())
     with pytest.raises(DatasetError, match="episode 0: 'base' turns faster than the filter passes"):
         low_pass(fast, 3.0)
-    loose = replace(log, model=Model(log.model.robot), u=log.u[:, :3])
-    found = Preparation(delay="auto").resolved(loose)
+    found = Preparation(delay="auto").resolved(replace(log, model=Model(log.model.robot), u=log.u[:, :3]))
     assert found.delay == 0.0
     assert found.why["delay"].startswith("u is taken to be on time: a delay is found from the torque of every joint")

@@ -170,8 +170,7 @@ def test_it_is_the_filter_the_differences_and_the_rows_that_it_says():
     assert prepared.metadata["preparation"]["sample_rate"] == pytest.approx([500.0, 100.0])
     assert prepared.metadata["preparation"]["differentiate"] == "q"
     assert prepared.metadata["preparation"]["cutoff"] == 12.0
-    again = Preparation(every=2).apply(prepared)
-    assert again.metadata["preparation"]["earlier"]["cutoff"] == 12.0
+    assert Preparation(every=2).apply(prepared).metadata["preparation"]["earlier"]["cutoff"] == 12.0
 
 
 @pytest.mark.parametrize(
@@ -189,8 +188,7 @@ def test_rows_depend_on_those_near_them_only(cutoff, late, seed):
     inner = (piece.time >= data.time[first]) & (piece.time < data.time[last])
     same = (whole.time >= data.time[first]) & (whole.time < data.time[last])
     for name, scale in (("q", 1.0), ("v", RATE), ("a", RATE**2), ("u", 1.0)):
-        difference = np.abs(getattr(piece, name)[inner] - getattr(whole, name)[same]).max()
-        assert difference < 1e-10 * scale
+        assert np.abs(getattr(piece, name)[inner] - getattr(whole, name)[same]).max() < 1e-10 * scale
 
 
 def test_a_delayed_torque_keeps_no_rows_without_one():

@@ -149,8 +149,7 @@ def test_rows_before_a_joint_has_moved_are_left_out():
     for rows, left_out in ((60 * first, True), (30 * first, False)):
         found = fit(model, log.rows(slice(0, rows)), Torques(), rows=500)
         assert ("rows_before_a_past" in found.settings) is left_out
-    way = np.abs(np.diff(q[: first + 1, 1])).sum()
-    assert FORGOTTEN / 500.0 - 0.005 < way < FORGOTTEN / 500.0 + 0.005
+    assert FORGOTTEN / 500.0 - 0.005 < np.abs(np.diff(q[: first + 1, 1])).sum() < FORGOTTEN / 500.0 + 0.005
     q[:, 1] = q[0, 1]  # a joint that never moves keeps its rows
     assert past_known(with_strokes(log_of(q, v, a, a, log.time)), model).all()
     assert past_known(log, arm_model(0)).all()

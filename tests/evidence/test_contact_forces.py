@@ -94,8 +94,7 @@ def test_stacked_rows_have_the_density_of_one_large_gaussian():
     maps = a, at.force_at("hand"), AffineMap(felt(a.offset), felt.matrix @ a.matrix)
     G = torch.cat([x.matrix for x in maps], 1)
     seen = log.a, log.measured[SENSOR] @ NORMAL[:, None], log.measured[ACCELEROMETER]
-    y = torch.cat([torch.tensor(x) for x in seen], 1)
-    r = (y - torch.cat([x.offset for x in maps], 1)).flatten()
+    r = (torch.cat([torch.tensor(x) for x in seen], 1) - torch.cat([x.offset for x in maps], 1)).flatten()
     B = model.unknown.direction(at)
     W = torch.block_diag(*(G @ B))
     n, C = len(log), B.shape[-1]

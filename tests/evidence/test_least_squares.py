@@ -94,8 +94,7 @@ def test_the_prior_decides_what_the_data_do_not():
     def prior(x):
         return np.array([0.1 * (x[2] - 7.0)]), np.array([[0.0, 0.0, 0.1]])
 
-    fit = weighted_least_squares(blind, prior, np.zeros(3), FREE)
-    assert fit.x[2] == pytest.approx(7.0, abs=1e-6)
+    assert weighted_least_squares(blind, prior, np.zeros(3), FREE).x[2] == pytest.approx(7.0, abs=1e-6)
 
 
 def test_correlation_time_of_an_autoregressive_process():

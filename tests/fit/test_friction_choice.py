@@ -68,8 +68,7 @@ def test_all_points_are_all_rows_whose_past_is_known():
     forces = Coulomb(LEVEL, sigma=3000.0, memory=True), JointFriction()
     options = OptimizerOptions(iterations=3)
     model = arm_model(0).with_forces(*forces, noise=Noise(0.1))
-    posterior = fit(model, log, points=len(log), restarts=1, options=options)
-    assert 150 < len(posterior.training) < len(log)
+    assert 150 < len(fit(model, log, points=len(log), restarts=1, options=options).training) < len(log)
 
 
 COUPLED = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 1.0]])

@@ -55,8 +55,7 @@ def sliding_data(rows: int, seed: int, joint_friction: float = 0.0) -> Dataset:
     found = torch.where(positive[:, None], solved[0], solved[1])
     a, multiplier = found[:, :3].numpy(), found[:, 3:]
     noise = NOISE * np.random.default_rng(seed + 100).standard_normal(a.shape)
-    Q_U = (joints - multiplier.abs() * resisting).numpy()
-    truth = {"a": a, "lambda": multiplier.numpy(), "Q_U": Q_U}
+    truth = {"a": a, "lambda": multiplier.numpy(), "Q_U": (joints - multiplier.abs() * resisting).numpy()}
     return replace(data, v=v.numpy(), a=a + noise, truth=truth)
 
 
@@ -129,8 +128,7 @@ def test_beyond_the_visited_speeds_it_expects_what_the_curve_says():
     speeds = fastest * torch.linspace(0.0, 5.0, 80, dtype=torch.float64)
     curve = first.curve("sliding", speeds).mean
     assert expected[0].expected is not None
-    error = (expected[0].expected.sliding(speeds) - curve)[speeds > fastest].abs().max()
-    assert float(error) < 0.02
+    assert float((expected[0].expected.sliding(speeds) - curve)[speeds > fastest].abs().max()) < 0.02
     assert float(curve.std()) > 1e-3  # it is no constant, which any continuation would meet
 
 

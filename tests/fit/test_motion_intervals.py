@@ -55,8 +55,7 @@ def test_widths_between_horizons_are_linear_and_grow_beyond_the_last():
     time = torch.tensor([0.0, 0.5, 1.0, 1.5, 2.0, 4.0], dtype=torch.float64)
     alone = found.half_width("q", time, None)[:, 0] / DEVIATIONS
     assert_close(alone, torch.tensor([0.0, 0.05, 0.1, 0.2, 0.3, 0.6], dtype=torch.float64))
-    spread = torch.full((3, 6, 1), 0.4, dtype=torch.float64)
-    both = found.half_width("q", time, spread)[0, :, 0] / DEVIATIONS
+    both = found.half_width("q", time, torch.full((3, 6, 1), 0.4, dtype=torch.float64))[0, :, 0] / DEVIATIONS
     expected = np.array([0.5, 0.5, 0.5, 1.0, 1.5, 1.5]) * np.hypot(0.4, [0.0, 0.05, 0.1, 0.2, 0.3, 0.6])
     np.testing.assert_allclose(both.numpy(), expected)
 
@@ -68,8 +67,7 @@ def test_they_are_stored_and_go_with_the_system(calibrated, tmp_path):
         for name in ("horizons", "rms", "factors"):
             expected = getattr(calibrated.motion_intervals, name)
             np.testing.assert_array_equal(getattr(again.motion_intervals, name), expected)
-    other = calibrated.with_model(slide(1.0, 1.0))
-    assert other.motion_intervals is None, "widths of another robot"
+    assert calibrated.with_model(slide(1.0, 1.0)).motion_intervals is None, "widths of another robot"
 
 
 def test_without_calibration_the_samples_decide(log):

@@ -200,8 +200,7 @@ def test_a_cause_is_what_ridge_regression_finds(times):
     cause = misfit(space.model_at(space.start), [rows], [data.a], [left], lambda each: each[0] / noise[:, None], found)
     C = (-(rows.delivered + left)[:, :, None] * np.eye(6) / noise[:, None]).reshape(r.size, -1)
     both = np.block([[C, J], [np.eye(6) / 0.2, np.zeros((6, space.size))], [np.zeros((space.size, 6)), one]])
-    right = np.concatenate([(r / noise).ravel(), np.zeros(6 + space.size)])
-    expected = -np.linalg.lstsq(both, right)[0]
+    expected = -np.linalg.lstsq(both, np.concatenate([(r / noise).ravel(), np.zeros(6 + space.size)]))[0]
     if times < 0.0:  # turned torques are no gains, though a linear step explains much by them
         assert 0.8 < abs(expected[:6]).max() < 1.6
         assert cause is None or "gains" not in cause[0].numbers

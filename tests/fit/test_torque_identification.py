@@ -112,8 +112,7 @@ def test_intervals_hold_the_truth():
 
 def test_what_the_log_does_not_show_is_said():
     train = recorded(60, 6, noise=0.1)
-    still = replace(train, v=np.zeros_like(train.v), a=np.zeros_like(train.a))
-    found = identified(still, given(), Viscous())
+    found = identified(replace(train, v=np.zeros_like(train.v), a=np.zeros_like(train.a)), given(), Viscous())
     assert found.parameters["viscous.pan"].decided_by == "prior"
     assert found.parameters["viscous.pan"].why == "no row shows it"
     assert found.parameters["upper.mass"].decided_by == "prior"  # never lifted, never turned

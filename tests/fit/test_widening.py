@@ -83,8 +83,7 @@ def test_an_unknown_variance_widens_as_the_closed_form_does():
     shares = [told / max(told, objective(theta + sign * step) - objective(theta)) for sign in (1.0, -1.0)]
     more = 0.5 * sum(k * ((m - mean) ** 2 + v - variance) for k, (m, v) in zip(shares, sides, strict=True))
     expected = math.sqrt(max(1.0, 1.0 + (more / variance).mean()))
-    states = widening._States(posterior)
-    assert states.mixture_factor(posterior) == pytest.approx(expected, rel=1e-2)
+    assert widening._States(posterior).mixture_factor(posterior) == pytest.approx(expected, rel=1e-2)
     assert expected > 1.01
 
 

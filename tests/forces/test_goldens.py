@@ -35,8 +35,7 @@ def of_law(law, dynamics) -> dict:
     names = law.bound_to(robot).memory_names(robot)
     bound = (replace(law, memory=False) if names else law).bound_to(robot)
     typical = {name: k + np.arange(1.0, 4.0) for k, name in enumerate(("force", "position", "velocity", "inertia"))}
-    seen = bound.seen(state)
-    features = () if isinstance(law, RigidBodies | Payload) else bound.features(seen)
+    features = () if isinstance(law, RigidBodies | Payload) else bound.features(bound.seen(state))
     opened = bound.open(bound) if bound.coefficients else bound
     return {
         "values": numbers(bound.values.values()),

@@ -85,8 +85,7 @@ def test_it_is_the_solution_of_dahls_equation():
 
 def test_it_is_smooth_in_sigma_and_bounded():
     past = torch.tensor(np.random.default_rng(0).normal(0.0, 1e-3, (4, 3, 6)))
-    sigma = SIGMA.clone().requires_grad_()
-    assert torch.autograd.gradcheck(lambda s: after_strokes(past, s), sigma)
+    assert torch.autograd.gradcheck(lambda s: after_strokes(past, s), SIGMA.clone().requires_grad_())
     assert float(after_strokes(past, SIGMA).abs().max()) < 1.0
     between = after_strokes(past, SIGMA, 1.0) - after_strokes(past, SIGMA, -1.0)
     torch.testing.assert_close(between, 2.0 * torch.exp(-SIGMA * past.abs().sum(-1)))  # what a start leaves
@@ -142,8 +141,7 @@ def test_load_and_speed_change_its_level(law, lugre_log):
     q, v = (torch.tensor(np.array(x)) for x in (lugre_log.q, lugre_log.v))
     a = model.robot.forward_dynamics(q, v, rigid)
     loaded = replace(lugre_log, u=u.numpy(), a=a.numpy())
-    seen = with_memory(loaded, model)
-    expected = model.dynamics(q, v, torch.tensor(seen.u)).acceleration_map().offset
+    expected = model.dynamics(q, v, torch.tensor(with_memory(loaded, model).u)).acceleration_map().offset
     torch.testing.assert_close(expected, a, rtol=1e-8, atol=1e-8)
     found = fit(arm_model(0).with_forces(law(memory=True)), loaded, Torques(), rows=1000)
     for name in ("level", "factor"):
@@ -234,7 +232,6 @@ def test_joints_that_stand_and_pauses_and_gaps_are_no_harm(lugre_log):  # the fi
             if not name.startswith("viscous"):
                 assert found[name].value == pytest.approx(value, rel=0.1), name
     q[:, 1], v[:, 1], a[:, 1] = q[0, 1], 0.0, 0.0
-    still = log_of(q, v, a, lugre_log.u, lugre_log.time)
-    found = fit(model, still, Torques(), rows=1000).parameters
+    found = fit(model, log_of(q, v, a, lugre_log.u, lugre_log.time), Torques(), rows=1000).parameters
     for name in ("coulomb.level.lift", "coulomb.sigma.lift"):
         assert (found[name].decided_by, found[name].why) == ("prior", "no row shows it")

@@ -76,8 +76,7 @@ def lines(draw: st.DrawFn) -> Line:
     how = st.sampled_from(("option", "option", "option", "replace", "replace", "path", "drop", "insert"))
     edit = st.tuples(st.integers(0, 40), how, options, WORDS | PATHS | st.sampled_from(AIR))
     own = [name for name in MOVING if name.strip() == command]
-    moving = draw(st.sampled_from(("", *own)))
-    return Line(command, moving, draw(st.lists(edit, min_size=1, max_size=4)))
+    return Line(command, draw(st.sampled_from(("", *own))), draw(st.lists(edit, min_size=1, max_size=4)))
 
 
 def words_of(case: Line) -> list[str]:

@@ -55,8 +55,7 @@ def test_factor_and_inverse_live_in_the_memory_of_the_matrix():
 def test_the_smallest_sufficient_jitter_is_added_and_reported(relative):
     """A matrix whose smallest eigenvalue is -relative / 3 of its mean diagonal."""
     basis = torch.linalg.qr(normal(5, 5)).Q
-    eigenvalues = torch.tensor([1.0, 1.0, 1.0, 2.0, -relative / 3.0], dtype=torch.float64)
-    matrix = (basis * eigenvalues) @ basis.mT
+    matrix = (basis * torch.tensor([1.0, 1.0, 1.0, 2.0, -relative / 3.0], dtype=torch.float64)) @ basis.mT
     matrix = 0.5 * (matrix + matrix.mT)
     with pytest.warns(NumericalWarning, match=r"5 x 5 covariance positive definite; larger noise"):
         factor = factorize(matrix.clone)

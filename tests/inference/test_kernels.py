@@ -83,8 +83,7 @@ def test_gradients_are_those_of_gpytorch(kernel):
 def test_the_variance_of_a_point_is_the_output_scale_to_the_last_bit():
     """Rounding of |z_i - z_i|^2 would make it smaller."""
     kernel = scaled_rbf(3)
-    K = kernel_matrix(kernel, 1e3 * normal(30, 3))
-    assert torch.equal(K.diagonal(), kernel.outputscale.expand(30))
+    assert torch.equal(kernel_matrix(kernel, 1e3 * normal(30, 3)).diagonal(), kernel.outputscale.expand(30))
 
 
 @pytest.mark.parametrize("shift", [1e3, 1e6])

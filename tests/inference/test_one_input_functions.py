@@ -102,8 +102,7 @@ def test_slopes_are_those_of_the_sums(expression):
 
 def test_what_has_no_form():
     """Several inputs, and what is smooth."""
-    kernels = LatentKernels([kernel_of("matern-3/2", 2, 1.0)])
-    several = Latents(kernels, (normal(5, 2),), (normal(5),))
+    several = Latents(LatentKernels([kernel_of("matern-3/2", 2, 1.0)]), (normal(5, 2),), (normal(5),))
     assert one_input_form(several, 0) is None
     assert drawn_form(draw_functions(posterior("matern-3/2", 2), 2, seed=0), several, 0) is None
     assert one_input_form(latents("squared-exponential", normal(5)), 0) is None

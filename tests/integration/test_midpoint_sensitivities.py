@@ -65,8 +65,7 @@ def test_derivatives_are_those_of_finite_differences(given):
     small, nv = 1e-6, model.robot.nv
 
     def q_at(dq, dv, friction):
-        of = accelerations(model, LEVELS + friction, 0.1)
-        return window_motions(of, q0 + dq, v0 + dv, u, H, guess).q
+        return window_motions(accelerations(model, LEVELS + friction, 0.1), q0 + dq, v0 + dv, u, H, guess).q
 
     found = window_motions(accelerations(model, LEVELS, 0.1), q0, v0, u, H, guess)
     e, f = small * torch.randn(2, 2 * nv, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
@@ -87,5 +86,4 @@ def test_windows_without_an_end_are_reported(given):
         a, slope = rows_jacobian(lambda v: away(q, v, u), v)
         return Linear(a, torch.zeros_like(slope), slope)
 
-    found = window_motions(Accelerations(away, linear), q0, v0.abs(), u, H, guess)
-    assert not bool(found.found.any())
+    assert not bool(window_motions(Accelerations(away, linear), q0, v0.abs(), u, H, guess).found.any())

@@ -79,8 +79,7 @@ def regular_states(built: Model, count: int) -> tuple[torch.Tensor, torch.Tensor
 def solve_kkt(M, Q, A, b):
     """a and lambda from [[M, -A^T], [A, 0]] [a; lambda] = [Q; b], dense; of minimum norm where A is redundant."""
     m, nv = A.shape[-2:]
-    batch = M.shape[:-2]
-    matrix = torch.cat([torch.cat([M, -A.mT], -1), torch.cat([A, A.new_zeros(*batch, m, m)], -1)], -2)
+    matrix = torch.cat([torch.cat([M, -A.mT], -1), torch.cat([A, A.new_zeros(*M.shape[:-2], m, m)], -1)], -2)
     right = torch.cat([Q, b], -1)[..., None]
     full_rank = m == 0 or int(torch.linalg.matrix_rank(A, rtol=1e-9).min()) == m
     if full_rank:

@@ -48,8 +48,7 @@ class TestAgainstDenseEquations:
     def test_H_and_the_constrained_offset(self, solved):
         """H is the response to unit forces; the constraint force gives the offset when nothing else acts."""
         dynamics, Q_U = solved
-        nothing = torch.zeros_like(Q_U)
-        at_rest, multiplier = solve_kkt(dynamics.M, nothing, dynamics.A, dynamics.b)
+        at_rest, multiplier = solve_kkt(dynamics.M, torch.zeros_like(Q_U), dynamics.A, dynamics.b)
         assert_close(
             (dynamics.M @ dynamics.constrained_offset[..., None])[..., 0],
             (dynamics.A.mT @ multiplier[..., None])[..., 0],

@@ -59,8 +59,7 @@ def test_accelerations_and_foot_forces_are_those_of_the_equations_of_motion(walk
                 rows.append((J, robot.kinematics(q[k], v[k]).frame_bias_acceleration(frame, point)[:3]))
         A = torch.cat([J for J, _ in rows]) if rows else torch.zeros(0, robot.nv).double()
         drift = torch.cat([each for _, each in rows]) if rows else torch.zeros(0).double()
-        zero = torch.zeros(len(A), len(A)).double()
-        whole = torch.cat([torch.cat([M, -A.mT], 1), torch.cat([A, zero], 1)])
+        whole = torch.cat([torch.cat([M, -A.mT], 1), torch.cat([A, torch.zeros(len(A), len(A)).double()], 1)])
         solution = torch.linalg.solve(whole, torch.cat([tau - bias, -drift]))
         assert_close(a[k], solution[: robot.nv], rtol=1e-7, atol=1e-7)
         acting = torch.repeat_interleave(u[k, 3:] > 0, 3)
@@ -80,8 +79,7 @@ def test_a_frame_that_is_held_neither_moves_nor_turns(robot):
     q, v, u = states(robot, 3)
     v = v - v  # at rest, so that the frame has to stay without acceleration of any kind
     a = model.dynamics(q, v, u).acceleration(torch.zeros_like(v))
-    moved = (robot.frame_jacobian(q, "a_foot") @ a[..., None])[..., 0]
-    assert moved.abs().max() < 1e-9 * a.abs().max()
+    assert (robot.frame_jacobian(q, "a_foot") @ a[..., None])[..., 0].abs().max() < 1e-9 * a.abs().max()
 
 
 def test_the_point_of_a_ball_that_touches_level_ground_rests(robot):

@@ -50,8 +50,7 @@ class Weight(Unknown):
         return ("kg",)
 
     def direction(self, dynamics):
-        J = dynamics.state.kinematics.frame_jacobian(self.frame, (0.0, 0.0, 0.0))
-        return -9.81 * J[..., 2, :, None]
+        return -9.81 * dynamics.state.kinematics.frame_jacobian(self.frame, (0.0, 0.0, 0.0))[..., 2, :, None]
 
     def point_force(self, dynamics):
         column = torch.tensor([[0.0], [0.0], [-9.81]], dtype=torch.float64)

@@ -230,8 +230,7 @@ def test_intervals_count_another_level_until_it_is_seen(steady):
 
 
 def test_scaled_friction_is_a_multiple():
-    gear = GearFriction(1.0, 0.2, 0.3, 0.5, 0.1, 0.05, memory=False)
-    model = slide(3.0, 4.0).with_forces(gear)
+    model = slide(3.0, 4.0).with_forces(GearFriction(1.0, 0.2, 0.3, 0.5, 0.1, 0.05, memory=False))
     q, v, u = torch.zeros(4, 1), torch.tensor([[-1.0], [0.01], [0.1], [2.0]]), torch.ones(4, 1)
     state = model.state(*(x.double() for x in (q, v, u)))
     once, twice = (
@@ -256,8 +255,7 @@ def test_many_rows_are_thinned():
 
 def test_what_it_is_not_learned_for():
     data = arm_data(30, seed=1)
-    frictionless = fit(data.model.with_forces(noise=Noise(0.1)), data, restarts=1)
-    assert "drift" not in frictionless.settings
+    assert "drift" not in fit(data.model.with_forces(noise=Noise(0.1)), data, restarts=1).settings
     log = recording(1, seconds=5.0)
     functions = fit(log.model.with_forces(JointFriction(), noise=Noise(NOISE)), log.rows(slice(0, 60)), restarts=1)
     assert "drift" in functions.settings

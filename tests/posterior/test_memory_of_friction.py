@@ -24,8 +24,7 @@ from forcegp.posterior import casadi_function
 )
 def test_compiled_motions_carry_the_state_along(integrator, transmission, lugre_log):  # noqa: F811  # the fixture
     law = Coulomb([0.8, 0.5, 0.3], 0.1, sigma=300.0, memory=("pan", "bend"), transmission=transmission)
-    model = arm_model(0).with_forces(law, noise=Noise(0.1))
-    posterior = fit(model, lugre_log.rows(slice(0, 200)))
+    posterior = fit(arm_model(0).with_forces(law, noise=Noise(0.1)), lugre_log.rows(slice(0, 200)))
     u = np.zeros((4, 60, 5))
     u[..., :3] = lugre_log.u[None, :60] * np.array([1.0, 0.5, -0.5, 0.2])[:, None, None]
     u[:, 0, 3:] = np.random.default_rng(0).uniform(-0.9, 0.9, (4, 2))

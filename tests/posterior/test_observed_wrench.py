@@ -67,8 +67,7 @@ def test():
 
 def acting(dataset, lag=0.06):
     """With the rotor speeds that act, from half a second on."""
-    late = lagged(dataset.u, dataset.time, lag)
-    return replace(dataset, u=late).rows(np.arange(120, len(dataset)))
+    return replace(dataset, u=lagged(dataset.u, dataset.time, lag)).rows(np.arange(120, len(dataset)))
 
 
 def test_new_wind_is_observed_from_the_past(posterior, test):

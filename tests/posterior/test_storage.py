@@ -149,8 +149,7 @@ def test_not_a_folder(tmp_path):
 def test_a_surface_that_is_code_cannot_be_stored(tmp_path):
     surface = ImplicitSurface(lambda p: p[2] + 0.2 * p[0] - 0.4)
     model = arm_model().with_contacts((Contact("hand", (0.0, 0.0, 0.2), surface),))
-    data = arm_data(12, 6, model)
-    fitted = fit(model.with_forces(JointForces()), data, restarts=1, options=OPTIONS)
+    fitted = fit(model.with_forces(JointForces()), arm_data(12, 6, model), restarts=1, options=OPTIONS)
     with pytest.raises(ContactError, match="never code"):
         save_posterior(fitted, tmp_path / "run")
     assert list(tmp_path.iterdir()) == []

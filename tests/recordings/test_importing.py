@@ -88,8 +88,7 @@ def test_a_single_gap_of_ten_steps_is_bridged_and_one_more_is_not(tmp_path):
     for missing, episodes in ((9, 1), (10, 2)):
         rows = np.r_[0:100, 100 + missing : 200]
         data = {name: values[rows] for name, values in motion().items()}
-        found = imported(write_text(tmp_path / "log.csv", table(data)), NAMES)
-        assert len(found.episodes) == episodes
+        assert len(imported(write_text(tmp_path / "log.csv", table(data)), NAMES).episodes) == episodes
 
 
 def test_start_and_end_count_from_the_first_row_of_each_episode(tmp_path):

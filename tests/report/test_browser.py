@@ -59,8 +59,7 @@ def opened(browser, path):
 def picture(page, place):
     """What the page shows, in grey and coarse."""
     page.screenshot(path=place, full_page=True)
-    image = Image.open(place).convert("L")
-    return np.asarray(image.resize(COARSE, Image.Resampling.BOX), dtype=float)
+    return np.asarray(Image.open(place).convert("L").resize(COARSE, Image.Resampling.BOX), dtype=float)
 
 
 def test_the_page_opens_without_network_looks_as_before_and_the_robot_moves(browser, report, tmp_path):

@@ -81,8 +81,7 @@ CASES = {
 def case(request):
     text, mimics, options = CASES[request.param]
     robot = Robot.from_urdf_text(with_mimics(text, mimics), **options)
-    states = np.random.default_rng(3).normal(size=(3, COUNT, robot.nv))
-    return robot, Projected(text, mimics, robot), *states
+    return robot, Projected(text, mimics, robot), *np.random.default_rng(3).normal(size=(3, COUNT, robot.nv))
 
 
 def close(ours, theirs):
@@ -145,8 +144,7 @@ def test_what_cannot_be_followed_is_named_and_can_be_locked(mimic, message):
     with pytest.raises(errors.RobotModelError, match=message) as caught:
         Robot.from_urdf_text(with_mimics(CHAIN, mimic))
     assert caught.value.remedy == {"locked": dict.fromkeys(sorted(mimic), 0.0)}
-    robot = Robot.from_urdf_text(with_mimics(CHAIN, mimic), **caught.value.remedy)
-    assert robot.nv == 4 - len(mimic)
+    assert Robot.from_urdf_text(with_mimics(CHAIN, mimic), **caught.value.remedy).nv == 4 - len(mimic)
 
 
 def test_mimics_that_do_nothing():

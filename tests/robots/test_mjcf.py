@@ -274,5 +274,4 @@ def test_rotors_on_links_that_move_are_inputs(tmp_path, base, gear):
         np.testing.assert_allclose(delivered[k], oracle.T.T @ oracle.data.qfrc_actuator, atol=1e-9)
     assert Model.from_json(model.to_json()).inputs == names
     if base:
-        held = Model.from_mjcf(tmp_path / "rotors.xml", locked={"tilt": 0.3})
-        assert held.inputs == ("right", "left")
+        assert Model.from_mjcf(tmp_path / "rotors.xml", locked={"tilt": 0.3}).inputs == ("right", "left")

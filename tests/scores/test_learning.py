@@ -46,8 +46,7 @@ def test_robots_that_fly_have_air_and_feet_that_stand_do_not_slide():
     rotors = Actuation(), Thrusters("body", ((0.2, 0.0, 0.0), (-0.1, 0.2, 0.0), (-0.1, -0.2, 0.0))), RigidBodies()
     robots = [Robot.from_urdf_text(DRONE, base="floating", locked=locked) for locked in ({"tilt": 0.0}, {})]
     drones = [Model(robot, (), rotors) for robot in robots]
-    limbs = Robot.from_urdf_text(LIMBS, base="floating")
-    walker = Model(limbs, fixed_point("a_foot", switch="a_stands"))
+    walker = Model(Robot.from_urdf_text(LIMBS, base="floating"), fixed_point("a_foot", switch="a_stands"))
     models = *drones, walker, Model(robots[0], (), (RigidBodies(),))
     assert usual_forces(arm_model(contacts=1)) == "gp:tool-friction"
     found = [usual_forces(model) for model in models]

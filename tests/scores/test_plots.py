@@ -37,8 +37,7 @@ def test_a_figure_that_cannot_be_drawn_leaves_the_old_file_and_nothing_else(tmp_
 
 
 def test_a_window_holds_the_rows_of_one_episode_in_order_of_time(test_data):
-    shuffled = test_data.rows(np.random.default_rng(0).permutation(len(test_data)))
-    rows = window(shuffled, 0.1, 0.2)
+    rows = window(test_data.rows(np.random.default_rng(0).permutation(len(test_data))), 0.1, 0.2)
     np.testing.assert_allclose(rows.time, test_data.time[(test_data.time >= 0.1) & (test_data.time <= 0.3)])
     with pytest.raises(InvalidInput, match=r"no rows from 5\.0 s on"):
         window(test_data, 5.0, 1.0)

@@ -99,8 +99,7 @@ class CheckInput:
     def below(self, cutoff: float) -> "CheckInput":
         """The same behind a filter at this frequency [Hz]."""
         shortest = min(np.ptp(self.even.time[self.even.episode == number]) for number in self.even.episodes)
-        trim = float(min(1.0 / cutoff, LONGEST_TRIM * shortest))
-        rows = Preparation(cutoff=cutoff, trim=trim).apply(self.even)
+        rows = Preparation(cutoff=cutoff, trim=float(min(1.0 / cutoff, LONGEST_TRIM * shortest))).apply(self.even)
         noise = np.array(preparation_report(rows.metadata)["acceleration_noise"]["after"], float)
         found = {"prepared": rows, "compared": rows, "compared_noise": np.nan_to_num(noise), "sharper": None}
         return replace(self, **found, compared_cutoff=cutoff)
@@ -201,8 +200,7 @@ def _few_stretches(dataset: Dataset) -> Dataset:
     length = STRETCH_ROWS if dataset.nv <= FEW_JOINTS else STRETCH_ROWS // 2
     if len(dataset) <= STRETCHES * length:
         return dataset
-    starts = np.linspace(0, len(dataset) - length, STRETCHES).astype(int)
-    rows = (starts[:, None] + np.arange(length)).ravel()
+    rows = (np.linspace(0, len(dataset) - length, STRETCHES).astype(int)[:, None] + np.arange(length)).ravel()
     pieces = np.repeat(np.arange(STRETCHES), length)
     _, numbers = np.unique(np.stack([pieces, dataset.episode[rows]]), axis=1, return_inverse=True)
     return replace(dataset.rows(rows), episode=numbers.ravel())

@@ -249,45 +249,42 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         at = int(np.argmin(left))
         return (float(left[at]), float(values[at])) if 0 < at < len(values) - 1 else (np.inf, 0.0)
 
+    def moved(joint: int, x: float) -> Change:
+        return lambda rows: replace(changed()(rows), q=rows.q + x * np.eye(rows.nv)[joint])
+
+    def geared(joint: int, x: float) -> Change:
+        return changed("qva", factor=np.where(np.arange(rows.nv) == joint, x, 1.0))
+
     for joint in _places(inputs.rotates):
-        one = np.eye(rows.nv)[joint]
-        left, x = best([needed_torques(robot, replace(rows, q=rows.q + y * one)) for y in zeros], waves, turns)
+        left, x = best([needed_torques(robot, moved(joint, y)(rows)) for y in zeros], waves, turns)
         what = (
             f"the torques fit positions of {names[joint]} that are {x:+.3g} rad ({x / DEGREE:+.0f} degrees) from the "
-            "logged ones: its zero is elsewhere"
         )
+        what += "logged ones: its zero is elsewhere"
         do = f"Add it to the column, as in forcegp import --q 'COLUMN {x:+.3g}', or correct the URDF; "
         do += "about the axis of a first joint it may be the base that is turned."
-        cause = number("joint zero", what, joint, x, NUMBER + 0.3, do=do)
         if abs(x) > 0.05:
-            found.append(
-                (left, cause, lambda x=x, one=one: now.after(lambda rows: replace(changed()(rows), q=rows.q + x * one)))
-            )
-    for joint in range(rows.nv):
-
-        def geared(y: float, joint: int = joint) -> Change:
-            return changed("qva", factor=np.where(np.arange(rows.nv) == joint, y, 1.0))
-
+            cause = number("joint zero", what, joint, x, NUMBER + 0.3, do=do)
+            found.append((left, cause, lambda joint=joint, x=x: now.after(moved(joint, x))))
+    for joint in np.flatnonzero(np.ptp(rows.q, axis=0) > 0.0).tolist():
         left, x = np.inf, 1.0
-        for step in (1.0, 0.1) if np.ptp(rows.q[:, joint]) > 0.0 else ():
+        for step in (1.0, 0.1):
             every = (x or 1.0) * RATIOS**step
-            left, x = best([needed_torques(robot, geared(y)(rows)) for y in every], np.eye(len(every)), every)
+            left, x = best([needed_torques(robot, geared(joint, y)(rows)) for y in every], np.eye(len(every)), every)
         what = f"the torques fit positions and velocities of {names[joint]} that are {x:.4g} times the logged ones"
         do = f"Correct its gear ratio, or the columns, as in forcegp import --q 'COLUMN * {x:.4g}'."
-        cause = number("gear ratio", what, joint, x, NUMBER + 0.4, do=do)
         if x > 0.0 and abs(np.log(x)) > 0.05:
-            found.append((left, cause, lambda geared=geared, x=x: now.after(geared(x))))
+            cause = number("gear ratio", what, joint, x, NUMBER + 0.4, do=do)
+            found.append((left, cause, lambda joint=joint, x=x: now.after(geared(joint, x))))
     for body, drive in enumerate(robot.layout.drives):
         length = float(torch.linalg.vector_norm(robot.tree.rest[body, :3, 3, 0]))
         if length == 0.0 or robot.layout.parents[body] < 0:
             continue  # where the whole robot stands changes nothing
         left, x = best([needed_torques(with_length(robot, body, y), rows) for y in parts], parabolas, FACTORS)
-        what = (
-            f"the torques fit {x:.3g} times the length from {names[drive.joint]} to the joint before "
-            f"({x * length:.3g} instead of {length:.3g} m)"
-        )
-        cause = number("lengths", what, drive.joint, x, NUMBER + 0.2)
+        what = f"the torques fit {x:.3g} times the length from {names[drive.joint]} to the joint before "
+        what += f"({x * length:.3g} instead of {length:.3g} m)"
         if abs(np.log(max(x, 1e-9))) > 0.05:
+            cause = number("lengths", what, drive.joint, x, NUMBER + 0.2)
             found.append((left, cause, lambda x=x, b=body: now.after(changed(), with_length(robot, b, x))))
     for _, cause, made in sorted(found, key=lambda each: each[0])[:SCANNED]:
         yield cause, made()

@@ -82,8 +82,7 @@ def base_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         yield look(about="base", what="too few successive rows to compare positions and velocities of the base.")
         return
     for group in model.robot.layout.groups:
-        own = np.arange(dataset.nv)[group.rows]
-        windows = _Windows.of(dataset, own[3:])
+        windows = _Windows.of(dataset, np.arange(dataset.nv)[group.rows][3:])
         q, v, a = (windows.of_signal(getattr(dataset, name)) for name in ("q", "v", "a"))
         at, v, a = q[:, group.places], v[:, group.rows], a[:, group.rows]
         yield from _of_velocity(windows, group, at, v, *_stated(dataset))
@@ -198,8 +197,7 @@ def _of_velocity(
     def mistaken(recorded: float, other: float, speed: float) -> bool:
         return recorded > CLEARLY * speed and other < CLEARLY * min(recorded, speed)
 
-    turned = _in_world(q, v)
-    raw = torch.where(torch.tensor([stated[part] == "world" for part in angular]), turned, v)
+    raw = torch.where(torch.tensor([stated[part] == "world" for part in angular]), _in_world(q, v), v)
 
     def best_axes(at: Tensor) -> tuple[dict[str, str], float, float]:
         """Parts of v that fit in other axes than stated, the error that is left with them, and that as stated."""

@@ -19,6 +19,7 @@ from forcegp.data.dataset import require_rows
 from forcegp.data.imu import imu_doubts
 from forcegp.doubts import LEVELS, Doubt, Doubts, listed, look
 from forcegp.errors import DatasetError, InvalidInput, require_type
+from forcegp.fit.force_sensors import force_sensor_doubts
 from forcegp.fit.sensors import torque_sensor_doubts
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -122,7 +123,8 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
     moved = Doubts(doubts).of("velocity").level != "wrong"
     contacts = contact_doubts(inputs.mended, model)
     if moved and inputs.prepared is not None:
-        doubts += [*imu_doubts(inputs.prepared, model), *torque_sensor_doubts(inputs.prepared, model)]
+        sensors = imu_doubts, torque_sensor_doubts, force_sensor_doubts
+        doubts += [doubt for of_sensors in sensors for doubt in of_sensors(inputs.prepared, model)]
     doubts += [*contacts, *stance_doubts(inputs.log, model)]
     comparison = None
     if inputs.compared is None or any(each.numbers.get("quantity") == "q" for each in registers):
@@ -163,7 +165,8 @@ def _of_base(dataset: Dataset, model: Model, inputs_of: Inputs) -> Doubts:
     of_base = unmeasured or list(base_doubts(dataset, model))
     if not unmeasured and Doubts(of_base).level != "wrong":  # forces in wrong axes show nothing
         of_base += carried_doubts(dataset, model)
-    of_base += imu_doubts(dataset, model) if Doubts(of_base).level != "wrong" else ()
+    sensors = imu_doubts, force_sensor_doubts
+    of_base += [x for of in sensors for x in of(dataset, model)] if Doubts(of_base).level != "wrong" else []
     flags = stance_doubts(dataset, model) if Doubts(of_joints).level != "wrong" else ()  # wrong v contradict any flag
     return Doubts([*of_base, *of_joints, *flags])
 

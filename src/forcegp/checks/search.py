@@ -27,7 +27,8 @@ GAIN = np.log(4.0)  # by which the product over all joints of what remains must 
 NOISE = 3.0  # how much of the power of the noise is left to every explanation
 BEAM, DEPTH = 3, 3  # explanations that are continued, and causes of one
 WORSE = 1.05  # share from which on predicting nothing is better
-BLOCKS = 4  # of the log, each of which is predicted from the others
+BLOCKS, T_95 = 4, 3.18  # of the log, each of which is predicted from the others; Student's t of one less
+ATTENUATED = 0.01  # of a factor: noise of accelerations makes it smaller
 FREE = 4.0  # share that an explanation may leave, over what a robot with any masses and any friction would
 GOOD = 0.03  # share that a good log may leave
 DOUBTFUL = 2e-3  # share above which causes are tried
@@ -97,8 +98,7 @@ class Explanation:
     @cached_property
     def value(self) -> float:
         """Logarithm of what remains, over all joints, and the costs of what was assumed."""
-        places = np.arange(len(self.chosen))
-        left = np.nansum((self._logarithms() + CHOICES)[places, self.chosen])
+        left = np.nansum((self._logarithms() + CHOICES)[np.arange(len(self.chosen)), self.chosen])
         return float(left) + sum(cause.cost for cause in self.causes) + SIGN * len(self.turned)
 
     @property
@@ -172,6 +172,14 @@ class Explanation:
             number, _ = positive_fit(friction[rest] - middle[2], target[rest])
             left += np.square(target[block] - (friction[block] - middle[2]) @ number).sum()
         return float(left / power)
+
+    def error_of_factor(self, joint: int) -> float:
+        """Half of its 95 % interval, by what each block of the log changes (jackknife)."""
+        u, tau, friction = self.log.rows.u[:, joint], self.log.tau[:, joint], self.log.friction[:, joint]
+        rows, columns = np.arange(len(u)), np.c_[tau, friction]
+        rests = [np.setdiff1d(rows, block) for block in np.array_split(rows, BLOCKS)]
+        found = [positive_fit(columns[x] - columns[x].mean(axis=0), u[x] - u[x].mean())[0][0] for x in rests]
+        return float(np.hypot(T_95 * np.std(found) * (BLOCKS - 1) ** 0.5, ATTENUATED * np.mean(found)))
 
     @cached_property
     def of_any_masses(self) -> Float[np.ndarray, "rows nv"]:
@@ -346,17 +354,17 @@ def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -
         off = off[(best.exact[off] <= EXPLAINED) & (best.shares[off] > RESTS)]
     if len(off) < (1 if explained else 2):
         return
-    joints, factors = inputs.named(off), factors[off]
-    each = ", ".join(f"{name} {value:.4g}" for name, value in zip(joints, factors, strict=True))
+    joints, factors, errors = inputs.named(off), factors[off], [*map(best.error_of_factor, off.tolist())]
+    each = ", ".join(f"{name} {x:.4g} ± {error:.1g}" for name, x, error in zip(joints, factors, errors, strict=True))
     yield Doubt(
         level="wrong" if not explained or factors.min() < 1.0 / FAR or factors.max() > MUCH_MORE else "look",
         about="torque constant" if len(off) == 1 else "torque unit",
-        what=f"the measured torque is a multiple of what the motion needs: {each}.",
+        what=f"the measured torque is a multiple of what the motion needs, if masses are right: {each}.",
         do="Such factors point to torque before the gears (multiply by the gear ratio), motor current (multiply by the "
         "torque constant), a rotor inertia that is missing, or wrong masses; compare with the data sheet, or let "
         "forcegp payload --forces gain,viscous,gear,offset,rotor estimate the constants of all joints.",
         joints=joints,
-        numbers={"factor": dict(zip(joints, factors.tolist(), strict=True))},
+        numbers={"factor": dict(zip(joints, factors.tolist(), strict=True)), "error_95": errors},
     )
 
 

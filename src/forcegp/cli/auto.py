@@ -56,8 +56,7 @@ class Auto(Command):
     replaces = False
 
     logs: Positional[Annotated[tuple[Path, ...], LOG, arg(metavar="LOG...", help_behavior_hint="")]]
-    """Files, or folders of ROS 2 bags, of the robot of --robot. Thrusters, actuators and contacts of another kind come
-    with --identified."""
+    """Files, or folders of ROS 2 bags, of --robot. Thrusters, actuators and other contacts come with --identified."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder of results; an unfinished one resumes."""
     correct: bool = False

@@ -69,8 +69,7 @@ class Export(Command):
     unchecked: bool = False
     """Do not compile the program and compare it with the model."""
     free: Annotated[str | None, unless_given("FREE.h5", "no monitor", str)] = None
-    """With a monitor of contacts, to be called at the rate of this log. It holds 40 s or more of free motion that the
-    model did not learn from."""
+    """With a monitor of contacts, called at the rate of this log: 40 s or more of free motion, not learned from."""
     alarms: AlarmOptions = AlarmOptions()
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
@@ -141,8 +140,7 @@ class Monitor(Command):
     out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write, with contacts.json."""
     free: Annotated[str, arg(metavar="S|FREE.h5")]
-    """Motion of 40 s or more without contacts, not used for training: the first S seconds of LOG, which are not
-    searched, or another log."""
+    """Motion of 40 s or more without contacts, not used for training: the first S seconds of LOG, or another log."""
     alarms: AlarmOptions = AlarmOptions()
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
@@ -234,8 +232,7 @@ class Excite(Command):
     seconds: Annotated[float, arg(metavar="S")] = 10.0
     """How long the motion lasts."""
     limits: Annotated[tuple[str, ...], listed(goes_on=NUMBERS), unless_given("WHAT=X,...", "the robot file's")] = ()
-    """Largest position (from the start), velocity, acceleration or torque, for all joints or for each. Of the limits of
-    the robot file nine tenths are used."""
+    """Largest position (from the start), velocity, acceleration, torque, of all or each; default: .9 of limits."""
     posture: Annotated[tuple[float, ...], listed(float), unless_given("Q,...", "middle of log or ranges")] = ()
     """Positions of the joints at both ends."""
     avoid: Annotated[tuple[str, ...], listed(goes_on=NUMBERS), unless_given(CONTACTS, "its contacts")] = ()

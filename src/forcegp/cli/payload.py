@@ -118,8 +118,7 @@ class Payload(Command):
         if forcegp.data.preparation_report(dataset.metadata):
             return model, dataset
         with terminal.progress(f"preparing {path}"):
-            raw = replace(dataset, model=model)
-            prepared = self.filter.preparation().apply(raw)
+            prepared = self.filter.preparation().apply(replace(dataset, model=model))
         why = forcegp.data.preparation_report(prepared.metadata)["why"]
         notes += [f"{path}: {name}: {why[name]}" for name in ("cutoff", "delay") if name in why]
         return model, prepared

@@ -50,8 +50,7 @@ class Score(Command):
     """What `identified` is, whose mass matrix turns errors of accelerations into forces."""
     split: Annotated[str | None, unless_given("SPLIT", "auto, where anything is fitted", str)] = None
     """What is held out. episodes:N,N...: these episodes. leave-one-out: every episode once. blocks:N:K,K...: of N
-    blocks of time of every episode those of these numbers, from 1. auto: a quarter of the episodes, or with one episode
-    blocks:5:3,5."""
+    blocks of time of every episode those of these numbers, from 1. auto: a quarter of episodes, or blocks:5:3,5."""
     guard: Annotated[float, arg(metavar="S")] = 0.25
     """Seconds of training rows left out beside held-out blocks; at least two time constants of the filter."""
     seeds: Annotated[int, arg(metavar="N")] = 5
@@ -65,8 +64,7 @@ class Score(Command):
     observe: Annotated[float, arg(metavar="S")] = 0.0
     """Seconds at the beginning of LOG that a RUN learns from, as a robot at work could; the rest is scored."""
     out: Annotated[Path | None, unless_given("FOLDER", "no folder")] = None
-    """The folder of results: page, numbers, models; of one RUN also report.html with the robot in motion. An
-    unfinished run resumes."""
+    """The folder of results: page, numbers, models; of one RUN also report.html. An unfinished run resumes."""
     models: CandidateOptions = CandidateOptions()
     search: SearchOptions = SearchOptions(points=100)
     robot: RobotOptions = RobotOptions()

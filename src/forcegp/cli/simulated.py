@@ -37,8 +37,7 @@ class Simulate(Command):
 
     kuka-surface: a KUKA iiwa slides its tool on a surface with unmodelled friction, as in Rath, Geist, Trimpe (2021),
     or moves above it. quadruped: a robot on a floating base that shifts its weight and lifts its feet, with an unknown
-    load of 2 kg. quadrotor: a drone on a path in wind, with late rotors. Equal seeds give equal motions; train and test
-    need different ones.
+    load of 2 kg. quadrotor: a drone on a path in wind, with late rotors. Give train and test different seeds.
 
     For example:
       forcegp simulate kuka-surface --seconds 100 --seed 1 --out train.h5
@@ -58,8 +57,7 @@ class Simulate(Command):
     noise: Annotated[float, arg(metavar="SIGMA")] = 0.1
     """Standard deviation of the noise on the measured acceleration in rad/s²; 0 for none."""
     tool_friction: Annotated[str | None, TOOL_FRICTION] = None
-    """Unmodelled friction of the tool: viscous, with 1 N/(m/s) unless given, or a law of dry friction by name, with 0.3
-    of the normal force while it slides."""
+    """Unmodelled friction of the tool: viscous, with 1 N/(m/s) unless given, or a law of dry friction by name."""
     joint_friction: Annotated[str | None, JOINT_FRICTION] = None
     """Unmodelled friction of the joints: none, or viscous and laws by name, as for --forces."""
     surface: Literal["plane", "tilted", "none"] = "plane"

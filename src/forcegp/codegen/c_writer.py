@@ -112,8 +112,7 @@ def write_function(
             operation, *rest = graph.nodes[node]
             if operation == "call":
                 given = ", ".join(_as_real(graph, k, operand) for k in graph.operands(node))
-                size = graph.outputs_of[node]
-                text.append(f"  real c{node}[{size}]; {{ const real z[] = {{{given}}};")
+                text.append(f"  real c{node}[{graph.outputs_of[node]}]; {{ const real z[] = {{{given}}};")
                 text.append(f"  {rest[0]}(t[{tables.index(rest[0])}], live, z, c{node}); }}")
                 continue
             if operation not in LEAVES:

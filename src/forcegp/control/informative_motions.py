@@ -142,8 +142,7 @@ class Excitation(Summary):
     def basis(self) -> list[BSpline]:
         """Of q, v and a, one function per free control point."""
         spans = max(8, round(SPANS * self.seconds))
-        knots = np.pad(np.linspace(0.0, self.seconds, spans + 1), 3, "edge")
-        q = BSpline(knots, np.eye(spans + 3)[:, 3:-3], 3)
+        q = BSpline(np.pad(np.linspace(0.0, self.seconds, spans + 1), 3, "edge"), np.eye(spans + 3)[:, 3:-3], 3)
         return [q, q.derivative(1), q.derivative(2)]
 
     @cached_property

@@ -213,8 +213,7 @@ class ContactMonitor:
         """
         noise = self.calibrated
         acceleration, force = (torch.as_tensor(x).square() for x in (noise.acceleration, noise.force))
-        at_rest = (torch.as_tensor(self.near_rest[0]) * slow).square()
-        S = (M * acceleration) @ M + (force + at_rest).diag_embed()
+        S = (M * acceleration) @ M + (force + (torch.as_tensor(self.near_rest[0]) * slow).square()).diag_embed()
         beyond = (inertial.abs() / self.largest).clamp_min(1.0)
         S = beyond[..., :, None] * S * beyond[..., None, :]
         return S if extra is None else S + extra

@@ -42,8 +42,7 @@ LEAVE_OUT = "leave the contact out (`contacts=none`)."
 def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> Doubts:
     """What the rows of `dataset` contradict about the contacts of `model` (default: its own); empty where nothing.
 
-    Looks at 240 rows, in order of the file, for motion that leaves a surface. Fewer than 10 rows say nothing. Not for
-    models without `RigidBodies`.
+    Looks at 240 rows, in order of the file, for motion that leaves a surface, of 10 or more. Not without `RigidBodies`.
     """
     model = dataset.model if model is None else model
     if len(dataset) < FEWEST_ROWS or not dataset.u.any() or not model.contacts or model.carries_known_forces:

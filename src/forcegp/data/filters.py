@@ -29,8 +29,7 @@ class LowPass:
     """Butterworth low-pass at `cutoff` Hz, run forwards and backwards so that nothing is delayed.
 
     Both ends are continued by point reflection until the transient has died out, so that straight lines pass; two
-    passes square the gain, which is 1/2 at the cut-off. Raises InvalidInput for a cut-off at or above half the sample
-    rate, DatasetError for too few rows.
+    passes square the gain, which is 1/2 at the cut-off. InvalidInput above half the rate, DatasetError for few rows.
     """
 
     cutoff: float
@@ -165,8 +164,7 @@ def differentiated(dataset: Dataset, source: Literal["q", "v"] = "v") -> Dataset
     """The Dataset with `a` computed from `v` by central differences, or `v` and `a` from `q`, within each episode.
 
     Filter `source` first (`low_pass`). `noise_std` becomes None, and `truth` is dropped where `v` changes. Raises
-    DatasetError for rows that are not in order of time, episodes of fewer than 3 rows and positions that jump by a
-    turn; InvalidInput for another source.
+    DatasetError for rows that are not in order of time, episodes of fewer than 3 rows and jumps; or InvalidInput.
     """
     if source not in ("q", "v"):
         raise InvalidInput(f"source is {source!r}; allowed: 'q' (gives v and a) or 'v' (gives a).")

@@ -75,8 +75,7 @@ def is_dataset(path: Path) -> bool:
 def new_file(path: Path) -> Iterator[h5py.File]:
     """An HDF5 file that is written as a whole where the context ends. Raises OSError where the disk is full.
 
-    Until then it is in memory: HDF5 that cannot write cannot close its file either, and crashes the process at its end
-    (2.0.0, segmentation fault).
+    Until then it is in memory: HDF5 2.0.0 that cannot write cannot close its file either, and crashes at the end.
     """
     with h5py.File("new", "w", driver="core", backing_store=False, block_size=2**24) as file:
         yield file

@@ -6,7 +6,7 @@ navigation technology", 2004, section 3.5), which is affine in the acceleration.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,9 +67,13 @@ def delay_doubts(
     if not dataset.time_ordered or len(inner) < len(SHIFTS):
         return
     moved = (np.stack([np.interp(time[inner] + s, time, x) for x in f.T], 1) for s in SHIFTS)
-    left = np.array([_rms(each - p[inner]) for each in moved])
-    late = lowest(left, SHIFTS)
-    if abs(late) > max(LEAST_DELAY, float(np.median(np.diff(time)))) and left.min() < LATE * left[len(SHIFTS) // 2]:
+    yield from late_doubts(which, [_rms(each - p[inner]) for each in moved], float(np.median(np.diff(time))))
+
+
+def late_doubts(which: str, left: Sequence[float], step: float) -> Iterator[Doubt]:
+    """A sensor that leaves so much at each of `SHIFTS`, and its delay if that is far less at another than 0."""
+    late = lowest(np.array(left), SHIFTS)
+    if abs(late) > max(LEAST_DELAY, step) and min(left) < LATE * left[len(SHIFTS) // 2]:
         when = f"{1e3 * abs(late):.1f} ms {'later' if late > 0.0 else 'earlier'} than the motion that it measures"
         what = f"the {which} is logged {when}."
         yield look(about="sensor delay", what=what, do="Shift its columns before an import.", numbers={"delay": late})

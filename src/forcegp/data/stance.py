@@ -31,8 +31,7 @@ of all that they carry: nothing, surely bearing."""
 CERTAIN, APART = 20.0, 1.5
 """How much likelier one class of forces is than the other; distance of their means over the sum of their widths."""
 FALLS, SURE = 0.2, 0.1
-"""Of the weight: nothing bears this share while a robot falls, and something where it stands; noise of its average up
-to which its absence decides."""
+"""Of the weight: nothing bears this while a robot falls, something where it stands; noise up to which it decides."""
 FEW = 10
 MANY_OPEN = 0.25  # share of open rows that more than changes of stance leave
 
@@ -42,8 +41,7 @@ class Stance:
     """Flags (rows, switches) of the contacts called `names`: 1 acts, 0 does not, NaN where the rows leave it open.
 
     `speed` [m/s] is that of what the contact holds, averaged over 40 ms, `slow` (switches,) below which it rests;
-    `force` [N] what the rows ask of it, `bearing` (2,) up to which nothing bears and from which the foot stands; NaN
-    where forces decide nothing.
+    `force` [N] what the rows ask of it, `bearing` (2,) up to which nothing bears, from which it stands, or NaN.
     """
 
     names: tuple[str, ...]
@@ -189,8 +187,7 @@ def _bearing(force: np.ndarray, moves: np.ndarray, quiet: bool = True) -> Float[
     """Forces up to which nothing bears, and from which a foot stands [N]; NaN where they do not differ.
 
     Logarithms of forces in two normal classes, split with the least error (Kittler & Illingworth 1986); in between
-    neither class is `CERTAIN` times as likely. Where hardly a foot moves, which `quiet` velocities tell or two classes,
-    shares of what feet carry.
+    neither class is `CERTAIN` times as likely. Where hardly a foot moves, shares of what they carry.
     """
     carried = np.sort(force[~moves])  # by what they carry: of a foot that swings most of the time, rest is rare
     standing = float(carried[np.searchsorted(carried.cumsum(), 0.5 * carried.sum())]) if len(carried) else 0.0

@@ -41,8 +41,7 @@ def strokes(
     """Displacements (rad or m) of each joint up to every row: since the last reversal, of the stroke before, and so on.
 
     They alternate in sign; those before the first row of an episode are 0. Of joints of several degrees of freedom all
-    are. Only positions count, so pauses and thinned rows do no harm while no reversal is lost. With a `transmission`
-    they are those of its motors.
+    are. Only positions count, so pauses and thinned rows do no harm. With a `transmission` they are those of motors.
     """
     out = np.zeros((len(dataset), dataset.nv, count))
     positions, steps = motor_positions(dataset, transmission)

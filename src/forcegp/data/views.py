@@ -67,8 +67,7 @@ def move_on(dataset: Dataset) -> bool:
 RESTS, IDLE = 0.01, 0.1
 """Share of its whole range within which a joint rests; of the largest range, which counts for idle joints."""
 STILL, SHORTEST, OFTEN, ALONE = 1e-3, 0.3, 0.25, 0.95
-"""Share of its range within which a joint stays for the shortest rest [s]; shares of rows at rest in logs of postures,
-and of postures alone."""
+"""Share of its range within which a joint stays for the shortest rest [s]; shares of rests in postures, and alone."""
 
 
 def postures(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:

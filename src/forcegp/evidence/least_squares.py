@@ -160,8 +160,7 @@ class Fit:
     """Where least squares ended.
 
     `x` (k,), `residual` (rows, nv) and `jacobian` (rows, nv, k), `noise` (nv,), `prior_information` (k, k). `span`
-    (rows, nv, m): directions of whitened residuals that unknown forces have. `expected`: nats of the first step of the
-    last round.
+    (rows, nv, m): directions of whitened residuals that unknown forces have. `expected`: nats of the last first step.
     """
 
     x: Float[np.ndarray, " k"]

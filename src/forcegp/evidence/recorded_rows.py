@@ -125,8 +125,7 @@ class RecordedRows:
     """States of one log of a model, the given forces there, and the terms of the equation of motion.
 
     `loaded` tells whether payloads that are estimated were there. Contacts that slide are refused unless `any_contact`.
-    `sensed` is what sensors measured, as `Dataset.measured`. `pushed` are joints on which something acts that nobody
-    measured: their torques show nothing.
+    `sensed` is what sensors measured, as `Dataset.measured`. `pushed` joints have torques that show nothing.
     """
 
     def __init__(

@@ -209,8 +209,7 @@ class Equations:
         for log, start, length in zip(self.logs, starts, lengths, strict=False):
             order = np.lexsort((log.time, log.episode)) if self.windows is None else np.arange(length)
             numbers.append(np.array_split(start + order, min(STRETCHES, sum(lengths))))
-        rows = [np.concatenate(each) for each in zip(*numbers, strict=True)]
-        return [each for each in rows if len(each)]
+        return [each for each in [np.concatenate(each) for each in zip(*numbers, strict=True)] if len(each)]
 
 
 class WindowMeans:

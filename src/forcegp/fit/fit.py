@@ -117,8 +117,7 @@ def fit(
     began are left out (`settings["rows_before_a_past"]`): what it remembers there, no log tells. Warns (DataWarning)
     where these are too many, and where the friction turns over less than the step of an encoder, or at a bound.
 
-    Friction in proportion to the normal force, with no `expected` friction, is fitted again under the normal force that
-    was found, until it settles.
+    Friction in proportion to the normal force, with no `expected` one, is fitted again until that force settles.
 
     Raises
     ------
@@ -311,8 +310,7 @@ class _Functions:
         if not self.model.is_open:
             return self._with_loads(rows, dataset)
         refuse_what_has_no_answer(self.model)
-        typical = typical_sizes(self.model, [rows])
-        space = ParameterSpace(with_payloads_placed(self.model, [dataset]), typical)
+        space = ParameterSpace(with_payloads_placed(self.model, [dataset]), typical_sizes(self.model, [rows]))
         x = space.start
         again, found, change, rounds = self, None, np.inf, 0
         while rounds < MOST_ROUNDS and change >= CHANGE:

@@ -50,8 +50,7 @@ class Whitening:
         if self.factor is None:
             return columns.flatten(0, 1)
         along = self.U.mT @ columns
-        across = (columns - self.U @ along).flatten(0, 1)
-        return torch.cat([across, self.factor.solve_lower(along.flatten(0, 1))])
+        return torch.cat([(columns - self.U @ along).flatten(0, 1), self.factor.solve_lower(along.flatten(0, 1))])
 
 
 class Slopes:
@@ -94,8 +93,7 @@ class FreeNumbers:
         terms, matrices = self.likelihood.checked_terms(kernels, parameters)
         distance, jacobian = self.prior
         with torch.no_grad():
-            white = Whitening.of(terms, matrices)
-            of_data = white(torch.cat([terms.residual[..., None], self.slopes], -1))
+            of_data = Whitening.of(terms, matrices)(torch.cat([terms.residual[..., None], self.slopes], -1))
             columns = torch.cat([of_data, torch.cat([distance[:, None], jacobian], -1)])
             step = torch.linalg.lstsq(columns[:, 1:], -columns[:, :1]).solution[:, 0]
         moved = terms._replace(residual=terms.residual + self.slopes @ step)

@@ -112,8 +112,7 @@ def _folds(dataset: Dataset, seconds: float) -> list[np.ndarray]:
             numbers[rows] = np.minimum((np.arange(len(rows)) * FOLDS) // len(rows), FOLDS - 1)
         else:
             numbers[rows], long = long % FOLDS, long + (lasting >= seconds)
-    parts = [numbers == fold for fold in range(FOLDS)]
-    return [part for part in parts if _lasts(dataset, part, seconds)]
+    return [part for part in [numbers == fold for fold in range(FOLDS)] if _lasts(dataset, part, seconds)]
 
 
 def _lasts(dataset: Dataset, part: np.ndarray, seconds: float) -> bool:

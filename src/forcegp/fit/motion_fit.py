@@ -255,8 +255,7 @@ def refine_on_motions(
     """Known laws and bodies fitted to the recorded positions, beginning from this posterior.
 
     Numbers that the laws of `stated` know by a standard deviation of 0 stay.
-    Raises InvalidInput for bases that move, windows that no episode has room for and uneven steps, NumericalError where
-    no motion is found near the recorded one.
+    Raises InvalidInput for bases that move, windows beyond episodes or uneven steps, NumericalError for no motion near.
     """
     posterior.model.robot.require_vectors("refinements on motions")
     recorded, stride = all_motions(dataset, seconds, STEP)

@@ -12,6 +12,7 @@ from forcegp.doubts import Doubt, look, ok, wrong
 from forcegp.errors import InvalidInput
 from forcegp.evidence import Accelerations, ContactForces, Evidence, FrameAcceleration, JointTorques, Sensor, Torques
 from forcegp.evidence.recorded_rows import share_of, slides
+from forcegp.fit.force_sensors import force_sensor_doubts
 from forcegp.fit.unseen import rows_of_known_physics
 from forcegp.model import Model
 from forcegp.noise import Noise
@@ -38,6 +39,7 @@ def with_sensors(dataset: Dataset, model: Model, rest: Evidence, sensors: Sequen
     """The log with the sensors that teach, IMUs named as they are mounted, and the model with their noise."""
     measured, levels = dict[str, np.ndarray](), dict[str, list[float]]()
     looked = torque_sensor_doubts(dataset, model) if any(isinstance(each, JointTorques) for each in sensors) else ()
+    forces = {doubt.numbers["frame"]: doubt for doubt in force_sensor_doubts(dataset, model) if doubt.level == "wrong"}
     links = {doubt.joints: doubt for doubt in looked if doubt.level == "wrong"}
     for each in sensors:
         each.check(dataset)
@@ -65,6 +67,8 @@ def with_sensors(dataset: Dataset, model: Model, rest: Evidence, sensors: Sequen
                     )
                 if said := links.get((name.removeprefix(TORQUE),)):
                     raise InvalidInput(str(said))
+            elif said := forces.get(name.removeprefix(FORCE)):
+                raise InvalidInput(str(said))
             elif isinstance(rest, Accelerations) and model.is_open and not model.unknown_forces:
                 raise InvalidInput(
                     "force sensors teach numbers beside torques, not beside accelerations; give Torques()."

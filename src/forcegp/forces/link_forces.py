@@ -130,8 +130,7 @@ class ToolForces(SharedInputs):
     def columns(self, dynamics: ConstrainedDynamics) -> dict[str, Callable[[], Tensor]]:
         state = dynamics.state
         if self.contact >= len(dynamics.contacts):  # the force is zero whatever its features are
-            nothing = state.q.new_zeros(*state.q.shape[:-1], 2)
-            return dict.fromkeys(self.allowed, lambda: nothing)
+            return dict.fromkeys(self.allowed, lambda: state.q.new_zeros(*state.q.shape[:-1], 2))
         where = ToolPoint.of_contact(dynamics, self.contact)
         axes = self._directions(dynamics, where)
         return {

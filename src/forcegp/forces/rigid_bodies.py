@@ -83,8 +83,7 @@ class Payload(WholeLaw):
 
     link: None stands for the base that moves, else for the last link of the last joint.
     mass [kg], center_of_mass [m] in the axes of the link, and inertia [kg m^2] (3, 3) about the centre of mass and
-        along these axes; without a mass, `forcegp.fit` estimates all ten numbers, with center_of_mass None all but the
-        mass. Other sizes are 0 by default.
+        along these axes; without a mass, `forcegp.fit` estimates all ten numbers, without a centre all but it.
     """
 
     link: str | None = None

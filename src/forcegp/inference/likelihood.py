@@ -164,8 +164,7 @@ def whiten(
         )
     logdet = lower.diagonal(dim1=-2, dim2=-1).log().sum(-1).expand(count).sum()
     W_white = torch.linalg.solve_triangular(lower, W, upper=False)
-    residual_white = torch.linalg.solve_triangular(lower, residual[..., None], upper=False)[..., 0]
-    return W_white, residual_white, logdet
+    return W_white, torch.linalg.solve_triangular(lower, residual[..., None], upper=False)[..., 0], logdet
 
 
 def deflate(W_white: Float[Tensor, "N D C"], y_white: Float[Tensor, "N D"]) -> Deflation:

@@ -142,15 +142,13 @@ class DrawnTerm:
             at = (e - self.grid[left]).clamp(torch.zeros_like(h), h)
             ends = [weights[0].gather(2, (left + k).expand(-1, weights[0].shape[1], -1)) for k in (0, 1)]
             between = ((h - at).sinh() * ends[0] + at.sinh() * ends[1]) / h.sinh()
-            beyond = (-(e - self.grid[left] - at).abs()).exp()
-            return (columns.mT * beyond * between).sum(1)
+            return (columns.mT * (-(e - self.grid[left] - at).abs()).exp() * between).sum(1)
         if not self.frequencies:
             return (columns @ weights[0][..., None])[..., 0]
         drawn = zip(self.term.factors, self.frequencies, strict=True)
         phase = sum(factor.embedding(z).unflatten(0, (count, -1)) @ omega[samples] for factor, omega in drawn)
         assert isinstance(phase, Tensor)
-        waves = phase.cos() @ weights[0].mT + phase.sin() @ weights[1].mT
-        return (columns * waves).sum(-1)
+        return (columns * (phase.cos() @ weights[0].mT + phase.sin() @ weights[1].mT)).sum(-1)
 
 
 FREQUENCIES = 256

@@ -177,8 +177,7 @@ def with_only(latent: ExactPosterior, rows: Int[Tensor, " kept"]) -> ExactPoster
     with torch.no_grad():
         deflation = Deflation(*(getattr(latent.system.deflation, name)[rows] for name in _PARTS))
         features = tuple(z[rows] for z in latent.features)
-        matrices = latent.kernels(features)
-        factor = factorize(lambda: deflated_covariance(deflation.C, matrices))
+        factor = factorize(lambda: deflated_covariance(deflation.C, latent.kernels(features)))
         return ExactPosterior(latent.kernels, features, _solved(deflation, factor))
 
 

@@ -155,8 +155,7 @@ def rk4(space: ConfigurationSpace, acceleration: Acceleration, q: Tensor, v: Ten
 def implicit_midpoint(space: ConfigurationSpace, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
     """v_m = v + dt/2 a(q + dt/2 v_m, v_m), v+ = 2 v_m - v, q+ = q + dt v_m: second order, for stiff friction.
 
-    A-stable and symplectic (Hairer, Lubich & Wanner 2006, II.1.3), by Newton's method with derivatives by torch. On a
-    manifold q+ = q exp(dt v_m).
+    A-stable and symplectic (Hairer, Lubich & Wanner 2006, II.1.3), by Newton's method. On manifolds q+ = q exp(dt v_m).
     """
 
     def moved(at: Tensor, share: float) -> Tensor:

@@ -53,8 +53,7 @@ class Contact:
     """A point of the robot stays on a surface: one bilateral constraint s(p(q)) = 0.
 
     `point` is in m in the link frame `frame`. With a `switch` it acts in rows whose input of that name is 1, not 0.
-    With a `radius` [m] the point is the centre of a ball that rolls on level ground, and what a `Held` surface holds is
-    the point of the ball that touches it.
+    With a `radius` [m] the point is the centre of a ball that rolls on level ground, of which `Held` holds the lowest.
     """
 
     frame: str
@@ -122,8 +121,7 @@ class Contact:
     ) -> tuple[Float[Tensor, "*batch nv"], Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
         """One row of A (..., nv), one entry of b (...), and the surface gradient s_p (..., 3), with A a = b.
 
-        A = s_p J_p, A' v = s_p Jdot_p v + (J_p v)^T s_pp (J_p v), b = -A' v - 2 zeta omega A v - omega^2 c (Rath et al.
-        2021, section 2).
+        A = s_p J_p, A' v = s_p Jdot_p v + (J_p v)^T s_pp (J_p v), b = -A' v - 2 zeta omega A v - omega^2 c (Rath 2021).
         """
         p, v = self.position(state.kinematics), state.v
         J = self._touching(state.kinematics.frame_jacobian(self.frame, self.point))
@@ -174,8 +172,7 @@ class State:
     """Positions, velocities and inputs of equal batch.
 
     `inputs` names the columns of u, `delivered` are the joint forces (..., nv) of its actuators, `strokes` the
-    displacements of each joint (or motor, for laws at motors) from reversal to reversal before the state, the last one
-    first, where they are known.
+    displacements of each joint (or motor, for laws at motors) between reversals before the state, the last first.
     """
 
     q: Float[Tensor, "*batch nq"]
@@ -297,8 +294,7 @@ class ConstrainedDynamics:
     def force_at(self, frame: str) -> AffineMap:
         """World force on the robot (..., 3) at the contacts of a frame together, in N.
 
-        Of a surface it is the part along the normal, (..., 1): friction along it is another force. Raises ContactError
-        where no contact is.
+        Of a surface it is the part along the normal, (..., 1): friction along it is another force. Or ContactError.
         """
         if not (places := [k for k, contact in enumerate(self.contacts) if contact.frame == frame]):
             raise ContactError(f"the model has no contact at {frame!r}, where a force was measured; give it one.")

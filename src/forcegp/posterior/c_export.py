@@ -64,8 +64,7 @@ def export_c(
     `steps` NAME_step of so many seconds by the `integrator` ("symplectic-euler", "rk4", "implicit-midpoint") and its
     Jacobian, `monitor`, a calibrated `ContactMonitor` of the posterior's predictor, NAME_monitor_step; a base that
     moves adds NAME_integrate, and derivatives in a step from q, friction that remembers NAME_remember. `name` of files
-    and functions is by default the robot's, `source` what the header names as the model's origin; `unchecked` neither
-    compiles nor compares.
+    and functions is by default the robot's, `source` the model's origin in the header; `unchecked` compiles nothing.
 
     Raises InvalidInput for what cannot be exported, FileFormatError for a folder that has files, CompilerError where
     the compiler fails, NumericalError where the program and `predict` differ, OSError.

@@ -44,8 +44,7 @@ def casadi_function(
     With `steps` (q, v, u) -> (q_next, v_next), a step of so many seconds by the `integrator`: "symplectic-euler",
     "rk4", or "implicit-midpoint" by CasADi's Newton method; and memory_next, columns of u, where laws remember. Where a
     base moves steps are explicit, a second result of the acceleration is q_dot (nq,), and quaternions count as their
-    directions. Raises MissingExtra without CasADi, InvalidInput for operations that no graph holds, steps that are no
-    positive number, and other integrators.
+    directions. Raises MissingExtra without CasADi, InvalidInput for what no graph holds, steps and integrators.
     """
     casadi: Any = required_extra("casadi", "casadi", "casadi_function")
     require_type("posterior", posterior, Posterior)

@@ -84,8 +84,7 @@ class Drift:
         A level that was followed is that of their sum, alike in size: their difference is left, half of the variance.
         """
         dry = max((s / b for s, b in zip(self.std, self.between, strict=True) if b > 0.0), default=0.0)
-        viscous = {"unknown": 1.0, "another": 0.5**0.5, "fit": 0.0}[self.here]
-        return np.array([dry, viscous])[:, None, None, None]
+        return np.array([dry, {"unknown": 1.0, "another": 0.5**0.5, "fit": 0.0}[self.here]])[:, None, None, None]
 
     def __str__(self) -> str:
         source = "assumed" if self.records == 1 else f"{self.records} records"

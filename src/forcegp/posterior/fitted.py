@@ -162,8 +162,7 @@ class Estimates(Summary, Mapping[str, Estimate]):
         """From the Jacobian of whitened residuals, with them as last column, rows by stretches, and of the prior.
 
         `slopes` are derivatives of the values in the coordinates, `changes` those of the coordinates without each
-        stretch, if not by one step; `move` what another cause that explains more would change. Without stretches the
-        covariance is F^-1.
+        stretch, if not by one step; `move` what a cause that explains more would change. Without stretches it is F^-1.
         """
         J, r, G = white[:, :-1], white[:, -1], prior.T @ prior
         whole, root = J.T @ J + G, np.linalg.inv(np.linalg.cholesky(G)).T

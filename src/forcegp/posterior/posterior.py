@@ -299,8 +299,7 @@ class Posterior(Fitted):
         """The same unknown forces in another model (robot, contacts, laws, stabilisation) with the same joints.
 
         Forces of contacts that it lacks are zero there. Raises InvalidInput for other joints and, without
-        `RigidBodies`, another robot, whose weight and inertia the processes lack; UnknownName where a force acts on a
-        frame that is not there.
+        `RigidBodies`, another robot, whose weight and inertia the processes lack; UnknownName for other frames.
         """
         require_type("model", model, Model)
         trained = self.trained

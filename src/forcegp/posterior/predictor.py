@@ -48,8 +48,7 @@ class Predictor(Summary):
     States are float64 tensors or arrays (size,) or (n, size), in the units of `predict`, with the `sizes` of q, v and
     u. Results are those of `predict`: means to rounding, covariances exactly or never below, as `kind` says
     ("compressed", "exact", "none"; `rank`, `inflation`). Differentiable once in tensors that require gradients; with
-    `compile=False` any number of times, and by `torch.func`, but for `vmap`. `prepare_seconds` is what preparing took,
-    with the compiler.
+    `compile=False` any number of times, and by `torch.func`, but for `vmap`. `prepare_seconds` include the compiler.
 
     Raises InvalidInput for wrong shapes, values that are not finite and where derivatives would be lost, NumericalError
     where the result is not finite. Where nothing can be compiled, torch computes the same, with one NumericalWarning.

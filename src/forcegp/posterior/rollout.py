@@ -57,8 +57,7 @@ def accelerations(posterior: Any, model: Model, samples: int = 0, seed: int = 0)
         mixing = prior.direction(dynamics)
         if not mixing.shape[-1]:
             return affine.offset.reshape(shape)
-        latents = functions(standardize(prior.features(dynamics)))
-        return affine((mixing @ latents[..., None])[..., 0]).reshape(shape)
+        return affine((mixing @ functions(standardize(prior.features(dynamics)))[..., None])[..., 0]).reshape(shape)
 
     return acceleration
 

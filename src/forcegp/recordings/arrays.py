@@ -189,8 +189,7 @@ REFERENCE = np.dtype(object)
 def matlab_arrays(path: Path) -> Arrays:
     """Of a .mat file: its matrices, and those in structs, called `struct/field`, and in cells. Vectors lie either way.
 
-    Of version 5 to 7, scipy reads whole variables, so what these hold must fit into memory. One of 7.3 is HDF5 whose
-    arrays lie column by column.
+    Of version 5 to 7, scipy reads whole variables, so these must fit into memory. One of 7.3 is HDF5, by columns.
     """
     if path.is_file() and h5py.is_hdf5(path):
         arrays = hdf5_arrays(path)

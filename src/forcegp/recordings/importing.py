@@ -82,8 +82,7 @@ def import_recordings(
 ) -> Dataset:
     """The dataset of this robot that these logs hold; `metadata["import"]` is what was done.
 
-    Each log is at least one episode; gaps and the episode numbers of a log make more. Only the columns that are used
-    have to fit into memory.
+    Each log is at least one episode; gaps and the episode numbers of a log make more. These must fit into memory.
 
     Raises FileFormatError, DatasetError and InvalidInput naming file, column, row, time and remedy. Warns
     (DataWarning) of what can be used but looks mistaken.
@@ -126,8 +125,7 @@ def import_recordings(
     if mapping.axes.get("force", ("world",)) == ("body",):
         at = model.robot.kinematics(torch.tensor(columns["q"]))
         for name, values in ((name, values) for name, values in measured.items() if name.startswith(FORCE)):
-            axes = at.frame_pose(name.removeprefix(FORCE))[:, :3, :3].numpy()
-            measured[name] = (axes @ values[..., None])[..., 0]
+            measured[name] = (at.frame_pose(name.removeprefix(FORCE))[:, :3, :3].numpy() @ values[..., None])[..., 0]
     return Dataset(**columns, measured=measured, model=model, metadata={"import": done})
 
 

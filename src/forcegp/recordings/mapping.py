@@ -53,7 +53,7 @@ UNITS: dict[str, dict[str, LogUnit]] = {
     | {"1": ONE}
     | _units("rad/s", {"rad/s": 1, "rev/s": _TURNS, "rpm": 60 * _TURNS}),
     "a": _units("rad/s^2", {"rad/s^2": 1, "deg/s^2": _DEGREES}) | _units("m/s^2", {"m/s^2": 1, "mm/s^2": 1e3}),
-    "force": _units("N", {"N": 1, "mN": 1e3, "kN": 1e-3}),
+    "force": _units("N", {"N": 1, "mN": 1e3, "kN": 1e-3, "kgf": 1 / STANDARD, "lbf": 1 / 4.4482216152605}),
     "torque": _units("Nm", {"Nm": 1, "mNm": 1e3, "kNm": 1e-3, "Ncm": 100}) | _units("N", {"N": 1}),
     "imu": _units("m/s^2", {"m/s^2": 1, "mm/s^2": 1e3, "g": 1 / STANDARD}),
 }

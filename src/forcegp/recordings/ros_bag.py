@@ -294,8 +294,7 @@ def read_on_one_clock(source: Source, plan: SignalPlan) -> Read:
         table = np.stack([track[name] for name in own[topic]], axis=1).astype(np.float64)
         values, ages, there = _at(stamps, track[stamp], table, largest, places)
         how = "interpolated" if largest.all() else "interpolated, u held" if largest.any() else "held"
-        other = stamp.removeprefix(topic) != time.removeprefix(clock)
-        ways.append(f"{topic} {how}" + f" (by {LOG_TIME})" * other)
+        ways.append(f"{topic} {how}" + f" (by {LOG_TIME})" * (stamp.removeprefix(topic) != time.removeprefix(clock)))
         kept &= there
         tracks.append((float(np.median(steps)) if len(steps) else np.inf, ages * seconds))
         found |= {name: values[:, column] for column, name in enumerate(own[topic])}

@@ -426,8 +426,7 @@ def columns_of(
 def layout_of(mapping: ColumnMapping, model: forcegp.Model, lacking: Mapping[str, Sequence[bool]], nv: int) -> Layout:
     """What is left to do once positions are those of a Dataset.
 
-    `lacking`: of each logged signal, which of its entries the log lacks. Raises InvalidInput for vectors that are half
-    there where their axes turn.
+    `lacking`: of each logged signal, which of its entries the log lacks. InvalidInput for half of a turned vector.
     """
     groups = bases(model.robot)
     derived = {name: [row for row, lacks in enumerate(own) if lacks] for name, own in lacking.items()}

@@ -94,8 +94,7 @@ def _visual(element: Element, urdf: Path | None, doubts: list[str]) -> Any:
     elif "mesh" in kinds:
         mesh = _loaded(kinds["mesh"], urdf, doubts)
     if mesh is not None:
-        origin = element.find("origin")
-        pose = (_numbers(origin, name) for name in ("rpy", "xyz"))
+        pose = (_numbers(element.find("origin"), name) for name in ("rpy", "xyz"))
         rpy, xyz = (np.array(values or (0.0, 0.0, 0.0)) for values in pose)
         mesh.apply_transform(transform(rotation_from_rpy(rpy), xyz))
     return mesh

@@ -260,8 +260,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         writer = MjcfWriter(self)
         text = writer.text()
         if writer.left_out:
-            left_out = ", ".join(writer.left_out)
-            seen = f"{self.source}: MJCF has no frames that move without mass; left out: {left_out}."
+            seen = f"{self.source}: MJCF has no frames that move without mass; left out: {', '.join(writer.left_out)}."
             warnings.warn(seen, RobotFileWarning, stacklevel=3)
         if path is not None:
             write_text(path, text)

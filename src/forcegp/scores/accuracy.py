@@ -288,8 +288,7 @@ def rows_outside(posterior: Posterior, dataset: Dataset) -> Iterator[Doubt]:
     for quantity in ("q", "v"):
         trained, given = getattr(posterior.training, quantity).cpu().numpy(), getattr(dataset, quantity)
         low, high = trained.min(axis=0), trained.max(axis=0)
-        room = MARGIN * (high - low) + POSTURE * float((high - low).max())
-        beyond = np.maximum(low - given, given - high) - room
+        beyond = np.maximum(low - given, given - high) - (MARGIN * (high - low) + POSTURE * float((high - low).max()))
         outside |= (beyond > 0.0).any(axis=1)
         for k, (name, share) in enumerate(zip(posterior.joint_names, (beyond > 0.0).mean(axis=0), strict=False)):
             here, there = (f"{x.min():.3g} to {x.max():.3g}" for x in (given[:, k], trained[:, k]))

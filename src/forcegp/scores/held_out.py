@@ -140,8 +140,7 @@ def _require_some(what: str, chosen: Sequence[int], known: Sequence[int]) -> Non
 def _episodes_apart(known: Sequence[int], episodes: Sequence[int]) -> Split:
     """Whole episodes."""
     _require_some("episodes", episodes, known)
-    rest = [number for number in known if number not in episodes]
-    sides = [listed([*map(str, each)]) for each in (rest, episodes)]
+    sides = [listed([*map(str, each)]) for each in ([number for number in known if number not in episodes], episodes)]
     words = "trained on whole episodes ({}), tested on others ({})".format(*sides)
     held_out = tuple((number, -math.inf, math.inf) for number in episodes)
     return Split(f"episodes-{'-'.join(map(str, episodes))}", words, held_out)

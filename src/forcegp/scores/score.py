@@ -56,8 +56,7 @@ def score(
 
     Posteriors alone and no `split`: they are scored on all rows of `log`. Otherwise every model is fitted for every
     split and seed to one side and scored on the other, `identified` (from all training rows) always among them. The
-    same call goes on after an interruption, and one with more models or seeds computes only these. A model that fails
-    is a row that names the error.
+    same call goes on after an interruption, and one with more models or seeds computes only these. Failures are rows.
 
     Parameters
     ----------

@@ -151,8 +151,7 @@ class Winner(NamedTuple):
     @property
     def sentence(self) -> str:
         """All of it."""
-        numbers = None if self.difference is None else self.difference.sentence
-        return ": ".join(filter(None, (self.why, numbers)))
+        return ": ".join(filter(None, (self.why, (None if self.difference is None else self.difference.sentence))))
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

@@ -89,8 +89,7 @@ def _episode(robot: Robot, model: Model, config: QuadrupedConfig, episode: int, 
     even = even.flatten(1)
     left = needed[:, :6] - (A[..., :6].mT @ even[..., None])[..., 0]
     forces = even + (torch.linalg.pinv(A[..., :6].mT, rtol=1e-9) @ left[..., None])[..., 0]
-    torques = (needed - (A.mT @ forces[..., None])[..., 0])[:, 6:]
-    return q, v, torch.cat([torques, stands], -1), a, Q_U, forces
+    return q, v, torch.cat([(needed - (A.mT @ forces[..., None])[..., 0])[:, 6:], stands], -1), a, Q_U, forces
 
 
 def _base_motion(
@@ -213,8 +212,7 @@ def _flight(robot: Robot, config: QuadrotorConfig, episode: int, steps: int) -> 
         flow = V[:3] - R.T @ air
         across, w = flow * [1.0, 1.0, 0.0], speeds.mean()
         ratio = 1.0 - THROUGH * flow[2] / (w * RADIUS) + ACROSS * (across @ across) / (w * RADIUS) ** 2
-        ground = 1.0 / (1.0 - 1.5 * (RADIUS / (4.0 * max(x[2], 1.5 * RADIUS))) ** 2)
-        thrust = THRUST * speeds**2 * ratio * ground
+        thrust = THRUST * speeds**2 * ratio * (1.0 / (1.0 - 1.5 * (RADIUS / (4.0 * max(x[2], 1.5 * RADIUS))) ** 2))
         drag = -BODY_DRAG * np.linalg.norm(flow) * flow
         force = drag - ROTOR_DRAG * speeds.sum() * flow + [0.0, 0.0, thrust.sum()]
         torque = np.cross(CENTRE, drag) + np.stack([PLACES[:, 1], -PLACES[:, 0], TORQUE]) @ thrust
@@ -235,8 +233,7 @@ def _flight(robot: Robot, config: QuadrotorConfig, episode: int, steps: int) -> 
         yaw = 0.5 * math.sin(turn[0] * k / RATE + turn[1])
         side = np.cross(up, [math.cos(yaw), math.sin(yaw), 0.0])
         side /= np.linalg.norm(side)
-        tilt = np.stack([np.cross(side, up), side, up], 1)
-        lean = Rotation.from_matrix(R.T @ tilt).as_rotvec()
+        lean = Rotation.from_matrix(R.T @ np.stack([np.cross(side, up), side, up], 1)).as_rotvec()
         moment = inertia @ ((turning**2 * lean - 2.0 * turning * V[3:]) * [1.0, 1.0, 0.3])
         share = mixer @ np.concatenate([[mass * (wanted @ R[:, 2])], moment])
         u = np.sqrt(np.clip(share / DATASHEET, LOWEST**2, HIGHEST**2))

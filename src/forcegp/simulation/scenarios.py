@@ -194,8 +194,7 @@ class QuadrupedConfig(CommonConfig):
 class QuadrotorConfig(CommonConfig):
     """A drone that follows a path in `wind` [m/s] from a random side, with gusts; rotors follow within `lag` [s].
 
-    `seed` draws path, side and gusts; the drone is always the same. `noise` in rad/s^2 and m/s^2. Raises InvalidInput
-    naming the field and its range.
+    `seed` draws path, side and gusts; the drone is always the same. `noise` in rad/s^2 and m/s^2. Raises InvalidInput.
     """
 
     wind: float = 4.0

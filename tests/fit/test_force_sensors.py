@@ -1,0 +1,131 @@
+"""Force sensors beside torques and motion: MuJoCo's arm with gears that stick, pushed at the hand; a real leg."""
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import mujoco as untyped
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tests.evidence.arm_in_mujoco import followed
+from tests.posterior.arm import arm_model
+
+from forcegp import ContactForces, Dataset, Model, Robot, Torques, check, fit
+from forcegp.data import Preparation
+from forcegp.errors import InvalidInput
+from forcegp.fit.force_sensors import force_sensor_doubts
+from forcegp.forces import Viscous
+from forcegp.mechanics import fixed_point
+
+mujoco = untyped
+DRY, RATE = np.array([0.3, 0.4, 0.2]), 250
+
+
+def pushes(q):
+    return np.array([6.0 * np.sin(5.0 * q[0]), -8.0 * np.sin(4.0 * q[1] + 1.0), 7.0 * np.cos(3.0 * q[2])])
+
+
+@cache
+def recorded(pushed=True):
+    """The log, the force on the hand, the axes of the hand, and what a sensor at the wrist measures of the hand."""
+    plant = []
+
+    def prepare(spec):
+        spec.body("hand").add_site(name="hand")
+        for kind in (mujoco.mjtSensor.mjSENS_FORCE, mujoco.mjtSensor.mjSENS_FRAMEQUAT):
+            spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="hand")
+        model = spec.compile()
+        model.dof_armature[:] = [0.1, 0.15, 0.04]
+        plant[:] = model, mujoco.MjData(model)
+        return model
+
+    def taken(q, v):
+        model, data = plant
+        data.qpos[:], J = q, np.zeros((3, 3))
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_jacBody(model, data, J, None, model.body("hand").id)
+        return DRY * np.tanh(v / 0.01) - pushed * J.T @ pushes(q)
+
+    (q, v, u, a, sensed), rng = followed(prepare, 12, RATE, 4, taken)
+    force = pushed * np.array([*map(pushes, q)]) + 0.02 * rng.standard_normal(q.shape)
+    R = Rotation.from_quat(sensed[:, [4, 5, 6, 3]]).as_matrix()
+    model = replace(arm_model(0), contacts=())
+    log = Dataset(q=q, v=v, u=u + 0.01 * rng.standard_normal(u.shape), a=a, time=np.arange(len(q)) / RATE, model=model)
+    return log, force, R, (R @ sensed[:, :3, None])[..., 0]
+
+
+def told(force, log=None):
+    log = replace(recorded()[0] if log is None else log, measured={"force.hand": force})
+    return list(force_sensor_doubts(log, log.model))
+
+
+def in_hand(R, values):
+    return (R @ np.broadcast_to(values, (len(R), 3))[..., None])[..., 0]
+
+
+TIME = np.linspace(-0.5, 0.5, 12 * RATE)[:, None]
+MISTAKES = {
+    "none": (lambda F, R: F, "ok", r"leaves 0\.03\d* %"),
+    "sign": (lambda F, R: -F, "wrong", r"as \(-x, -y, -z\); (.|\n)*or turn all torques"),
+    "order": (lambda F, R: F[:, [1, 2, 0]], "wrong", r"as \(z, x, y\); (.|\n)*hand=X,Y,Z\."),
+    "mirrored": (lambda F, R: F * [1.0, -1.0, 1.0], "wrong", r"as \(x, -y, z\)"),
+    "of the hand": (lambda F, R: in_hand(R.mT, F), "wrong", "along the axes of the frame; (.|\n)*--axes force=body"),
+    "turned twice": (lambda F, R: in_hand(R, F), "wrong", "along the axes of the world; (.|\n)*--axes force=world"),
+    "kN": (lambda F, R: F / 1000.0, "look", "in kN, or torques are off"),
+    "kgf": (lambda F, R: F / 9.80665, "look", "--unit force=kgf"),
+    "a gain of 12": (lambda F, R: F / 12.0, "ok", "leaves"),
+    "not tared": (lambda F, R: F + in_hand(R, [1.2, 0.0, -0.6]), "look", r"off by \(1.18, -0.08\d*, -0.57\d*\) N"),
+    "drift": (
+        lambda F, R: F + in_hand(R, TIME * [4.0, 0.0, 3.0]),
+        "look",
+        r"drifts by \((4.0|3.9)\d, .*, (2.9|3.0)\d*\) N",
+    ),
+    "a step": (lambda F, R: F + in_hand(R, (TIME > 0.34) * [3.0, 0.0, -2.0]), "ok", "leaves 3"),
+    "a faint signal": (lambda F, R: 2.0 * np.random.default_rng(0).normal(size=F.shape), "look", "does not follow"),
+    "a fainter one": (lambda F, R: 0.8 * np.random.default_rng(0).normal(size=F.shape), "ok", "hardly notice"),
+    "another signal": (lambda F, R: 5.0 * np.random.default_rng(0).normal(size=F.shape), "look", "does not follow"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_what_is_wrong_with_a_sensor_is_told(mistake):
+    change, level, words = MISTAKES[mistake]
+    _, force, R, _ = recorded()
+    doubt, *others = told(change(force, R))
+    assert (doubt.level, others) == (level, [])
+    assert re.search(words, str(doubt)), str(doubt)
+
+
+def test_a_late_sensor_and_a_weight_that_counts_twice():
+    found = told(np.roll(recorded()[1], 5, axis=0))
+    assert found[1].about == "sensor delay"
+    assert found[1].numbers["delay"] == pytest.approx(0.02, abs=0.001)
+    log, force, _, held = recorded(pushed=False)
+    for sign, words in ((-1.0, "counts twice"), (1.0, "give the columns with a minus")):
+        [doubt] = told(sign * held + force, log)
+        assert doubt.numbers["mass"] == pytest.approx(-0.6 * sign, rel=0.02)  # of the hand
+        assert words in doubt.do
+    [doubt] = told(force, log)
+    assert "hardly notice" in doubt.what
+
+
+def test_a_fit_refuses_what_is_wrong():
+    log, force, _, _ = recorded()
+    wrong = replace(log, measured={"force.hand": -force})
+    assert check(wrong).doubts.of("force sensor").level == "wrong"
+    with pytest.raises(InvalidInput, match="or turn all torques"):
+        fit(log.model.with_forces(Viscous()), wrong, [Torques(), ContactForces("hand")])
+
+
+@pytest.mark.parametrize(("sign", "level"), [(1.0, "ok"), (-1.0, "wrong")])
+def test_a_real_leg(shared, sign, level):
+    realdata = shared("realdata")
+    time, *columns = np.loadtxt(realdata / "hopper" / "hopper_A.csv.gz", delimiter=",", skiprows=1).T
+    q, u, force = (np.array(columns[k : k + 3]).T for k in (0, 3, 6))
+    model = Model(Robot.from_urdf(realdata / "hopper" / "teststand.urdf"), fixed_point("contact"))
+    measured = {"force.contact": sign * force}
+    raw = Dataset(q=q, v=0.0 * q, u=u, a=0.0 * q, time=time, model=model, measured=measured)
+    log = Preparation(cutoff=20.0, every=5, trim=0.2).apply(raw)
+    assert [each.level for each in force_sensor_doubts(log, model)] == [level]
