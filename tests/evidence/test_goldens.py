@@ -80,7 +80,7 @@ def test_residuals_of_rows_and_what_their_coordinates_mean(contact):
     x = np.clip(space.start + 0.05 * np.random.default_rng(1).standard_normal(space.size), *space.bounds)
     levels, motion = rows.rough_noise(x, log.a), rows.moving(log.a)
     likely = rows.likely(x, motion, levels)
-    bounds = [np.clip(each, -1e3, 1e3) for each in (*space.bounds, space.longest_steps)]
+    bounds = [np.clip(each, -1e3, 1e3) for each in (*space.bounds, space.longest_steps(x))]
     found = {
         "coordinates": [space.start, *bounds, *space.prior(x), space.moved(x, 0.1 * x), space.number_slopes(x)],
         "parameters": {f"{each.name} {each.unit}": [each.start, each.prior] for each in space.parameters},

@@ -196,7 +196,7 @@ def weighted_least_squares(
     start: Float[np.ndarray, " k"],
     bounds: tuple[np.ndarray, np.ndarray],
     *,
-    longest: Float[np.ndarray, " k"] | float = np.inf,
+    longest: Callable[[np.ndarray], np.ndarray] | float = np.inf,
     progress: Callable[[int, float], None] | None = None,
     held: Float[np.ndarray, "rows m nv"] | None = None,
     known: Float[np.ndarray, " nv"] | None = None,
@@ -207,9 +207,9 @@ def weighted_least_squares(
 ) -> Fit:
     """Minimise sum_nj (r_nj / sigma_j)^2 + |prior|^2 over x and sigma; `progress(round, rms)` after each round.
 
-    `longest` is the most that a coordinate may change in one step. `held` are directions of r that unknown forces have,
-    which do not count. `known` is sigma where it is not to be found. A round takes so many `evaluations` at most. Steps
-    follow `moved`: residuals that are as good as linear along it have no curved valleys. With `sizes` of r, sigma is
+    `longest` is the most that a coordinate may change in a step from there. `held` are directions of r that unknown
+    forces have, which do not count. `known` is sigma where it is not to be found. A round takes so many `evaluations`.
+    Steps follow `moved`: residuals that are as good as linear along it have no curved valleys. With `sizes`, sigma is
     drawn towards one share of these, as if by `SHARED` rows more: of a few rows a joint may be fitted exactly.
     `roughly` ends sooner, within some hundredths of the noise and a nat.
     """
@@ -288,7 +288,7 @@ def _minimized(
     point: Callable[[np.ndarray], _Point],
     x: np.ndarray,
     bounds: tuple[np.ndarray, np.ndarray],
-    longest: np.ndarray | float,
+    longest: Callable[[np.ndarray], np.ndarray] | float,
     most: int,
     moved: Moved = np.add,
     content: float = CONTENT,
@@ -302,7 +302,7 @@ def _minimized(
     for evaluation in range(1, most + 1):
         damped = here.curvature + damping * np.diag(here.curvature.diagonal() + 1e-12)
         step = step_within(here.gradient, damped, low - here.x, high - here.x)
-        step /= float((abs(step) / longest).max(initial=1.0))
+        step /= float((abs(step) / (longest(here.x) if callable(longest) else longest)).max(initial=1.0))
         expected = -float(here.gradient @ step + 0.5 * step @ here.curvature @ step)
         first = expected if first is None else first
         if abs(expected) <= 1e-3 * content or idle == 2:

@@ -113,11 +113,14 @@ class ParameterSpace:
         free = np.full(self.bodies.size, np.inf)
         return self._joined(-free, [t.low for t in self.terms]), self._joined(free, [t.high for t in self.terms])
 
-    @property
-    def longest_steps(self) -> Float[np.ndarray, " k"]:
-        """Most that a coordinate should change at once: infinite for those that the torque is linear in."""
+    def longest_steps(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """Most that a coordinate should change at once: infinite for those that the torque is linear in.
+
+        What lies off the diagonal of a body's factor may double: a light one may be far away, or have its mass there.
+        """
         each = [np.full_like(term.size, 1.0 if term.logarithm else np.inf) for term in self.terms]
-        return self._joined(np.full(self.bodies.size, 1.0), each)
+        off = np.abs(x[: self.bodies.size].reshape(-1, 10)) * (np.arange(10) > 3)
+        return self._joined(np.maximum(1.0, off).ravel(), each)
 
     def prior(self, x: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " entries"], Float[np.ndarray, "entries k"]]:
         """Distance from the prior in its standard deviations, and its Jacobian."""
@@ -339,8 +342,7 @@ def _derivatives(
                 each = torch.stack(parts, dim=-1)[..., None]
             out.append(-(each if B is None else B @ each).cpu().numpy())
     amplitude = amplitude.detach()
-    force = amplitude if B is None else (B @ amplitude[..., None])[..., 0]
-    return force.cpu().numpy(), out
+    return (amplitude if B is None else (B @ amplitude[..., None])[..., 0]).cpu().numpy(), out
 
 
 def _terms(model: Model, typical: Mapping[str, np.ndarray]) -> list[Term]:

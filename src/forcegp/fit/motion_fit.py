@@ -205,7 +205,7 @@ class MotionFit:
         for _ in range(ITERATIONS):
             N, right, G, g = self.curvature(here, noise, sigma, damping)
             step = step_within(-right.numpy(), N.numpy(), *(end - here.x.numpy() for end in space.bounds))
-            dx = torch.as_tensor(step / (abs(step) / space.longest_steps).max(initial=1.0))
+            dx = torch.as_tensor(step / (abs(step) / space.longest_steps(here.x.numpy())).max(initial=1.0))
             change = g - G @ dx
             foreseen = here.cost - self.expected(here, noise, sigma, dx, change)
             if not foreseen > CONTENT or damping > MOST_DAMPING:

@@ -124,8 +124,7 @@ class Estimates(Summary, Mapping[str, Estimate]):
         """Of all bodies that were estimated, and its standard deviation in kg."""
         own = [k for k, each in enumerate(self.entries) if each.name.endswith(".mass")]
         assert self.covariance is not None, "there are estimates"
-        variance = float(self.covariance[np.ix_(own, own)].sum())
-        return sum(self.entries[k].value for k in own), max(variance, 0.0) ** 0.5
+        return sum(self.entries[k].value for k in own), max(float(self.covariance[np.ix_(own, own)].sum()), 0.0) ** 0.5
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain JSON values."""

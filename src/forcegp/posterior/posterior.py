@@ -272,7 +272,7 @@ class Posterior(Fitted):
             given = q.repeat(count, 1), v.repeat(count, 1), forces.repeat(1, count, 1), dt
             loops, added = None, None if feedback is None else flat_feedback(feedback, shape, forces.shape[-1])
             if feedback is None:
-                loops = loops_for(self, model, integrator, len(forces), copies, seed)
+                loops = loops_for(self, model, integrator, forces.shape, copies, seed)
             work = accelerations(self, model, copies, seed)
             found = moved(shape, loops, method, work, model, *given, feedback=added, what=what)
             return Rollout(time, *found[:4], integrator, model)

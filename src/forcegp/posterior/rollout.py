@@ -33,6 +33,7 @@ from forcegp.robots.manifold import ConfigurationSpace
 
 STEPS_TO_COMPILE = 2000
 """Steps of some milliseconds each, and as many for every contact; fewer are done before a program is compiled."""
+TOGETHER, FUNCTIONS = 10, 3  # motions, and unknown functions, that cost as much as one step again
 ROWS_PER_BLOCK = 4096
 """States whose constraint is evaluated at once."""
 
@@ -224,10 +225,11 @@ def remembering(
 
 
 def loops_for(
-    posterior: Any, model: Model, integrator: str, steps: int, samples: int, seed: int
+    posterior: Any, model: Model, integrator: str, motions: Sequence[int], samples: int, seed: int
 ) -> list[RowFunction] | None:
-    """Compiled loops, where motions are long enough to be worth compiling them."""
-    work = steps * max(1, samples) * (1 + len(model.contacts))
+    """Compiled loops, where steps and number of `motions` are worth compiling them."""
+    work = motions[0] * (1.0 + motions[1] / TOGETHER) * (1.0 + len(posterior.latent_names) / FUNCTIONS)
+    work *= max(1, samples) * (1 + len(model.contacts))
     if integrator not in steps_of(model.robot.space) or work < STEPS_TO_COMPILE:
         return None
     try:

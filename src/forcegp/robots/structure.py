@@ -243,8 +243,7 @@ class RobotStructure(Summary):
     @property
     def single_joint_names(self) -> tuple[str, ...]:
         """Names of the joints of one degree of freedom: where there are actuators and friction."""
-        names = self.joint_names
-        return tuple(names[row] for row in self.space.single_rows)
+        return tuple(self.joint_names[row] for row in self.space.single_rows)
 
     @property
     def posture_names(self) -> tuple[str, ...]:

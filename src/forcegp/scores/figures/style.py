@@ -130,5 +130,4 @@ def short_joint_names(names: Sequence[str]) -> list[str]:
     different = next((place for place, letters in enumerate(columns) if len(set(letters)) > 1), len(columns))
     shared = names[0][:different]
     shared = shared[: max(shared.rfind(mark) for mark in "_-/. ") + 1]
-    ends = [name[len(shared) :] for name in names]
-    return [f"joint {end}" if end.isdigit() else end for end in ends]
+    return [f"joint {end}" if end.isdigit() else end for end in [name[len(shared) :] for name in names]]
