@@ -284,4 +284,4 @@ def seconds_of(texts: Sequence[str | None]) -> np.ndarray:
             days = date(*(day if day[0] > 31 else reversed(day))).toordinal() - date(1970, 1, 1).toordinal()
             hour, minute, second = f"{found[3] or '0:0'}:0".replace(",", ".").split(":")[:3]
             seconds[row] = 86400.0 * days + 3600 * int(hour) + 60 * int(minute) + float(second)
-    return seconds + 86400.0 * np.cumsum(((seconds < 86400.0) & (np.diff(seconds, prepend=seconds[:1]) < -43200.0)))
+    return seconds + 86400.0 * np.cumsum((seconds < 86400.0) & (np.diff(seconds, prepend=seconds[:1]) < -43200.0))
