@@ -140,7 +140,7 @@ class Monitor(Command):
     out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write, with contacts.json."""
     free: Annotated[str, arg(metavar="S|FREE.h5")]
-    """Motion of 40 s or more without contacts, not used for training: the first S seconds of LOG, or another log."""
+    """Motion without contacts, 40 s or more, not learned from: S seconds of LOG (not searched), or another log."""
     alarms: AlarmOptions = AlarmOptions()
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:

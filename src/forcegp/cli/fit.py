@@ -86,7 +86,7 @@ class Fit(Command):
     """Points that stay on surfaces, instead of the dataset's contacts; m, in the axes of the link FRAME. SURFACE is
     plane:nx,ny,nz,offset or sphere:cx,cy,cz,radius; FRAME@x,y,z:held is bolted down. none: no contact."""
     noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
-    """Noise of the measured acceleration: a standard deviation in rad/s², learned, or as the dataset states it."""
+    """Noise of the measured acceleration: a standard deviation in rad/s², learned, or the dataset's (else learned)."""
     force_noise: Annotated[float | None, unless_given("SIGMA", "none", float)] = None
     """Noise of the joint forces as well: a standard deviation in Nm, where the search begins with --noise learned."""
     engine: Literal["auto", "exact", "inducing"] = "auto"

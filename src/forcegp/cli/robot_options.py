@@ -27,7 +27,7 @@ class RobotFileOptions:
     """How a robot file is read."""
 
     inertias: Literal["strict", "nearest"] = "strict"
-    """What to do about a physically impossible inertia. strict: refuse the URDF. nearest: use the nearest possible."""
+    """For a physically impossible inertia. strict: refuse it. nearest: take the nearest possible, and warn."""
     base: Annotated[Literal["fixed", "floating"] | None, BASES] = None
     """How the base is held. fixed: bolted to the world, also where the robot has legs or rotors. floating: free."""
     lock: Annotated[tuple[str, ...], listed(), unless_given("JOINT=RAD,...", "as recorded")] = ()

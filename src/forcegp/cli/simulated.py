@@ -57,7 +57,7 @@ class Simulate(Command):
     noise: Annotated[float, arg(metavar="SIGMA")] = 0.1
     """Standard deviation of the noise on the measured acceleration in rad/s²; 0 for none."""
     tool_friction: Annotated[str | None, TOOL_FRICTION] = None
-    """Unmodelled friction of the tool: viscous, with 1 N/(m/s) unless given, or a law of dry friction by name."""
+    """Friction of the tool: viscous, 1 N/(m/s) unless given, or a law of dry friction by name, 0.3 of the load."""
     joint_friction: Annotated[str | None, JOINT_FRICTION] = None
     """Unmodelled friction of the joints: none, or viscous and laws by name, as for --forces."""
     surface: Literal["plane", "tilted", "none"] = "plane"

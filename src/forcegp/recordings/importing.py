@@ -82,7 +82,7 @@ def import_recordings(
 ) -> Dataset:
     """The dataset of this robot that these logs hold; `metadata["import"]` is what was done.
 
-    Each log is at least one episode; gaps and the episode numbers of a log make more. These must fit into memory.
+    Gaps and episode numbers of a log make episodes. Only the columns that are used have to fit into memory.
 
     Raises FileFormatError, DatasetError and InvalidInput naming file, column, row, time and remedy. Warns
     (DataWarning) of what can be used but looks mistaken.

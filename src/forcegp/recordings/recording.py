@@ -31,7 +31,7 @@ class Recording:
 
     `told` is what people should know; `signals` those that were logged, (rows, entries) in SI, in the order of a
     Dataset; `time` [s] from the first row on, whose stamp is `begin`; `jumps` rows before which something turns too
-    far. `stretches` are episode number and rows without gaps, `step` their median step [s], `worst` the largest.
+    far. `stretches`: episode and rows without gaps, `step` [s] their median step, `worst` the largest deviation of it.
     """
 
     told: dict[str, Any]
