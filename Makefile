@@ -60,7 +60,7 @@ release-check:  ## build what is published, check it, and try it in empty enviro
 	for python in python3.11 python3.12 python3.13 python3.14; do \
 		$$python -c pass 2> /dev/null || { echo "$$python is not here, and was not tried."; continue; }; \
 		$$python -m venv build/release/$$python || exit 1; \
-		build/release/$$python/bin/pip install --quiet --extra-index-url $(TORCH_INDEX) --constraint constraints.txt "$$(ls dist/*.whl)[sim]" || exit 1; \
+		build/release/$$python/bin/pip install --quiet --retries 0 --extra-index-url $(TORCH_INDEX) --constraint constraints.txt "$$(ls dist/*.whl)[sim]" || exit 1; \
 		(cd build/release/$$python && bin/forcegp demo) || exit 1; \
 	done
 	tar -xzf dist/*.tar.gz -C build/release
