@@ -15,7 +15,7 @@ from forcegp import ContactForces, Dataset, Model, Robot, Torques, check, fit
 from forcegp.data import Preparation
 from forcegp.errors import InvalidInput
 from forcegp.fit.force_sensors import force_sensor_doubts
-from forcegp.forces import Viscous
+from forcegp.forces import Actuation, Viscous
 from forcegp.mechanics import fixed_point
 
 mujoco = untyped
@@ -116,7 +116,7 @@ def test_a_fit_refuses_what_is_wrong():
     wrong = replace(log, measured={"force.hand": -force})
     assert check(wrong).doubts.of("force sensor").level == "wrong"
     with pytest.raises(InvalidInput, match="or turn all torques"):
-        fit(log.model.with_forces(Viscous()), wrong, [Torques(), ContactForces("hand")])
+        fit(log.model.with_forces(Actuation(gain=None), Viscous()), wrong, [Torques(), ContactForces("hand")])
 
 
 @pytest.mark.parametrize(("sign", "level"), [(1.0, "ok"), (-1.0, "wrong")])

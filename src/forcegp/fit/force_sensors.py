@@ -5,6 +5,7 @@ of F all orders and signs are tried, also as if F were along the axes of the fra
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import permutations, product
 
 import numpy as np
@@ -37,7 +38,8 @@ def force_sensor_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         return
     middle = max(0, (len(dataset) - MOST_ROWS) // 2)
     dataset = dataset.rows(slice(middle, middle + MOST_ROWS))
-    rows, robot = rows_of_known_physics(model, dataset), model.robot
+    robot, stated = model.robot, model.with_forces(replace(model.actuation, gain=1.0))  # unknown gains: as logged
+    rows = rows_of_known_physics(stated, dataset)
     missing = rows.in_torque(np.zeros(0), rows.moving(dataset.a))[0][:, : robot.nv]
     q, v, _, a = tensors(dataset)
     with torch.no_grad():
@@ -45,10 +47,8 @@ def force_sensor_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     driven = np.isin(robot.joint_names, robot.single_joint_names)
     laws = np.stack([dataset.v, np.sign(dataset.v), np.ones(dataset.v.shape), dataset.a], axis=-1) * driven[:, None]
     laws = np.concatenate([laws, regressor], axis=-1)
-    bases = list[np.ndarray]()
-    for each in short_means(dataset, *laws.swapaxes(0, 1)):
-        basis, values, _ = np.linalg.svd(each, full_matrices=False)
-        bases.append(basis[:, values > 1e-9 * values[0]])
+    parts = [np.linalg.svd(each, full_matrices=False)[:2] for each in short_means(dataset, *laws.swapaxes(0, 1))]
+    bases = [basis[:, values > 1e-9 * values[0]] for basis, values in parts]
     size = np.sqrt(np.square(missing + rows.at_contacts).mean(axis=0)) + 1e-12
     idle = driven & (np.ptp(rows.delivered, axis=0) == 0.0)  # a hand may push it
     weight = np.where(idle, 0.0, 1.0 / np.maximum(size, 0.05 * size.max()))
