@@ -59,8 +59,7 @@ def test_a_model_becomes_casadi_functions(forcegp, folder):
     differences = json.loads(done.stdout)["differences"]
     assert differences["arm.casadi"] < 1e-11
     assert differences["arm_step.casadi"] < 1e-8
-    loaded = casadi.Function.load(str(folder / "planner" / "arm_step.casadi"))
-    assert loaded.name_out() == ["q_next", "v_next"]
+    assert casadi.Function.load(str(folder / "planner" / "arm_step.casadi")).name_out() == ["q_next", "v_next"]
     refused = forcegp("export", "run", "--to", "casadi", "--out", "never", "--jacobian", folder=folder)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
     assert "--jacobian is for --to c" in refused.stderr

@@ -69,8 +69,7 @@ def test_the_folder_holds_the_page_the_numbers_and_the_model_from_all_rows(found
     assert {name: stored[name] for name in told} == told
     assert stored["configuration"]["points"] == 40
     rows, model = Dataset.load(folder / "log.h5"), load_posterior(folder / "results" / "model")
-    error = np.abs(rows.a - model.predict(rows.q, rows.v, rows.u).mean.numpy()).mean()
-    assert error < 0.5 * np.abs(rows.a).mean()
+    assert np.abs(rows.a - model.predict(rows.q, rows.v, rows.u).mean.numpy()).mean() < 0.5 * np.abs(rows.a).mean()
 
 
 def test_the_same_command_resumes_and_another_is_refused(forcegp, found, folder):

@@ -141,8 +141,7 @@ def test_a_force_is_asked_for_only_at_the_surface(touching):
 
 
 def test_friction_that_remembers_is_that_of_the_positions_seen(touching):
-    model = arm_model().with_forces(Coulomb([0.4, 0.3, 0.2], memory=True, sigma=200.0))
-    posterior = fit(model, arm_data(30, 0))
+    posterior = fit(arm_model().with_forces(Coulomb([0.4, 0.3, 0.2], memory=True, sigma=200.0)), arm_data(30, 0))
     control = HybridForce(posterior.predictor(covariance="none"), **GAINS, torque_limits=1e6)
     q, v = state(posterior)
     step = np.array([1e-3, -2e-3, 5e-4])

@@ -55,7 +55,6 @@ def test_noise_of_positions_is_no_motion_of_feet_that_stand():
     q[:, :3] += 3e-5 * noise.standard_normal((len(q), 3))
     q[:, 7:] += 1e-4 * noise.standard_normal(q[:, 7:].shape)
     v = differentiate(q, clean_walk.time, space)
-    a = differentiate(v, clean_walk.time)
-    assert wrong(replace(clean_walk, q=q, v=v, a=a, noise_std=None, truth={})) == []
+    assert wrong(replace(clean_walk, q=q, v=v, a=differentiate(v, clean_walk.time), noise_std=None, truth={})) == []
     lifted = 1.0 - clean_walk.u[:, -4:]
     assert wrong(replace(clean_walk, u=np.hstack([clean_walk.u[:, :-4], lifted]), truth={})) == [1]

@@ -50,8 +50,7 @@ def test_it_is_nested_without_repetition_and_deterministic(points, data):
 def test_repeated_rows_come_last(points):
     repeated = np.concatenate([points, points[::-1]])
     distinct = len(np.unique(points, axis=0))
-    chosen = farthest_point_sampling(repeated, len(repeated))
-    assert len(np.unique(repeated[chosen[:distinct]], axis=0)) == distinct
+    assert len(np.unique(repeated[farthest_point_sampling(repeated, len(repeated))[:distinct]], axis=0)) == distinct
 
 
 @pytest.mark.parametrize(

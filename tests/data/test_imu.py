@@ -56,8 +56,7 @@ def recorded():
 
 def changed(change, cutoff=10.0):
     raw, _ = recorded()
-    at_rest = expected(replace(raw, v=0.0 * raw.v, a=0.0 * raw.a), raw.model, NAME)
-    f = change(raw.measured[NAME], at_rest, raw.time)
+    f = change(raw.measured[NAME], expected(replace(raw, v=0.0 * raw.v, a=0.0 * raw.a), raw.model, NAME), raw.time)
     return Preparation(cutoff=cutoff).apply(replace(raw, measured={NAME: f}))
 
 

@@ -55,8 +55,7 @@ def tumbling(
     q, v, a = turned.as_quat(), omega, omega_rate
     if base == "floating":
         q, v, a = (np.concatenate(x, 1) for x in ((p, q), (linear, v), (linear_rate, a)))
-    robot = Robot.from_urdf_text(LIMBS, base=base)
-    model = Model(robot, fixed_point("a_foot", (0.0, 0.0, 0.0), switch="down"))
+    model = Model(Robot.from_urdf_text(LIMBS, base=base), fixed_point("a_foot", (0.0, 0.0, 0.0), switch="down"))
     u = np.stack([np.sin(5 * t), np.cos(4 * t), np.sin(3 * t), (t % 1.0 < 0.5).astype(float)], 1)
     q, v, a = (np.column_stack([x, *more]) for x, more in ((q, joints), (v, djoints), (a, ddjoints)))
     return Dataset(q=q, v=v, u=u, a=a, time=t, model=model)

@@ -84,8 +84,7 @@ def hop(base: str, rate: float, stands: float, gravity=(0.0, 0.0, -9.81)):
     q[:, up], v[:, up], a[:, up] = 0.5 + z, dz, ddz
     q[:, -1], v[:, -1], a[:, -1] = 0.5 + flags * z, flags * dz, flags * ddz
     u = np.stack([5.0 * (ddz + 9.81), 0.0 * flags], 1)
-    model = Model(robot, fixed_point("foot", switch="stands"))
-    return Dataset(q=q, v=v, u=u, a=a, time=time, model=model), flags
+    return Dataset(q=q, v=v, u=u, a=a, time=time, model=Model(robot, fixed_point("foot", switch="stands"))), flags
 
 
 @pytest.mark.parametrize(("rate", "stands", "cutoff"), [(50.0, 0.1, 8.0), (50.0, 0.14, 10.0), (50.0, 0.12, 15.0)])

@@ -157,8 +157,7 @@ def test_a_sensor_shows_forces_along_the_normal(tmp_path, monkeypatch):
     """Something pulls the tool onto the plane, the more the faster it moves: no acceleration shows it."""
     monkeypatch.setitem(FORCES, "world-forces", WorldForces)  # so that files carry it
     at = measured(on_plane(), on_plane(), rows=160)
-    kinematics = on_plane().robot.kinematics(*tensors(at, "q", "v"))
-    J = kinematics.frame_jacobian("hand", (0.0, 0.0, 0.2))[:, :3].numpy()
+    J = on_plane().robot.kinematics(*tensors(at, "q", "v")).frame_jacobian("hand", (0.0, 0.0, 0.2))[:, :3].numpy()
     pull = -4.0 * np.tanh(2.0 * (J @ at.v[..., None])[:, 1, 0])
     push = (J.transpose(0, 2, 1) @ NORMAL) * pull[:, None]
     log = measured(on_plane(), on_plane(), rows=160, noise=0.02, push=push)

@@ -77,8 +77,7 @@ def test_start_values_are_the_moments_of_the_pseudo_inverse_force_residual():
 def test_a_constant_feature_keeps_its_scale():
     model = likelihood(rows=6)
     data = model.training
-    constant = TrainingData(data.q, data.v, torch.full_like(data.u, 2.0), data.a)
-    model = MarginalLikelihood(model.model, constant)
+    model = MarginalLikelihood(model.model, TrainingData(data.q, data.v, torch.full_like(data.u, 2.0), data.a))
     assert torch.equal(model.standardization.scale[0][6:], torch.ones(3).double())
     assert bool(torch.isfinite(model(model.kernels, all_parameters(model.kernels))))
 

@@ -16,7 +16,7 @@ from forcegp.data import Preparation
 from forcegp.errors import InvalidInput
 from forcegp.fit.force_sensors import force_sensor_doubts
 from forcegp.forces import Actuation, Viscous
-from forcegp.mechanics import fixed_point
+from forcegp.mechanics import fixed_frame, fixed_point
 
 mujoco = untyped
 DRY, RATE = np.array([0.3, 0.4, 0.2]), 250
@@ -109,6 +109,15 @@ def test_a_late_sensor_and_a_weight_that_counts_twice():
         assert words in doubt.do
     [doubt] = told(force, log)
     assert "hardly notice" in doubt.what
+
+
+def test_short_logs_and_two_points_tell_nothing_and_known_gains_count():
+    log, force, _, _ = recorded()
+    held = log.model.with_contacts(fixed_frame("hand"))
+    assert "too short" in told(-force[:500], log.rows(slice(0, 500)))[0].what
+    assert list(force_sensor_doubts(replace(log, measured={"force.hand": -force}), held)) == []
+    weak = replace(log, u=2.0 * log.u, model=log.model.with_forces(Actuation(gain=0.5)))
+    assert told(force, weak)[0].numbers["factor"] == pytest.approx(1.0, abs=0.01)
 
 
 def test_a_fit_refuses_what_is_wrong():

@@ -376,8 +376,7 @@ def test_masses_of_a_noisy_trot():
     model = quadruped.walker()
     with pytest.warns(DataWarning, match="leave the stance open"):
         log = Preparation(cutoff="auto", stance="auto").apply(quadruped.recorded(model, 1, "trot", 5.0)[0])
-    opened = model.with_forces(RigidBodies(["trunk"]), Viscous(), Coulomb(), Rotor())
-    found = fit(opened, log, rows=600).parameters
+    found = fit(model.with_forces(RigidBodies(["trunk"]), Viscous(), Coulomb(), Rotor()), log, rows=600).parameters
     rotors = np.array([each.value for name, each in found.items() if name.startswith("rotor")])
     assert found["trunk.mass"].value == pytest.approx(8.0, abs=0.06)
     assert np.sqrt(np.square(rotors - 0.008).mean()) < 0.004

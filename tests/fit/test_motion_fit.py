@@ -115,8 +115,7 @@ def test_inertias_are_found_as_well(along_the_law):
     light = slide(3.0, 4.0)
     light = light.with_robot(Robot.from_urdf_text(URDF.replace('mass value="5"', 'mass value="4"')))
     posterior = fit_model(light.with_forces(noise=QUIET), along_the_law, points=50, restarts=1)
-    after = refined(posterior, along_the_law, 1.0)
-    assert after.model.robot.link("cart").mass == pytest.approx(5.0, rel=0.01)
+    assert refined(posterior, along_the_law, 1.0).model.robot.link("cart").mass == pytest.approx(5.0, rel=0.01)
 
 
 def test_what_is_stored_predicts_the_same(along_the_law, tmp_path):

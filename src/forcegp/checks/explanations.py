@@ -259,8 +259,8 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         left, x = best([needed_torques(robot, moved(joint, y)(rows)) for y in zeros], waves, turns)
         what = (
             f"the torques fit positions of {names[joint]} that are {x:+.3g} rad ({x / DEGREE:+.0f} degrees) from the "
+            "logged ones: its zero is elsewhere"
         )
-        what += "logged ones: its zero is elsewhere"
         do = f"Add it to the column, as in forcegp import --q 'COLUMN {x:+.3g}', or correct the URDF; "
         do += "about the axis of a first joint it may be the base that is turned."
         if abs(x) > 0.05:

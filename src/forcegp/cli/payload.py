@@ -138,7 +138,7 @@ def with_payload(
     loaded = model.with_forces(*bodies, forcegp.Payload(link, mass, None))
     torques: Any
     torques, *sensors = usual_evidence(loaded, rows)
-    evidence = (replace(torques, mean=WIDER * torques.mean if torques.mean else WINDOW), *sensors)
+    evidence = (replace(torques, mean=round(WIDER * torques.mean, 4) if torques.mean else WINDOW), *sensors)
     return forcegp.scores.learn(loaded, rows, evidence, baseline=baseline)[0]
 
 

@@ -197,8 +197,7 @@ def _judged(dataset: Dataset, cutoff: float, source: Literal["q", "v"]) -> tuple
     away = SETTLED / tried[0] + abs(delay)
     times = [rows.time for _, rows, _ in episodes_in_order(log)]
     inner = np.concatenate([(time >= time[0] + away) & (time <= time[-1] - away) for time in times])
-    folds = np.array_split(np.arange(int(inner.sum())), FOLDS)
-    sides = [np.concatenate(folds[first::2]) for first in (0, 1)]
+    sides = [np.concatenate(np.array_split(np.arange(int(inner.sum())), FOLDS)[first::2]) for first in (0, 1)]
     sharp = torque_columns(behind(tried[-1]))
 
     def judged(values: Float[np.ndarray, "rows columns"]) -> np.ndarray:

@@ -161,8 +161,7 @@ class _Forces:
         def explained(where: np.ndarray) -> np.ndarray:
             return self.causes(where)[0] @ law.T
 
-        steps = STEP * np.eye(3)
-        slope = [(explained(wind + step) - explained(wind - step)) / (2.0 * STEP) for step in steps[:2]]
+        slope = [(explained(wind + step) - explained(wind - step)) / (2.0 * STEP) for step in (STEP * np.eye(3))[:2]]
         return self.wrench - explained(wind), np.stack([*slope, np.zeros_like(slope[0])], axis=-1)
 
 

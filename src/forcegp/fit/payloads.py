@@ -248,8 +248,7 @@ def _columns(
     names, columns = [], []
     for body, drive in enumerate(robot.layout.drives):
         if robot.layout.parents[body] >= 0 and bool(robot.tree.rest[body, :3, 3].any()):
-            longer = with_length(robot, body, 1.0 + STEP)
-            change = longer.inverse_dynamics(q, v, at) - robot.inverse_dynamics(q, v, at)
+            change = with_length(robot, body, 1.0 + STEP).inverse_dynamics(q, v, at) - robot.inverse_dynamics(q, v, at)
             names.append(robot.joint_names[drive.joint])
             columns.append(change.cpu().numpy() / STEP)
     return names, np.stack(columns, axis=-1) if columns else np.zeros((*a.shape, 0))

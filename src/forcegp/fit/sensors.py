@@ -32,7 +32,7 @@ def usual_evidence(model: Model, dataset: Dataset) -> tuple[Evidence, ...]:
     sensors += [JointTorques()] if any(name.startswith(TORQUE) for name in measured) else []
     moves = not model.robot.space.is_vector_space
     cutoff = preparation_report(dataset.metadata).get("cutoff") if moves and dataset.time_ordered else None
-    return Torques("both" if felt or moves else "u", PERIODS / cutoff if cutoff else None), *sensors
+    return Torques("both" if felt or moves else "u", round(PERIODS / cutoff, 4) if cutoff else None), *sensors
 
 
 def with_sensors(dataset: Dataset, model: Model, rest: Evidence, sensors: Sequence[Sensor]) -> tuple[Dataset, Model]:

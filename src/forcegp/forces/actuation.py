@@ -264,5 +264,4 @@ def forces_of_mjcf(robot: Robot, found: Translation) -> tuple[Force, ...]:
     thrusters = (Thrusters.of_wrench(each.link, each.wrench, each.name) for each in pushing)
     sprung = {name: each for name, each in found.springs.items() if name in moving}
     stiffness, rest = ({name: each[k] for name, each in sprung.items()} for k in (0, 1))
-    springs = (Spring(stiffness, rest),) if sprung else ()
-    return (actuation, *thrusters, *forces_of_file(robot)[1:], *springs)
+    return (actuation, *thrusters, *forces_of_file(robot)[1:], *((Spring(stiffness, rest),) if sprung else ()))

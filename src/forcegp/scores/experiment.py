@@ -148,8 +148,7 @@ class Experiment:
 
     def jobs(self, models: Mapping[str, Candidate], seeds: int) -> tuple[list[Job], list[Job]]:
         """Identifications, and the models, which read their results; those that use all rows with one seed only."""
-        text = json.dumps(self.configuration, sort_keys=True)
-        common = {"configuration": hashlib.sha256(text.encode()).hexdigest()}
+        common = {"configuration": hashlib.sha256(json.dumps(self.configuration, sort_keys=True).encode()).hexdigest()}
         wanted = sorted({self.identifies, *(each.identification for each in models.values() if each.identification)})
         identifications, fits = list[Job](), list[Job]()
 

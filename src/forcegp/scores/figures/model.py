@@ -208,8 +208,7 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
         if truth is not None and truth.shape == other.shape == size.shape:
             style.draw_line(axes, rows.time, (other * truth)[:, index], style.TRUTH, 3.5, "true", alpha=0.3)
         if contact.frame in sensed:
-            along = dynamics.normals[:, index].numpy() / size[:, [index]]
-            there = (along * sensed[contact.frame]).sum(1)
+            there = ((dynamics.normals[:, index].numpy() / size[:, [index]]) * sensed[contact.frame]).sum(1)
             style.draw_line(axes, rows.time, there, style.TRUTH, 3.5, "measured", alpha=0.3)
         style.draw_band(axes, rows.time, mean[:, index], spread[:, index], alpha=0.3, label="95 % band")
         style.draw_line(axes, rows.time, mean[:, index], style.PREDICTION, 1.3, "predicted")
