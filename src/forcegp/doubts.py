@@ -20,8 +20,7 @@ LEVELS: tuple[Level, ...] = ("ok", "look", "wrong")
 class Doubt:
     """One thing that was looked at.
 
-    level: ok; look, a person should judge; wrong, results would be wrong. about: what was looked at, the same words for
-        all.
+    level: ok; look, a person should judge; wrong, results would be wrong. about: what was looked at, in few words.
     what: what was seen, with joint, row, time and numbers. do: what to do about it, beside the `command`.
     joints: names of the joints concerned; numbers: the numbers of `what`, for programs.
     correction: what an import has to state, for `ColumnMapping.corrected_by`: unit, sign and order by signal,

@@ -40,10 +40,8 @@ class Model(Summary):
     robot: its kinematics and inertia.
     contacts: points that stay on surfaces; also what `fixed_point` and `fixed_frame` give, several each.
     forces: everything that acts: laws add up to Q_K, unknown ones to Q_U. None: what the robot's file states
-        (actuation, rigid bodies, damping, dry friction, springs). Without `RigidBodies` unknown forces carry gravity
-        and actuation.
-    noise: of the measured acceleration, a `Noise` or its standard deviation. None takes what a log states, or learns
-        it.
+        (actuation, rigid bodies, damping, dry friction, springs). Unknown forces carry what has no law, also gravity.
+    noise: of the measured acceleration, a `Noise` or its standard deviation. None: as a log states, or learned.
     baumgarte: stabilisation, if the motion has it.
 
     Raises InvalidInput, UnknownName or ContactError for parts that do not fit the robot.

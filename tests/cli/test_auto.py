@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from tests.checks import corruptions
 from tests.checks.corruptions import recorded_under
-from tests.checks.logs import clean, pendulum
+from tests.checks.logs import clean
 from tests.goldens.compare import assert_unchanged
 from tests.simulation.pendulum import double_pendulum
 
-from forcegp import Coulomb, Dataset, Noise, Robot, Viscous, fit, load_posterior
+from forcegp import Dataset, Robot, load_posterior
 from forcegp.cli.answer import is_explained, verdict
 from forcegp.cli.auto import default_models
 from forcegp.cli.logs import prepared_rows
@@ -201,14 +201,16 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
 
 @pytest.mark.usefixtures("unchecked")  # a stand-in for a posterior
 def test_accelerations_are_learned_from_where_torques_make_them_predictable():
-    data = clean(0, pendulum(), noise=0.0)
-    known = fit(data.model.with_forces(Viscous(0.1), Coulomb(0.2), noise=Noise(1.0)), data)
-    assert default_models(data.model, known, data)[-1] == "identified@accelerations"
-    assert default_models(data.model, known, data, ["elbow"])[-1] == "identified+gp:joint-friction"
-    arm = clean(0, noise=0.0)
-    exact = replace(arm, u=arm.u - 0.1 * arm.v - 0.2 * np.tanh(arm.v / 0.05))
-    assert default_models(arm.model, SimpleNamespace(model=arm.model), exact)[-1] == "identified@accelerations"
-    wrist = replace(exact, a=exact.a + np.array([0.0, 0.0, 100.0]) * np.random.default_rng(0).normal(size=arm.a.shape))
-    assert default_models(arm.model, SimpleNamespace(model=arm.model), wrist)[-1] == "identified@torques:both"
-    loud = replace(data, u=data.u + 3.0 * np.random.default_rng(0).normal(size=data.u.shape))
-    assert default_models(data.model, known, loud)[-1] == "identified+gp:joint-friction"
+    arm, normal, given = clean(0, noise=0.0), np.random.default_rng(0).normal, SimpleNamespace()
+    given.model, u = arm.model, arm.u - 0.1 * arm.v - 0.2 * np.tanh(arm.v / 0.05)
+    off = u.std(axis=0) * [1.0, 0.0, 0.0] * normal(size=u.shape)
+
+    def last(off: np.ndarray, a: np.ndarray = arm.a, still: tuple[str, ...] = ()) -> str:
+        return default_models(arm.model, given, replace(arm, u=u + off, a=a), still)[-1]
+
+    assert last(0.15 * off) == "identified@accelerations"
+    assert last(0.07 * off) == last(0.0 * off) == "identified+gp:joint-friction", "nothing is left to learn"
+    assert last(0.15 * off, still=("elbow",)) == "identified+gp:joint-friction"
+    wrist = arm.a + np.array([0.0, 0.0, 100.0]) * normal(size=off.shape)
+    assert last(0.15 * off, wrist) == "identified@torques:both"
+    assert last(30.0 * normal(size=off.shape)) == "identified+gp:joint-friction"

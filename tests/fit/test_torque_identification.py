@@ -131,6 +131,16 @@ def test_progress_and_a_limit_on_rows():
     assert seen[-1][2].startswith(f"all rows, step {len(seen)}: ")
 
 
+def test_means_over_time_need_few_rows_in_each_window():
+    log = replace(recorded(6000, 8, torque_noise=0.2), time=np.arange(6000) / 60.0)
+    model = log.model.with_forces(*LAWS)
+    for seconds, rows in ((0.2, 5000), (0.4, 2500), (2.0, 2000)):
+        found = fit(model, log, Torques(mean=seconds)).estimates
+        assert found.rows == pytest.approx(rows, abs=10)
+    every = fit(model, log, Torques(mean=2.0), rows=6000).estimates
+    assert all(abs(each.value - every[name].value) < 3.0 * each.std for name, each in found.items())
+
+
 def test_models_that_cannot_be_identified_so():
     data = recorded(5, 9)
     with pytest.raises(InvalidInput, match="touches something with hand"):

@@ -127,8 +127,7 @@ class TrackingController(Controller):
 class ComputedTorque(TrackingController):
     """u = M (a_d + Kd (v_d - v) + Kp (q_d - q)) + h - Q_U: all forces compensated, also those learned.
 
-    * model: `posterior.predictor()`, or a `Model` without anything learned, which takes longer. Gains as
-      `TrackingController` has them.
+    * model: `posterior.predictor()`, or a `Model` without anything learned, which takes longer.
     Forces are those at (q, v_d): at the measured velocity dry friction would follow noise and overshoot. Friction that
     remembers has the state of the positions that were seen (`past`); steps of at most `position_noise` (rad or m) are
     those of the encoder, which would wear it down.
@@ -344,8 +343,7 @@ class MPPI(Controller):
     * predictor: `posterior.predictor()`, with whose mean it plans.
     * cost: costs (...) of whole motions q, v (..., T+1, nv) under u (..., T, nv), the last state included.
     * torque_limits: largest absolute torques in Nm (N), a number or one per joint; None takes the efforts of the URDF.
-    * noise: largest standard deviation around the plan, None for half the limits; it falls to a twentieth from sequence
-      to sequence.
+    * noise: largest standard deviation around the plan, None for half the limits; it falls to a twentieth.
     * integrator: of the motions; None takes `usual_integrator`. The attribute `integrator` says which it is.
 
     Raises InvalidInput for arguments that do not fit, NumericalError where no sequence has a finite cost.

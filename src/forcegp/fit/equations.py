@@ -70,15 +70,20 @@ class Equations:
         """Rows by log."""
         return np.split(values, self.ends)
 
-    def equations(self, x: np.ndarray, parts: Sequence[tuple[np.ndarray, ...]]) -> tuple[np.ndarray, Jacobian]:
-        """Residuals and their Jacobian in x, from derivatives in standard parameters and coordinates of laws."""
+    def equations(
+        self, x: np.ndarray, parts: Sequence[tuple[np.ndarray, ...]], windows: "WindowMeans | None" = None
+    ) -> tuple[np.ndarray, Jacobian]:
+        """Residuals and their Jacobian in x, from derivatives in standard parameters and coordinates of laws.
+
+        With `windows` means of these, which are taken before the numbers of columns are multiplied.
+        """
         r, Y, in_terms = zip(*parts, strict=True)
-        residual = np.concatenate(r)
+        residual, mean = np.concatenate(r), np.asarray if windows is None else windows.mean
         if len(Y) != len(self._stays) or any(a is not b for a, b in zip(Y, self._stays, strict=True)):
             flat = np.concatenate(Y).reshape(*residual.shape, 10 * len(self.space.carried))
-            self._stays, self._regressor = Y, Regressor(flat)
+            self._stays, self._regressor = Y, Regressor(mean(flat))
         slopes = self.space.bodies.slopes(x[: self.space.bodies.size])
-        return residual, Chained(self._regressor, slopes, np.concatenate(in_terms))
+        return mean(residual), Chained(self._regressor, slopes, mean(np.concatenate(in_terms)))
 
     def _moving(self, a: Float[np.ndarray, " nv"]) -> list[Motion]:
         """All rows with these accelerations."""
@@ -100,13 +105,14 @@ class Equations:
         Those of passive joints are over their inertia: else they would vanish with the bodies that they move.
         """
         found = [part.in_torque(x, motion)[:3] for part, motion in zip(self.parts, motions, strict=True)]
-        r, jacobian = self.equations(x, found)
+        windows = None if self.held.shape[1] else self.windows
+        r, jacobian = self.equations(x, found, windows)
         for joint, (own, first) in self.passive.items():
             jacobian, (inertia, *slopes) = np.asarray(jacobian), self._inertia(x, joint, own) / first
             r[:, joint] /= inertia
             jacobian[:, joint] = (jacobian[:, joint] - r[:, [joint]] * np.array(slopes)) / inertia
-        if self.windows is not None:
-            free = partial(without, span=orthonormal_columns(self.hidden) if self.held.shape[1] else None)
+        if self.windows is not None and windows is None:
+            free = partial(without, span=orthonormal_columns(self.hidden))
             r, jacobian = self.windows.mean(free(r)), self.windows.mean(free(np.asarray(jacobian)))
         return self._as_logged(x, r, np.asarray(jacobian)) if self.in_units_of_log else (r, jacobian)
 

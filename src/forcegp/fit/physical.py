@@ -31,6 +31,8 @@ ROWS = 5_000
 """Rows that are used at most, evenly spread: more of a filtered recording add little."""
 EQUATIONS = 40_000
 """As many rows hold these equations, one per degree of freedom, at most."""
+WINDOWED, PER_WINDOW = 2_000, 10
+"""Of means over windows so many rows are enough, or so many in each: half a second of a filtered log has few more."""
 REWEIGHTINGS = 2
 """Searches in which accelerations are weighted by noise of both kinds."""
 SEARCHES = 20
@@ -72,12 +74,14 @@ def fit_physical(
     bodies = any(getattr(law, "learn", ()) or (isinstance(law, Payload) and not law.known) for law in model.laws)
     robot, thick = thickened(model.robot) if bodies else (model.robot, ())
     model = replace(model, robot=robot)
-    most = min(ROWS, EQUATIONS // robot.nv) if rows is None else rows
+    most, seconds = min(ROWS, EQUATIONS // robot.nv), evidence.mean if isinstance(evidence, Torques) else None
+    if seconds:
+        most = min(most, max(WINDOWED, int(PER_WINDOW * max(np.ptp(log.time) for log in logs) / seconds)))
     logs = [with_memory(log, model) for log in logs]
     model = with_payloads_placed(model, logs)
     if robot.space.is_vector_space and evidence.of_torque and not evidence.noisy_in_both:
         logs = [one_row_per_rest(log) for log in logs]
-    logs = [log.rows(evenly(log, most)) for log in logs]
+    logs = [log.rows(evenly(log, most if rows is None else rows)) for log in logs]
     typical = typical_sizes(model, logs) if near is None else near.typical
     space = ParameterSpace(model, typical)
     unseen = Unseen.of(model, logs[0], typical["force"])

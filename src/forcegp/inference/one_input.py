@@ -91,8 +91,7 @@ class OneInputFunctions:
     def c_source(self, name: str) -> str:
         """`static void name(const double *table, real s, real *f, real *slope)`, R entries of f and of slope or NULL.
 
-        C99 for one state (real is double, AT(x, k) is x) or several in the lanes of a GCC vector; needs <math.h>,
-        r_exp, ....
+        C99 for one state (real is double, AT(x, k) is x) or several in the lanes of a GCC vector.
         """
         n, E, first = len(self.curves), range(len(self.envelopes)), 0
         names = [{"z": f"(p[{i}] * s)", "y": f"y{i}", "rate": f"p[{i}]"} for i in range(n)]

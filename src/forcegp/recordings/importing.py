@@ -36,8 +36,7 @@ class ImportOptions:
 
     Fields
     ------
-    gap: seconds without a row, or a message of one of several topics, that begin another episode; None for ten median
-        steps.
+    gap: seconds without a row, or a message of one of several topics, that begin another episode; None: ten steps.
     rate: "auto" gives uneven rows even times at the median of the recordings' median rates, a number (Hz) all rows at
         that rate; "log" keeps every stamp.
     start, end: seconds from the first row of each episode that are kept.

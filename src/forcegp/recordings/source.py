@@ -53,7 +53,8 @@ class Source(ABC):
         found = self.table(names)
         if not len(found[names[0]]):
             raise FileFormatError(f"{self.path} has no rows; give a log with rows.")
-        return {name: as_column(found[name]) for name in names}
+        integers = [name for name in names if found[name].dtype.kind in "iu" and found[name].dtype != np.uint64]
+        return {name: np.ascontiguousarray(found[name], np.int64 if name in integers else float) for name in names}
 
     @property
     def vectors(self) -> Mapping[str, tuple[str, ...]]:
@@ -95,13 +96,6 @@ def require_distinct(path: Path, names: Sequence[str]) -> None:
 def element_names(name: str, width: int) -> list[str]:
     """`name[0] ... name[width-1]`."""
     return [f"{name}[{index}]" for index in range(width)]
-
-
-def as_column(values: np.ndarray) -> np.ndarray:
-    """int64 for integers that fit, else float64."""
-    if values.dtype.kind in "iu" and values.dtype != np.uint64:
-        return np.ascontiguousarray(values, dtype=np.int64)
-    return np.ascontiguousarray(values, dtype=np.float64)
 
 
 def arrow_numbers(column: Any) -> np.ndarray:
