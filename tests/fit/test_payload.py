@@ -184,6 +184,22 @@ def test_causes_that_explain_more_are_named_and_in_the_interval(cause, off):
     assert all(low <= true <= high for (low, high), true in zip(ends, [MASS, *CENTER], strict=True))
 
 
+ENCODERS = ("gear ratio", 1.2, 0.5), ("gear ratio", 1.08, 0.05), ("joint zero", 0.1, 0.5), ("joint zero", 0.04, 0.05)
+
+
+@pytest.mark.parametrize(("cause", "true", "noise"), ENCODERS)
+@pytest.mark.filterwarnings("ignore::forcegp.errors.DataWarning")
+def test_a_wrong_encoder_is_named(cause, true, noise):
+    """Positions of one joint, and what follows from them; from sizes on that are no error of a fit."""
+    data, one = log(loaded(), 1, noise=noise), np.arange(6) == 2
+    wrong = {x: getattr(data, x) / np.where(one, true, 1.0) for x in "qva"}
+    data = replace(data, **(wrong if cause == "gear ratio" else {"q": data.q - true * one}))
+    [doubt] = Found(data, rows=800).posterior.settings["doubts"]
+    named = true > 1.1 or 0.05 < true < 1.0
+    assert doubt["numbers"].get(cause) == (pytest.approx({"elbow_joint": true}, rel=0.1) if named else None)
+    assert not named or float(doubt["what"].partition(" leave ")[2].partition("%")[0]) > 30.0
+
+
 @pytest.mark.parametrize("times", [1.3, -1.0])
 def test_a_cause_is_what_ridge_regression_finds(times):
     """Of dense equations in numbers and factors, with the priors as rows: few rows, so that these count."""

@@ -186,9 +186,13 @@ MOST_FACTORS = 3  # of one cause that a person can look for
 
 
 def other_causes(payload: Mapping[str, Any]) -> dict[str, str]:
-    """What would explain more than this payload, by cause; beside none, what drives alone do."""
+    """What would explain more than this payload, by cause; beside none, what drives and encoders alone do."""
     mass = payload.get("parameters", {}).get("payload.mass", {"value": 1.0, "std": 0.0})
     doubts = [each for each in payload.get("doubts", ()) if each["about"] == "payload"]
     causes = ((cause, len(own), each["what"]) for each in doubts for cause, own in each["numbers"].items())
     some = mass["value"] > mass["std"]
-    return {cause: what for cause, factors, what in causes if factors <= MOST_FACTORS and (some or cause == "gains")}
+    return {
+        cause: what
+        for cause, factors, what in causes
+        if factors <= MOST_FACTORS and (some or cause not in ("lengths", "masses"))
+    }

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -118,12 +119,16 @@ CAUSES = {
     "gains": (0.2, "torques of the log times", "Check these drives; `gain` among the forces estimates them."),
     "lengths": (0.1, "lengths before the joints times", "Compare the URDF's lengths with the robot."),
     "masses": (0.2, "masses of the links times", "Give a baseline (a log without the payload), or identify all links."),
+    "gear ratio": (0.2, "positions and velocities of the log times", "Compare the gear's ratio with its data sheet."),
+    "joint zero": (0.1, "positions of the log plus", "Compare the joint's zero with that of the URDF."),
 }
-"""Usual deviations of the logarithms of factors, what they are of, and what to do. All factors of a cause are tried,
-and each alone. Of two the first is named, unless the other explains a tenth more: what it explains less the half of
-the logarithm of the rows for each factor (Schwarz 1978)."""
+"""Usual deviations of the logarithms of factors (of zeros in rad or m), what they are of, and what to do. All factors
+of a cause are tried, and each alone. Of two the first is named, unless the other explains a tenth more: what it
+explains less the half of the logarithm of the rows for each factor (Schwarz 1978)."""
+ALONE, MOSTLY = {"gear ratio": 0.1, "joint zero": 0.05}, 0.3
+"""Of these no two are tried at once, and one is so large at least, and explains this share of what is left."""
 STEP = 1e-4
-"""Of a length, for its derivative."""
+"""Of lengths, ratios and zeros, for derivatives."""
 WRONG = 0.03
 """Logarithm of the largest factor below which a cause is not worth a word."""
 NO_STEP = 0.8
@@ -151,8 +156,9 @@ def misfit(
     scales = [10 * k for k, each in enumerate(rows[0].space.carried) if each.payload is not None]
     if np.linalg.norm(fit.residual) <= RIGHT * np.linalg.norm(0.5 * fit.jacobian[..., scales]):
         return None  # of the torques of payloads, next to nothing is left
-    for cause, (usual, said, do) in CAUSES.items():
-        if (cause != "lengths" and not actuation.is_exact) or (cause != "gains" and moving):
+    options = dict[str, tuple[Any, ...]]()
+    for cause, (usual, _, _) in CAUSES.items():
+        if (cause in ("gains", "masses") and not actuation.is_exact) or (cause != "gains" and moving):
             continue  # a factor of all masses is one of the gains that are estimated, or of all those of a base
         names, columns = zip(*(_columns(cause, model, *each) for each in zip(rows, a, left, strict=True)), strict=True)
         C = white(columns).reshape(r.size, -1)
@@ -161,26 +167,30 @@ def misfit(
         across, every = J.T @ C, np.arange(C.shape[1])
         own, slope = C.T @ C - across.T @ inverse @ across + np.eye(len(every)) / usual**2, C.T @ r
         tried = list[tuple[float, float, np.ndarray, np.ndarray]]()
-        for some in (*([] if moving else [every]), *every[:, None]):
+        for some in (*([] if moving or cause in ALONE else [every]), *every[:, None]):
             change = np.zeros(len(every))
             change[some] = -np.linalg.solve(own[np.ix_(some, some)], slope[some])
             more = -0.5 * float(slope @ change)
             tried.append((more - 0.5 * len(some) * np.log(r.size), more, change, -inverse @ (across @ change)))
-        worth, more, change, move = max(tried, key=lambda each: each[0])
-        instead = _instead(rows[0].space, fit, C, usual, least, more) if cause == "gains" else None
-        change, move = instead or (change, move)
+        options[cause] = names[0], C, *max(tried, key=lambda each: each[0])
+    most = max((more for _, _, _, more, *_ in options.values()), default=0.0)
+    for cause, (names, C, worth, more, *changes) in options.items():
+        usual, said, do = CAUSES[cause]
+        instead = _instead(rows[0].space, fit, C, usual, least, most) if cause == "gains" else None
+        change, move = instead or changes
         off, factors = abs(change) > WRONG, np.exp(change) if instead is None else 1.0 + change
-        clearly = instead is not None or (worth > best and more > least)
-        if clearly and off.any() and abs(change).max() < NO_STEP:
-            told = ", ".join(f"{factors[k]:.3g} ({names[0][k]})" for k in np.flatnonzero(off))
+        clearly = instead is not None or (worth > best and more > max(least, MOSTLY * cost * (cause in ALONE)))
+        if clearly and off.any() and ALONE.get(cause, 0.0) < abs(change).max() < NO_STEP:
+            factors, unit = (change, " rad") if cause == "joint zero" else (factors, "")
+            told = ", ".join(f"{factors[k]:.3g}{unit} ({names[k]})" for k in np.flatnonzero(off))
             less = f"leave {more / cost:.0%} less unexplained" if more < cost else "explain nearly all of it"
             less = less if instead is None else "do as well as any payload"
             doubt = look(
                 about="payload",
                 what=f"{said} {told} would {less}. The intervals hold what that would change.",
                 do=do,
-                joints=tuple(np.array(names[0])[off].tolist()),
-                numbers={cause: {names[0][k]: float(factors[k]) for k in np.flatnonzero(change)}},
+                joints=tuple(np.array(names)[off].tolist()),
+                numbers={cause: {names[k]: float(factors[k]) for k in np.flatnonzero(change)}},
             )
             best, found = 1.1 * worth, (doubt, move, more)
             if instead is not None:
@@ -246,7 +256,14 @@ def _columns(
         return [body.child for body in robot.layout.bodies], rows.by_body(a)
     q, v, at = (torch.as_tensor(np.array(x), device=robot.device) for x in (rows.q, rows.v, a))
     names, columns = [], []
-    for body, drive in enumerate(robot.layout.drives):
+    for joint, name in enumerate(robot.joint_names if cause in ALONE and robot.space.is_vector_space else ()):
+        if cause == "joint zero" and robot.joint(name).type == "prismatic":
+            continue
+        one = STEP * torch.eye(robot.nv, dtype=q.dtype, device=q.device)[joint]
+        there = (q + one, v, at) if cause == "joint zero" else (x + one * x for x in (q, v, at))
+        names.append(name)
+        columns.append((robot.inverse_dynamics(*there) - robot.inverse_dynamics(q, v, at)).cpu().numpy() / STEP)
+    for body, drive in enumerate(() if cause in ALONE else robot.layout.drives):
         if robot.layout.parents[body] >= 0 and bool(robot.tree.rest[body, :3, 3].any()):
             change = with_length(robot, body, 1.0 + STEP).inverse_dynamics(q, v, at) - robot.inverse_dynamics(q, v, at)
             names.append(robot.joint_names[drive.joint])
