@@ -184,13 +184,17 @@ class Explanation:
     @cached_property
     def of_any_masses(self) -> Float[np.ndarray, "rows nv"]:
         """What is left of each torque by a robot with any masses and friction."""
+        return self.left_beside(np.ones((*self.log.rows.q.shape, 1)))
+
+    def left_beside(self, more: Float[np.ndarray, "rows nv k"]) -> Float[np.ndarray, "rows nv"]:
+        """The same with these columns of each joint, too."""
         rows, robot = self.log.rows, self.log.robot
         q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
         with torch.no_grad():
             regressor = robot.kinematics(q, v).torque_regressor(a).flatten(-2).cpu().numpy()
         left = []
         for k, u in enumerate(rows.u.T):
-            columns = np.c_[regressor[:, k], self.log.friction[:, k], np.ones(len(u))]
+            columns = np.c_[regressor[:, k], self.log.friction[:, k], np.ones(len(u)), more[:, k]]
             size = np.linalg.norm(columns, axis=0)
             basis, values, _ = np.linalg.svd(columns[:, size > 0.0] / size[size > 0.0], full_matrices=False)
             basis = basis[:, values > 1e-8 * values[0]]

@@ -5,14 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
-from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, UNKNOWN, Explanation
+from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, UNKNOWN, Explanation, moving
 from forcegp.checks.torques import WIDTHS, Comparison, stretch, with_gravity
-from forcegp.data import Dataset, estimate_delay
+from forcegp.data import Dataset, estimate_delay, with_strokes
 from forcegp.data.views import consecutive, rests
 from forcegp.doubts import Doubt, listed, look, ok, wrong
 from forcegp.errors import DatasetError
+from forcegp.forces.presliding import after_strokes
 from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.summary import plain
@@ -25,6 +27,7 @@ SPRINGS, DAMPING = tuple(np.geomspace(1.0, 40.0, 24).tolist()), (0.02, 0.1, 0.3)
 """Resonances that are tried [Hz], and shares of critical damping."""
 BELOW = 1.0 / 3.0  # of a resonance, where a robot is as good as rigid
 MOST_ROWS = 2000  # on which that is judged
+STIFFNESS = 50.0, 200.0, 800.0  # of what friction remembers, over the reciprocal deviation of positions
 SURE, TELLS = 200.0, 30.0  # nats that a stretch of time in which something is touched explains: in all, and of a joint
 SEEN, WARMER = 1e-3, 0.1  # share of the largest direction of columns; logarithm of a ratio of friction that is told
 RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
@@ -178,28 +181,45 @@ def _delays(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
 
 def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     """A stretch of time in which several torques are far from any robot of these lengths, unlike before and after."""
-    left, rows, ones = found.of_any_masses, found.log.rows, np.ones((len(found.log.rows), 1))
-    alive = [np.hstack([ones, -ones, x[:, None]]) for x in left.T if x.any()]
-    if len(rows) < FEWEST_ROWS or not alive:
+    rows, ones = found.log.rows, np.ones((len(found.log.rows), 1))
+    if len(rows) < FEWEST_ROWS:
         return
-    _, _, first, last = max(map(stretch, alive))
-    inside = np.isin(np.arange(len(rows)), np.arange(first, last))
-    power = [np.square(left[each]).mean(0) + 1e-300 for each in (inside, ~inside, slice(None))]
-    told = inside.sum() * np.log(power[2] / power[0]) + (~inside).sum() * np.log(power[2] / power[1])
-    gains = told * (power[0] > power[1])
-    joints, smeared = np.flatnonzero(gains > TELLS), 2.0 / inputs.compared_cutoff
-    begin, end = rows.time[first] - smeared, rows.time[last - 1] + smeared
-    lasts = end - begin > 2.5 * smeared  # longer than a period of the cut-off, unlike what a filter makes of a turn
-    if gains.sum() > SURE and len(joints) > 1 and lasts and first > 0 and last < len(rows):
-        times = np.sqrt(power[0] / power[1])[joints].max()
-        yield look(
-            about="push",
-            what=f"from {begin:.4g} to {end:.4g} s the torques of {listed(inputs.named(joints))} are up to {times:.2g} "
-            "times as far from any masses and friction as elsewhere: a contact, or a load, in these seconds.",
-            do=f"Leave them out by forcegp import --without {begin:.2f},{end:.2f}, as forcegp auto does.",
-            joints=inputs.named(joints),
-            numbers={"seconds": [float(begin), float(end)], "gains": gains[joints].tolist()},
-        )
+    for again in (False, True):  # beside friction that remembers, which looks like a push where a joint hardly moves
+        left = found.left_beside(_remembered(found, inputs)) if again else found.of_any_masses
+        alive = [np.hstack([ones, -ones, x[:, None]]) for x in left.T if x.any()]
+        if not alive:
+            return
+        _, _, first, last = max(map(stretch, alive))
+        inside = np.isin(np.arange(len(rows)), np.arange(first, last))
+        power = [np.square(left[each]).mean(0) + 1e-300 for each in (inside, ~inside, slice(None))]
+        told = inside.sum() * np.log(power[2] / power[0]) + (~inside).sum() * np.log(power[2] / power[1])
+        gains = told * (power[0] > power[1])
+        joints, smeared = np.flatnonzero(gains > TELLS / (1 + again)), 2.0 / inputs.compared_cutoff
+        begin, end = rows.time[first] - smeared, rows.time[last - 1] + smeared
+        lasts = end - begin > 2.5 * smeared  # longer than a period of the cut-off, unlike what a filter makes of a turn
+        if not (gains.sum() > SURE / (1 + again) and len(joints) > 1 and lasts and first > 0 and last < len(rows)):
+            return
+    times = np.sqrt(power[0] / power[1])[joints].max()
+    yield look(
+        about="push",
+        what=f"from {begin:.4g} to {end:.4g} s the torques of {listed(inputs.named(joints))} are up to {times:.2g} "
+        "times as far from any masses and friction as elsewhere: a contact, or a load, in these seconds.",
+        do=f"Leave them out by forcegp import --without {begin:.2f},{end:.2f}, as forcegp auto does.",
+        joints=inputs.named(joints),
+        numbers={"seconds": [float(begin), float(end)], "gains": gains[joints].tolist()},
+    )
+
+
+def _remembered(found: Explanation, inputs: CheckInput) -> Float[np.ndarray, "rows nv k"]:
+    """What dry friction of each joint remembers, under each of `STIFFNESS`."""
+    assert inputs.compared is not None
+    dense = with_strokes(found.log.changed(inputs.compared))
+    past = moving(replace(inputs, compared=dense).rows()).strokes
+    if past is None:
+        return np.zeros((*found.log.rows.q.shape, 0))
+    spread = np.maximum(found.log.rows.q.std(axis=0), 1e-9)
+    each = [after_strokes(torch.tensor(past), torch.tensor(sigma / spread)).numpy() for sigma in STIFFNESS]
+    return np.stack(each, axis=-1)
 
 
 def held_points(inputs: CheckInput) -> list[Doubt]:
