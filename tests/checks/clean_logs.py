@@ -87,3 +87,17 @@ def clean_logs(seed: int) -> Iterator[tuple[str, Dataset]]:
         ),
     )
     yield "no noise at all", rests(two_links(), seed, noise=0.0)
+
+
+def between_postures(robot: Robot, seed: int, seconds: float, share: float = 1.0) -> Dataset:
+    """Moves of two seconds, or this share of them, of some joints each, under LuGre friction of 1 Nm."""
+    rng, time = np.random.default_rng(seed), np.arange(int(200.0 * seconds)) / 200.0
+    count, move = (int(seconds / 2.0) + 2, robot.nv), (time // 2.0).astype(int)
+    steps = rng.uniform(0.05, 0.6, count) * rng.choice([-1, 1], count) * (rng.random(count) < 0.7)
+    s, P = np.clip((time / 2.0 - move) / share, 0.0, 1.0)[:, None], np.cumsum(steps, 0)
+    q = P[move] + (P[move + 1] - P[move]) * s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+    data, bristle, held = with_motion(robot, q, 200.0, seed, 0.0), np.zeros(robot.nv), []
+    for v in np.repeat(data.v, 20, axis=0):
+        bristle = bristle + (v - abs(v) * bristle / 2e-3) / 4000.0
+        held.append(bristle / 2e-3)
+    return replace(data, u=data.u + held[19::20] + 0.02 * rng.normal(size=q.shape))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tests.checks.clean_logs import clean_logs, rests, with_motion
+from tests.checks.clean_logs import between_postures, clean_logs, rests, with_motion
 from tests.checks.corruptions import (
     CORRUPTIONS,
     ROBOTS,
@@ -19,7 +19,6 @@ from tests.checks.corruptions import (
     said_by_fit,
     two_links,
 )
-from tests.checks.logs import arm
 from tests.checks.logs import clean as filtered_log
 from tests.goldens.compare import assert_unchanged
 from tests.posterior.arm import arm_model
@@ -153,16 +152,8 @@ def test_gears_that_stick_are_no_unknown_cause_and_more_than_they_hold_is_one(ti
 
 
 def test_friction_that_remembers_is_no_push():
-    """LuGre friction between postures: about a turn it is far from any that velocities make, for seconds here."""
-    rng, time, moves = np.random.default_rng(4), np.arange(4800) / 200.0, np.arange(4800) // 400
-    steps = rng.uniform(0.05, 0.6, (13, 3)) * rng.choice([-1, 1], (13, 3)) * (rng.random((13, 3)) < 0.7)
-    s, P = (time / 2.0 - moves)[:, None], np.cumsum(steps, 0)
-    q = P[moves] + (P[moves + 1] - P[moves]) * s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
-    data, bristle, held = with_motion(arm().robot, q, 200.0, 4, 0.0), np.zeros(3), []
-    for v in np.repeat(data.v, 20, axis=0):
-        bristle = bristle + (v - abs(v) * bristle / 2e-3) / 4000.0
-        held.append(bristle / 2e-3)
-    assert not check(replace(data, u=data.u + held[19::20] + 0.02 * rng.normal(size=q.shape))).doubts.of("push")
+    """About a turn it is far from any that velocities make, for seconds here."""
+    assert not check(between_postures(arm_model().robot, 3, 24.0)).doubts.of("push")
 
 
 def test_torques_in_steps_are_right_and_friction_that_fades_is_named():

@@ -6,6 +6,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 import torch
+from tests.checks.clean_logs import between_postures
 from tests.forces.test_presliding import JOINTS, log_of, lugre_log, motion  # noqa: F401  # a fixture
 from tests.posterior.arm import arm_model
 
@@ -153,12 +154,20 @@ def test_a_part_that_makes_no_friction_is_none(part, friction, found):
     assert [part in parts for parts in parts_of(log_with(friction))[1]["parts"].values()] == [found] * 3
 
 
-@pytest.mark.parametrize(("rows", "enough"), [(700, False), (3000, True)])
+@pytest.mark.parametrize(("rows", "enough"), [(250, False), (400, True), (3000, True)])
 def test_few_reversals_show_no_memory(rows, enough, lugre_log):  # noqa: F811  # the fixture
     log = lugre_log.rows(slice(0, rows))
     choice = choose_friction(arm_model(0).with_forces(Viscous(0.0)), replace(log, strokes=None))
     assert (len(choice.few_reversals) == 0) == enough
     assert all("memory" not in choice.parts[JOINTS.index(name)] for name in choice.few_reversals)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_joints_that_hardly_turn_have_the_memory_of_the_others(seed):
+    log = between_postures(arm_model(0).robot, seed, 6.0, 0.7)
+    choice = choose_friction(arm_model(0).with_forces(Viscous(0.0)), log)
+    assert choice.few_reversals
+    assert choice.has("memory").all()
 
 
 def test_long_logs_are_thinned(monkeypatch):
