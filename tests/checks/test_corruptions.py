@@ -165,6 +165,8 @@ def test_torques_in_steps_are_right_and_friction_that_fades_is_named():
         drift = check(replace(data, u=data.u + dry * (1.0 - fade * data.time)[:, None])).doubts.of("drift")
         told = [each.numbers["ratio"] == pytest.approx({"joint1": ratio, "joint2": ratio}, abs=0.05) for each in drift]
         assert told == [True] * bool(fade)
+    alone = check(replace(data, u=data.u + dry * (1.0 - np.array([0.0, 0.05]) * data.time[:, None]))).doubts.of("drift")
+    assert [each.joints for each in alone] == [("joint2",)]
 
 
 def test_short_and_unordered_logs_are_looked_at_too():

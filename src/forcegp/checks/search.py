@@ -391,8 +391,8 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     rows, shares = root.log.rows, ", ".join(f"{inputs.names[k]} {100.0 * root.rough[k]:.0f} %" for k in bad)
     numbers: dict[str, object] = {"unexplained": root.rough[bad].tolist(), "rows": len(rows)}
     do = "Look at these joints there: contacts, brakes, cables, another robot, or a channel that is not a torque."
-    where, seconds, others = _where(root, int(bad[np.argmax(root.rough[bad])]), inputs)
-    if others is not None and (left := replace(root, log=replace(root.log, rows=others)).rough.max()) <= EXPLAINED:
+    where, seconds, left = _where(root, int(bad[np.argmax(root.rough[bad])]), inputs)
+    if left <= EXPLAINED:
         where += f", and elsewhere at most {100.0 * left:.2g} % stays: a contact, or a load, in these seconds"
         numbers["seconds"] = [float(x) for x in seconds.split(",")]
         do = f"Leave them out by forcegp import --without {seconds}, as forcegp auto does."
@@ -421,18 +421,22 @@ def _sticks(root: Explanation, joint: int) -> bool:
     return bool(moving.rough[joint] <= EXPLAINED and left[~moves].max() <= HELD * holds)
 
 
-def _where(root: Explanation, joint: int, inputs: CheckInput) -> tuple[str, str, Dataset | None]:
-    """Where in q, v or time most of what is left of a torque sits; of time the ends, and the rows elsewhere."""
-    rows, best, found = root.log.rows, 0.0, ("", "", None)
+def _where(root: Explanation, joint: int, inputs: CheckInput) -> tuple[str, str, float]:
+    """Where in time, q or v most of what is left of a torque sits; of time the ends, and what stays elsewhere at most.
+
+    Time is enough where little stays elsewhere: what touches a robot also stops it, so that v shows it as well.
+    """
+    rows, best, found = root.log.rows, 0.0, ("", "", np.inf)
     level = np.ones(len(rows))
     signals = np.c_[root.log.friction[:, joint], level, -level, rows.u[:, joint] - root.log.tau[:, joint]]
-    for name, values, unit in (("q", rows.q[:, joint], inputs.unit_of_each("q")[joint]), ("time", rows.time, "s"),
+    for name, values, unit in (("time", rows.time, "s"), ("q", rows.q[:, joint], inputs.unit_of_each("q")[joint]),
                                ("v", rows.v[:, joint], inputs.unit_of_each("v")[joint])):  # fmt: skip
         order = np.argsort(values, kind="stable")
         gain, share, first, last = stretch(signals[order])
-        if gain > best and share > MOSTLY:
+        if gain > best and share > MOSTLY and found[2] > EXPLAINED:
             ends = values[order[[max(first - 1, 0), min(last, len(rows) - 1)]]]
             text = f"; {100.0 * share:.0f} % of it at {inputs.names[joint]} for {name} between {ends[0]:.3g} and "
-            others = rows.rows(np.sort(np.r_[order[:first], order[last:]])) if name == "time" else None
-            best, found = gain, (f"{text}{ends[1]:.3g} {unit}", f"{ends[0]:.2f},{ends[1]:.2f}", others)
+            others = rows.rows(np.sort(np.r_[order[:first], order[last:]]))
+            left = replace(root, log=replace(root.log, rows=others)).rough.max() if name == "time" else np.inf
+            best, found = gain, (f"{text}{ends[1]:.3g} {unit}", f"{ends[0]:.2f},{ends[1]:.2f}", float(left))
     return found

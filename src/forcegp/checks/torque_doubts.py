@@ -35,13 +35,13 @@ RESTS = 0.05  # share of what the joints alone would move a point by, below whic
 
 def torque_doubts(inputs: CheckInput, found: Explanation) -> list[Doubt]:
     """Friction that drifts, and delay, of a log whose errors were corrected."""
-    return [*_drift(found), *_delays(inputs, found.log)]
+    return [*_drift(found, inputs), *_delays(inputs, found.log)]
 
 
-def _drift(found: Explanation) -> Iterator[Doubt]:
+def _drift(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     """Friction that is another at the end of the log than at its beginning, in a robot of any masses.
 
-    Blocks of time that are left out decide, of all joints together, and the change in the median joint.
+    Blocks of time that are left out decide, of all joints together and the change in the median joint, or of each.
     """
     rows, robot, count = found.log.rows, found.log.robot, len(found.log.rows)
     if count < FEWEST_ROWS:
@@ -49,22 +49,25 @@ def _drift(found: Explanation) -> Iterator[Doubt]:
     q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
     bodies = robot.kinematics(q, v).torque_regressor(a).flatten(-2).cpu().numpy()
     time = (rows.time - rows.time.mean()) / max(float(np.ptp(rows.time)), 1e-300)
-    block, changed, told = np.arange(count) * BLOCKS // count, dict[str, float](), 0.0
+    block, changed, told = np.arange(count) * BLOCKS // count, dict[str, float](), dict[str, float]()
+    friction_of = np.concatenate([found.log.friction, _remembered(found, inputs)], axis=-1)
     for joint in np.flatnonzero((found.chosen == 0) & (found.shares > DOUBTFUL)):
-        u, friction = rows.u[:, joint], found.log.friction[:, joint]
+        u, friction, name = rows.u[:, joint], friction_of[:, joint], rows.joint_names[joint]
         steady, moved = np.c_[bodies[:, joint], np.ones(count)], np.c_[friction, friction * time[:, None]]
         left = []
         for columns in (np.c_[steady, friction], np.c_[steady, moved]):
             basis = _basis(columns)
             numbers = [np.linalg.lstsq(basis[block != k], u[block != k])[0] for k in range(BLOCKS)]
             left.append(sum(np.square((u - basis @ x)[block == k]).sum() for k, x in enumerate(numbers)))
-        told += float(np.log(left[1] / max(left[0], 1e-300)))
+        told[name] = float(np.log(left[1] / max(left[0], 1e-300)))
         basis, size = _basis(steady), np.linalg.norm(moved, axis=0) + 1e-300
         rest = (moved - basis @ (basis.T @ moved)) / size
         level, slope = np.split(np.linalg.lstsq(rest, u - basis @ (basis.T @ u), rcond=SEEN)[0] / size, 2)
         begin, end = (float(np.std(friction @ (level + x * slope))) for x in (-0.5, 0.5))
-        changed[rows.joint_names[joint]] = end / max(begin, 1e-300)
-    if told < np.log(MUCH) and abs(np.log(np.median([*changed.values()]))) > WARMER:
+        changed[name] = end / max(begin, 1e-300)
+    if sum(told.values()) >= np.log(MUCH) or abs(np.log(np.median([*changed.values()]))) <= WARMER:
+        changed = {k: x for k, x in changed.items() if told[k] < np.log(MUCH) and abs(np.log(x)) > WARMER}
+    if changed:
         each = ", ".join(f"{name} {ratio:.2g}" for name, ratio in changed.items())
         what = (
             f"friction changes with time, with temperature perhaps: at the end it is so many times the first: {each}."
