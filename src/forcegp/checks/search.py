@@ -231,7 +231,7 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
     few = len(root.log.rows) < FEWEST_ROWS
     if few or (root.shares <= np.maximum(NOISE * root.floor, DOUBTFUL)).all():
         return root, []
-    every, frontier = [root.with_signs()], [root.with_signs()]
+    every = frontier = [root.with_signs(), *([root] if root.with_signs().turned else [])]  # a spring looks like a sign
     for _ in range(DEPTH):
         grown: list[Explanation] = []
         for now in frontier:
@@ -242,7 +242,7 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
                 before = now.value if cause.number else max(now.value, now.unscaled)  # mistakes first, factors then
                 if made.value < before - 0.5 * GAIN:
                     grown.append(made)
-        every += grown
+        every = every + grown
         frontier = sorted(grown, key=lambda each: each.value)[:BEAM]
         if not grown or (frontier[0].shares <= np.maximum(NOISE * root.floor, DOUBTFUL)).all():
             break
