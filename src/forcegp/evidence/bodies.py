@@ -161,8 +161,7 @@ class Bodies:
         inner, change = _log_cholesky(x)
         values, vectors = np.linalg.eigh(inner)
         values = np.maximum(values, np.finfo(np.float64).tiny)
-        logs = np.log(values)
-        turned = np.swapaxes(vectors, -1, -2)
+        logs, turned = np.log(values), np.swapaxes(vectors, -1, -2)
         logarithm = vectors @ (logs[..., None] * turned)
         # derivative of a matrix function (Daleckii & Krein): divided differences in the axes of the argument
         gap = values[:, :, None] - values[:, None, :]
@@ -219,8 +218,7 @@ def upper_cholesky(matrices: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "
 def _log_cholesky(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """F F^T (n, 4, 4) and its derivatives (n, 10, 4, 4)."""
     x = x.reshape(-1, 10)
-    scale = np.exp(x[:, 0])
-    F = np.zeros((len(x), 4, 4))
+    scale, F = np.exp(x[:, 0]), np.zeros((len(x), 4, 4))
     derivatives = np.zeros((len(x), 10, 4, 4))
     F[:, 3, 3] = scale
     for k, (i, j) in enumerate(_PLACES, start=1):

@@ -250,8 +250,7 @@ def weighted_least_squares(
         content = CONTENT if near else ROUGHLY
         if settled:
             break
-    span = _span(held, noise)
-    in_prior = prior(x)[1]
+    span, in_prior = _span(held, noise), prior(x)[1]
     return Fit(x, r, np.asarray(jacobian), noise, in_prior.T @ in_prior, total, settled and converged, span, expected)
 
 
@@ -364,8 +363,7 @@ def correlation_time(residual: Float[np.ndarray, "rows nv"], episode: Int[np.nda
 
     The sum ends as Geyer's initial positive sequence does ("Practical Markov chain Monte Carlo", Stat. Science 1992).
     """
-    total = (residual**2).sum(0)
-    times = np.ones(residual.shape[1])
+    total, times = (residual**2).sum(0), np.ones(residual.shape[1])
     open_ = np.ones(residual.shape[1], dtype=bool)
     for lag in range(1, len(residual) - 1, 2):
         pair = np.zeros(residual.shape[1])

@@ -318,16 +318,14 @@ def _derivatives(
 
     They are (rows, nv, k), or (rows, nv) where entry j acts on joint j alone.
     """
-    rows = features[0].shape[:-1]
-    wanted = {term.name for term in terms}
+    rows, wanted = features[0].shape[:-1], {term.name for term in terms}
     numbers = {
         name: value.expand(*rows, *value.shape).clone().requires_grad_(name in wanted) for name, value in values.items()
     }
     with torch.enable_grad():
         # a number that all directions share has no last dimension to broadcast along
         given = {name: value[..., None] if value.dim() == len(rows) else value for name, value in numbers.items()}
-        amplitude = law.amplitude(features, given)
-        out = []
+        amplitude, out = law.amplitude(features, given), []
         for term in terms:
             if term.joints is not None:  # amplitude j depends on entry j alone
                 total, number = amplitude.sum(), numbers[term.name]

@@ -107,8 +107,7 @@ class ExpectedFriction:
         with the coefficient mu. A divisor below `SMALLEST_SHARE` is set to it, with a NumericalWarning.
         """
         state, multiplier = dynamics.state, dynamics.multiplier_map()
-        robot = state.robot
-        rows = multiplier.matrix[..., contact, :]
+        robot, rows = state.robot, multiplier.matrix[..., contact, :]
         free = multiplier.offset[..., contact]
         for index, (_, curve) in zip(joint_indices([name for name, _ in self.joints], robot), self.joints, strict=True):
             free = free - rows[..., index] * curve(state.v[..., index])

@@ -304,8 +304,7 @@ def law_columns(laws: Iterable[Law], robot: Robot, q: np.ndarray, v: Values, u: 
     friction counts as where a joint has slid on for long: these states have no past.
     """
     at_q, at_v, at_u = (torch.tensor(np.array(x), device=robot.device) for x in (q, v, u))
-    state = State(at_q, at_v, at_u, robot)
-    out = []
+    state, out = State(at_q, at_v, at_u, robot), []
     for law in laws:
         if not isinstance(law, JointLaw):
             continue
@@ -313,8 +312,7 @@ def law_columns(laws: Iterable[Law], robot: Robot, q: np.ndarray, v: Values, u: 
         known = law.with_values({first: 1.0}) if first in law.learned else law  # type: ignore[dict-item]  # a number is one of what coefficients take
         own = (replace(known, memory=False) if isinstance(known, DryFriction) else known).bound_to(robot)
         with torch.no_grad():
-            needed = -own.force(state).cpu().numpy()
-            inertia = own.added_inertia(robot)
+            needed, inertia = -own.force(state).cpu().numpy(), own.added_inertia(robot)
         out.append(needed if inertia is None else needed + a @ inertia.cpu().numpy().T)
     return out
 

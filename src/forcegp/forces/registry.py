@@ -138,8 +138,7 @@ def _one(text: str, expression: Any) -> Any:
 
 def called(what: str, make: Callable[..., Any], options: Sequence[str], fixed: Mapping[str, Any] | None = None) -> Any:
     """`make` with options FIELD=VALUE; the first may leave its field out. Raises InvalidInput, naming `what`."""
-    given = dict(fixed or {})
-    allowed = signature(make).parameters
+    given, allowed = dict(fixed or {}), signature(make).parameters
     for option in options:
         key, equals, value = (part.strip() for part in option.partition("="))
         if not equals and key in allowed and (key == MEMORY or allowed[key].default is False):

@@ -31,8 +31,7 @@ def pivoted_cholesky(
     Source: Harbrecht, Peters & Schneider (2012), "On the low-rank approximation by the pivoted Cholesky decomposition".
     """
     with torch.no_grad():
-        remainder = kernel.diagonal(z).clone()
-        count = len(z)
+        remainder, count = kernel.diagonal(z).clone(), len(z)
         rows = z.new_empty(min(most, count), count)
         indices: list[int] = []
         floor = ROUNDING * float(remainder.max()) if count else 0.0

@@ -331,8 +331,7 @@ def _contractions(system: DeflatedSystem, K_needed: Sequence[bool]) -> tuple[Ten
     count, rank, _ = C.shape
     inverse = system.factor.into_inverse_factor()
     K_gradients = [torch.outer(beta[:, c], -0.5 * beta[:, c]) if need else None for c, need in enumerate(K_needed)]
-    diagonal = C.new_zeros(count, rank, rank)
-    height = max(1, INNER // max(1, rank))
+    diagonal, height = C.new_zeros(count, rank, rank), max(1, INNER // max(1, rank))
     for start in range(0, count, height):
         stop = min(count, start + height)
         rows = inverse[start * rank : stop * rank, : stop * rank]

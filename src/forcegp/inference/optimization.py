@@ -137,8 +137,7 @@ def minimize_objective(
     `rival` is the best value of earlier starts. Raises FitError where the objective cannot be evaluated at the start.
     """
     options = options or OptimizerOptions()
-    start_time = time.process_time()
-    search = _Search(objective, initial)
+    start_time, search = time.process_time(), _Search(objective, initial)
     if search.evaluate(search.best_point) is None:
         raise FitError(f"the marginal likelihood cannot be evaluated at the start values: {search.cause}")
     history = [search.best_value]

@@ -209,8 +209,7 @@ def _solved(deflation: Deflation, factor: CholeskyFactor) -> DeflatedSystem:
 
 def _padded(deflation: Deflation, rank: int) -> Deflation:
     """The same with zeros in place of the directions that rows of higher rank have; nothing depends on them."""
-    more = rank - deflation.rank
-    pad = torch.nn.functional.pad
+    more, pad = rank - deflation.rank, torch.nn.functional.pad
     U, C, t = pad(deflation.U, (0, more)), pad(deflation.C, (0, 0, 0, more)), pad(deflation.t, (0, more))
     return Deflation(U, C, t, deflation.remainder)
 

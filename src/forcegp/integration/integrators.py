@@ -296,8 +296,7 @@ def warn_of_divergence(diverged_at: Tensor, not_found: Tensor, dt: float, what: 
     ended = diverged_at >= 0
     if not bool(ended.any()):
         return
-    first = int(diverged_at[ended].min())
-    lost = int(not_found.sum())
+    first, lost = int(diverged_at[ended].min()), int(not_found.sum())
     cause = f"a joint faster than {SPEED_LIMIT:g} rad/s or m/s, or a state that is not finite"
     if lost:
         cause = NO_ROOT + (f" ({lost} of them), or {cause}" if lost < int(ended.sum()) else "")

@@ -229,8 +229,7 @@ def followed(posterior: Posterior, rows: Dataset) -> Posterior:
         else:  # its level is about that of the fit
             here, d, P = "another", -level[own] / (1.0 + level[own]), np.diag(between[own] ** 2)
         for row, age in zip(record, ages, strict=True):
-            P = P + age * np.diag(rate[own] ** 2)
-            f = friction[row]
+            P, f = P + age * np.diag(rate[own] ** 2), friction[row]
             gain = np.linalg.solve(f[:, None] * P * f + noise, f[:, None] * P).T
             d = d + gain @ (missed[row] - (bias[own] + d) * f)
             P = P - gain @ (f[:, None] * P)

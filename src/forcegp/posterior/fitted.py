@@ -239,8 +239,7 @@ class MotionIntervals:
         """Of the 95 % interval; `spread` is the standard deviation of samples (..., T+1, nv)."""
         kind = ("q", "v").index(quantity)
         rms, factor = self.rms[:, kind], self.factors[int(spread is None), :, kind]
-        at = time.cpu().numpy()
-        ends = np.array([0.0, *self.horizons])
+        at, ends = time.cpu().numpy(), np.array([0.0, *self.horizons])
         beyond = np.maximum(at / self.horizons[-1], 1.0)[:, None]  # the last horizon errors go on as they grew
         r = beyond * _between(at, ends, rms)
         c = np.stack([np.interp(at, self.horizons, each) for each in factor.T], axis=-1)

@@ -31,8 +31,7 @@ def joint_forces_given(
         return whole, learned
     assert whole.covariance is not None, "as above"
     a, std = seen
-    H = acceleration.matrix
-    missed = a - acceleration(learned.mean)
+    H, missed = acceleration.matrix, a - acceleration(learned.mean)
     V = H @ whole.covariance @ H.mT + torch.diag_embed(std.square())
 
     def given(prior: Gaussian, across: Tensor) -> Gaussian:

@@ -207,8 +207,7 @@ class Programs:
                 slope = jacobian(graph, Q := copied(at.forces), graph.inputs[-self.sizes[2] :])
                 outputs = {"Q": Q, "around": [node for row in slope for node in row] + copied(at.around)}
             case "passive":
-                zeros = [ZERO] * self.sizes[1]
-                add = partial(graph.apply, "add")
+                zeros, add = [ZERO] * self.sizes[1], partial(graph.apply, "add")
                 outputs = {"Q": reduce(lambda x, y: list(map(add, x, y)), map(copied, at.parts), zeros)}
             case "components" | "deviations":
                 outputs = {"Q": [node for part in at.parts for node in copied(part)]}

@@ -54,8 +54,7 @@ def accelerations(posterior: Any, model: Model, samples: int = 0, seed: int = 0)
         if samples:  # not -1: u may have no columns
             q, v, u = (x.reshape(samples, len(x) // samples, x.shape[-1]) for x in (q, v, u))
         dynamics = model.dynamics(q, v, u)
-        affine = dynamics.acceleration_map()
-        mixing = prior.direction(dynamics)
+        affine, mixing = dynamics.acceleration_map(), prior.direction(dynamics)
         if not mixing.shape[-1]:
             return affine.offset.reshape(shape)
         return affine((mixing @ functions(standardize(prior.features(dynamics)))[..., None])[..., 0]).reshape(shape)

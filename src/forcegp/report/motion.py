@@ -211,8 +211,7 @@ def recording(recorded: RecordedScene) -> str:
     with redirect_stdout(io.StringIO()):  # where it prints its address, which results must not be mixed with
         server = viser.ViserServer(host="127.0.0.1", port=port)
     try:
-        show = _drawn(server, recorded)
-        serializer = server.get_scene_serializer()
+        show, serializer = _drawn(server, recorded), server.get_scene_serializer()
         for row in range(len(recorded.time)):
             show(row)
             last = row + 1 == len(recorded.time)

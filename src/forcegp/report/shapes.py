@@ -80,8 +80,7 @@ def reach(robot: Robot) -> float:
 
 def _visual(element: Element, urdf: Path | None, doubts: list[str]) -> Any:
     """The mesh of one visual element in the frame of its link; None where it cannot be drawn, with a doubt why."""
-    creation = trimesh_module().creation
-    geometry = element.find("geometry")
+    creation, geometry = trimesh_module().creation, element.find("geometry")
     kinds = {} if geometry is None else {child.tag: child for child in geometry}
     mesh: Any = None
     if "box" in kinds:

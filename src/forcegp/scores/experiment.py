@@ -216,8 +216,7 @@ def _score(
 ) -> dict[str, Any]:
     identified, before = identified_before(store, spec["identified"]) if "identified" in spec else (None, 0.0)
     train, test = split.apply(experiment.rows_for(identified))
-    test = decided(test)
-    start = time.process_time()
+    test, start = decided(test), time.process_time()
     posterior = experiment.fitted(work, train, split.apply(experiment.recording)[0], identified, spec["seed"])
     seconds = before + time.process_time() - start
     model, _ = identified_before(store, spec["mass_matrix"])

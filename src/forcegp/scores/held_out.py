@@ -208,8 +208,7 @@ def held_out_motions(
     wanted = tuple(HORIZONS if horizons is None else horizons)
     if not all(isinstance(h, int | float) and 0.0 < h < np.inf for h in wanted):
         raise InvalidInput(f"horizons are {list(wanted)}; give positive numbers of seconds.")
-    wanted = tuple(sorted(set(wanted)))
-    starts = whole_number("starts", starts, 1)
+    wanted, starts = tuple(sorted(set(wanted))), whole_number("starts", starts, 1)
     if not wanted:
         return HeldOutMotions()
     if not recording.time_ordered:

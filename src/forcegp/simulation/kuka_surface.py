@@ -155,10 +155,8 @@ class IdealContact:
         self.touched = self.touched or distance <= 0.0
         if not self.touched or self.friction is None:
             return ContactForces(0.0, np.zeros(3), np.zeros_like(applied), False, np.zeros_like(applied))
-        normal = self.table.gradient(point).numpy()
-        jacobian = state.jacobian[:3]
-        velocity = jacobian @ state.v
-        row = normal @ jacobian
+        normal, jacobian = self.table.gradient(point).numpy(), state.jacobian[:3]
+        velocity, row = jacobian @ state.v, normal @ jacobian
         # A a = b, the second derivative of distance(p(q)) = 0 with Baumgarte's terms (Rath et al. 2021, eqs. 3 and 4)
         bias = normal @ state.bias_acceleration[:3] + velocity @ self.table.hessian(point).numpy() @ velocity
         b = -bias - 2.0 * self.zeta * self.omega * (row @ state.v) - self.omega**2 * distance

@@ -142,8 +142,7 @@ def _joint_angles(robot: Robot, base: Tensor, home: Tensor, x: Tensor) -> Tensor
     """Positions (n, nq) at which the feet are at x, by Newton's method from the posture at home."""
     q = torch.cat([base, home[7:].expand(len(base), -1)], -1)
     for _ in range(NEWTON):
-        kinematics = robot.kinematics(q)
-        change = []
+        kinematics, change = robot.kinematics(q), []
         for k, leg in enumerate(LEGS):
             own = kinematics.frame_jacobian(f"{leg}_foot")[:, :3, 6 + 3 * k : 9 + 3 * k]
             change.append(torch.linalg.solve(own, x[:, k] - kinematics.frame_pose(f"{leg}_foot")[:, :3, 3]))
