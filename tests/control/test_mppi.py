@@ -31,8 +31,7 @@ def predictor():
 
 
 def cost(q, v, u):
-    state = torch.cat([q, v], dim=-1)
-    weights = torch.tensor(STATE_COST)
+    state, weights = torch.cat([q, v], dim=-1), torch.tensor(STATE_COST)
     return ((state @ weights) * state).sum((-1, -2)) + TORQUE_COST * u.square().sum((-1, -2))
 
 
@@ -52,8 +51,7 @@ def played(control, steps=80):
     """Summed cost of a motion from 1 m at rest under a controller (q, v) -> u, in closed form for constant u."""
     q, v, total, torques = np.array([1.0]), np.zeros(1), 0.0, []
     for _ in range(steps):
-        u = np.asarray(control(q, v))
-        state = np.concatenate([q, v])
+        u, state = np.asarray(control(q, v)), np.concatenate([q, v])
         total += state @ STATE_COST @ state + TORQUE_COST * float(u @ u)
         q, v = q + DT * v + 0.5 * DT**2 * u / MASS, v + DT * u / MASS
         torques.append(u)

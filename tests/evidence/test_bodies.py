@@ -39,8 +39,7 @@ def difference(function, x, step=1e-6):
 
 
 def test_zero_is_the_reference():
-    ours = bodies()
-    robot = Robot.from_urdf_text(URDF)
+    ours, robot = bodies(), Robot.from_urdf_text(URDF)
     np.testing.assert_allclose(ours.parameters(np.zeros(30)).ravel(), standard_parameters(robot), atol=1e-13)
     np.testing.assert_allclose(ours.distance(np.zeros(30))[0], 0.0, atol=1e-14)
 

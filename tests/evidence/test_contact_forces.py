@@ -145,8 +145,7 @@ def test_friction_under_load_counts_the_gain():
     model = arm_model(0).with_forces(Actuation(gain=LogNormal(1.0, 0.3)), LoadFriction(None, 0.0, 0.2))
     space = ParameterSpace(model, typical_sizes(model, [free]))
     rows = RecordedRows(space, free.q, free.v, free.u)
-    x = space.start + 0.05
-    motion = rows.moving(free.a)
+    x, motion = space.start + 0.05, rows.moving(free.a)
     in_x = rows.in_torque(x, motion)[2]
     assert_slopes(lambda x: rows.in_torque(x, motion)[0], x, in_x)
     found = fit(model, free, Torques()).parameters

@@ -74,8 +74,7 @@ def test_what_a_model_states_is_where_the_coordinates_start(names):
 @pytest.mark.parametrize("names", CHOICES)
 def test_jacobians(names, likelihood):
     _, space, (q, v, u, a) = made(*names)
-    rows = RecordedRows(space, q, v, u)
-    x = space.start
+    rows, x = RecordedRows(space, q, v, u), space.start
     x[: space.bodies.size] = 0.2 * np.random.default_rng(1).normal(size=space.bodies.size)
 
     def residual(x):

@@ -38,12 +38,10 @@ def filtered(rows: int = 480, seed: int = 0, cutoff: float | None = CUTOFF) -> D
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 3))
 def test_kept_rows_lie_apart_and_every_other_row_is_near_an_earlier_one(seed, episodes):
-    draw = np.random.default_rng(seed)
-    whole = filtered(200)
+    draw, whole = np.random.default_rng(seed), filtered(200)
     some = replace(whole, time_ordered=False).rows(draw.permutation(200))
     log = replace(some, episode=draw.integers(0, episodes, 200))
-    kept = independent_rows(log)
-    apart = LowPass(CUTOFF).memory - 1e-9
+    kept, apart = independent_rows(log), LowPass(CUTOFF).memory - 1e-9
     rows = [int(np.flatnonzero(log.time == time)[0]) for time in kept.time]
     near = (np.abs(log.time[:, None] - log.time) < apart) & (log.episode[:, None] == log.episode)
     assert near[np.ix_(rows, rows)].sum() == len(rows)

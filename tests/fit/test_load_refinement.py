@@ -40,12 +40,10 @@ def sliding_data(rows: int, seed: int, joint_friction: float = 0.0) -> Dataset:
     v = torch.tensor(data.v)
     v = v - (torch.linalg.pinv(A) @ (A @ v[..., None]))[..., 0]  # along the plane
     states = torch.tensor(data.q), v, torch.tensor(data.u)
-    dynamics = model.dynamics(*states)
-    velocity = (J @ v[..., None])[..., 0]
+    dynamics, velocity = model.dynamics(*states), (J @ v[..., None])[..., 0]
     speed = velocity.norm(dim=-1)
     resisting = coefficient(speed)[:, None] * (J.mT @ (velocity / speed[:, None])[..., None])[..., 0]
-    joints = -joint_friction * v
-    solved = []
+    joints, solved = -joint_friction * v, []
     for sign in (1.0, -1.0):
         top = torch.cat([dynamics.M, (sign * resisting)[..., None] - A.mT], -1)
         matrix = torch.cat([top, torch.cat([A, A.new_zeros(rows, 1, 1)], -1)], -2)

@@ -68,8 +68,7 @@ def test_a_controller_that_remembers_tracks_better(learned):
 def test_pushes_are_felt_through_gears(learned):
     arm, posteriors = learned
     free = [arm.log(seed, 60.0, late=0.0) for seed in (300, 301)]
-    quiet = arm.log(302, 150.0, late=0.0)
-    found = {}
+    quiet, found = arm.log(302, 150.0, late=0.0), {}
     for laws, posterior in posteriors.items():
         monitor = ContactMonitor(posterior.model, dt=STEP)
         monitor.calibrate([(each.q, each.v, each.u) for each in free])

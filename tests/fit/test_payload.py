@@ -378,8 +378,7 @@ UNIVERSAL = """<mujoco><compiler angle="radian"/><worldbody><body name="upper"><
 
 def test_two_joints_in_one_body_have_no_mass_between_them():
     """MuJoCo's inverse dynamics of a forearm with a payload of 0.5 kg, under a joint with two axes."""
-    mujoco = pytest.importorskip("mujoco")
-    file = UNIVERSAL.format(0, 1)
+    mujoco, file = pytest.importorskip("mujoco"), UNIVERSAL.format(0, 1)
     model = mujoco.MjModel.from_xml_string(UNIVERSAL.format(0.05 * 0.5 / 1.5, 1.5))
     state, time = mujoco.MjData(model), np.arange(0.0, 10.0, 0.01)
     at = np.array([0.9, 1.3, 1.7]) * time[:, None] + np.arange(3)

@@ -109,8 +109,7 @@ def test_a_term_that_moves_no_joint_is_refused(data):
     ids=["friction", "position", "sum"],
 )
 def test_a_joint_that_never_moves_teaches_nothing_of_its_own(data, prior, message):
-    free = data.model.with_contacts([])
-    moving = np.array([1.0, 0.0, 1.0])
+    free, moving = data.model.with_contacts([]), np.array([1.0, 0.0, 1.0])
     stuck = with_columns(data, q=data.q * moving, v=data.v * moving, model=free)
     if isinstance(prior, tuple) and ContactFriction() in prior:
         stuck = with_columns(data, v=data.v * moving)

@@ -170,8 +170,7 @@ def test_friction_under_load_does_not_explain_the_torque_by_itself():
 
     The first joint has friction under load, and its mu is found.
     """
-    robot = arm_model(0).robot
-    generator = np.random.default_rng(0)
+    robot, generator = arm_model(0).robot, np.random.default_rng(0)
     q, v, a = generator.normal(size=(3, 400, 3))
     torque = robot.inverse_dynamics(*(torch.tensor(x) for x in (q, v, a))).numpy()
     sign = np.tanh(v / 0.05)

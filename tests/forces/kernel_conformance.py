@@ -106,8 +106,7 @@ class KernelConformance:
 
     def test_parameters_travel_by_name(self, kernel, dimension):
         """Through a file, a process and a copy; the kernel that receives them is a fresh one."""
-        latent = LatentKernels([kernel])
-        z = [normal(6, dimension)]
+        latent, z = LatentKernels([kernel]), [normal(6, dimension)]
         with torch.no_grad():
             expected = latent(z)[0]
             stored = load(save({name: value.contiguous() for name, value in latent.initial_parameters().items()}))
@@ -133,8 +132,7 @@ class KernelConformance:
     def test_every_start_of_a_search_can_be_evaluated(self, dimension):
         """With a value and a slope that lead somewhere."""
         latent = LatentKernels([kernel_of(self.expression, dimension, VARIANCE)])
-        z = [normal(8, dimension)]
-        target = normal(8, 1, seed=2)
+        z, target = [normal(8, dimension)], normal(8, 1, seed=2)
         for index in range(4):
             start = latent.initial_parameters()
             start = dict(started(start, start, 0, index))

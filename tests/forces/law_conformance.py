@@ -125,8 +125,7 @@ class LawConformance:
         assert torch.equal(load_posterior(tmp_path / "run").predict(*states).mean, prediction.mean)
 
     def test_it_survives_files_and_texts(self, model, log):
-        again = Model.from_json(model.to_json())
-        states = self.states(log)
+        again, states = Model.from_json(model.to_json()), self.states(log)
         torch.testing.assert_close(again.dynamics(*states).Q_K, model.dynamics(*states).Q_K, rtol=0.0, atol=0.0)
         name = force_name(self.law)
         assert type(force_from_dict(json.loads(json.dumps(force_to_dict(self.law))))) is type(self.law)

@@ -66,8 +66,7 @@ def test_friction_is_a_function_of_one_velocity():
 
 
 def test_linear_against_its_formula():
-    kernel = kernel_of("linear", 3, 1.0)
-    variances = float64([[0.5, 2.0, 1.5]])
+    kernel, variances = kernel_of("linear", 3, 1.0), float64([[0.5, 2.0, 1.5]])
     kernel.variance = variances
     z = normal(6, 3)
     torch.testing.assert_close(matrix(kernel, z), z @ torch.diag(variances[0]) @ z.mT, rtol=1e-13, atol=1e-14)
@@ -82,8 +81,7 @@ def test_linear_against_its_formula():
     ],
 )
 def test_functions_of_the_distance_against_their_formulas(name, formula):
-    kernel = kernel_of(name, 3, 1.3)
-    z = normal(6, 3)
+    kernel, z = kernel_of(name, 3, 1.3), normal(6, 3)
     r = (z[:, None] - z[None]).norm(dim=-1) / 3**0.5
     torch.testing.assert_close(matrix(kernel, z), 1.3 * formula(r), rtol=1e-12, atol=1e-14)
 
@@ -91,8 +89,7 @@ def test_functions_of_the_distance_against_their_formulas(name, formula):
 @pytest.mark.parametrize("name", ["matern-1/2", "matern-3/2"])
 def test_points_that_nearly_coincide_keep_their_difference(name):
     """A distance of 1e-9 from a difference of squares would be 1e-8 or nothing."""
-    kernel = kernel_of(name, 1, 1.0)
-    z = float64([[5.0], [5.0 + 2.0**-30]])
+    kernel, z = kernel_of(name, 1, 1.0), float64([[5.0], [5.0 + 2.0**-30]])
     missing = 1.0 - float(kernel_cross(kernel, z[:1], z[1:]).detach())
     expected = 2.0**-30 if name == "matern-1/2" else 0.0
     assert missing == pytest.approx(expected, rel=1e-5, abs=1e-15)
@@ -148,8 +145,7 @@ def test_a_kernel_of_ones_own(monkeypatch):
 )
 def test_hyperpriors_are_normal_in_the_logarithm(expression, part, center, spread):
     latent = LatentKernels([kernel_of(expression, 2, 0.6)])
-    start = latent.initial_parameters()
-    name = f"kernels.0.{part}"
+    start, name = latent.initial_parameters(), f"kernels.0.{part}"
     moved = start | {name: start[name] + 0.7}
     normal_prior = torch.distributions.Normal(float64(center), spread)
     difference = normal_prior.log_prob(moved[name]).sum() - normal_prior.log_prob(start[name]).sum()

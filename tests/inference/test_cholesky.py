@@ -27,8 +27,7 @@ def positive_definite(size: int, seed: int = 0) -> torch.Tensor:
 @pytest.mark.usefixtures("route")
 @pytest.mark.parametrize("size", [0, 1, 2, 7, 150])
 def test_everything_a_factor_does_with_the_lower_triangle(size):
-    matrix = positive_definite(size)
-    right = normal(size, 3, seed=1)
+    matrix, right = positive_definite(size), normal(size, 3, seed=1)
     kept = right.clone()
     factor = factorize(lambda: matrix.masked_fill(torch.ones(size, size).triu(1).bool(), math.nan))
     assert factor.jitter == 0.0
@@ -44,8 +43,7 @@ def test_everything_a_factor_does_with_the_lower_triangle(size):
 def test_factor_and_inverse_live_in_the_memory_of_the_matrix():
     """Two copies of 288 MB less at 6000 x 6000."""
     matrix = positive_definite(20)
-    address = matrix.data_ptr()
-    factor = factorize(lambda: matrix)
+    address, factor = matrix.data_ptr(), factorize(lambda: matrix)
     assert factor.lower.data_ptr() == address
     assert factor.into_inverse_factor().data_ptr() == address
 

@@ -143,8 +143,7 @@ def with_priors() -> gk.ScaleKernel:
 def test_log_prior_and_its_gradient():
     kernels = LatentKernels([with_priors(), gk.LinearKernel().double(), with_priors()])
     parameters = {name: (value + 0.2).requires_grad_() for name, value in kernels.initial_parameters().items()}
-    value = kernels.log_prior(parameters)
-    expected = 0.0
+    value, expected = kernels.log_prior(parameters), 0.0
     for c in (0, 2):
         lengthscale = torch.nn.functional.softplus(parameters[f"kernels.{c}.base_kernel.raw_lengthscale"])
         outputscale = torch.nn.functional.softplus(parameters[f"kernels.{c}.raw_outputscale"])

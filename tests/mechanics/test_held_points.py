@@ -91,8 +91,7 @@ def test_the_point_of_a_ball_that_touches_level_ground_rests(robot):
     def rates(at):
         return model.dynamics(at, v, u).A @ v[..., None]
 
-    touching = rates(q)[..., 0]
-    kinematics = robot.kinematics(q, v)
+    touching, kinematics = rates(q)[..., 0], robot.kinematics(q, v)
     below = (
         -radius * kinematics.frame_pose("a_foot")[..., 2, :3]
     ).tolist()  # of the world's z, in the axes of the foot

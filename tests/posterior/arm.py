@@ -99,8 +99,7 @@ def arm_data(rows: int, seed: int, model: Model | None = None) -> Dataset:
     v = generator.normal(0.0, 0.7, (rows, 3))
     u = generator.normal(0.0, 3.0, (rows, 3))
     states = [torch.tensor(x) for x in (q, v, u)]
-    dynamics = model.dynamics(*states)
-    Q_U = unknown_force(states[1])
+    dynamics, Q_U = model.dynamics(*states), unknown_force(states[1])
     a = dynamics.acceleration(Q_U).numpy()
     return Dataset(
         q=q,

@@ -15,8 +15,7 @@ SENSOR = 2e-5
 @cache
 def motion(seconds: float = 3.0, seed: int = 0, noise: float = SENSOR) -> Dataset:
     """A smooth motion of the free arm, the torques that make it, and positions with white noise; nothing else."""
-    model = arm_model(contacts=0)
-    generator = np.random.default_rng(seed)
+    model, generator = arm_model(contacts=0), np.random.default_rng(seed)
     time = STEP * np.arange(round(seconds / STEP))
     rate, phase = generator.uniform(2.0, 8.0, (3, 1, 3)), generator.uniform(0.0, 6.3, (3, 1, 3))
     size, angle = generator.uniform(0.5, 1.0, (3, 1, 3)) / rate, rate * time[:, None] + phase

@@ -89,8 +89,7 @@ def states() -> list[np.ndarray]:
 def test_every_function_computes_what_the_model_does(posterior, library, states):
     predicted = posterior.predict(*states)
     reference = posterior.predictor(compile=False)
-    covariance = reference(*states)[1]
-    linear = reference.linearize(*states)
+    covariance, linear = reference(*states)[1], reference.linearize(*states)
     step = reference.linearize_step(*states, DT, "rk4")
     for k in range(5):
         at = [x[k] for x in states]

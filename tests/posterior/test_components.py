@@ -91,8 +91,7 @@ def test_components_are_those_of_dense_conditioning(posterior, dense, states, co
     moved = posterior.with_contacts(OTHER_CONTACTS[contacts])
     dynamics = moved.model.dynamics(*states)
     mean, covariance = dense.latents(dense.scaled(dynamics))
-    B = PRIOR.direction(dynamics)
-    components = moved.components(*states)
+    B, components = PRIOR.direction(dynamics), moved.components(*states)
     assert tuple(components) == ("joint-friction", "contact-friction", "weight")
     for name, which in zip(components, (slice(0, 3), slice(3, 4), slice(4, 5)), strict=True):
         part, b = components[name], B[..., which]
@@ -111,8 +110,7 @@ def test_components_are_those_of_dense_conditioning(posterior, dense, states, co
     close(total.covariance, B @ covariance @ B.mT)
     alone = sum(part.joint_force.covariance for part in components.values())
     assert float((total.covariance - alone).abs().max()) > 1e-4  # the data tie the parts to each other
-    learned = B @ covariance @ B.mT
-    noise = moved.unlearned(dynamics)
+    learned, noise = B @ covariance @ B.mT, moved.unlearned(dynamics)
     whole = learned if noise is None else learned + noise
     for gaussian, affine, spread in (
         (predicted.multiplier, dynamics.multiplier_map(), whole),

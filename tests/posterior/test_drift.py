@@ -208,8 +208,7 @@ def test_motions_that_go_on_in_the_record_have_its_level(steady):
 def test_intervals_count_another_level_until_it_is_seen(steady):
     log, posterior = steady
     posterior = calibrated(posterior, log, (0.1, 0.5))
-    fresh = posterior.motion_intervals
-    motions = recorded_motions(log, 40, 0.5)
+    fresh, motions = posterior.motion_intervals, recorded_motions(log, 40, 0.5)
     start = motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt
     for place, kind in enumerate((Coulomb, Viscous)):
         louder = replace(posterior, target=scaled(posterior.model, torch.tensor([1.0 + BETWEEN]), kind))

@@ -70,8 +70,7 @@ def test_nothing_is_overwritten_unasked(posterior, run):
 
 @pytest.mark.parametrize("name", sorted(FILES))
 def test_a_flipped_bit_in_any_file_is_noticed(run, name):
-    content = (run / name).read_bytes()
-    generator = random.Random(name)
+    content, generator = (run / name).read_bytes(), random.Random(name)
     for _ in range(12):
         place, bit = generator.randrange(len(content)), 1 << generator.randrange(8)
         (run / name).write_bytes(content[:place] + bytes([content[place] ^ bit]) + content[place + 1 :])

@@ -76,8 +76,7 @@ def test_forces_and_acceleration_belong_together(posterior, test):
 
 def test_equals_dense_gaussian_conditioning(posterior, train, test):
     """p(a*) from one joint covariance of all training accelerations, written plainly."""
-    model = posterior.likelihood
-    kernels = list(posterior.latent.kernels)
+    model, kernels = posterior.likelihood, list(posterior.latent.kernels)
 
     def parts(data):
         dynamics = train.model.dynamics(*map(torch.tensor, (data.q, data.v, data.u)))
@@ -87,8 +86,7 @@ def test_equals_dense_gaussian_conditioning(posterior, train, test):
 
     H, m, z = parts(train)
     H_new, m_new, z_new = parts(test.rows(slice(0, 5)))
-    S = torch.zeros(60, 3, 60, 3).double()
-    cross = torch.zeros(5, 3, 60, 3).double()
+    S, cross = torch.zeros(60, 3, 60, 3).double(), torch.zeros(5, 3, 60, 3).double()
     prior = torch.zeros(5, 3, 3).double()
     for joint, kernel in enumerate(kernels):
         w, w_new = H[..., joint], H_new[..., joint]
@@ -162,8 +160,7 @@ def test_predictions_given_accelerations_are_those_of_one_large_gaussian():
     log = measured(on_plane(Viscous(0.7)), on_plane(), rows=20, noise=0.05)
     posterior = fit(model, log, [Accelerations(), ContactForces()], **QUICK)
     states, at = tensors(log, "q", "v", "u"), model.dynamics(*tensors(log, "q", "v", "u"))
-    a = torch.tensor(log.a) + 0.1
-    plain = posterior.predict(*states)
+    a, plain = torch.tensor(log.a) + 0.1, posterior.predict(*states)
     H, C = at.H, at.contact_force_map().matrix
     force = posterior.hyperparameters["noise.log_force"].exp()  # learned beside a sensor
     S = plain.unknown_force.covariance + torch.diag(force.square())

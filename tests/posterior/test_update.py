@@ -107,8 +107,7 @@ def test_everything_else_works_after_an_update(tmp_path):
     data = arm_data(20, seed=13)
     posterior = learned(data, model=data.model.with_forces(JointFriction()))
     grown = posterior.update(data.rows(slice(12, 20)))
-    moved = grown.with_contacts([])
-    expected = at_once(posterior, data)
+    moved, expected = grown.with_contacts([]), at_once(posterior, data)
     assert_same(moved, expected.with_contacts([]), data)
     curves = [each.curve(grown.latent_names[0], [0.1, 0.2]).mean for each in (grown, expected)]
     torch.testing.assert_close(*curves)

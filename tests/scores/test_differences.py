@@ -39,8 +39,7 @@ def test_chance_of_seeds_and_of_stretches_adds_up():
 
 def test_the_interval_of_a_ratio_holds_the_true_one():
     """Two models of expected squared errors 1 and .81, over few stretches and seeds, both with effects of their own."""
-    generator = np.random.default_rng(3)
-    held = []
+    generator, held = np.random.default_rng(3), []
     for _ in range(200):
         level = generator.gamma(4.0, 0.25, size=(1, 1, 12))  # stretches that are hard for both
         own = generator.gamma(20.0, 0.05, size=(2, 1, 1, 12)) * generator.gamma(20.0, 0.05, size=(2, 4, 1, 1))

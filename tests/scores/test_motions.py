@@ -118,8 +118,7 @@ def test_a_base_that_turns_is_off_by_the_angle_whatever_the_sign_of_its_quaterni
     text = SLEDGE.split("<joint")[0].format(mass=2.0).replace('<link name="base"/>', "") + "</robot>"
     model = Model(Robot.from_urdf_text(text, base="floating", gravity=(0.0, 0.0, 0.0)))
     time = STEP * np.arange(51)
-    half = 0.5 * (3.0 * time + 0.4)
-    q = np.zeros((51, 7))
+    half, q = 0.5 * (3.0 * time + 0.4), np.zeros((51, 7))
     q[:, 0], q[:, 5], q[:, 6] = 1.0, np.sin(half), np.cos(half)
     v = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 3.0], (51, 1))
     data = Dataset(q=q, v=v, u=np.zeros((51, 0)), a=0.0 * v, time=time, model=model)

@@ -103,8 +103,7 @@ def test_without_analytical_mean_the_processes_answer_for_the_known_forces_too(w
 
 
 def test_blocks_of_rows_join_seamlessly(posterior):
-    data = arm_data(BLOCK + 3, seed=2)
-    calls = []
+    data, calls = arm_data(BLOCK + 3, seed=2), []
     with watched(lambda done, total, _: calls.append((done, total))):
         whole = predict_rows(posterior, data)
     assert calls == [(BLOCK, len(data)), (len(data), len(data))]

@@ -41,8 +41,7 @@ def test_rows_obey_the_equations_of_motion(clean):
 
 
 def test_velocities_and_accelerations_are_derivatives(clean):
-    inside = np.arange(1, 200)
-    q = torch.tensor(clean.q)
+    inside, q = np.arange(1, 200), torch.tensor(clean.q)
     slope = 120.0 * clean.model.robot.difference(q[inside - 1], q[inside + 1])
     np.testing.assert_allclose(slope, clean.v[inside], atol=2e-3)
     np.testing.assert_allclose(120.0 * (clean.v[inside + 1] - clean.v[inside - 1]), clean.a[inside], atol=0.1)

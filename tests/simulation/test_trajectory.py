@@ -56,8 +56,7 @@ def test_the_tilted_plane_falls_towards_positive_x_by_its_angle():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_velocity_and_acceleration_of_the_bent_path_are_derivatives(kind):
-    config = KukaSurfaceConfig(surface=kind)
-    start = np.array([0.1, 0.5, 0.3])
+    config, start = KukaSurfaceConfig(surface=kind), np.array([0.1, 0.5, 0.3])
     flat = random_path(config, start, 4.0, np.random.default_rng(3))
 
     def path(time: np.ndarray):
@@ -79,8 +78,7 @@ def turned(quaternion: np.ndarray) -> np.ndarray:
 
 
 def test_the_law_is_the_published_one_with_the_pseudo_inverse():
-    rng = np.random.default_rng(0)
-    orientation = np.array([0.0, -1.0, 0.0, 0.0])
+    rng, orientation = np.random.default_rng(0), np.array([0.0, -1.0, 0.0, 0.0])
     posture, selected = np.deg2rad((85, 50, -10, -100, -170, -25, -100)), np.array([0, 1, 1, 0, 1, 0, 0.0])
     for _ in range(20):
         q, v, J, bias = rng.normal(size=7), rng.normal(size=7), rng.normal(size=(6, 7)), rng.normal(size=6)
