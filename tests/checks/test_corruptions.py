@@ -28,6 +28,7 @@ from forcegp.checks import check, quick_check
 from forcegp.checks.check_input import CheckInput
 from forcegp.checks.explanations import _units
 from forcegp.checks.search import search
+from forcegp.checks.torque_doubts import _remembered
 from forcegp.checks.torque_doubts import held_points
 from forcegp.data import Dataset
 from forcegp.model import Model
@@ -154,7 +155,12 @@ def test_gears_that_stick_are_no_unknown_cause_and_more_than_they_hold_is_one(ti
 
 def test_friction_that_remembers_is_no_push():
     """About a turn it is far from any that velocities make, for seconds here."""
-    assert not check(between_postures(arm_model().robot, 3, 24.0)).doubts.of("push")
+    data = between_postures(arm_model().robot, 3, 24.0)
+    assert not check(data).doubts.of("push")
+    inputs = CheckInput.of(data, data.model)
+    found = search(inputs)[0]
+    again = _remembered(found, inputs.below(3.0))  # which has other rows
+    np.testing.assert_allclose(again, _remembered(found, inputs), atol=0.3)
 
 
 def test_torques_in_steps_are_right_and_friction_that_fades_is_named():

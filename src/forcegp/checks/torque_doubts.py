@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
-from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, UNKNOWN, Explanation, moving
+from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, UNKNOWN, Explanation
 from forcegp.checks.torques import WIDTHS, Comparison, stretch, with_gravity
 from forcegp.data import Dataset, estimate_delay, with_strokes
 from forcegp.data.views import consecutive, rests
@@ -216,13 +216,13 @@ def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
 def _remembered(found: Explanation, inputs: CheckInput) -> Float[np.ndarray, "rows nv k"]:
     """What dry friction of each joint remembers, under each of `STIFFNESS`."""
     assert inputs.compared is not None
-    dense = with_strokes(found.log.changed(inputs.compared))
-    past = moving(replace(inputs, compared=dense).rows()).strokes
-    if past is None:
-        return np.zeros((*found.log.rows.q.shape, 0))
-    spread = np.maximum(found.log.rows.q.std(axis=0), 1e-9)
-    each = [after_strokes(torch.tensor(past), torch.tensor(sigma / spread)).numpy() for sigma in STIFFNESS]
-    return np.stack(each, axis=-1)
+    rows, dense = found.log.rows, with_strokes(found.log.changed(inputs.compared))
+    if dense.strokes is None:
+        return np.zeros((*rows.q.shape, 0))
+    long = float(np.ptp(dense.time)) + 1.0  # a delay that was corrected moves rows in time
+    at = np.searchsorted(dense.time + long * dense.episode, rows.time + long * rows.episode)
+    past, spread = torch.tensor(dense.strokes[at.clip(0, len(dense) - 1)]), np.maximum(rows.q.std(axis=0), 1e-9)
+    return np.stack([after_strokes(past, torch.tensor(each / spread)).numpy() for each in STIFFNESS], axis=-1)
 
 
 def held_points(inputs: CheckInput) -> list[Doubt]:
