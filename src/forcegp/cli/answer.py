@@ -83,7 +83,8 @@ def answer_lines(
         ("dry friction", friction_in_words(identified.model, recording, force, still) + but_for(still)),
         ("viscous", each("viscous", f"{force} per {q}/s")),
         ("rotors", each("rotor", inertia)),
-        *([("springs", each("spring.stiffness", f"{force} per {q}"))] if f"spring.stiffness.{joints[0]}" in values else []),
+        *([("springs", each("spring.stiffness", f"{force} per {q}"))]
+          if f"spring.stiffness.{joints[0]}" in values else []),
     ] if joints else []  # fmt: skip
     (mass, error), causes = values.total_mass, {} if unsettled else other_causes(content["payload"] or {})
     if "gains" in causes:  # what it changes of a payload, it changes of all
