@@ -4,6 +4,7 @@ import fnmatch
 import json
 import math
 import re
+import tempfile
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,7 +15,6 @@ from typing import Any
 
 import h5py
 import numpy as np
-import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.lib import format as npy
 from pyarrow import parquet, types
@@ -22,6 +22,8 @@ from typing_extensions import override
 
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput
 from forcegp.recordings.source import (
+    HARMLESS,
+    LARGEST_EXPANSION,
     LONGEST_VECTOR,
     Columns,
     Source,
@@ -32,6 +34,7 @@ from forcegp.recordings.source import (
     require_plausible_size,
 )
 from forcegp.recordings.tables import seconds_of
+from forcegp.robots.sandbox import MEMORY, SECONDS, read_apart
 from forcegp.summary import listed
 
 SEPARATOR = "/"
@@ -110,18 +113,18 @@ class ArrayFile(Source):
         return {name: tables[own] if at is None else tables[own][:, at] for name, (own, at) in places.items()}
 
 
-NUMPY = "a NumPy archive", zipfile.BadZipFile, NotImplementedError
+NUMPY = "a NumPy archive"
 
 
 def numpy_arrays(path: Path) -> Arrays:
     """Of an .npz file. What it claims to hold is compared with its size before anything is expanded."""
 
     def content(name: str) -> np.ndarray:
-        with reading(path, *NUMPY), np.load(path, allow_pickle=False) as archive:
+        with reading(path, NUMPY), np.load(path, allow_pickle=False) as archive:
             return archive[name]
 
     found = {}
-    with reading(path, *NUMPY), zipfile.ZipFile(path) as archive:
+    with reading(path, NUMPY), zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         require_plausible_size(path, "the archive", sum(x.file_size for x in members), path.stat().st_size)
         for member in members:
@@ -202,14 +205,16 @@ def matlab_arrays(path: Path) -> Arrays:
             name: (shape, lambda name=name, shape=shape: arrays[name][1]().T.reshape(shape))
             for name, shape in upright.items()
         }
-    from scipy.io import loadmat, matlab
-
-    with reading(path, MATLAB, matlab.MatReadError, NotImplementedError, MemoryError, IndexError):
-        size = path.stat().st_size
-        for name, shape, _ in matlab.whosmat(str(path)):
-            require_plausible_size(path, repr(name), 8 * math.prod(shape), size)
-        content = loadmat(str(path), simplify_cells=True)
-        return _lists({name: value for name, value in content.items() if not name.startswith("__")})
+    with reading(path, MATLAB), tempfile.TemporaryDirectory() as folder:
+        kept, size = Path(folder, "kept.npz"), path.stat().st_size
+        asked = {"path": str(path), "kept": str(kept), "most": max(HARMLESS, LARGEST_EXPANSION * size)}
+        asked |= {"seconds": SECONDS + (size >> 22), "memory": MEMORY + 50 * size}
+        answer = read_apart("matlab", str(path), asked, FileFormatError, "save it again, as arrays of numbers")
+        if "refused" in answer:
+            raise ValueError(answer["refused"])
+        with np.load(kept, allow_pickle=False) as arrays:
+            restored = {name: arrays[name] for name in arrays.files}
+        return _lists(json.loads(answer["content"], object_hook=lambda own: restored[own["#"]] if "#" in own else own))
 
 
 def _referred(file: h5py.File, item: Any) -> Any:
@@ -256,7 +261,7 @@ def _numbers(value: Any, name: str) -> Iterator[tuple[str, np.ndarray]]:
             yield from _numbers(dict(zip(names, inside, strict=True)) if named else inside, f"{name}/{key}")
         return
     array = seconds_of([value])[0] if isinstance(value, str) else value
-    with suppress(TypeError, ValueError):
+    with suppress(TypeError, ValueError, OverflowError):  # an integer of 400 digits
         array = np.array(array)
         array = np.array(value, dtype=np.float64) if array.dtype == object else array
         if array.dtype.kind in "fiub" and not (isinstance(value, str) and np.isnan(array)):
@@ -281,7 +286,7 @@ def parquet_arrays(path: Path) -> Arrays:
     """Of a Parquet file: numeric columns, and columns of lists of equal length, that of the first row."""
 
     def content(name: str, width: int | None) -> np.ndarray:
-        with reading(path, PARQUET, pa.ArrowException), parquet.ParquetFile(path, pre_buffer=False) as file:
+        with reading(path, PARQUET), parquet.ParquetFile(path, pre_buffer=False) as file:
             column = file.read(columns=[name]).column(name).combine_chunks()
             if width is None:
                 return arrow_numbers(column)
@@ -294,10 +299,13 @@ def parquet_arrays(path: Path) -> Arrays:
             return arrow_numbers(column.flatten()).reshape(len(column), width)
 
     widths: dict[str, int | None] = {}
-    with reading(path, PARQUET, pa.ArrowException), parquet.ParquetFile(path, pre_buffer=False) as file:
-        rows = file.metadata.num_rows
+    with reading(path, PARQUET), parquet.ParquetFile(path, pre_buffer=False) as file:
+        rows, stored = file.metadata.num_rows, file.metadata
         if not rows:
             raise FileFormatError(f"{path} has columns but no rows.")
+        groups = (stored.row_group(index) for index in range(stored.num_row_groups))
+        values = sum(group.column(index).num_values for group in groups for index in range(stored.num_columns))
+        require_plausible_size(path, "a column", 8 * values, path.stat().st_size)  # equal numbers take no space
         for field in file.schema_arrow:
             if types.is_floating(field.type) or types.is_integer(field.type):
                 widths[field.name] = None

@@ -41,7 +41,7 @@ def read_mapping(path: Path, known: Sequence[str]) -> dict[str, Any]:
     """
     if not path.is_file():
         raise FileFormatError(f"{path} is not a file; give `mapping` a YAML file.")
-    with reading(path, "YAML", yaml.YAMLError, AttributeError, IndexError):  # !!timestamp x, !!int ''
+    with reading(path, "YAML"):
         if path.stat().st_size > LARGEST:
             raise FileFormatError(f"{path} is larger than 1 MiB; that is no mapping of columns.")
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_OnceLoader)  # a SafeLoader
@@ -73,5 +73,5 @@ def _words(path: Path, key: str, value: Any) -> Any:
 
 def beside(log: Path) -> Path | None:
     """The mapping that belongs to a log: STEM.yaml beside it, or forcegp.yaml in its folder."""
-    own = log.with_name(f"{log.name.split('.')[0]}.yaml")
+    own = log.parent / f"{log.name.split('.')[0]}.yaml"  # also of a folder such as '.', which has no name
     return next((path for path in (own, log.parent / OF_FOLDER) if path.is_file()), None)

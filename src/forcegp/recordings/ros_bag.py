@@ -72,8 +72,7 @@ class RosBag(Source):
         reader_of = required_extra("rosbags.highlevel", "logs", "reading bags").AnyReader
         types = required_extra("rosbags.typesys", "logs", "reading bags")
         known = types.get_typestore(types.Stores.ROS1_NOETIC if self.ros1 else types.Stores.LATEST)
-        # Exception: rosbags meets damaged files with whatever its parsers, sqlite, zstd and lz4 raise
-        with reading(self.path, "a bag", Exception), reader_of(self._read, default_typestore=known) as reader:
+        with reading(self.path, "a bag"), reader_of(self._read, default_typestore=known) as reader:
             # rosbags 0.11 does not publish its list of MCAP chunks; a version without it reads them unchecked
             for storage in (getattr(bag, "storage", None) for bag in reader.readers):
                 for store in getattr(storage, "storages", [storage]):  # a directory has several, a file is one
