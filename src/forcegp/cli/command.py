@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import os
 import platform
 import re
@@ -25,6 +26,7 @@ from forcegp.atomic_files import (
     read_json,
     require_replaceable,
     require_writable,
+    unreadable,
     write_digests,
     write_json,
 )
@@ -187,6 +189,8 @@ class Command(ABC):
                 for path in given if isinstance(given, tuple) else () if given is None else (given,):
                     if not mark.is_there(path):
                         raise FileFormatError(f"{path}{mark.refusal}")
+                    if why := unreadable(path, math.inf):
+                        raise FileFormatError(f"{path} {why}; give a file that is.")
                     inputs.append(path)
         path = self.output
         for given in (*inputs, *([] if path is None else [path])):

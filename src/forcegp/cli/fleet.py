@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from forcegp.atomic_files import write_text
+from forcegp.atomic_files import unreadable, write_text
 from forcegp.cli.arguments import COMMANDS, command_class, parsed
 from forcegp.cli.command import Command, options_of
 from forcegp.cli.terminal import Terminal, facts
@@ -172,6 +172,8 @@ def lines_of(command: str, common: Sequence[str], path: Path, out: Path) -> dict
     """By name, the words of each line of a list. Raises InvalidInput for words of no command, and FileFormatError."""
     lines = dict[str, list[str]]()
     try:
+        if why := unreadable(path):
+            raise OSError(f"it {why}")
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise FileFormatError(f"{path} cannot be read ({error}); give a text file with a log in each line.") from None

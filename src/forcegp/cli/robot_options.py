@@ -13,7 +13,7 @@ from tyro.conf import UseAppendAction, arg
 import forcegp
 import forcegp.mechanics
 import forcegp.posterior
-from forcegp.atomic_files import SUMS, require_unchanged
+from forcegp.atomic_files import SUMS, require_unchanged, unreadable
 from forcegp.cli.command import FIELDS, IDENTIFIED, URDF, listed, numbers_of, split_list, unless_given
 from forcegp.errors import FileFormatError, InvalidInput
 
@@ -117,8 +117,8 @@ class RobotOptions(RobotFileOptions):
         if not path.exists() and (place / "model.json").exists():
             return identified_system(forcegp.posterior.load_posterior(place).model)  # that of `save_posterior`
         try:
-            if path.is_fifo():  # to open it would wait for a writer for ever
-                raise OSError("it is not a regular file")
+            if why := unreadable(path):
+                raise OSError(f"it {why}")
             return forcegp.Model.from_json(path.read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError) as error:
             raise FileFormatError(

@@ -9,6 +9,7 @@ import numpy as np
 from defusedxml import minidom
 from jaxtyping import Float
 
+from forcegp.atomic_files import unreadable
 from forcegp.errors import LARGEST, InvalidInput, NonPhysicalInertia, RobotModelError, UnknownName, required_extra
 from forcegp.robots.arguments import Problems, Vector, by_joint, finite_vector
 from forcegp.robots.inertia import physical_objection
@@ -25,14 +26,9 @@ LARGEST_FILE = 16 << 20
 def read_text(path: str | Path) -> str:
     """Decode a URDF file; :class:`RobotModelError` where there is none or it is not text."""
     path = Path(path)
-    if path.is_fifo():  # to open it would wait for a writer for ever
-        raise RobotModelError(f"{path}: is not a regular file; give the path of a URDF file.")
+    if why := unreadable(path, LARGEST_FILE):
+        raise RobotModelError(f"{path}: {why}; give the URDF file of one robot.")
     try:
-        if path.is_file() and path.stat().st_size > LARGEST_FILE:
-            raise RobotModelError(
-                f"{path}: holds {path.stat().st_size >> 20} MiB, more than the {LARGEST_FILE >> 20} MiB that a robot "
-                "file may have; give the URDF file of one robot."
-            )
         data = path.read_bytes()
     except FileNotFoundError:
         raise RobotModelError(f"{path}: no such file; give the path of a URDF file.") from None
