@@ -60,6 +60,9 @@ def _console(**how: Any) -> Console:
                 shown = segment.control or printable(segment.text) == segment.text
                 yield segment if shown else Segment(printable(segment.text), segment.style)
 
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError  # rich would end with the code of an error
+
     return Plain(highlight=False, markup=False, emoji=False, **how)
 
 
