@@ -22,6 +22,8 @@ TEMPORARY = ".tmp"
 LOCK, OLD = ".lock", ".old"
 TRIAL = 2**16
 """Bytes that `require_writable` writes."""
+MARK = "Written by forcegp"
+"""Stands near the end of pages and robot files, which may be replaced."""
 LARGEST_TEXT = 32 << 20
 """Bytes of JSON or of a list that forcegp wrote: digests, settings, results; most have some thousand."""
 
@@ -147,6 +149,13 @@ def read_json(path: Path, remedy: str) -> dict[str, Any]:
     if not isinstance(stored, dict):
         raise FileFormatError(f"{path} is damaged; {remedy}.")
     return stored
+
+
+def is_marked(path: Path) -> bool:
+    """Whether a file ends as those that forcegp marks with `MARK`; no more of it is read, for it may be another."""
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - 200, 0))
+        return MARK.encode() in file.read()
 
 
 def remove_leftovers(folder: Path) -> None:

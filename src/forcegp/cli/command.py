@@ -314,13 +314,3 @@ def _same(one: Path, other: Path) -> bool:
     with contextlib.suppress(OSError):  # one of them does not exist
         return one.samefile(other)
     return os.path.realpath(one) == os.path.realpath(other)
-
-
-def begins(mark: bytes) -> Callable[[Path], bool]:
-    """Whether a file begins so; no more of it is read, for it may be large and not ours."""
-
-    def own(path: Path) -> bool:
-        with path.open("rb") as file:
-            return file.read(len(mark)) == mark
-
-    return own
