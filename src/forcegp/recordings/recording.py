@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import forcegp.robots
 from forcegp.data.configurations import following
-from forcegp.data.dataset import SENSORS
+from forcegp.data.dataset import BEYOND, LARGEST_MEASURED, SENSORS
 from forcegp.data.views import ends_of_range
 from forcegp.errors import DatasetError, FileFormatError, MistakenUnit
 from forcegp.recordings.ros_bag import Read, read_on_one_clock
@@ -74,6 +74,10 @@ def read_recording(
     columns = read.columns
     rows = len(columns[plan.columns[0]])
     values = np.stack([item.value(columns, rows) for item in plan.signals], axis=1)
+    for row, column in np.argwhere((np.abs(values) > LARGEST_MEASURED) & np.isfinite(values))[:1]:
+        item, where = plan.signals[column], f"{values[row, column]:g} at {source.place(int(row))}"
+        seen = f"{source.path}: column {item.expression.text!r} ({item.signal} of joint {item.joint!r}) is {where}"
+        raise DatasetError(f"{seen}, {BEYOND} Map another column, state its `unit`, or repair these rows.")
     lost = _lost(label, plan, columns, values, skip=options.bad_rows == "skip")
     skipped = [f"rows left out because they lack a value: {lost.sum()} of {rows}"] if lost.any() else []
     skipped += _at_ends(plan, values, lost)
@@ -267,7 +271,7 @@ def _episodes(column: np.ndarray, source: Source) -> Int[np.ndarray, "n 2"]:
     return np.stack([own, starts], axis=1)
 
 
-BEYOND = 0.1
+MARGIN = 0.1
 """Of its range: how far a position may be beyond the limits of the URDF. Stops give way, and zeros are set by hand."""
 
 TURNS = 4.0 * np.pi  # rad: positions of a joint beyond this whose unit is not stated as rad are taken for degrees
@@ -287,7 +291,7 @@ def _require_plausible_positions(
             continue
         low, high = float(column.min()), float(column.max())
         lower, upper = limits.get(item.joint, (-np.inf, np.inf))
-        margin = BEYOND * (upper - lower) if np.isfinite(upper - lower) else 0.0
+        margin = MARGIN * (upper - lower) if np.isfinite(upper - lower) else 0.0
         least, most = lower - margin, upper + margin
         degrees = item.unit.name == "rad" and max(-low, high) > TURNS
         other = (
