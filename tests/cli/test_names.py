@@ -35,6 +35,7 @@ def test_in_a_terminal(forcegp, urdf, tmp_path):
     assert "\u202e" not in done.stdout
     refused = forcegp("robot", "\x1b[31mno.urdf", folder=tmp_path)
     assert (refused.returncode, "\x1b" in refused.stderr, "\\x1b[31mno" in refused.stderr) == (2, False, True)
+    assert len(printable("a" * 10**7)) < 5000
     assert printable("größe 关节\n\t🦾") == "größe 关节\n\t🦾"
 
 

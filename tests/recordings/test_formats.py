@@ -1,6 +1,7 @@
 """Every format passes the same tests."""
 
 import json
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -25,6 +26,7 @@ from tests.recordings.source_conformance import SourceConformance
 
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput
 from forcegp.recordings import ColumnMapping, import_recordings, open_source
+from forcegp.recordings.source import require_distinct
 
 
 class Tables(SourceConformance):
@@ -354,3 +356,7 @@ def test_a_dataset_of_our_own_is_not_a_log(tmp_path):
     arm_data(20, seed=0).save(tmp_path / "arm.h5")
     with pytest.raises(FileFormatError, match="a dataset of forcegp already"):
         open_source(tmp_path / "arm.h5")
+
+
+def test_a_great_number_of_columns_is_compared_once():
+    require_distinct(Path("log.csv"), [f"c{k}" for k in range(200_000)])

@@ -144,7 +144,7 @@ class View(Command):
         if len(self.paths) not in (1, 2):
             raise InvalidInput(f"{len(self.paths)} paths were given; give a dataset, or a model and a dataset.")
         *runs, log = self.paths
-        self.require_free_file(self.out, is_marked, "a report")
+        self.require_free_file(self.out, is_marked, "a report of forcegp")
         posterior = forcegp.load_posterior(runs[0]) if runs else None
         recorded = forcegp.report.recorded_scene(
             forcegp.Dataset.load(log), posterior, start=self.start, seconds=self.seconds, shapes=self.shapes
