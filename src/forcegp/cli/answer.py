@@ -186,8 +186,7 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset, still: Sequ
 
 def _motion(scores: forcegp.scores.Scores, model: str) -> float | None:
     """Error of q at the longest horizon; None where all motions diverge, or none was scored."""
-    quantity = f"position after {scores.horizons[-1]:g} s" if scores.horizons else ""
-    return _known(scores, "rmse", quantity, model)
+    return _known(scores, "rmse", f"position after {scores.horizons[-1]:g} s" if scores.horizons else "", model)
 
 
 def _known(scores: forcegp.scores.Scores, score: str, quantity: str, model: str) -> float | None:

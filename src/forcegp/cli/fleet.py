@@ -182,8 +182,7 @@ def lines_of(command: str, common: Sequence[str], path: Path, out: Path) -> dict
             given = shlex.split(line, comments=True)
             if not given:
                 continue
-            differing = [word.partition("=")[0] for word in given if word.startswith("--")]
-            words = [*_split(common, differing)[1], *given]
+            words = [*_split(common, [word.partition("=")[0] for word in given if word.startswith("--")])[1], *given]
             asked: Any = parsed([command, *words, "--out", str(out)])
             name = (asked.logs[0] if hasattr(asked, "logs") else asked.log).name.partition(".")[0]
             while not name or name in lines or name == JOBS:  # the last is where rows are kept

@@ -177,8 +177,7 @@ class ColumnOptions:
                 terminal.note(f"the columns are mapped by {path}")
         if path is None:
             return self._stated()
-        names = [item.name for item in fields(forcegp.recordings.ColumnMapping)]
-        stored = forcegp.recordings.read_mapping(path, names)
+        stored = forcegp.recordings.read_mapping(path, [item.name for item in fields(forcegp.recordings.ColumnMapping)])
         left = {name: value for name, value in stored.items() if getattr(self, name) in (None, False)}
         try:
             return replace(self, **left)._stated()

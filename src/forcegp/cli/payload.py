@@ -105,8 +105,7 @@ class Payload(Command):
         title = f"payload in the frame of {content['link']}, beside {beside}; {found.estimates.rows} rows"
         own = {name: each for name, each in found.estimates.items() if name.startswith("payload.")}
         others = {name: each for name, each in found.estimates.items() if name not in own and baseline is None}
-        tables = [estimates_table("joints", others)] if others else []
-        terminal.show(estimates_table(title, own), *tables)
+        terminal.show(estimates_table(title, own), *([estimates_table("joints", others)] if others else []))
         return content
 
     def _rows(self, terminal: Terminal, path: Path, notes: list[str]) -> tuple[forcegp.Model, forcegp.Dataset]:
@@ -155,8 +154,7 @@ def calibrated(found: Any) -> forcegp.Model:
 def payload_dict(found: Any, baseline: bool) -> dict[str, Any]:
     """Payload and other numbers as plain JSON values, with the link that carries it."""
     [payload] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
-    doubts = found.settings["doubts"]
-    return {"link": payload.link, "baseline": baseline, "doubts": doubts, **found.estimates.to_dict()}
+    return {"link": payload.link, "baseline": baseline, "doubts": found.settings["doubts"], **found.estimates.to_dict()}
 
 
 SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
@@ -190,9 +188,8 @@ def other_causes(payload: Mapping[str, Any]) -> dict[str, str]:
     mass = payload.get("parameters", {}).get("payload.mass", {"value": 1.0, "std": 0.0})
     doubts = [each for each in payload.get("doubts", ()) if each["about"] == "payload"]
     causes = ((cause, len(own), each["what"]) for each in doubts for cause, own in each["numbers"].items())
-    some = mass["value"] > mass["std"]
     return {
         cause: what
         for cause, factors, what in causes
-        if factors <= MOST_FACTORS and (some or cause not in ("lengths", "masses"))
+        if factors <= MOST_FACTORS and (mass["value"] > mass["std"] or cause not in ("lengths", "masses"))
     }

@@ -79,8 +79,7 @@ class RobotOptions(RobotFileOptions):
         else:
             assert recorded is not None, "there is one of both"
             text, source = recorded.robot.urdf_text, recorded.robot.source
-            changed = forcegp.Robot.from_urdf_text(text, source=source, inertias=self.inertias, **changes)
-            own = forcegp.Model(changed)
+            own = forcegp.Model(forcegp.Robot.from_urdf_text(text, source=source, inertias=self.inertias, **changes))
         # robots with other joints are refused by their names: clearer than an armature of the wrong length
         if recorded is None or own.robot.joint_names != recorded.robot.joint_names:
             return own
@@ -90,8 +89,7 @@ class RobotOptions(RobotFileOptions):
             robot = robot.with_armature(rotors | changes.get("armature", {}))
         model = recorded.with_robot(robot)
         if self.robot is not None:  # its damping, dry friction and springs
-            there = model.laws
-            new = (law for law in own.laws if not any(law.takes_the_place_of(each) for each in there))
+            new = (law for law in own.laws if not any(law.takes_the_place_of(each) for each in model.laws))
             model = model.with_forces(*new)
         return model
 

@@ -222,8 +222,7 @@ class Reproduce(Command):
         with terminal.progress(f"reproducing {self.figure} ({self.preset})"):
             how: dict[str, Any] = {"command": command, "docs": None, "jobs": checked_jobs(self.jobs)}
             summaries = reproduce(experiments, self.preset, out, **how)
-        page = out / page_of(experiments)
-        terminal.show(f"{page} reports the results; figures, JSON and CSV are in {out / NAME}.")
+        terminal.show(f"{out / page_of(experiments)} reports the results; figures, JSON and CSV are in {out / NAME}.")
         return {"out": str(out), "preset": self.preset, "figures": summaries}
 
 

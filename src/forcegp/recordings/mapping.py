@@ -148,8 +148,7 @@ class ColumnMapping:
         if self.orientation not in (None, *ORIENTATIONS):
             raise InvalidInput(f"orientation is {self.orientation!r}; give {', '.join(ORIENTATIONS)}.")
         for signal, names in self.axes.items():
-            known = AXES.get(signal, ())
-            if not 1 <= len(names) <= 2 or not set(names) <= set(known) or names[1:] == ("imu",):
+            if not 1 <= len(names) <= 2 or not set(names) <= set(AXES.get(signal, ())) or names[1:] == ("imu",):
                 raise InvalidInput(
                     f"axes of {signal} are {','.join(names)}; give v body or world, a body, world or imu, or two of "
                     "them: of the linear and of the angular part, which no `imu` measures as an acceleration."
@@ -179,8 +178,7 @@ class ColumnMapping:
         places = [joints.index(name) for name in self.joints or joints]
 
         def in_order(values: Sequence[Any]) -> tuple[Any, ...]:
-            alike = len(set(values)) == 1
-            return (values[0],) if alike else tuple(values[place] for place in places)
+            return (values[0],) if len(set(values)) == 1 else tuple(values[place] for place in places)
 
         sign = dict(self.sign)
         for signal, values in correction.get("sign", {}).items():
@@ -344,8 +342,7 @@ def _says(signal: str, around: tuple[str, str]) -> bool:
     """Do the last word before the joint's name or the first after it name the signal?"""
     before = re.split(r"[^A-Za-z_]+", around[0].rstrip("_.:/ -["))[-1]
     after = re.split(r"[^A-Za-z_]+", around[1].lstrip("_.:/ -]"))[0]
-    words = {word.strip("_").lower() for word in (before, after)} - {""}
-    return bool(words & WORDS[signal])
+    return bool(({word.strip("_").lower() for word in (before, after)} - {""}) & WORDS[signal])
 
 
 TOKEN = (
