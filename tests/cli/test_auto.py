@@ -118,8 +118,7 @@ def test_the_printed_command_keeps_every_option():
         "--accept --overwrite --cutoff 9 --every 3 --lock finger=0.1 --gravity=-9.81,0,0 --link tool --without 1,2.5"
     )
     others += " --forces given --forces gp:joint,viscous --out here"
-    words = ["auto", "a.txt", "b.txt", *columns.split(), *others.split()]
-    command = parse_arguments(words)
+    command = parse_arguments(["auto", "a.txt", "b.txt", *columns.split(), *others.split()])
     mapping = command.columns.mapped([], Terminal(json=False))
     assert parse_arguments(shlex.split(command._command(mapping, command.robot))[1:]) == command
 
@@ -184,8 +183,7 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
     assert some.startswith("Use “the URDF” for hip, knee: on unseen time it leaves 10 to 16 % of each acceleration")
     assert some.endswith("Not for the others, of whose acceleration is left: wrist 280 %.")
     # a light wrist has no acceleration to speak of, and a torque that is known to 5 %
-    whole = told([0.1, 0.16, 2.8], shares=[0.02, 0.03, 0.05])
-    assert whole == (
+    assert told([0.1, 0.16, 2.8], shares=[0.02, 0.03, 0.05]) == (
         "Use “the URDF”: on unseen time it leaves 2 to 5 % of each torque, "
         "but it is for torques: do not predict motions, positions 1 s ahead are wrong by 0.01 rad."
     )

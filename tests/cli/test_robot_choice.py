@@ -29,11 +29,9 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("robots")
     (folder / "arm.urdf").write_text(URDF)
     (folder / "broken.urdf").write_text(BROKEN)
-    data = arm_data(20, 0, arm_model(0))
-    data.save(folder / "recorded.h5")
+    arm_data(20, 0, arm_model(0)).save(folder / "recorded.h5")
     model = arm_model(0)
-    known = (*model.forces, Coulomb([0.1, 0.2, 0.3]))
-    (folder / SYSTEM_FILE).write_text(replace(model, forces=known).to_json())
+    (folder / SYSTEM_FILE).write_text(replace(model, forces=(*model.forces, Coulomb([0.1, 0.2, 0.3]))).to_json())
     return folder
 
 

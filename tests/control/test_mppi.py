@@ -32,8 +32,7 @@ def predictor():
 
 def cost(q, v, u):
     state = torch.cat([q, v], dim=-1)
-    weights = torch.tensor(STATE_COST)
-    return ((state @ weights) * state).sum((-1, -2)) + TORQUE_COST * u.square().sum((-1, -2))
+    return ((state @ torch.tensor(STATE_COST)) * state).sum((-1, -2)) + TORQUE_COST * u.square().sum((-1, -2))
 
 
 def controller(predictor, **changes):

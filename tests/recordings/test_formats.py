@@ -99,8 +99,7 @@ def test_texts_of_other_programs(tmp_path, encoding, head, row, begin):
 
 
 def test_the_last_lines_are_rows_whatever_stands_above(tmp_path):
-    lines = [*["1,2,3"] * 30, "t;q", *["0;5"] * 20, ""]
-    (tmp_path / "log.csv").write_text("\n".join(lines))
+    (tmp_path / "log.csv").write_text("\n".join([*["1,2,3"] * 30, "t;q", *["0;5"] * 20, ""]))
     assert_array_equal(open_source(tmp_path / "log.csv").read(["q"])["q"], [5.0] * 20)
 
 
@@ -170,8 +169,7 @@ class TestNumpyArchive(Tables):
 
 class TestPartOfAnArchive(TestNumpyArchive):
     def write(self, folder):
-        both = {"run1": np.zeros((3, 2)), "run2": motion()["q"]}
-        np.savez_compressed(folder / "log.npz", **both)
+        np.savez_compressed(folder / "log.npz", **{"run1": np.zeros((3, 2)), "run2": motion()["q"]})
         return folder / "log.npz"
 
     def open(self, path):
@@ -248,10 +246,9 @@ def test_lists_of_objects_are_rows_or_episodes(tmp_path, write):
 
 
 def test_lines_of_json_are_rows_and_the_last_may_be_cut(tmp_path):
-    stamps = [f"2024-01-01T00:00:0{row}.5Z" for row in range(4)]
     lines = [
         {"stamp": stamp, "names": ["b", "a"], "pos": [row, 2 * row], "u": None if row else 3}
-        for row, stamp in enumerate(stamps)
+        for row, stamp in enumerate([f"2024-01-01T00:00:0{row}.5Z" for row in range(4)])
     ]
     (tmp_path / "log.jsonl").write_text("\n".join(map(json.dumps, lines))[:-5])
     with pytest.warns(DataWarning, match="the 3 whole lines before are read"):

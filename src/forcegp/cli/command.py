@@ -74,8 +74,6 @@ def listed(of: type[str | float] = str, goes_on: str | None = None) -> Primitive
 
 NUMBERS = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(:.*)?"
 """What continues an entry that holds numbers: FRAME@x,y,z:SURFACE:n,n,n,n, or WHAT=X,X."""
-
-
 FIELDS = r"\w+ *=.*"  # what continues a force: NAME:FIELD=VALUE,FIELD=VALUE
 
 

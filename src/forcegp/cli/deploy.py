@@ -117,8 +117,6 @@ def _casadi(options: Export, terminal: Terminal, posterior: Any, folder: Path) -
 
 TARGETS: dict[str, Callable[[Export, Terminal, Any, Path], dict[str, Any]]] = {"c": _c, "casadi": _casadi}
 """What writes each target to a folder; a new one is a function here and a name in `Export.to`."""
-
-
 PLACE = tuple(f"{name}_{axis}" for name in ("point", "force", "force_std") for axis in "xyz")
 COLUMNS = ("start", "end", "peak", "probability", "link", "also", "newton", *PLACE)
 APART = 0.25  # alarms that are less apart in s belong to one contact

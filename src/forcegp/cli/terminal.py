@@ -43,8 +43,6 @@ def with_option_names(message: str, options: Collection[str]) -> str:
 
 
 PLAIN_SECONDS = 10.0  # between two lines about progress where there is no terminal to draw a bar on
-
-
 UNLIMITED = 10_000  # columns of a terminal that cuts nothing
 
 
@@ -184,8 +182,6 @@ class Terminal:
 
 
 NONE = "–"
-
-
 COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}  # of doubts by their level
 PLAIN: dict[str, Any] = {"title_justify": "left", "title_style": "bold", "pad_edge": False}
 

@@ -32,8 +32,6 @@ PACKAGES = (
 )
 LONGEST = 600.0
 """Seconds after which a compiler hangs: our longest program takes it a fiftieth of that."""
-
-
 WITHOUT = "or do without it: a robot itself, predictor(compile=False), export_c(unchecked=True)"
 ELSEWHERE = "choose another folder (the environment variable XDG_CACHE_HOME, robot.compile(folder=...))"
 
