@@ -13,6 +13,8 @@ from forcegp.scores.accuracy import ACCELERATION, TORQUE
 from forcegp.scores.page import number
 from forcegp.scores.scores import USABLE
 
+LEAST_COVERAGE = 0.8  # of 95 % intervals that is no reason to doubt them
+
 
 def short_name(name: str) -> str:
     """What a model is called in the answer."""
@@ -140,9 +142,6 @@ def left_of_torques(scores: forcegp.scores.Scores, best: str) -> list[tuple[str,
             shares[short_name(name)] = " ".join(numbers)
     told = "; ".join(f"{name} {numbers}" for name, numbers in shares.items())
     return [("torque left", f"on unseen time, % of the recorded one of each joint: {told}")] if told else []
-
-
-LEAST_COVERAGE = 0.8  # of 95 % intervals that is no reason to doubt them
 
 
 def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset, still: Sequence[str] = ()) -> str:

@@ -23,6 +23,10 @@ Columns = Annotated[str | None, unless_given("COLUMNS", "by the names", str)]
 MappingFile = Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "log.yaml or forcegp.yaml beside it", Path)]
 Text = Annotated[str | None, unless_given("TEXT", "none", str)]
 Seconds = Annotated[float | None, unless_given("S", "all", float)]
+REPAIRED = {
+    "repeated_stamps_dropped": "rows dropped for a repeated time stamp",
+    "rows_in_stretches_too_short": "rows left out in stretches of fewer than 5",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,12 +279,6 @@ class Import(Command):
             )
         dataset = forcegp.Dataset.load(path)
         return replace(dataset, model=self.robot.chosen_model(dataset, path))
-
-
-REPAIRED = {
-    "repeated_stamps_dropped": "rows dropped for a repeated time stamp",
-    "rows_in_stretches_too_short": "rows left out in stretches of fewer than 5",
-}
 
 
 def _imported(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> str:

@@ -27,6 +27,8 @@ WINDOW = 0.4
 WIDER = 2.3
 """Where a base moves, times the windows of a fit: a mass needs less of what is fast than rotors do."""
 LAWS = "viscous", "gear", "offset", "rotor"
+SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
+MOST_FACTORS = 3  # of one cause that a person can look for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,9 +159,6 @@ def payload_dict(found: Any, baseline: bool) -> dict[str, Any]:
     return {"link": payload.link, "baseline": baseline, "doubts": found.settings["doubts"], **found.estimates.to_dict()}
 
 
-SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
-
-
 def payload_text(found: Any) -> str:
     """Mass with its 95 % interval and place; or that there is none."""
     parts = {name: found.estimates[f"payload.{name}"] for name in ("mass", *(f"center_of_mass.{x}" for x in "xyz"))}
@@ -178,9 +177,6 @@ def drives_of(model: forcegp.Model) -> str:
     """What the masses of a base that moves are as right as."""
     thrusters = forcegp.data.thruster_columns(model)
     return "" if model.robot.base == "fixed" else "thrust coefficients" if thrusters else "torques"
-
-
-MOST_FACTORS = 3  # of one cause that a person can look for
 
 
 def other_causes(payload: Mapping[str, Any]) -> dict[str, str]:

@@ -26,6 +26,11 @@ _ARGUMENT = re.compile(r"`([a-z_.]+)(?:=([^`]*))?`")
 
 OTHERWISE = {"contacts": "contact", "folder": "out", "locked": "lock", "model": "robot"}
 """Options whose argument has another name in Python."""
+PLAIN_SECONDS = 10.0  # between two lines about progress where there is no terminal to draw a bar on
+UNLIMITED = 10_000  # columns of a terminal that cuts nothing
+NONE = "–"
+COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}  # of doubts by their level
+PLAIN: dict[str, Any] = {"title_justify": "left", "title_style": "bold", "pad_edge": False}
 
 
 def with_option_names(message: str, options: Collection[str]) -> str:
@@ -40,10 +45,6 @@ def with_option_names(message: str, options: Collection[str]) -> str:
         return flag if value in ("", "True") else f"{flag}{'=' if value.startswith('-') else ' '}{value}"
 
     return _ARGUMENT.sub(option, message)
-
-
-PLAIN_SECONDS = 10.0  # between two lines about progress where there is no terminal to draw a bar on
-UNLIMITED = 10_000  # columns of a terminal that cuts nothing
 
 
 def _console(**how: Any) -> Console:
@@ -179,11 +180,6 @@ class Terminal:
                 self.note(f"{what}: {done / total:.0%}{note and f', {note}'}")
 
         return report
-
-
-NONE = "–"
-COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}  # of doubts by their level
-PLAIN: dict[str, Any] = {"title_justify": "left", "title_style": "bold", "pad_edge": False}
 
 
 def facts(title: str, values: Mapping[str, str]) -> Table:

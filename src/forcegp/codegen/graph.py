@@ -252,8 +252,7 @@ def jacobian(
 
 def partials(graph: Graph, node: int) -> list[tuple[int, Callable[[], int]]]:
     """The operands of a node, and what makes its derivative in each of them when it is needed."""
-    operation = graph.nodes[node][0]
-    operands = graph.operands(node)
+    operation, operands = graph.nodes[node][0], graph.operands(node)
     if operation in FLAT:
         return []
     if operation == "output":

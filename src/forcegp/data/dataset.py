@@ -25,6 +25,8 @@ from forcegp.summary import Summary, listed, rounded
 
 ROTATION = {"q": "rad", "v": "rad/s", "u": "Nm", "a": "rad/s^2"}  # units of a revolute or continuous joint
 TRANSLATION = {"q": "m", "v": "m/s", "u": "N", "a": "m/s^2"}  # units of a prismatic joint
+SENSORS = FORCE, IMU, TORQUE = "force.", "imu.", "torque."
+"""Begin names of measured forces and what accelerometers measure, by frame, and of torques at links, by joint."""
 
 
 def units_for(robot: forcegp.robots.Robot) -> dict[str, Any]:
@@ -225,10 +227,6 @@ def _noise_std(given: object, joint_names: tuple[str, ...]) -> np.ndarray | None
             "known or if there is no noise."
         )
     return values
-
-
-SENSORS = FORCE, IMU, TORQUE = "force.", "imu.", "torque."
-"""Begin names of measured forces and what accelerometers measure, by frame, and of torques at links, by joint."""
 
 
 def imu_place(name: str) -> tuple[str, list[float], Float[np.ndarray, "3 3"]]:

@@ -194,8 +194,7 @@ def _judged(dataset: Dataset, cutoff: float, source: Literal["q", "v"]) -> tuple
 
     delay = np.nan_to_num(estimate_delay(behind(cutoff), cutoff).common)  # the best guess, sure or not
     log = shifted(log, float(delay))
-    away = SETTLED / tried[0] + abs(delay)
-    times = [rows.time for _, rows, _ in episodes_in_order(log)]
+    away, times = SETTLED / tried[0] + abs(delay), [rows.time for _, rows, _ in episodes_in_order(log)]
     inner = np.concatenate([(time >= time[0] + away) & (time <= time[-1] - away) for time in times])
     sides = [np.concatenate(np.array_split(np.arange(int(inner.sum())), FOLDS)[first::2]) for first in (0, 1)]
     sharp = torque_columns(behind(tried[-1]))

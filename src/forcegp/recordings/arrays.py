@@ -39,6 +39,9 @@ from forcegp.summary import listed
 
 SEPARATOR = "/"
 MOST_NAMES = 12  # of arrays in a message
+NUMPY, HDF5, MATLAB, PARQUET = "a NumPy archive", "an HDF5 file", "a MATLAB file", "a Parquet file"
+INTERNAL = "#"  # begins names under which MATLAB keeps the contents of cells
+REFERENCE = np.dtype(object)
 
 Arrays = Mapping[str, tuple[tuple[int, ...], Callable[[], np.ndarray]]]
 """By full name, shape and content of every array of numbers in a file."""
@@ -113,9 +116,6 @@ class ArrayFile(Source):
         return {name: tables[own] if at is None else tables[own][:, at] for name, (own, at) in places.items()}
 
 
-NUMPY = "a NumPy archive"
-
-
 def numpy_arrays(path: Path) -> Arrays:
     """Of an .npz file. What it claims to hold is compared with its size before anything is expanded."""
 
@@ -149,9 +149,6 @@ def numpy_arrays(path: Path) -> Arrays:
     return found
 
 
-HDF5 = "an HDF5 file"
-
-
 def hdf5_arrays(path: Path) -> Arrays:
     """Of all groups of an HDF5 file, in which they must lie: links to other files are never followed."""
 
@@ -182,11 +179,6 @@ def _stored(path: Path, group: h5py.Group, prefix: str) -> Iterator[tuple[str, t
         elif isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and item.shape is not None:
             require_plausible_size(path, repr(full), item.size * item.dtype.itemsize, item.id.get_storage_size())
             yield full, tuple(item.shape)
-
-
-MATLAB = "a MATLAB file"
-INTERNAL = "#"  # begins names under which MATLAB keeps the contents of cells
-REFERENCE = np.dtype(object)
 
 
 def matlab_arrays(path: Path) -> Arrays:
@@ -278,10 +270,6 @@ def _numbers(value: Any, name: str) -> Iterator[tuple[str, np.ndarray]]:
                 yield from ((f"{name}/{number}{key}", own) for key, own in part.items())
 
 
-PARQUET = "a Parquet file"
-LISTS = (types.is_list, types.is_large_list, types.is_fixed_size_list)
-
-
 def parquet_arrays(path: Path) -> Arrays:
     """Of a Parquet file: numeric columns, and columns of lists of equal length, that of the first row."""
 
@@ -309,7 +297,7 @@ def parquet_arrays(path: Path) -> Arrays:
         for field in file.schema_arrow:
             if types.is_floating(field.type) or types.is_integer(field.type):
                 widths[field.name] = None
-            elif any(is_list(field.type) for is_list in LISTS):
+            elif types.is_list(field.type) or types.is_large_list(field.type) or types.is_fixed_size_list(field.type):
                 first = next(file.iter_batches(1, columns=[field.name])).column(0)[0]
                 kind = field.type.value_type
                 if first.is_valid and len(first) and (types.is_floating(kind) or types.is_integer(kind)):

@@ -21,6 +21,9 @@ from forcegp.doubts import stated_as
 from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
 from forcegp.recordings.source import Source
 
+UNIT_OF_A_NAME = re.compile(r"[\[(]([^\d\[(]+)[\])]$|_([A-Za-z]{2,})$")
+COMMA = re.compile(r",(?![^{\[]*[}\]])(?=(?:[^`]*`[^`]*`)*[^`]*$)")
+
 
 @dataclass(frozen=True)
 class LogUnit:
@@ -67,9 +70,6 @@ def log_unit(quantity: str, name: str) -> LogUnit:
     meant = {known.lower(): known for known in units}
     require_known("unit", spelled, f"the units of {quantity}", units, synonyms=meant)
     return units[spelled]
-
-
-UNIT_OF_A_NAME = re.compile(r"[\[(]([^\d\[(]+)[\])]$|_([A-Za-z]{2,})$")
 
 
 def named_unit(quantity: str, column: str) -> str | None:
@@ -261,9 +261,6 @@ def expanded(pattern: str, joints: Sequence[str], names: Collection[str] = ()) -
     if math.prod(map(len, choices)) > LONGEST_LIST:
         raise InvalidInput(f"{pattern!r} stands for more than {LONGEST_LIST} columns.")
     return written(product(*choices))
-
-
-COMMA = re.compile(r",(?![^{\[]*[}\]])(?=(?:[^`]*`[^`]*`)*[^`]*$)")
 
 
 def listed(text: str) -> list[str]:

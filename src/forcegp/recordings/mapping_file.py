@@ -12,6 +12,8 @@ from forcegp.recordings.source import reading
 
 LARGEST = 2**20  # bytes
 OF_FOLDER = "forcegp.yaml"
+KINDS = {"step": (float, "seconds"), "ned": (bool, "true or false"), "side_by_side": (bool, "true or false")}
+"""What is no text, and its name."""
 
 
 class _OnceLoader(yaml.SafeLoader):
@@ -28,10 +30,6 @@ class _OnceLoader(yaml.SafeLoader):
         if repeated := [key for key in keys if keys.count(key) > 1]:
             raise yaml.constructor.ConstructorError(None, None, f"{repeated[0]!r} stands twice", node.start_mark)
         return super().construct_mapping(node, deep)
-
-
-KINDS = {"step": (float, "seconds"), "ned": (bool, "true or false"), "side_by_side": (bool, "true or false")}
-"""What is no text, and its name."""
 
 
 def read_mapping(path: Path, known: Sequence[str]) -> dict[str, Any]:

@@ -23,6 +23,8 @@ from forcegp.robots.manifold import POSITIONS, TURN, ConfigurationSpace
 
 Jumps = tuple[Int[np.ndarray, " jumps"], str, str]
 """Rows before which something moves too far, what was seen, and what to do."""
+LARGEST_ERROR = 0.01  # of the length of a quaternion: more is no rounding
+ROUNDED = 1e-9  # differences from length 1 beyond this are reported
 
 
 @dataclass(frozen=True)
@@ -185,10 +187,6 @@ def _continued(plan: SignalPlan, values: np.ndarray, begins: np.ndarray, unwrap:
     return jumps
 
 
-LARGEST_ERROR = 0.01  # of the length of a quaternion: more is no rounding
-ROUNDED = 1e-9  # differences from length 1 beyond this are reported
-
-
 def read_poses(
     space: ConfigurationSpace,
     orientation: str,
@@ -330,8 +328,7 @@ def _stretches(
 
     Of rows with the same stamp the first is kept. DatasetError for time that runs backwards and impossible rates.
     """
-    begins = episodes[:, 1]
-    steps = np.diff(time)
+    begins, steps = episodes[:, 1], np.diff(time)
     steps[begins[begins > 0] - 1] = np.nan
     backwards = np.flatnonzero(steps < 0)
     if backwards.size:
@@ -360,8 +357,7 @@ def _stretches(
     paused = read.paused(options.gap, GAP)
     used = np.flatnonzero(kept & ~paused)
     number = np.searchsorted(begins, used, side="right") - 1
-    same = np.diff(number) == 0
-    between = np.diff(time[used])
+    same, between = np.diff(number) == 0, np.diff(time[used])
     step = float(np.median(between[same])) if same.any() else typical
     limit = GAP * step if options.gap is None else options.gap
     inside = same & (between <= limit) & (np.diff(np.cumsum(paused)[used]) == 0)

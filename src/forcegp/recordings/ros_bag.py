@@ -34,6 +34,8 @@ TWICE = re.compile(r"(pose|twist|accel)\.\1$")
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 NANOSECONDS = 10**9
 NUMBER, ARRAY = (int, float), (np.ndarray, list)  # a union written at the call would be made for every field
+MOST_WHOLE = 0.5
+"""Of the rows of a table: where more have all columns, the others were lost, and no topics stand side by side."""
 
 
 class RosBag(Source):
@@ -343,10 +345,6 @@ def _stamp_beside(source: Source, topic: str, wanted: str) -> str:
     if found is None:
         raise InvalidInput(f"{source.path}: {topic} has no {wanted}; name as `time` a {LOG_TIME}.")
     return found
-
-
-MOST_WHOLE = 0.5
-"""Of the rows of a table: where more have all columns, the others were lost, and no topics stand side by side."""
 
 
 def _topics(columns: Columns, plan: SignalPlan) -> tuple[dict[str, str], dict[str, Bool[np.ndarray, " rows"]]]:

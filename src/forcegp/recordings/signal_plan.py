@@ -405,8 +405,7 @@ def columns_of(
     """
     robot, own = model.robot, model.robot.single_joint_names
     kinds = {joint.name: TRANSLATION if joint.type == "prismatic" else ROTATION for joint in robot.joints}
-    of_log = dict(zip(own, joints, strict=True))
-    driven = tuple(model.actuation.names) == own
+    of_log, driven = dict(zip(own, joints, strict=True)), tuple(model.actuation.names) == own
     switches = model.inputs[len(model.actuators) :]
 
     def unit(signal: str, name: str) -> str | None:

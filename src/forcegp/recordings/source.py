@@ -18,6 +18,10 @@ Columns = dict[str, np.ndarray]
 LONGEST_VECTOR = 4096  # columns of a table in one array; wider ones are pictures and the like, not signals of joints
 MOST_LOST = 0.05  # of the rows: a driver loses single messages; what lacks more is another topic, sensor or log
 ELEMENT = re.compile(r"(?P<vector>.*)\[\d+\]$", re.DOTALL)
+LARGEST_EXPANSION = 200
+"""Logs of sensors shrink by a factor of 2 to 20, numbers written as text with all digits by 50 at most."""
+
+HARMLESS = 100 * 2**20  # Bytes; what expands to no more than this is never refused
 
 
 class Source(ABC):
@@ -117,12 +121,6 @@ def reading(path: Path, what: str) -> Iterator[None]:
             f"{path} cannot be read as {what}: {reason.rstrip('.')}. It may be truncated or of another format; "
             "copy or write it again."
         ) from error
-
-
-LARGEST_EXPANSION = 200
-"""Logs of sensors shrink by a factor of 2 to 20, numbers written as text with all digits by 50 at most."""
-
-HARMLESS = 100 * 2**20  # Bytes; what expands to no more than this is never refused
 
 
 def require_plausible_size(path: Path, what: str, declared: int, stored: int) -> None:

@@ -211,13 +211,11 @@ def lay_out(
     below = [joint for link in still if hung for joint in children[link] if joint.name not in held]
     own = {joint.name for joint in below if joint.type == "floating"}  # the file's own hold of its base
     if base == "floating" and not own:
-        links = {OUTSIDE: Placement(WORLD, np.eye(4))}
-        stack = [free_joint(BASE, OUTSIDE, root)]
+        links, stack = {OUTSIDE: Placement(WORLD, np.eye(4))}, [free_joint(BASE, OUTSIDE, root)]
     while stack:
         joint = stack.pop()
         above = links[joint.parent]
-        offset = above.offset @ joint.origin
-        free = joint.type == "floating"
+        offset, free = above.offset @ joint.origin, joint.type == "floating"
         bolted = joint.name in own and base == "fixed"
         if bolted or joint.type == "fixed" or joint.name in held:
             still = np.eye(4) if free else joint_motion(joint, held.get(joint.name, 0.0))

@@ -207,8 +207,7 @@ def difference(start: Float[Tensor, "*batch 7"], end: Float[Tensor, "*batch 7"])
     sines = (turn[..., :3] ** 2).sum(-1, keepdim=True)
     arc = _smooth(sines, _ARCSINE, lambda sine: torch.atan2(sine, turn[..., 3:]) / sine, small=1e-3)  # over its sine
     angular = 2.0 * arc * turn[..., :3]
-    square = (angular * angular).sum(-1, keepdim=True)
-    linear = (first.mT @ (to - from_)[..., None])[..., 0]
+    square, linear = (angular * angular).sum(-1, keepdim=True), (first.mT @ (to - from_)[..., None])[..., 0]
     once = torch.linalg.cross(angular, linear)
     linear = linear - 0.5 * once + _cotangent(square) * torch.linalg.cross(angular, once)
     return torch.cat([linear, angular], -1)
@@ -252,8 +251,7 @@ def _smooth(
     square: Tensor, series: Sequence[float], closed: Callable[[Tensor], Tensor], small: float = SMALL
 ) -> Tensor:
     """A function of t^2 that is smooth at 0: `closed` of t, or below `small` the power series in t^2."""
-    large = square > small
-    total = torch.full_like(square, series[-1])
+    large, total = square > small, torch.full_like(square, series[-1])
     for coefficient in reversed(series[:-1]):
         total = total * square + coefficient
     # the branch that is not taken has a finite gradient, too

@@ -25,6 +25,9 @@ from forcegp.robots.urdf_file import read_text
 
 DEEPEST = 20
 """Files that include files; each is read by a function that calls itself."""
+SMALLEST = 2e-15
+"""kg m^2; MuJoCo takes no smaller inertia, so that ideal rods and points get this one."""
+KINDS = {"floating": "free", "prismatic": "slide", "revolute": "hinge", "continuous": "hinge"}
 
 
 def is_mjcf(text: str) -> bool:
@@ -99,11 +102,6 @@ def _meshes_outside(text: str, path: Path | None, source: str) -> list[str]:
     for name in (name for tag, name in apart if tag == "flexcomp"):  # is opened before it is known whether it is needed
         raise RobotModelError(outside.format(source, name))
     return [name for _, name in apart]
-
-
-SMALLEST = 2e-15
-"""kg m^2; MuJoCo takes no smaller inertia, so that ideal rods and points get this one."""
-KINDS = {"floating": "free", "prismatic": "slide", "revolute": "hinge", "continuous": "hinge"}
 
 
 class MjcfWriter:

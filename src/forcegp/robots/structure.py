@@ -67,8 +67,7 @@ class Tree:
 
 def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndarray) -> Tree:
     """Batched constants for :mod:`forcegp.robots.kinematics`, on the CPU."""
-    n = len(layout.bodies)
-    revolute = np.array([joint.type != "prismatic" for joint in layout.bodies])
+    n, revolute = len(layout.bodies), np.array([joint.type != "prismatic" for joint in layout.bodies])
     rest, sine, cosine, slide = np.zeros((4, n, 4, 4))
     own, positions = np.eye(n), np.arange(len(layout.joints))
     for group in layout.groups:
