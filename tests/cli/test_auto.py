@@ -140,11 +140,13 @@ def test_a_log_that_needs_no_filter_says_so():
         ("auto log.csv --robot arm.urdf --out deep/er", "the folder deep does not exist"),
         ("auto log.csv --robot arm.urdf --q Wnkel_{1..2} --u Moment_{1..2} --time Zeit --out x", "Wnkel_1"),
         ("auto log.csv --robot arm.urdf --out mine", "mine was not written by forcegp auto"),
+        (f"auto log.csv {' '.join(COLUMNS)} --link zz --out x", "no frame 'zz'"),
+        (f"auto log.csv {' '.join(COLUMNS)} --forces zz --out x", "no model is called 'zz'"),
     ],
 )
 def test_what_cannot_be_is_one_line(folder, forcegp, words, message):
     (folder / "mine").mkdir(exist_ok=True)
-    (folder / "mine" / "letter.txt").write_text("keep")
+    (folder / "mine" / "log.h5").write_text("keep")
     refused = forcegp(*words.split(), folder=folder)
     assert refused.returncode == 2
     assert message in refused.stderr

@@ -260,14 +260,14 @@ class Command(ABC):
 
     def require_free(self, path: Path | None) -> None:
         """Refuse what exists, but empty folders, and with --overwrite what only this command wrote."""
-        if path is None:
-            return
+        if path is not None:
+            require_replaceable(path, f"`{self.kind}`", self.wrote, overwrite=self.overwrite)
+            require_writable(path)
 
-        def own(folder: Path) -> bool:
-            return read_json(folder / CONFIG, "choose another name").get("kind") == self.kind
-
-        require_replaceable(path, f"`{self.kind}`", own, overwrite=self.overwrite)
-        require_writable(path)
+    def wrote(self, folder: Path) -> bool:
+        """Whether this command wrote a folder. Raises FileFormatError for a config.json that is none."""
+        there = (folder / CONFIG).exists()
+        return there and read_json(folder / CONFIG, "choose another name").get("kind") == self.kind
 
     def require_free_file(
         self, path: Path | None, own: Callable[[Path], bool] | None = None, what: str = "a dataset of forcegp"
