@@ -80,6 +80,7 @@ def test_an_identified_system_brings_its_forces_and_keeps_the_contacts_of_the_da
         ("--robot arm.urdf --gravity 0,0,down", "is no list of numbers"),
         ("--robot arm.urdf --lock pan", "is not JOINT=RAD"),
         ("--robot arm.urdf --lock pan=nan", "'nan' is not a finite number"),
+        ("--robot arm.urdf --lock pan=1e308", "'1e308' is not a finite number of at most 1e+09"),
         ("--robot arm.urdf --armature pan=1,pan=2", "names pan twice"),
         ("--robot arm.urdf --armature elbow=1", "elbow"),
         ("--robot arm.urdf --lock elbow=1", "elbow"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ import forcegp.mechanics
 import forcegp.posterior
 from forcegp.atomic_files import SUMS, require_unchanged, unreadable
 from forcegp.cli.command import FIELDS, IDENTIFIED, URDF, listed, numbers_of, split_list, unless_given
-from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.errors import LARGEST, FileFormatError, InvalidInput
 
 SYSTEM_FILE = "system.json"  # where a folder that `forcegp fit` wrote holds robot and known forces
 
@@ -155,9 +154,9 @@ def _named(words: Sequence[str], option: str, syntax: str) -> dict[str, float]:
             raise InvalidInput(f"{option} {word} is not {syntax}.")
         if name in out:
             raise InvalidInput(f"{option} names {name} twice; give each joint once.")
-        complaint = f"{option} {word}: {text!r} is not a finite number."
+        complaint = f"{option} {word}: {text!r} is not a finite number of at most {LARGEST:g} in SI units."
         [out[name]] = numbers_of(text, complaint, one=True)
-        if not math.isfinite(out[name]):
+        if not abs(out[name]) <= LARGEST:
             raise InvalidInput(complaint)
     return out
 

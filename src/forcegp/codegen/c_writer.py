@@ -14,6 +14,8 @@ from math import factorial
 
 from forcegp.codegen.graph import LEAVES, Graph
 
+LANE_BY_LANE = ("tan",)
+
 
 @cache
 def c_text(module: str, file: str) -> str:
@@ -29,9 +31,6 @@ def sections(module: str, file: str) -> dict[str, str]:
 def filled(text: str, words: Mapping[str, object]) -> str:
     """The text with what stands for every `@WORD@`."""
     return re.sub("@([A-Z_0-9]+)@", lambda found: str(words[found[1]]), text)
-
-
-LANE_BY_LANE = ("tan",)
 
 
 def _horner(coefficients: list[float], variable: str) -> str:

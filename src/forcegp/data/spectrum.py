@@ -28,6 +28,10 @@ LEAST_RISE = 10.0
 
 LEAST_NOISE = 1e-3
 """Noise of the unfiltered acceleration, relative to its spread, below which there is nothing to filter."""
+FACTORS = 0.5, 0.7, 1.0, 1.4, 2.0  # of the cut-off that the spectrum shows
+MOST_ROWS, MOST_NUMBERS = 20_000, 2.5e7
+FOLDS = 8  # stretches of time: the odd ones judge what the even ones teach, and the other way round
+SETTLED = 2.0  # periods of the lowest cut-off at the ends of an episode that filters spoil
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -153,12 +157,6 @@ def _knee_and_floor(
     share = np.log(smooth[left] / (2.0 * floor)) / np.log(smooth[left] / smooth[right])
     cutoff = float(np.exp(np.log(centers[left]) * (1.0 - share) + np.log(centers[right]) * share))
     return float(knee), floor, cutoff if cutoff <= HIGHEST * frequency[-1] else np.nan
-
-
-FACTORS = 0.5, 0.7, 1.0, 1.4, 2.0  # of the cut-off that the spectrum shows
-MOST_ROWS, MOST_NUMBERS = 20_000, 2.5e7
-FOLDS = 8  # stretches of time: the odd ones judge what the even ones teach, and the other way round
-SETTLED = 2.0  # periods of the lowest cut-off at the ends of an episode that filters spoil
 
 
 def held_out_cutoff(

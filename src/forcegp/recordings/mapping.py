@@ -23,6 +23,20 @@ from forcegp.recordings.source import Source
 
 UNIT_OF_A_NAME = re.compile(r"[\[(]([^\d\[(]+)[\])]$|_([A-Za-z]{2,})$")
 COMMA = re.compile(r",(?![^{\[]*[}\]])(?=(?:[^`]*`[^`]*`)*[^`]*$)")
+EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body", "force": "foot=fx,fy,fz"}
+OF_IMU, OF_LINKS = "imu", "torque"  # before the frame of an IMU, and the joint of a torque, in `force`
+BRACES = re.compile(r"\{([^{}]*)\}")
+RANGE = re.compile(r"(\d+)\.\.(\d+)")
+LONGEST_LIST = 4096
+JOINTS = "joints"
+WORDS = {
+    "q": {"q", "pos", "position", "positions", "angle", "angles", "joint_pos", "joint_position"},
+    "v": {"v", "qd", "dq", "vel", "velocity", "velocities", "joint_vel", "joint_velocity"},
+    "u": {"u", "tau", "torque", "torques", "effort", "efforts", "eff", "joint_torque", "joint_effort"},
+    "a": {"a", "qdd", "ddq", "acc", "acceleration", "accelerations"},
+    "time": {"t", "time", "timestamp", "stamp", "time_s", "seconds"},
+}
+"""What the rest of a column's name, beside that of the joint, must mean."""
 
 
 @dataclass(frozen=True)
@@ -212,10 +226,6 @@ class ColumnMapping:
         return {name: value for name, value in found.items() if value not in (None, (), {}, False)}
 
 
-EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body", "force": "foot=fx,fy,fz"}
-OF_IMU, OF_LINKS = "imu", "torque"  # before the frame of an IMU, and the joint of a torque, in `force`
-
-
 def by_quantity(flag: str, text: str) -> dict[str, tuple[str, ...]]:
     """`q=deg,m,time=ms` as {"q": ("deg", "m"), "time": ("ms",)}: what follows a name up to the next is its list."""
     found: dict[str, tuple[str, ...]] = {}
@@ -231,12 +241,6 @@ def by_quantity(flag: str, text: str) -> dict[str, tuple[str, ...]]:
             raise InvalidInput(f"--{flag} is {text!r}; write for example {flag} {EXAMPLES[flag]}.")
         found[name] = (*found.get(name, ()), part.strip())
     return found
-
-
-BRACES = re.compile(r"\{([^{}]*)\}")
-RANGE = re.compile(r"(\d+)\.\.(\d+)")
-LONGEST_LIST = 4096
-JOINTS = "joints"
 
 
 def expanded(pattern: str, joints: Sequence[str], names: Collection[str] = ()) -> list[str]:
@@ -288,16 +292,6 @@ def _choices(pattern: str, inside: str, joints: Sequence[str]) -> list[str]:
     if len(choices) > 1 and all(choices):
         return choices
     raise InvalidInput(f"{pattern!r}: write {{1..7}}, {{a,b}} or {{joints}} in braces, not {{{inside}}}.")
-
-
-WORDS = {
-    "q": {"q", "pos", "position", "positions", "angle", "angles", "joint_pos", "joint_position"},
-    "v": {"v", "qd", "dq", "vel", "velocity", "velocities", "joint_vel", "joint_velocity"},
-    "u": {"u", "tau", "torque", "torques", "effort", "efforts", "eff", "joint_torque", "joint_effort"},
-    "a": {"a", "qdd", "ddq", "acc", "acceleration", "accelerations"},
-    "time": {"t", "time", "timestamp", "stamp", "time_s", "seconds"},
-}
-"""What the rest of a column's name, beside that of the joint, must mean."""
 
 
 def named_after(joint: str) -> re.Pattern[str]:

@@ -25,6 +25,20 @@ Jumps = tuple[Int[np.ndarray, " jumps"], str, str]
 """Rows before which something moves too far, what was seen, and what to do."""
 LARGEST_ERROR = 0.01  # of the length of a quaternion: more is no rounding
 ROUNDED = 1e-9  # differences from length 1 beyond this are reported
+MARGIN = 0.1
+"""Of its range: how far a position may be beyond the limits of the URDF. Stops give way, and zeros are set by hand."""
+
+TURNS = 4.0 * np.pi  # rad: positions of a joint beyond this whose unit is not stated as rad are taken for degrees
+REPEATED = 0.05
+"""Of the median step: a stamp that comes sooner after another is the same one again; nothing is sampled so unevenly."""
+
+GAP = 10.0
+"""Median steps. A cubic spline through samples g apart misses at most 5/384 (2 pi f g)^4 of the amplitude of a sine of
+frequency f (Hall & Meyer 1976): over 10 steps at 1 kHz 0.013 % at 5 Hz, 3 % at 20 Hz. Longer pauses end episodes."""
+
+FEWEST_ROWS = 5  # of an episode: two derivatives by central differences need so many
+SLOWEST, FASTEST = 2.0, 2e5
+"""Rows per second beyond which a log of a robot is taken for one whose time is in another unit."""
 
 
 @dataclass(frozen=True)
@@ -269,12 +283,6 @@ def _episodes(column: np.ndarray, source: Source) -> Int[np.ndarray, "n 2"]:
     return np.stack([own, starts], axis=1)
 
 
-MARGIN = 0.1
-"""Of its range: how far a position may be beyond the limits of the URDF. Stops give way, and zeros are set by hand."""
-
-TURNS = 4.0 * np.pi  # rad: positions of a joint beyond this whose unit is not stated as rad are taken for degrees
-
-
 def _require_plausible_positions(
     label: str,
     values: Float[np.ndarray, "rows signals"],
@@ -307,18 +315,6 @@ def _require_plausible_positions(
         if degrees and item.joint not in believed and not np.isfinite(upper - lower):
             hint = f"Give `unit` q={units} if it is in deg, `unit` q=rad if not."
             raise MistakenUnit(f"{where}, more than two turns. {hint}", "q", units)
-
-
-REPEATED = 0.05
-"""Of the median step: a stamp that comes sooner after another is the same one again; nothing is sampled so unevenly."""
-
-GAP = 10.0
-"""Median steps. A cubic spline through samples g apart misses at most 5/384 (2 pi f g)^4 of the amplitude of a sine of
-frequency f (Hall & Meyer 1976): over 10 steps at 1 kHz 0.013 % at 5 Hz, 3 % at 20 Hz. Longer pauses end episodes."""
-
-FEWEST_ROWS = 5  # of an episode: two derivatives by central differences need so many
-SLOWEST, FASTEST = 2.0, 2e5
-"""Rows per second beyond which a log of a robot is taken for one whose time is in another unit."""
 
 
 def _stretches(

@@ -45,6 +45,9 @@ LACKING = Expression("derive", {}, ast.Constant(0.0), ())
 LACKS = re.compile(r"derive\d*")
 EPISODE = "episode_index"  # numbers the episodes where nothing else is stated, as in datasets of LeRobot
 MOST_NAMES = 40  # of columns in a message
+PLACE_WORDS = {"", "p", "pos", "position", "base", "body", "trunk", "torso", "root", "pelvis"}
+TURN_WORDS = {"q", "quat", "quaternion", "orientation", "rotation", "rot"}
+"""The last word before x, y, z, and before the parts of a turn, in columns of the pose of a base."""
 
 
 @dataclass(frozen=True)
@@ -233,11 +236,6 @@ def signal_plan(
         episode=episode,
         guessed=tuple(guessed),
     )
-
-
-PLACE_WORDS = {"", "p", "pos", "position", "base", "body", "trunk", "torso", "root", "pelvis"}
-TURN_WORDS = {"q", "quat", "quaternion", "orientation", "rotation", "rot"}
-"""The last word before x, y, z, and before the parts of a turn, in columns of the pose of a base."""
 
 
 def guessed_pose(parts: Sequence[str], source: Source) -> tuple[str, ...] | None:

@@ -29,6 +29,13 @@ ROTOR = r".*(rotor|propeller)s?"
 BODY = r"pelvis|flying|drone|uav|quadrotor|.*copter"
 ENOUGH = {LIMB: 2, ROTOR: 3, BODY: 1}
 """So many tell. Rotors count on the links that stand still: motors of arms have some in other places."""
+WORLD = -1
+BASE = "base"
+"""Name of the joint between the world and a base that moves."""
+OUTSIDE = "(world)"
+"""What carries such a base; no link of the robot."""
+MOST_BODIES = 1000
+"""Matrices of all pairs of bodies are kept for a robot."""
 
 
 def check_base(description: RobotDescription, standing: Sequence[str], problems: Problems) -> None:
@@ -113,15 +120,6 @@ def with_followers(
             sums = {key: getattr(whole[name], key) + by * getattr(body, key) for key, by in factors.items()}
             whole[name] = replace(whole[name], **sums)
     return tuple(whole.values())
-
-
-WORLD = -1
-BASE = "base"
-"""Name of the joint between the world and a base that moves."""
-OUTSIDE = "(world)"
-"""What carries such a base; no link of the robot."""
-MOST_BODIES = 1000
-"""Matrices of all pairs of bodies are kept for a robot."""
 
 
 @dataclass(frozen=True)

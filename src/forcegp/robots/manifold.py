@@ -21,6 +21,8 @@ POSITIONS = ("x", "y", "z", *QUATERNION)
 VELOCITIES = ("x", "y", "z", "rx", "ry", "rz")
 TURN = slice(3, 7)
 NEUTRAL = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+_BERNOULLI = (1 / 2, 1 / 12, 0.0, -1 / 720, 0.0, 1 / 30240, 0.0, -1 / 1209600, 0.0, 1 / 47900160)
+"""Of x / (1 - exp(-x)), from the first power on."""
 
 
 @dataclass(frozen=True)
@@ -222,10 +224,6 @@ def chart_velocity(step: Float[Tensor, "*#batch 6"], v: Float[Tensor, "*#batch 6
         if coefficient:
             total = total + coefficient * torch.cat(moved, -1)
     return total
-
-
-_BERNOULLI = (1 / 2, 1 / 12, 0.0, -1 / 720, 0.0, 1 / 30240, 0.0, -1 / 1209600, 0.0, 1 / 47900160)
-"""Of x / (1 - exp(-x)), from the first power on."""
 
 
 def quaternion_product(left: Float[Tensor, "*batch 4"], right: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:

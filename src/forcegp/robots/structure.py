@@ -19,6 +19,9 @@ from forcegp.robots.manifold import ConfigurationSpace, Group, pose
 from forcegp.robots.urdf import Joint, Link, RobotDescription
 from forcegp.summary import Summary, listed
 
+MASSLESS = Link(0.0, np.zeros(3), np.zeros((3, 3)))
+DOWN = ("down_x", "down_y", "down_z")
+
 
 @dataclass(frozen=True, eq=False)
 class Tree:
@@ -134,10 +137,6 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
         has_armature=bool(armature.any()),
         **{name: torch.tensor(array, dtype=torch.float64) for name, array in constants.items()},
     )
-
-
-MASSLESS = Link(0.0, np.zeros(3), np.zeros((3, 3)))
-DOWN = ("down_x", "down_y", "down_z")
 
 
 class RigidBodyDynamics(ABC):

@@ -21,6 +21,14 @@ HEAVIEST = 1e9
 """kg and kg m^2, of one link: far from where products of inertias overflow."""
 LARGEST_FILE = 16 << 20
 """Bytes; robot files have some hundred thousand."""
+IN_THE_FILE = (
+    ". Correct its <inertial> element (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>)"
+)
+InertiaChoice = Literal["strict", "nearest"]
+"""What to do about a link with an inertia that no body has: refuse it, or replace it by the nearest possible."""
+
+MARGIN = 1e-3
+"""Smallest second moment of a repaired body as a fraction of their sum: 3 % of its size thick, not a plate."""
 
 
 def read_text(path: str | Path) -> str:
@@ -143,13 +151,6 @@ def inertial_element(mass: float, center_of_mass: Iterable[float], inertia: np.n
     return f'<inertial>{origin}<mass value="{float(mass)!r}"/><inertia {moments}/></inertial>'
 
 
-InertiaChoice = Literal["strict", "nearest"]
-"""What to do about a link with an inertia that no body has: refuse it, or replace it by the nearest possible."""
-
-MARGIN = 1e-3
-"""Smallest second moment of a repaired body as a fraction of their sum: 3 % of its size thick, not a plate."""
-
-
 def nearest_inertia(inertia: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
     """The inertia (kg m^2) of the body whose second moments are nearest, and at least `MARGIN` of their sum."""
     moments, axes = np.linalg.eigh(inertia)
@@ -210,11 +211,6 @@ def with_chosen_inertias(
         if inertial is not None and name not in layout.moving and np.isnan(inertial.inertia).all():
             links[name] = replace(inertial, inertia=np.zeros((3, 3)))  # of a link that never moves
     return text, replace(description, links=links)
-
-
-IN_THE_FILE = (
-    ". Correct its <inertial> element (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>)"
-)
 
 
 def read_robot_file(path: str | Path) -> str:
