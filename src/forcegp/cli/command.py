@@ -188,7 +188,7 @@ class Command(ABC):
                     if not mark.is_there(path):
                         raise FileFormatError(f"{path}{mark.refusal}")
                     if why := unreadable(path, math.inf):
-                        raise FileFormatError(f"{path} {why}; give a file that is.")
+                        raise FileFormatError(f"{path} {why}; give a regular file.")
                     inputs.append(path)
         path = self.output
         for given in (*inputs, *([] if path is None else [path])):

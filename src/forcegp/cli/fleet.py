@@ -17,7 +17,7 @@ from forcegp.atomic_files import unreadable, write_text
 from forcegp.cli.arguments import COMMANDS, command_class, parsed
 from forcegp.cli.command import Command, options_of
 from forcegp.cli.terminal import Terminal, facts
-from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, spreadsheet_cell
+from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, printable, spreadsheet_cell
 from forcegp.jobs import JOBS, Job, JobStore, run_jobs
 from forcegp.parallel import Jobs
 
@@ -134,7 +134,7 @@ def one(store: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any
             with asked.alone():
                 found = numbers_of(asked.run(terminal))
         except (ForceGPError, OSError, MemoryError) as told:
-            error = " ".join(str(told).split())
+            error = printable(" ".join(str(told).split()))
         except Exception as defect:  # one log must not cost the others theirs
             error = f"an error in forcegp itself, {type(defect).__name__}: {defect}"
     return {"error": error, "warnings": terminal.warnings, "numbers": found}
