@@ -63,6 +63,7 @@ ATTACKS = {
         {},
         "not below the folder",
     ),
+    "a pipe": (SCENE.format("", '<flexcomp name="f" type="mesh" file="pipe.stl"/>' + BODY), {}, "a pipe or device"),
     "a grid above": (
         SCENE.format("", '<flexcomp name="f" type="mesh" file="../secret.obj"/>' + BODY),
         {},
@@ -78,6 +79,7 @@ def test_files_of_mujoco_cost_no_more_than_their_limits_and_read_only_their_fold
     monkeypatch.setattr(sandbox, "MEMORY", 300 << 20)
     (folder := tmp_path / "robot").mkdir()
     (tmp_path / "secret.xml").write_text(f"<mujoco>{BODY}</mujoco>")
+    os.mkfifo(folder / "pipe.stl")
     for name, content in {"robot.xml": text, **beside}.items():
         (folder / name).write_text(content)
     if not message:

@@ -136,7 +136,7 @@ def _compiled(request: dict[str, Any]) -> dict[str, Any]:
         needed = _without_appearance(mujoco, spec)
         meshes = next((mesh.file for mesh in spec.meshes if mesh.file in request["outside"]), None)
         if meshes is not None:
-            return {"refused": f"mesh {meshes!r} is not below the folder of the file", "meshes": needed}
+            return {"refused": f"mesh {meshes!r} is a pipe, or not below the folder of the file", "meshes": needed}
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")
             model = spec.compile()
