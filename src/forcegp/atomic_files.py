@@ -22,6 +22,10 @@ TEMPORARY = ".tmp"
 LOCK, OLD = ".lock", ".old"
 TRIAL = 2**16
 """Bytes that `require_writable` writes."""
+MARK = "Written by forcegp"
+"""Stands near the end of pages and robot files, which may be replaced."""
+LARGEST_TEXT = 32 << 20
+"""Bytes of JSON or of a list that forcegp wrote: digests, settings, results; most have some thousand."""
 
 
 @contextmanager
@@ -101,6 +105,8 @@ def require_replaceable(
     if not overwrite:
         raise FileFormatError(f"{folder} exists already; choose another name, or add `overwrite=True`.")
     listed = {SUMS, *own}
+    if why := unreadable(folder / SUMS):
+        raise FileFormatError(f"{folder / SUMS} {why}; choose another name.")
     with contextlib.suppress(OSError, ValueError):
         listed |= {line[66:] for line in (folder / SUMS).read_text(encoding="utf-8").splitlines()}
     entries = (entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
@@ -122,8 +128,20 @@ def write_json(path: str | Path, content: Mapping[str, Any]) -> None:
     write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
+def unreadable(path: Path, most: float = LARGEST_TEXT) -> str | None:
+    """What speaks against opening a file: pipes and devices never end, and one of more bytes than `most` is another."""
+    if path.is_dir() or not path.exists():  # for which opening has its own errors
+        return None
+    if not path.is_file():
+        return "is not a regular file"
+    size = path.stat().st_size
+    return None if size <= most else f"holds {size >> 20} MiB, more than the {most / 2**20:.0f} MiB of such a file"
+
+
 def read_json(path: Path, remedy: str) -> dict[str, Any]:
     """Return the JSON object in a file. Raises FileFormatError, which ends in the remedy, for anything else."""
+    if why := unreadable(path):
+        raise FileFormatError(f"{path} {why}; {remedy}.")
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:  # also numbers of 5000 digits
@@ -131,6 +149,13 @@ def read_json(path: Path, remedy: str) -> dict[str, Any]:
     if not isinstance(stored, dict):
         raise FileFormatError(f"{path} is damaged; {remedy}.")
     return stored
+
+
+def is_marked(path: Path) -> bool:
+    """Whether a file ends as those that forcegp marks with `MARK`; no more of it is read, for it may be another."""
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - 200, 0))
+        return MARK.encode() in file.read()
 
 
 def remove_leftovers(folder: Path) -> None:
@@ -245,8 +270,8 @@ def require_unchanged(folder: Path, remedy: str) -> None:
     sums = folder / SUMS
     if not sums.exists():
         raise FileFormatError(f"{folder} is incomplete: it has no {SUMS}; {remedy}")
-    if sums.is_fifo():  # to open it would wait for a writer for ever
-        raise FileFormatError(f"{folder} is damaged: {SUMS} is not a regular file; {remedy}")
+    if why := unreadable(sums):
+        raise FileFormatError(f"{folder} is damaged: {SUMS} {why}; {remedy}")
     try:
         stored = sums.read_bytes().splitlines(True)
         names = [line[66:].decode("utf-8").removesuffix("\n") for line in stored]

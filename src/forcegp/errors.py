@@ -131,13 +131,18 @@ def require_plausible(stored: Any, name: str = "") -> None:
 
 ACTING = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 """What acts on a terminal; compiled here, for at its first use there may be no memory left to say so."""
+LONGEST_TEXT = 4000
+"""Letters in one text on a terminal."""
 
 
 def printable(text: str) -> str:
     r"""The text with what would act on a terminal instead of being seen written out, as in \x1b.
 
     Control characters but line breaks and tabs, and what turns the direction of writing round (Unicode, TR 36, 2.10).
+    Of a text of more letters than `LONGEST_TEXT`, beginning and end: files hold names of millions.
     """
+    if len(text) > LONGEST_TEXT:
+        text = f"{text[: LONGEST_TEXT // 2]} ... {text[-LONGEST_TEXT // 2 :]}"
     return ACTING.sub(lambda found: ascii(found[0])[1:-1], text)
 
 

@@ -44,8 +44,7 @@ def rests(robot: Robot, seed: int, noise: float = 0.05, jitter: float = 0.0) -> 
 
 def one_rests(robot: Robot, seed: int) -> Dataset:
     """The second joint is held all the time."""
-    q = clean(robot, seed).q * np.array([1.0, 0.0]) + np.array([0.0, 0.3])
-    return with_motion(robot, q, 250.0, seed)
+    return with_motion(robot, clean(robot, seed).q * np.array([1.0, 0.0]) + np.array([0.0, 0.3]), 250.0, seed)
 
 
 def odd_friction(robot: Robot, seed: int) -> Dataset:

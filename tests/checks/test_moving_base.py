@@ -168,8 +168,7 @@ def flight(seed: int = 0, noise: bool = True) -> tuple[Dataset, np.ndarray]:
     time, draw = np.arange(2400) / FLYING, np.random.default_rng(seed).normal
     size, turns = np.array([1.5, 1.2, 0.4]), np.array([1.3, 1.9, 1.1])
     position, velocity = (size * np.sin(turns * time[:, None])), size * turns * np.cos(turns * time[:, None])
-    acceleration = -size * turns**2 * np.sin(turns * time[:, None])
-    up = acceleration + np.array([0.0, 0.0, 9.81])
+    up = (-size * turns**2 * np.sin(turns * time[:, None])) + np.array([0.0, 0.0, 9.81])
     length = np.linalg.norm(up, axis=1, keepdims=True)
     side = np.cross(up / length, [1.0, 0.3, 0.0])
     side /= np.linalg.norm(side, axis=1, keepdims=True)

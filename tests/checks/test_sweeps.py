@@ -84,8 +84,7 @@ def test_clipped_torques(sign):
             said = []
             for rows in range(7, 34):
                 u = np.random.default_rng(0).permutation(np.linspace(-1.0, 0.99, 2000))
-                at = 100 + np.arange(rows) // run * 50 + np.arange(rows) % run
-                u[at], u[5 : 5 + near] = 1.0, 1.0 - 1.9e-3
+                u[100 + np.arange(rows) // run * 50 + np.arange(rows) % run], u[5 : 5 + near] = 1.0, 1.0 - 1.9e-3
                 doubts = signal_doubts(seen(swing(rows=2000, u=sign * u, v=np.ones(2000))))
                 said.append([levels(doubts), *(each.numbers.get("row", 0) for each in doubts)])
             found[f"{near} {run}"] = [sum(each) for each in said]

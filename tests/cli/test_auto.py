@@ -118,8 +118,7 @@ def test_the_printed_command_keeps_every_option():
         "--accept --overwrite --cutoff 9 --every 3 --lock finger=0.1 --gravity=-9.81,0,0 --link tool --without 1,2.5"
     )
     others += " --forces given --forces gp:joint,viscous --out here"
-    words = ["auto", "a.txt", "b.txt", *columns.split(), *others.split()]
-    command = parse_arguments(words)
+    command = parse_arguments(["auto", "a.txt", "b.txt", *columns.split(), *others.split()])
     mapping = command.columns.mapped([], Terminal(json=False))
     assert parse_arguments(shlex.split(command._command(mapping, command.robot))[1:]) == command
 
@@ -141,11 +140,13 @@ def test_a_log_that_needs_no_filter_says_so():
         ("auto log.csv --robot arm.urdf --out deep/er", "the folder deep does not exist"),
         ("auto log.csv --robot arm.urdf --q Wnkel_{1..2} --u Moment_{1..2} --time Zeit --out x", "Wnkel_1"),
         ("auto log.csv --robot arm.urdf --out mine", "mine was not written by forcegp auto"),
+        (f"auto log.csv {' '.join(COLUMNS)} --link zz --out x", "no frame 'zz'"),
+        (f"auto log.csv {' '.join(COLUMNS)} --forces zz --out x", "no model is called 'zz'"),
     ],
 )
 def test_what_cannot_be_is_one_line(folder, forcegp, words, message):
     (folder / "mine").mkdir(exist_ok=True)
-    (folder / "mine" / "letter.txt").write_text("keep")
+    (folder / "mine" / "log.h5").write_text("keep")
     refused = forcegp(*words.split(), folder=folder)
     assert refused.returncode == 2
     assert message in refused.stderr
@@ -184,8 +185,7 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
     assert some.startswith("Use “the URDF” for hip, knee: on unseen time it leaves 10 to 16 % of each acceleration")
     assert some.endswith("Not for the others, of whose acceleration is left: wrist 280 %.")
     # a light wrist has no acceleration to speak of, and a torque that is known to 5 %
-    whole = told([0.1, 0.16, 2.8], shares=[0.02, 0.03, 0.05])
-    assert whole == (
+    assert told([0.1, 0.16, 2.8], shares=[0.02, 0.03, 0.05]) == (
         "Use “the URDF”: on unseen time it leaves 2 to 5 % of each torque, "
         "but it is for torques: do not predict motions, positions 1 s ahead are wrong by 0.01 rad."
     )

@@ -31,6 +31,7 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "damaged.h5").write_bytes(content[: len(content) // 2])
     (tmp_path / "arm.urdf").write_text(URDF)
     (tmp_path / "other.urdf").write_text(URDF.replace('"bend"', '"wrist"'))
+    (tmp_path / "zero.urdf").symlink_to("/dev/zero")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years of work")
     return tmp_path
@@ -48,6 +49,9 @@ WRONG = [
     ("score mine arm.h5", "mine holds no model.json"),
     ("simulate kuka-surface --out arm.h5", "arm.h5 exists already"),
     ("simulate kuka-surface --out a.h5 --seconds -1", "seconds is -1.0; it must be one number, from"),
+    ("robot zero.urdf", "is not a regular file"), ("check arm.h5 --identified /dev/zero", "is not a regular file"),
+    ("fit --logs-from /dev/zero --out run", "it is not a regular file"),
+    ("view arm.h5 --shapes zero.urdf", "is not a regular file"),
     ("simulate mars --out a.h5", "'mars'"), ("learn arm.h5", "Available subcommands: auto, demo, simulate, "),
 ]  # fmt: skip
 

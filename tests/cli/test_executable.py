@@ -53,6 +53,20 @@ def test_version_and_help_through_the_module(installed):
     assert all(re.search(rf"^\W*{command}\s", done.stdout, re.M) for command in COMMANDS)
 
 
+@pytest.mark.parametrize("closed", [">&-", ">&- 2>&- <&-"])
+def test_a_stream_that_is_closed_is_no_error(executable, folder, closed):
+    words = ["sh", "-c", f"{executable} robot arm.urdf {closed}"]
+    done = subprocess.run(words, cwd=folder, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_reader_that_has_seen_enough_is_no_error(executable, folder):
+    words = [executable, "robot", "arm.urdf"]
+    with subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as running:
+        running.stdout.close()
+        assert (running.wait(), running.stderr.read()) == (0, b"")
+
+
 def test_an_environment_that_libraries_do_not_take_is_one_sentence(tmp_path):
     words = [sys.executable, "-m", "forcegp", "robot", "no.urdf"]
     how = {"cwd": tmp_path, "capture_output": True, "text": True, "check": False}

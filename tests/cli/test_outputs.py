@@ -13,7 +13,7 @@ from tests.posterior.arm import URDF, arm_data
 import forcegp
 import forcegp.scores
 from forcegp import Dataset
-from forcegp.atomic_files import write_digests
+from forcegp.atomic_files import MARK, write_digests
 from forcegp.cli.main import main, parse_arguments
 
 QUICK = "--points 8 --iterations 2 --restarts 1 --no-checks"
@@ -195,6 +195,24 @@ def test_overwriting_is_for_files_of_the_same_kind(folder, capfd, name):
         told = refused([name if word == "OUT" else word for word in words.split()], capfd)
         assert f"{name} is not a dataset of forcegp, so it is not overwritten" in told
     assert Path(name).read_bytes() == before
+
+
+ALIKE = {
+    "robot arm.urdf --out mine.xml": '<mujoco model="mine"><worldbody/></mujoco>',
+    "robot arm.urdf --out mine.urdf": URDF,
+    "view arm.h5 --out mine.html": f"<html>{MARK}, a novel{' ' * 300}</html>",
+    "excite --robot arm.urdf --out mine.csv": "t,q_a,v_a,a_a,u_a\n0,0,0,0,0\n0.01,0,1,2,3\n0.02,0.1,0,0,0\n",
+}
+
+
+@pytest.mark.parametrize("words", ALIKE)
+def test_only_what_forcegp_wrote_is_replaced(folder, capfd, words):
+    (mine := Path(words.split()[-1])).write_text(ALIKE[words])
+    assert "of forcegp, so it is not overwritten" in refused([*words.split(), "--overwrite"], capfd)
+    assert mine.read_text() == ALIKE[words]
+    if words.startswith("robot"):
+        mine.unlink()
+        assert [main([*words.split(), *more]) for more in ((), (), ("--overwrite",))] == [0, 2, 0]
 
 
 def test_a_changed_model_of_an_identification_is_refused(folder, capfd):

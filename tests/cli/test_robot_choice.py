@@ -29,11 +29,9 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("robots")
     (folder / "arm.urdf").write_text(URDF)
     (folder / "broken.urdf").write_text(BROKEN)
-    data = arm_data(20, 0, arm_model(0))
-    data.save(folder / "recorded.h5")
+    arm_data(20, 0, arm_model(0)).save(folder / "recorded.h5")
     model = arm_model(0)
-    known = (*model.forces, Coulomb([0.1, 0.2, 0.3]))
-    (folder / SYSTEM_FILE).write_text(replace(model, forces=known).to_json())
+    (folder / SYSTEM_FILE).write_text(replace(model, forces=(*model.forces, Coulomb([0.1, 0.2, 0.3]))).to_json())
     return folder
 
 
@@ -82,6 +80,7 @@ def test_an_identified_system_brings_its_forces_and_keeps_the_contacts_of_the_da
         ("--robot arm.urdf --gravity 0,0,down", "is no list of numbers"),
         ("--robot arm.urdf --lock pan", "is not JOINT=RAD"),
         ("--robot arm.urdf --lock pan=nan", "'nan' is not a finite number"),
+        ("--robot arm.urdf --lock pan=1e308", "'1e308' is not a finite number of at most 1e+09"),
         ("--robot arm.urdf --armature pan=1,pan=2", "names pan twice"),
         ("--robot arm.urdf --armature elbow=1", "elbow"),
         ("--robot arm.urdf --lock elbow=1", "elbow"),

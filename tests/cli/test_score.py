@@ -81,8 +81,7 @@ def test_the_same_command_resumes_and_another_is_refused(forcegp, found, folder)
     told = json.loads(done.stdout)
     for name in found["models"]:
         assert told["models"][name]["scores"] == found["models"][name]["scores"]
-    changed = [39 if word == 40 else word for word in QUICK]
-    done = forcegp(*words, *changed, "--out", "results", folder=folder)
+    done = forcegp(*words, *[39 if word == 40 else word for word in QUICK], "--out", "results", folder=folder)
     assert (done.returncode, done.stdout) == (2, "")
     assert "holds results with another points" in done.stderr
     assert done.stderr.count("\n") == 1

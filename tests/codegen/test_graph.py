@@ -175,10 +175,8 @@ def test_distances_have_no_slope_where_they_vanish(count):
         (normal(1, count), normal(1, count)),
     )
     slopes = jacobian(graph, flat([found]), graph.inputs)[0]
-    same = [np.array([0.3])] * (2 * count)
-    assert [float(x[0]) for x in evaluated(graph, slopes, same)] == [0.0] * (2 * count)
-    apart = [np.array([float(k**2)]) for k in range(2 * count)]
-    assert evaluated(graph, flat([found]), apart)[0] == math.sqrt(
+    assert [float(x[0]) for x in evaluated(graph, slopes, [np.array([0.3])] * (2 * count))] == [0.0] * (2 * count)
+    assert evaluated(graph, flat([found]), [np.array([float(k**2)]) for k in range(2 * count)])[0] == math.sqrt(
         sum((k**2 - (k + count) ** 2) ** 2 for k in range(count))
     )
 

@@ -53,8 +53,7 @@ def test_torques_keep_their_limits():
 @pytest.fixture(scope="module")
 def touching():
     """What was learned of an arm of three joints on a sphere, with friction under load."""
-    forces = JointFriction(), ContactFriction(load=True, expected=0.2)
-    return quick_fit(arm_model().with_forces(forces))
+    return quick_fit(arm_model().with_forces((JointFriction(), ContactFriction(load=True, expected=0.2))))
 
 
 def state(posterior):
@@ -102,8 +101,7 @@ def test_joint_forces_are_those_of_predict_and_of_torch(touching):
     assert_close(found.Q, dynamics.Q_K + touching.predict(q, v, u).unknown_force.mean, rtol=1e-8, atol=1e-10)
     step = 1e-5 * torch.eye(3, dtype=torch.float64)
     ahead, back = ([plain.joint_forces(q, v, u + sign * row).Q for row in step] for sign in (1.0, -1.0))
-    difference = (torch.stack(ahead, -1) - torch.stack(back, -1)) / 2e-5
-    assert_close(found.dQ_du, difference, rtol=1e-5, atol=1e-7)
+    assert_close(found.dQ_du, (torch.stack(ahead, -1) - torch.stack(back, -1)) / 2e-5, rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.parametrize("force", [None, -1.0, [1.0, 2.0], np.nan])
@@ -153,8 +151,7 @@ def test_friction_that_remembers_is_that_of_the_positions_seen(touching):
     M, A, b = (x.numpy() for x in (at.M, at.A, at.b))
     inverse = np.linalg.inv(M)
     a = inverse @ A.T @ np.linalg.solve(A @ inverse @ A.T, b)
-    expected = posterior.predictor(covariance="none").inverse_dynamics(q + step, v, a, [7.0], memory=z).mean
-    assert_close(u, expected)
+    assert_close(u, posterior.predictor(covariance="none").inverse_dynamics(q + step, v, a, [7.0], memory=z).mean)
 
 
 def test_models_with_and_without_contacts(touching):

@@ -7,8 +7,6 @@ from forcegp.model import Model
 from forcegp.robots import Robot
 
 NAMES = ("shoulder", "elbow")
-
-
 LINK = """<link name="{}">
   <inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
 

@@ -70,7 +70,7 @@ def test_wrong_fields_are_named(changes, message):
     st.sampled_from(["q", "v", "u", "a"]),
     st.integers(0, 39),
     st.integers(0, 1),
-    st.sampled_from([np.nan, np.inf, -np.inf]),
+    st.sampled_from([np.nan, np.inf, -np.inf, 1e16, -1e308]),
 )
 def test_the_row_and_column_of_a_bad_number_are_named(name, row, column, value):
     given = columns()
@@ -83,7 +83,7 @@ def test_the_row_and_column_of_a_bad_number_are_named(name, row, column, value):
 def test_time_increases_within_an_episode_but_may_start_again_in_the_next():
     time = 0.01 * np.arange(40)
     dataset(time=np.r_[time[:20], time[:20]])
-    for wrong in (time[4], time[4] - 1.0):
+    for wrong in (time[4], time[4] - 1.0, time[4] + 1e-12):
         broken = time.copy()
         broken[5] = wrong
         with pytest.raises(DatasetError, match=r"time does not increase at row 5 \(episode 0"):

@@ -77,8 +77,7 @@ def test_knee_floor_and_cutoff_of_a_power_law_over_white_noise(derivatives, turn
     assert knee == pytest.approx(turn * (4.0 / derivatives - 1.0) ** 0.125, rel=0.09)
     seen = density[(frequency >= 1.2 * knee) & (frequency <= min(5.0 * knee, 0.95 * top))]
     assert floor == pytest.approx(np.median(seen) / (1.0 - 1.0 / (9.0 * segments)) ** 3)
-    reached = turn * (2.0 * floor / 3.0 - 1.0) ** -0.125
-    assert cutoff == pytest.approx(reached, rel=0.02)
+    assert cutoff == pytest.approx(turn * (2.0 * floor / 3.0 - 1.0) ** -0.125, rel=0.02)
 
 
 # ---------------------------------------------------------------- delay

@@ -144,8 +144,7 @@ def test_rows_before_a_joint_has_moved_are_left_out():
     assert known[first:].all()
     assert first >= 15
     for share, said in ((0.09, False), (0.11, True)):
-        many = np.arange(1000) >= 1000 * share
-        assert bool(list(doubts_of_past(model, log, many))) is said
+        assert bool(list(doubts_of_past(model, log, np.arange(1000) >= 1000 * share))) is said
     for rows, left_out in ((60 * first, True), (30 * first, False)):
         found = fit(model, log.rows(slice(0, rows)), Torques(), rows=500)
         assert ("rows_before_a_past" in found.settings) is left_out

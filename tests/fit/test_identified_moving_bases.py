@@ -36,8 +36,6 @@ from forcegp.robots import Robot
 
 FEET = (*fixed_point("a_foot", switch="a_stands"), *fixed_point("b_foot", (0.0, 0.0, 0.1), "b_stands"))
 FRICTION = Viscous(0.3), Coulomb(0.5, 0.2)
-
-
 OPEN = Viscous(), Coulomb()
 EVIDENCE = {"torque": Torques(), "acceleration": Accelerations(), "both": Torques("both")}
 

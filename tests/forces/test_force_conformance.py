@@ -16,8 +16,6 @@ from forcegp.forces import (
 from forcegp.forces.contact_friction import ExpectedFriction, TabulatedCurve
 
 TIP = ("hand", (0.0, 0.0, 0.2))  # where the arm touches its plane
-
-
 # random states and a fit of a few iterations: friction that was found may lift the contact without end somewhere
 JAMS = pytest.mark.filterwarnings("ignore:the expected friction nearly jams")
 

@@ -21,8 +21,6 @@ from forcegp.forces import (
 )
 
 THREE = [0.5, 0.4, 0.3]
-
-
 PLAIN = {
     "Viscous": Viscous(THREE),
     "DirectionalFriction": DirectionalFriction(THREE),

@@ -107,8 +107,7 @@ def _forces(kind: Any, **arguments: Any) -> None:
     """No numbers are returned: what a coefficient of 1e308 overflows to is refused by `predict`."""
     made = kind(**arguments)
     model = INPUTS.data.model.with_contacts(())
-    known = (*model.forces, made)
-    forcegp.Model(model.robot, (), known).dynamics(*STATE).acceleration_map()
+    forcegp.Model(model.robot, (), (*model.forces, made)).dynamics(*STATE).acceleration_map()
 
 
 def _with(force: Any) -> Any:

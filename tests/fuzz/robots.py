@@ -45,8 +45,6 @@ FREE = (
 )
 ROBOTS = {"arm": URDF, "mimic": MIMIC, "free": FREE} | {f"mjcf {name}": text for name, text in ALL.items()}
 BASES = (None, "fixed", "floating", "planar", "", "Floating", 5, ("floating",), ["planar"], {}, b"planar")
-
-
 CASES = st.builds(
     RobotFile,
     st.lists(XML_EDITS, max_size=4),
@@ -80,12 +78,10 @@ def check(case: RobotFile, folder: Path) -> None:
         repr(model)
         if robot.nv:
             q = random_positions(robot, torch.Generator().manual_seed(0))[0]
-            M = robot.mass_matrix(q)
-            if not bool(torch.isfinite(M).all()):
+            if not bool(torch.isfinite(robot.mass_matrix(q)).all()):
                 raise DefectError("a mass matrix that is not finite")
             model.dynamics(q, torch.zeros(robot.nv).double(), torch.zeros(len(model.inputs)).double())
-        again = Robot.from_urdf_text(robot.to_urdf(), base=robot.base, locked=robot.locked)
-        if again.nv != robot.nv:
+        if Robot.from_urdf_text(robot.to_urdf(), base=robot.base, locked=robot.locked).nv != robot.nv:
             raise DefectError("another robot is read from what was written")
         Model.from_json(model.to_json())
         if case.robot.startswith("mjcf") and case.damage is None:

@@ -66,8 +66,7 @@ CASES = [*zip(("fit", *("check", "import") * len(OTHERS)), OTHERS, strict=False)
 
 @pytest.mark.parametrize(("command", "stated"), CASES, ids=json.dumps)
 def test_metadata_of_another_kind_do_not_matter(place, stated, command):
-    data = INPUTS.free
-    data.save(place / "data.h5")
+    INPUTS.free.save(place / "data.h5")
     with h5py.File(place / "data.h5", "r+") as file:
         del file["metadata"]
         file["metadata"] = np.bytes_(json.dumps(stated))

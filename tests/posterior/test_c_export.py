@@ -139,8 +139,7 @@ def test_the_torques_for_a_motion_and_every_force_are_those_of_the_model(frictio
         np.testing.assert_allclose(u, wanted[k], rtol=1e-10, atol=1e-10)
         bits, (force, deviation) = call(library.arm_forces_deviation, [6, 6], *(x[k] for x in states))
         assert bits == 0
-        rows = np.stack([force.reshape(-1, 3), deviation.reshape(-1, 3)], axis=1)
-        found = dict(zip(parts, rows, strict=True))
+        found = dict(zip(parts, np.stack([force.reshape(-1, 3), deviation.reshape(-1, 3)], axis=1), strict=True))
         for name, part in parts.items():
             np.testing.assert_allclose(found[name][0], part.joint_force.mean[k], rtol=1e-9, atol=1e-12)
             exact = part.joint_force.covariance[k].diagonal().clamp_min(0.0).sqrt().numpy()
@@ -280,8 +279,7 @@ def test_an_implicit_step_that_is_not_found_is_reported_as_such(friction, states
 def test_sums_that_cancel_may_differ_by_their_rounding(tmp_path, states):
     """Without an analytical mean, processes sum gravity and inertia up from terms thousands of times as large."""
     smooth = quick_fit(arm_model().with_forces(JointForces()).without_mean(), arm_data(60, 0), 60)
-    rows = [torch.tensor(x) for x in states]
-    q, v, u = (x[None] if x.dim() == 1 else x for x in rows)
+    q, v, u = (x[None] if x.dim() == 1 else x for x in [torch.tensor(x) for x in states])
     dynamics = smooth.dynamics(q, v, u)
     W = dynamics.H @ smooth.model.unknown.direction(dynamics)
     features = smooth.likelihood.standardization(smooth.model.unknown.features(dynamics))

@@ -213,8 +213,7 @@ def test_intervals_count_another_level_until_it_is_seen(steady):
     for place, kind in enumerate((Coulomb, Viscous)):
         louder = replace(posterior, target=scaled(posterior.model, torch.tensor([1.0 + BETWEEN]), kind))
         away = louder.rollout(*start, integrator="rk4").q - posterior.rollout(*start, integrator="rk4").q
-        expected = float(away[:, -1].square().mean().sqrt())
-        assert fresh.drift[place, -1, 0, 0] == pytest.approx(expected, rel=0.25)
+        assert fresh.drift[place, -1, 0, 0] == pytest.approx(float(away[:, -1].square().mean().sqrt()), rel=0.25)
     same = posterior.update(recording(1, seconds=61.0).rows(slice(-100, None))).motion_intervals
     other = posterior.update(recording(7, seconds=20.0)).motion_intervals
     assert not same.drift.any()

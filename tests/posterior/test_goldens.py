@@ -32,8 +32,6 @@ POSTERIORS = {
     "laws": lambda: fit(arm_model(0).with_forces(Viscous()), arm_data(30, 0, arm_model(0)), Accelerations()),
     "drift": lambda: fitted(recording(1, 0.02, seconds=8.0)),
 }
-
-
 INTEGRATORS = {"friction": "symplectic-euler", "drift": "rk4", "laws": "implicit-midpoint"}
 
 

@@ -120,8 +120,7 @@ def test_a_model_with_wind_learns_rows_of_another_flight(posterior, test, tmp_pa
     """Exactly as a posterior that was stored; rows that show no wind are refused."""
     rows = acting(test)
     save_posterior(posterior, tmp_path / "drone")
-    loaded = load_posterior(tmp_path / "drone")
-    more = [each.update(rows.rows(np.arange(300))) for each in (posterior, loaded)]
+    more = [each.update(rows.rows(np.arange(300))) for each in (posterior, load_posterior(tmp_path / "drone"))]
     assert more[0].model.inputs == posterior.model.inputs
     assert len(more[0].training) == len(posterior.training) + 275  # those with .1 s before them
     means = [each.predict(rows.q[:5], rows.v[:5], rows.u[:5], covariance=False).mean for each in more]

@@ -87,8 +87,7 @@ def test_samples_are_functions_that_obey_the_constraint(posterior, start):
     assert drawn.q.shape == (5, 2, STEPS + 1, 3)
     assert drawn.a.shape == (5, 2, STEPS, 3)
     dynamics = arm_model(baumgarte=Baumgarte(10.0)).dynamics(drawn.q[..., :-1, :], drawn.v[..., :-1, :], u)
-    violation = (dynamics.A @ drawn.a[..., None])[..., 0] - dynamics.b
-    assert violation.abs().max() <= 1e-10
+    assert ((dynamics.A @ drawn.a[..., None])[..., 0] - dynamics.b).abs().max() <= 1e-10
     assert drawn.a[:, :, 0].std(0).max() > 1e-4  # they differ
     again = posterior.rollout(q, v, u, DT, baumgarte=Baumgarte(10.0), samples=5, seed=3)
     torch.testing.assert_close(again.samples.q, drawn.q, rtol=0, atol=0)
@@ -156,8 +155,7 @@ def test_feedback_is_asked_once_per_step_and_acts_until_the_next(posterior, star
     assert [k for k, _, _ in asked] == list(range(STEPS))
     torch.testing.assert_close(torch.stack([at for _, at, _ in asked], dim=1), rollout.q[:, :-1], rtol=0, atol=0)
     torch.testing.assert_close(torch.stack([rate for _, _, rate in asked], dim=1), rollout.v[:, :-1], rtol=0, atol=0)
-    applied = u - gains[:, None] * rollout.v[:, :-1]
-    same = posterior.rollout(q, v, applied, DT, integrator=integrator)
+    same = posterior.rollout(q, v, u - gains[:, None] * rollout.v[:, :-1], DT, integrator=integrator)
     torch.testing.assert_close(rollout.q, same.q, rtol=1e-12, atol=1e-12)
     assert not torch.allclose(rollout.v, posterior.rollout(q, v, u, DT, integrator=integrator).v, atol=1e-6)
 

@@ -180,10 +180,16 @@ def test_a_model_that_was_carried_to_another_system_predicts_there_after_loading
     assert torch.equal(load_posterior(again).predict(*states).mean, loaded.predict(*states).mean)
 
 
-def test_a_pipe_as_model_or_as_digests_is_refused_at_once(tmp_path):
+def test_pipes_and_files_too_large_are_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / "model.json")
     with pytest.raises(FileFormatError, match=r"holds no model\.json"):
         load_posterior(tmp_path)
     os.mkfifo(tmp_path / SUMS)
     with pytest.raises(FileFormatError, match=f"{SUMS} is not a regular file; fit again"):
         require_unchanged(tmp_path, "fit again")
+    for name in (SUMS, "model.json"):  # which a sparse file costs nothing to claim
+        (tmp_path / name).unlink()
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(2**40)
+        with pytest.raises(FileFormatError, match=f"{name} holds 1048576 MiB, more than the 32 MiB"):
+            require_unchanged(tmp_path, "fit again") if name == SUMS else load_posterior(tmp_path)

@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import os
 import pickle
 import zipfile
 from collections.abc import Callable
@@ -10,7 +11,10 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pyarrow as pa
+import scipy.io
 from numpy.lib import format as npy
+from pyarrow import parquet
 from tests.recordings.log_files import motion, table, write_bag2, write_hdf5, write_text
 
 FLAGS = "--time time --q q_{joints} --v v_{joints} --u u_{joints} --robot arm.urdf"
@@ -119,8 +123,24 @@ def claiming(shape: tuple[int, ...]) -> bytes:
 
 
 def bomb_of_gzip(folder: Path) -> Path:
-    (folder / "log.csv.gz").write_bytes(gzip.compress(b"time,q\n" + b"0,0\n" * (40 * 2**20), 9))
-    return folder / "log.csv.gz"
+    parts = b"time,q\n" + b"0,0\n" * (40 * 2**20), b"0,0\n"  # the size that a file states is that of its last part
+    return written("log.csv.gz", b"".join(gzip.compress(part, 9) for part in parts))(folder)
+
+
+def bomb_of_parquet(folder: Path) -> Path:
+    parquet.write_table(pa.table({"q": np.zeros(2**24)}), folder / "log.parquet")
+    return folder / "log.parquet"
+
+
+def crashing_matlab(folder: Path) -> Path:
+    """One byte at which scipy's reader ends with the signal SIGSEGV."""
+    scipy.io.savemat(file := io.BytesIO(), {"time": np.arange(8.0)})
+    return written("log.mat", file.getvalue()[:176] + b"\0" + file.getvalue()[177:])(folder)
+
+
+def pipe(folder: Path) -> Path:
+    os.mkfifo(folder / "log.csv")
+    return folder / "log.csv"
 
 
 def linked(folder: Path) -> Path:
@@ -187,7 +207,14 @@ BROKEN = {
     "binary": Broken(written("log.csv", bytes(range(256)) * 9), "holds binary data"),
     "pickle": Broken(written("log.pkl", pickle.dumps([1])), "reading those runs code"),
     "folder": Broken(folder_of_logs, "no ROS 2 bag (metadata.yaml)"),
+    "folder without a name": Broken(lambda folder: folder, ". is a folder, but no ROS 2 bag (metadata.yaml)"),
     "gzip bomb": Broken(bomb_of_gzip, "no log of sensors shrinks so far"),
+    "bomb of zeros": Broken(bomb_of_parquet, "no log of sensors shrinks so far", ARRAYS),
+    "pipe": Broken(pipe, "log.csv is not a regular file"),
+    "crash of scipy": Broken(crashing_matlab, "log.mat: matlab crashed at it", ARRAYS),
+    "long integer": Broken(written("log.json", b"[1%b]" % (b"0" * 400)), "no array of numbers", ARRAYS),
+    "huge number": Broken(setting("u_elbow", 7, 1e100), "'u_elbow' (u of joint 'elbow') is 1e+100 at row 7"),
+    "huge time": Broken(scaled(1e300, "time"), "the median step is"),
     "time backwards": Broken(csv(swapped), "time runs backwards by 0.00195312 s at row 51 (line 53)"),
     "time stands still": Broken(csv(constant_time), "all rows have the same time stamp"),
     "ms given as s": Broken(scaled(1e3, "time"), "add --unit time=ms"),
@@ -205,6 +232,7 @@ BROKEN = {
         GOOD, "is no combination", FLAGS.replace("--q q_{joints}", "--q q_shoulder**q_elbow,q_elbow")
     ),
     "cut member": Broken(lambda f: member(f, claiming((200, 2))), "claims the shape (200, 2)", ARRAYS),
+    "bad header": Broken(lambda f: member(f, npy.magic(1, 0) + b"\xff\x10" + b"{" * 5000), "a NumPy archive", ARRAYS),
     "npz bomb": Broken(lambda f: member(f, claiming((10**8, 2)) + bytes(2 * 10**8)), "shrinks so far", ARRAYS),
     "Python objects": Broken(lambda f: archive(f, q=np.array([{}], object)), "reading them runs code", ARRAYS),
     "other lengths": Broken(lambda f: archive(f, u=np.ones((7, 2))), "different numbers of rows", ARRAYS),

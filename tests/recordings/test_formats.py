@@ -1,6 +1,7 @@
 """Every format passes the same tests."""
 
 import json
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -25,6 +26,7 @@ from tests.recordings.source_conformance import SourceConformance
 
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput
 from forcegp.recordings import ColumnMapping, import_recordings, open_source
+from forcegp.recordings.source import require_distinct
 
 
 class Tables(SourceConformance):
@@ -97,8 +99,7 @@ def test_texts_of_other_programs(tmp_path, encoding, head, row, begin):
 
 
 def test_the_last_lines_are_rows_whatever_stands_above(tmp_path):
-    lines = [*["1,2,3"] * 30, "t;q", *["0;5"] * 20, ""]
-    (tmp_path / "log.csv").write_text("\n".join(lines))
+    (tmp_path / "log.csv").write_text("\n".join([*["1,2,3"] * 30, "t;q", *["0;5"] * 20, ""]))
     assert_array_equal(open_source(tmp_path / "log.csv").read(["q"])["q"], [5.0] * 20)
 
 
@@ -168,8 +169,7 @@ class TestNumpyArchive(Tables):
 
 class TestPartOfAnArchive(TestNumpyArchive):
     def write(self, folder):
-        both = {"run1": np.zeros((3, 2)), "run2": motion()["q"]}
-        np.savez_compressed(folder / "log.npz", **both)
+        np.savez_compressed(folder / "log.npz", **{"run1": np.zeros((3, 2)), "run2": motion()["q"]})
         return folder / "log.npz"
 
     def open(self, path):
@@ -246,10 +246,9 @@ def test_lists_of_objects_are_rows_or_episodes(tmp_path, write):
 
 
 def test_lines_of_json_are_rows_and_the_last_may_be_cut(tmp_path):
-    stamps = [f"2024-01-01T00:00:0{row}.5Z" for row in range(4)]
     lines = [
         {"stamp": stamp, "names": ["b", "a"], "pos": [row, 2 * row], "u": None if row else 3}
-        for row, stamp in enumerate(stamps)
+        for row, stamp in enumerate([f"2024-01-01T00:00:0{row}.5Z" for row in range(4)])
     ]
     (tmp_path / "log.jsonl").write_text("\n".join(map(json.dumps, lines))[:-5])
     with pytest.warns(DataWarning, match="the 3 whole lines before are read"):
@@ -354,3 +353,7 @@ def test_a_dataset_of_our_own_is_not_a_log(tmp_path):
     arm_data(20, seed=0).save(tmp_path / "arm.h5")
     with pytest.raises(FileFormatError, match="a dataset of forcegp already"):
         open_source(tmp_path / "arm.h5")
+
+
+def test_a_great_number_of_columns_is_compared_once():
+    require_distinct(Path("log.csv"), [f"c{k}" for k in range(200_000)])

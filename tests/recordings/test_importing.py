@@ -34,8 +34,7 @@ def uneven(rows=1000, seed=3):
     """Motion at times that jitter by a fifth of a step."""
     data = motion(rows)
     time = data["time"] + STEP * np.random.default_rng(seed).uniform(-0.2, 0.2, rows)
-    smooth = {name: CubicSpline(data["time"], data[name], axis=0)(time) for name in "qvu"}
-    return {"time": time, **smooth}
+    return {"time": time, **{name: CubicSpline(data["time"], data[name], axis=0)(time) for name in "qvu"}}
 
 
 @pytest.mark.parametrize("logged", [("q", "u"), ("q", "v", "u")])
@@ -62,8 +61,7 @@ def test_a_combination_that_is_not_finite_is_named_with_its_row(tmp_path):
 
 def test_a_rate_that_is_asked_for_is_the_rate(tmp_path):
     path = write_text(tmp_path / "log.csv", table(motion()))
-    found = imported(path, NAMES, rate=1000.0)
-    np.testing.assert_allclose(np.diff(found.time), 1e-3, rtol=1e-9)
+    np.testing.assert_allclose(np.diff(imported(path, NAMES, rate=1000.0).time), 1e-3, rtol=1e-9)
     with pytest.warns(DataWarning, match="below the 512 Hz of the log"):
         imported(path, NAMES, rate=100.0)
 
@@ -97,20 +95,17 @@ def test_start_and_end_count_from_the_first_row_of_each_episode(tmp_path):
     mapping = dataclasses.replace(NAMES, episode="run")
     span = {"start": 10 * STEP, "end": 40 * STEP, "without": (15.5 * STEP, 27.5 * STEP)}
     found = imported(write_text(tmp_path / "log.csv", columns), mapping, **span)
-    kept = np.r_[10:16, 28:41, 110:116, 128:141]
-    np.testing.assert_array_equal(found.q, data["q"][kept])
+    np.testing.assert_array_equal(found.q, data["q"][np.r_[10:16, 28:41, 110:116, 128:141]])
     assert [episode["number"] for episode in found.metadata["import"]["episodes"]] == [4, 4, 7, 7]
 
 
 def test_wrapped_angles_are_continued_if_told_so(tmp_path):
     data = motion()
     data["q"] = 9.0 * data["time"][:, None] / data["time"][-1] + np.array([0.0, 1.0])
-    wrapped = {**data, "q": (data["q"] + np.pi) % (2 * np.pi) - np.pi}
-    path = write_text(tmp_path / "log.csv", table(wrapped))
+    path = write_text(tmp_path / "log.csv", table({**data, "q": (data["q"] + np.pi) % (2 * np.pi) - np.pi}))
     with pytest.raises(DatasetError, match="Add `unwrap`"):
         imported(path, NAMES)
-    found = imported(path, NAMES, unwrap=True)
-    np.testing.assert_allclose(found.q, data["q"], atol=1e-13)
+    np.testing.assert_allclose(imported(path, NAMES, unwrap=True).q, data["q"], atol=1e-13)
 
 
 def test_coupled_angles_units_signs_and_constants(tmp_path):
@@ -170,11 +165,9 @@ def test_stamps_in_nanoseconds_keep_their_last_digit(tmp_path):
     data = motion()
     stamps = 1_700_000_000_123_456_789 + np.round(data["time"] * 1e9).astype(np.int64)
     rows = zip(stamps, data["q"][:, 0].tolist(), strict=True)
-    lines = ["stamp,q1,q2", *(f"{stamp},{q!r},{q!r}" for stamp, q in rows)]
-    (tmp_path / "log.csv").write_text("\n".join(lines))
+    (tmp_path / "log.csv").write_text("\n".join(["stamp,q1,q2", *(f"{stamp},{q!r},{q!r}" for stamp, q in rows)]))
     mapping = ColumnMapping(time="stamp", q=("q{1..2}",), u=("0",), unit={"time": ("ns",)})
-    found = imported(tmp_path / "log.csv", mapping)
-    np.testing.assert_array_equal(found.time, data["time"])
+    np.testing.assert_array_equal(imported(tmp_path / "log.csv", mapping).time, data["time"])
 
 
 def test_velocities_that_hold_no_number_are_derived_and_said(tmp_path):

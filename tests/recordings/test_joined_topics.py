@@ -178,8 +178,7 @@ def test_angles_that_wrap_are_not_interpolated_across(tmp_path):
     rows = zip(base, nanoseconds(base).tolist(), strict=True)
     messages = [("/odom", s, odometry(s, [t, 0, 1, 0, 0, 0, 1], [1.0, 0, 0, 0, 0, 0])) for t, s in rows]
     for t, stamp in zip(joint, nanoseconds(joint).tolist(), strict=True):
-        angle = (np.rad2deg(3.0 * t) + 180.0) % 360.0 - 180.0
-        messages.append(("/joints", stamp, joint_state(stamp, angle)))
+        messages.append(("/joints", stamp, joint_state(stamp, (np.rad2deg(3.0 * t) + 180.0) % 360.0 - 180.0)))
     path = written(tmp_path, messages)
     mapping = ColumnMapping(q=("/odom:pose", "/joints:position.knee"), u=("0",), unit={"q": ("deg",)})
     model = Model(Robot.from_urdf_text(HOPPER.replace("revolute", "continuous"), base="floating"))

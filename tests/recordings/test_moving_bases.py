@@ -65,8 +65,7 @@ def either_sign(flight):
 def angles_in_degrees(flight):
     R = turn(flight).as_matrix()
     yaw, roll = np.arctan2(R[:, 1, 0], R[:, 0, 0]), np.arctan2(R[:, 2, 1], R[:, 2, 2])
-    pitch = -np.arcsin(R[:, 2, 0])
-    q = np.hstack([1000.0 * flight.q[:, :3], np.rad2deg(np.stack([roll, pitch, yaw], axis=1))])
+    q = np.hstack([1000.0 * flight.q[:, :3], np.rad2deg(np.stack([roll, -np.arcsin(R[:, 2, 0]), yaw], axis=1))])
     return {"q": q}, {"q": ("q{0..5}",), "orientation": "angles", "unit": {"q": ("mm", "deg")}}
 
 
@@ -239,8 +238,7 @@ def test_qpos_qvel_and_qacc_of_mujoco(tmp_path):
     model = Model.from_file(tmp_path / "box.xml", base="floating")
     axes = {"v": ("world", "body"), "a": ("world", "body")}
     found = import_recordings([path], replace(PLAIN, u=None, orientation="wxyz", axes=axes), model=model)
-    moved = differentiate(found.q, found.time, model.robot.space)
-    assert_allclose(found.v[1:-1], moved[1:-1], rtol=0, atol=1e-4)
+    assert_allclose(found.v[1:-1], differentiate(found.q, found.time, model.robot.space)[1:-1], rtol=0, atol=1e-4)
     q, v, u = (torch.tensor(x) for x in (found.q, found.v, found.u))
     assert_allclose(found.a, model.dynamics(q, v, u).acceleration(torch.zeros_like(v)).numpy(), rtol=0, atol=1e-9)
 

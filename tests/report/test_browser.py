@@ -45,8 +45,7 @@ def report(tmp_path_factory, page):
 
 def opened(browser, path):
     """The page without network, and what its console complains of."""
-    context = browser.new_context(viewport={"width": 1200, "height": 1000}, offline=True)
-    page, complaints = context.new_page(), []
+    page, complaints = browser.new_context(viewport={"width": 1200, "height": 1000}, offline=True).new_page(), []
     page.set_default_timeout(300_000)  # ms: without a GPU, on a busy machine, a picture takes more than the usual 30 s
     page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: complaints.append(str(error)))

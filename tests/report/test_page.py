@@ -8,8 +8,9 @@ import pytest
 from PIL import Image
 
 from forcegp import score
+from forcegp.atomic_files import is_marked
 from forcegp.errors import InvalidInput
-from forcegp.report import Page, is_page, model_page, scores_sentence, write_page
+from forcegp.report import Page, model_page, scores_sentence, write_page
 from forcegp.scores.figures.model import PICTURES
 
 
@@ -43,12 +44,12 @@ def test_text_is_escaped(tmp_path):
 def test_own_pages_are_recognised_and_kept(page, tmp_path):
     path = tmp_path / "report.html"
     write_page(path, Page("t", "b"))
-    assert is_page(path)
+    assert is_marked(path)
     with pytest.raises(InvalidInput, match="exists already"):
         write_page(path, Page("t", "other"), overwrite=False)
     assert "other" not in path.read_text()
     (tmp_path / "mine.html").write_text("<html>mine</html>")
-    assert not is_page(tmp_path / "mine.html")
+    assert not is_marked(tmp_path / "mine.html")
 
 
 def test_what_cannot_be_drawn_is_named(swinging, friction, monkeypatch):

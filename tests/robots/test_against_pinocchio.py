@@ -85,8 +85,7 @@ def test_every_frame(text):
 @pytest.fixture(params=[*MODELS])
 def at_one_state(request):
     text = MODELS[request.param]()
-    armature = 0.1 * np.arange(1, 1 + Robot.from_urdf_text(text).nv)
-    robot = Robot.from_urdf_text(text, armature=armature)
+    robot = Robot.from_urdf_text(text, armature=0.1 * np.arange(1, 1 + Robot.from_urdf_text(text).nv))
     return robot, Oracle(text, robot), *np.random.default_rng(11).normal(size=(3, robot.nv))
 
 

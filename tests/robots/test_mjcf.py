@@ -197,10 +197,9 @@ def written(robot):
 
 
 def followers(robot):
-    drives = zip(robot.layout.bodies, robot.layout.drives, strict=True)
     return {
         body.name: (robot.joint_names[drive.joint], drive.multiplier, drive.offset)
-        for body, drive in drives
+        for body, drive in zip(robot.layout.bodies, robot.layout.drives, strict=True)
         if body.name not in robot.joint_names
     }
 
@@ -236,8 +235,7 @@ def test_rods_and_points_and_last_links_without_mass(tmp_path):
     <link name="rod"><inertial><origin xyz="0 0 .5"/><mass value="2"/>
     <inertia ixx="{0}" iyy="{0}" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
     for moment in (0.0, 0.3):
-        robot = Robot.from_urdf_text(text.format(moment))
-        robot.to_mjcf(tmp_path / "rod.xml")
+        Robot.from_urdf_text(text.format(moment)).to_mjcf(tmp_path / "rod.xml")
         again = Robot.from_file(tmp_path / "rod.xml")
         assert again.mass_matrix(torch.zeros(1).double()).item() == pytest.approx(0.5 + moment, rel=1e-12)
     bare = text.format(0.3).replace('value="2"', 'value="0"').replace('"0.3"', '"0"')

@@ -56,8 +56,7 @@ def test_armature_by_name_and_in_order(chain):
     assert named.armature.tolist() == ordered.armature.tolist() == [0.0, 0.2, 0.0, 0.0]
     assert named.with_armature({"skew": 0.3}).armature.tolist() == [0.0, 0.2, 0.3, 0.0]
     q = torch.zeros(4, dtype=torch.float64)
-    added = named.mass_matrix(q) - chain.mass_matrix(q)
-    torch.testing.assert_close(added, torch.diag(named.armature))
+    torch.testing.assert_close(named.mass_matrix(q) - chain.mass_matrix(q), torch.diag(named.armature))
 
 
 def test_robot_is_immutable_and_survives_pickling(chain):

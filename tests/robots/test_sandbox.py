@@ -1,5 +1,7 @@
 """Robot files that attack their reader: each is one line, within limits, and reads nothing outside of its folder."""
 
+import os
+
 import pytest
 
 from forcegp import Robot
@@ -61,6 +63,7 @@ ATTACKS = {
         {},
         "not below the folder",
     ),
+    "a pipe": (SCENE.format("", '<flexcomp name="f" type="mesh" file="pipe.stl"/>' + BODY), {}, "a pipe or device"),
     "a grid above": (
         SCENE.format("", '<flexcomp name="f" type="mesh" file="../secret.obj"/>' + BODY),
         {},
@@ -76,6 +79,7 @@ def test_files_of_mujoco_cost_no_more_than_their_limits_and_read_only_their_fold
     monkeypatch.setattr(sandbox, "MEMORY", 300 << 20)
     (folder := tmp_path / "robot").mkdir()
     (tmp_path / "secret.xml").write_text(f"<mujoco>{BODY}</mujoco>")
+    os.mkfifo(folder / "pipe.stl")
     for name, content in {"robot.xml": text, **beside}.items():
         (folder / name).write_text(content)
     if not message:
@@ -110,6 +114,7 @@ PARTS = """<link name="base"/><joint name="j" type="revolute"><parent link="base
 EXPRESSIONS = {
     "xacro.load_yaml('../secret.yaml')": "only read below its folder",
     "xacro.load_yaml('/etc/hostname')": "only read below its folder",
+    "xacro.load_yaml('pipe')": "only read below its folder",
     "10**10**10": "or needed more than 2 s",
     "[0] * 10**12": "could not expand it|or needed more",
 }
@@ -119,7 +124,9 @@ EXPRESSIONS = {
 def test_macros_read_below_their_folder_within_limits(expression, tmp_path, monkeypatch):
     pytest.importorskip("xacro")
     monkeypatch.setattr(sandbox, "SECONDS", 2)
+    monkeypatch.syspath_prepend(tmp_path)  # as `python -m` does with the current folder
     (folder := tmp_path / "robot").mkdir()
+    os.mkfifo(folder / "pipe")
     for name in ("secret.yaml", "robot/own.yaml"):
         (tmp_path / name).write_text("mass: 2.0")
     (folder / "arm.xacro").write_text(MACRO % "xacro.load_yaml('own.yaml')" + PARTS)

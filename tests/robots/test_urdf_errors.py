@@ -63,6 +63,7 @@ WRONG = {
         with_joint("swing", "arm", "tool", '<link name="tool"/>').replace('"fixed"', '"floating"'),
         ["joint 'swing'", "has no mass", "--lock swing=0"],
     ),
+    "mimic of 1e200": (changed("<axis", '<mimic joint="a" multiplier="1e200"/><axis'), ["'hinge'", "above 1e+09"]),
     "mimic of none": (
         changed("<axis", '<mimic joint="other" multiplier="2"/><axis'),
         ["joint 'hinge' mimics 'other'", "which the file lacks", "no movable joint"],

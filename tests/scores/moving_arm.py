@@ -64,12 +64,11 @@ def moving_arm(seconds: float = 2.0, episodes: int = 2, seed: int = 0, stribeck:
         step = integrator(acceleration, q, v, STEP)
         q, v = step.q, step.v
     arrays = {name: np.stack(values, axis=1).reshape(-1, 3) for name, values in found.items()}
-    given = given_system()
     return Dataset(
         **{**arrays, "a": arrays["a"] + NOISE * generator.normal(size=arrays["a"].shape)},
         time=np.tile(time, episodes),
         episode=np.repeat(np.arange(episodes), rows),
-        model=given,
+        model=given_system(),
         noise_std=np.full(3, NOISE),
     )
 

@@ -188,8 +188,7 @@ def test_models_refined_on_motions_move_better_and_laws_stand_side_by_side():
     assert scores.models[viscous]["kind"] == "identified"
     assert viscous in scores.models[viscous]["summary"]
     assert scores.value("nrmse", model=dry) < scores.value("nrmse", model=viscous), "it has dry friction"
-    final = scores.fit(dry, {})
-    assert {"Viscous", "Coulomb"} <= {type(law).__name__ for law in final.model.laws}
+    assert {"Viscous", "Coulomb"} <= {type(law).__name__ for law in scores.fit(dry, {}).model.laws}
 
 
 @pytest.mark.parametrize(

@@ -32,8 +32,7 @@ def test_chance_of_seeds_and_of_stretches_adds_up():
     found = paired_difference("force", "a", "b", 1.0 + difference, np.ones_like(difference))
     seeds, stretches = (difference.mean(axis=axis).ravel() for axis in (2, 0))
     parts = [each.var(ddof=1) / len(each) for each in (seeds, stretches)]
-    freedom = sum(parts) ** 2 / (parts[0] ** 2 / 3 + parts[1] ** 2 / 6)
-    half = student.ppf(0.975, freedom) * np.sqrt(sum(parts))
+    half = student.ppf(0.975, sum(parts) ** 2 / (parts[0] ** 2 / 3 + parts[1] ** 2 / 6)) * np.sqrt(sum(parts))
     assert np.ptp(np.log(found.interval)) == pytest.approx(half, rel=1e-3)
 
 

@@ -35,12 +35,11 @@ def recording(rows: int = 101, episodes: int = 2, force: float = FORCE) -> Datas
     v = 0.1 + a * time[:, None]
     q = 0.1 * time[:, None] + 0.5 * a * time[:, None] ** 2
     arrays = {"q": q, "v": v, "u": np.full((rows, 1), force), "a": a}
-    model = sledge(TRUE_MASS)
     return Dataset(
         **{name: np.tile(values, (episodes, 1)) for name, values in arrays.items()},
         time=np.tile(time, episodes),
         episode=np.repeat(np.arange(episodes), rows),
-        model=model,
+        model=sledge(TRUE_MASS),
     )
 
 

@@ -51,13 +51,11 @@ def test_blocks_share_no_row_and_keep_their_distance(blocks, wanted, guard, epis
         inside = np.abs(place - np.round(place)) > 1e-9  # on a border rounding decides
         assert (test[here & inside] == np.isin(number, wanted)[here & inside]).all()
         if train[here].any() and test[here].any():
-            apart = np.abs(data.time[here & train][:, None] - data.time[here & test]).min()
-            assert apart >= guard * (1 - 1e-12)
+            assert np.abs(data.time[here & train][:, None] - data.time[here & test]).min() >= guard * (1 - 1e-12)
         # a row that is on neither side lies within the guard of a held-out block, and so of its border
         for row in np.flatnonzero(here & ~train & ~test):
             borders = [number for number in range(1, blocks) if (number in wanted) != (number + 1 in wanted)]
-            distance = min(abs(place[row] - border) for border in borders) * length / blocks
-            assert distance <= guard + 1e-12
+            assert (min(abs(place[row] - border) for border in borders) * length / blocks) <= guard + 1e-12
 
 
 def test_a_decimated_recording_is_divided_at_the_same_moments():
@@ -112,8 +110,7 @@ def test_seeds_choose_other_training_rows_that_lie_far_apart():
 
     def nearest(data) -> float:
         x = np.hstack([data.q, data.v, data.u]) / np.hstack([train.q, train.v, train.u]).std(0)
-        distance = np.linalg.norm(x[:, None] - x, axis=-1) + 1e9 * np.eye(len(x))
-        return float(distance.min(axis=1).mean())
+        return float((np.linalg.norm(x[:, None] - x, axis=-1) + 1e9 * np.eye(len(x))).min(axis=1).mean())
 
     random = train.rows(np.random.default_rng(0).choice(300, 40, replace=False))
     assert nearest(chosen[0]) > 1.2 * nearest(random)

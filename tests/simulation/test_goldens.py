@@ -24,9 +24,8 @@ def test_rows_of_a_seed_are_what_they_were(scene):
 
 
 def test_numbers_of_scenarios_are_what_they_were():
-    configs = {name: vars(config) for name, (config, _) in SCENARIOS.items()}
     given = {
         name: {each: x for each, x in members.items() if isinstance(x, float | tuple | str)}
-        for name, members in configs.items()
+        for name, members in {name: vars(config) for name, (config, _) in SCENARIOS.items()}.items()
     }
     assert_unchanged("simulation/numbers", given)

@@ -37,8 +37,7 @@ def test_the_unknown_force_is_viscous_friction_at_the_tool_point(data):
     q, v, unknown = tensors(data, "q", "v", "Q_U")
     point = torch.tensor([0.0, 0.0, 0.1], dtype=torch.float64)
     jacobian = data.model.robot.frame_jacobian(q, TOOL_LINK, point)[:, :3]
-    friction = -1.0 * (jacobian @ v[..., None])
-    np.testing.assert_allclose(unknown, (jacobian.mT @ friction)[..., 0], atol=1e-12)
+    np.testing.assert_allclose(unknown, (jacobian.mT @ (-1.0 * (jacobian @ v[..., None])))[..., 0], atol=1e-12)
 
 
 def test_rows_follow_each_other_by_symplectic_euler(data):

@@ -24,8 +24,7 @@ def one_segment(length: float, duration: float, acceleration: float) -> SegmentP
 
 def test_acceleration_cruise_and_braking_by_hand():
     # 1 s of 2 m/s^2, 3 s at 2 m/s, 1 s of braking: 1 + 6 + 1 = 8 m
-    path = one_segment(8.0, 5.0, 2.0)
-    position, velocity, acceleration = path.sample(np.array([0.0, 0.5, 1.0, 2.5, 4.0, 4.5]))
+    position, velocity, acceleration = one_segment(8.0, 5.0, 2.0).sample(np.array([0.0, 0.5, 1.0, 2.5, 4.0, 4.5]))
     np.testing.assert_allclose(position[:, 1], [2.0, 2.25, 3.0, 6.0, 9.0, 9.75], atol=1e-12)
     np.testing.assert_allclose(velocity[:, 1], [0.0, 1.0, 2.0, 2.0, 2.0, 1.0], atol=1e-12)
     np.testing.assert_allclose(acceleration[:, 1], [2.0, 2.0, 0.0, 0.0, -2.0, -2.0], atol=1e-12)

@@ -13,6 +13,8 @@ from forcegp.scores.accuracy import ACCELERATION, TORQUE
 from forcegp.scores.page import number
 from forcegp.scores.scores import USABLE
 
+LEAST_COVERAGE = 0.8  # of 95 % intervals that is no reason to doubt them
+
 
 def short_name(name: str) -> str:
     """What a model is called in the answer."""
@@ -141,9 +143,6 @@ def left_of_torques(scores: forcegp.scores.Scores, best: str) -> list[tuple[str,
     return [("torque left", f"on unseen time, % of the recorded one of each joint: {told}")] if told else []
 
 
-LEAST_COVERAGE = 0.8  # of 95 % intervals that is no reason to doubt them
-
-
 def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset, still: Sequence[str] = ()) -> str:
     """Use it, use it for these joints, or do not use it; what it was measured by, and against the URDF alone."""
     best = scores.recommended
@@ -185,8 +184,7 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset, still: Sequ
 
 def _motion(scores: forcegp.scores.Scores, model: str) -> float | None:
     """Error of q at the longest horizon; None where all motions diverge, or none was scored."""
-    quantity = f"position after {scores.horizons[-1]:g} s" if scores.horizons else ""
-    return _known(scores, "rmse", quantity, model)
+    return _known(scores, "rmse", f"position after {scores.horizons[-1]:g} s" if scores.horizons else "", model)
 
 
 def _known(scores: forcegp.scores.Scores, score: str, quantity: str, model: str) -> float | None:

@@ -80,8 +80,7 @@ def parsed(words: Sequence[str]) -> Command:
     config = (FlagCreatePairsOff, OmitArgPrefixes)
     if {"-h", "--help"} & set(others):
         tyro.cli(with_texts(kind), prog=f"forcegp {name}", args=["--help"], config=config)
-    others = _checked(name, kind, others)
-    complaint = io.StringIO()
+    others, complaint = _checked(name, kind, others), io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
             return tyro.cli(kind, prog=f"forcegp {name}", args=others, config=config)

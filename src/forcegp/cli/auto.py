@@ -79,17 +79,20 @@ class Auto(Command):
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Do all of it. Raises DatasetError for mistakes that nobody has corrected yet."""
         from forcegp.fit.friction_choice import with_choice_of  # PyTorch is not needed for a page of help
+        from forcegp.scores.models import candidates
 
         if not self.logs:
             raise InvalidInput("give at least one log.")
         begin = time.process_time()
         self.filter.preparation()  # refused now, not after minutes
-        present = {each.name for each in self.out.iterdir()} if self.out.is_dir() else set()
-        if self.out.is_file() or (present and "log.h5" not in present):
+        present = self.out.is_dir() and any(not each.name.startswith(".") for each in self.out.iterdir())
+        if self.out.is_file() or (present and not self.wrote(self.out)):
             raise InvalidInput(f"{self.out} was not written by forcegp auto; choose another name.")
         if not self.out.parent.is_dir():
             raise InvalidInput(f"the folder {self.out.parent} does not exist; create it first.")
         model, mapping = self.columns.model(self.robot), self.columns.mapped(self.logs, terminal)
+        model.with_forces(forcegp.Payload(self.link, None, None))  # a link and forces that are not there, likewise
+        candidates(self.models.names() or ("given",), model, identification(model))
         for note in forces_of(model):
             terminal.note(note)
         dataset, done, mapping, mistakes, robot = self._imported(terminal, model, mapping)
@@ -110,6 +113,8 @@ class Auto(Command):
                 terminal.note(f"{doubt.about}: {doubt.what}")
         dataset = forcegp.checks.without_pushes(dataset, report.doubts)
         self.out.mkdir(parents=True, exist_ok=True)
+        if not present:  # by which an unfinished folder is known
+            write_json(self.out / CONFIG, {"kind": self.kind, "command": corrected})
         with atomic_file(self.out / "log.h5", overwrite=True) as temporary:
             dataset.save(temporary)
         with terminal.progress("preparing"):

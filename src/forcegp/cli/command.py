@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import os
 import platform
 import re
@@ -25,6 +26,7 @@ from forcegp.atomic_files import (
     read_json,
     require_replaceable,
     require_writable,
+    unreadable,
     write_digests,
     write_json,
 )
@@ -72,8 +74,6 @@ def listed(of: type[str | float] = str, goes_on: str | None = None) -> Primitive
 
 NUMBERS = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(:.*)?"
 """What continues an entry that holds numbers: FRAME@x,y,z:SURFACE:n,n,n,n, or WHAT=X,X."""
-
-
 FIELDS = r"\w+ *=.*"  # what continues a force: NAME:FIELD=VALUE,FIELD=VALUE
 
 
@@ -187,6 +187,8 @@ class Command(ABC):
                 for path in given if isinstance(given, tuple) else () if given is None else (given,):
                     if not mark.is_there(path):
                         raise FileFormatError(f"{path}{mark.refusal}")
+                    if why := unreadable(path, math.inf):
+                        raise FileFormatError(f"{path} {why}; give a regular file.")
                     inputs.append(path)
         path = self.output
         for given in (*inputs, *([] if path is None else [path])):
@@ -258,14 +260,14 @@ class Command(ABC):
 
     def require_free(self, path: Path | None) -> None:
         """Refuse what exists, but empty folders, and with --overwrite what only this command wrote."""
-        if path is None:
-            return
+        if path is not None:
+            require_replaceable(path, f"`{self.kind}`", self.wrote, overwrite=self.overwrite)
+            require_writable(path)
 
-        def own(folder: Path) -> bool:
-            return read_json(folder / CONFIG, "choose another name").get("kind") == self.kind
-
-        require_replaceable(path, f"`{self.kind}`", own, overwrite=self.overwrite)
-        require_writable(path)
+    def wrote(self, folder: Path) -> bool:
+        """Whether this command wrote a folder. Raises FileFormatError for a config.json that is none."""
+        there = (folder / CONFIG).exists()
+        return there and read_json(folder / CONFIG, "choose another name").get("kind") == self.kind
 
     def require_free_file(
         self, path: Path | None, own: Callable[[Path], bool] | None = None, what: str = "a dataset of forcegp"
@@ -310,13 +312,3 @@ def _same(one: Path, other: Path) -> bool:
     with contextlib.suppress(OSError):  # one of them does not exist
         return one.samefile(other)
     return os.path.realpath(one) == os.path.realpath(other)
-
-
-def begins(mark: bytes) -> Callable[[Path], bool]:
-    """Whether a file begins so; no more of it is read, for it may be large and not ours."""
-
-    def own(path: Path) -> bool:
-        with path.open("rb") as file:
-            return file.read(len(mark)) == mark
-
-    return own

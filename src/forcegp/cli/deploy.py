@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import csv
+import math
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +17,7 @@ import forcegp.data
 import forcegp.posterior
 import forcegp.scores
 from forcegp.atomic_files import write_json
-from forcegp.cli.command import DATASET, MODEL, NUMBERS, Command, begins, listed, numbers_of, unless_given
+from forcegp.cli.command import DATASET, MODEL, NUMBERS, Command, listed, numbers_of, unless_given
 from forcegp.cli.robot_options import CONTACTS, RobotOptions, parse_contacts, require_same_joints
 from forcegp.cli.terminal import Terminal, columns
 from forcegp.errors import InvalidInput
@@ -114,8 +117,6 @@ def _casadi(options: Export, terminal: Terminal, posterior: Any, folder: Path) -
 
 TARGETS: dict[str, Callable[[Export, Terminal, Any, Path], dict[str, Any]]] = {"c": _c, "casadi": _casadi}
 """What writes each target to a folder; a new one is a function here and a name in `Export.to`."""
-
-
 PLACE = tuple(f"{name}_{axis}" for name in ("point", "force", "force_std") for axis in "xyz")
 COLUMNS = ("start", "end", "peak", "probability", "link", "also", "newton", *PLACE)
 APART = 0.25  # alarms that are less apart in s belong to one contact
@@ -247,7 +248,7 @@ class Excite(Command):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Choose, write, draw and show."""
-        self.require_free_file(self.out, begins(b"t,q_"), "a motion of forcegp")
+        self.require_free_file(self.out, _is_motion, "a motion of forcegp")
         model, limits = self.robot.chosen(), {}
         if (model is None) == (self.model is None):
             raise InvalidInput("give either the folder of a fitted model or --robot ARM.urdf.")
@@ -270,3 +271,19 @@ class Excite(Command):
         rows = [[name, *map(number, each)] for name, *each in of_joints]
         terminal.show(columns(str(self.out), ["joint", *table], rows))
         return {"out": str(self.out), "usage": usage, "spread": spread, "condition": chosen.condition}
+
+
+def _is_motion(path: Path) -> bool:
+    """Whether `Excite` wrote this: the same columns, 100 rows per second, from rest to rest at one posture."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = csv.reader(file)
+            header, *table = next(rows), next(rows), next(rows), *deque(rows, 1)
+        first, second, last = ([float(text) for text in row] for row in table)
+    except (ValueError, StopIteration, csv.Error):
+        return False
+    joints = [name[2:] for name in header if name.startswith("q_")]
+    q, rest = slice(1, 1 + len(joints)), slice(1 + len(joints), 1 + 3 * len(joints))
+    moves = any(first[rest] + last[rest]) or math.dist(first[q], last[q]) > 1e-6
+    named = header == ["t", *(f"{what}_{joint}" for what in "qvau" for joint in joints)]
+    return named and not moves and [first[0], second[0]] == [0.0, 0.01]

@@ -53,6 +53,8 @@ NEARLY_ALL = 0.995
 HARDLY_ANY = 0.2  # share below which something is wrong with the contact, rather than the tool in the air
 USUAL_FORCES = "gp:joint-friction, in contact gp:tool-friction, in flight gp:aerodynamic"
 LEARNED_FROM = "accelerations with gp:, else torques, of a base that moves torques:both"
+SHOWN = {"m": ("mm", 1e3), "kg m^2": ("kg m²", 1.0)}
+"""Units of files, and those that people read, with the factor between them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,8 +150,7 @@ class Fit(Command):
 
     def _known(self, dataset: forcegp.Dataset) -> forcegp.Model:
         """The dataset's own model, with the robot and contacts that the options give."""
-        contacts = parse_contacts(self.contact)
-        model = self.robot.chosen_model(dataset, self.log)
+        contacts, model = parse_contacts(self.contact), self.robot.chosen_model(dataset, self.log)
         return model.with_contacts(contacts) if self.contact else model
 
     def _check(self, terminal: Terminal, dataset: forcegp.Dataset, model: forcegp.Model) -> None:
@@ -267,10 +268,6 @@ def fit_report(run: Path, posterior: Any, found: Mapping[str, Any]) -> list[Any]
 
 def _per_joint(values: list[float]) -> str:
     return f"{values[0]:.4g}" if len(set(values)) == 1 else " ".join(f"{value:.3g}" for value in values)
-
-
-SHOWN = {"m": ("mm", 1e3), "kg m^2": ("kg m²", 1.0)}
-"""Units of files, and those that people read, with the factor between them."""
 
 
 def estimates_table(title: str, estimates: Mapping[str, forcegp.posterior.Estimate]) -> Any:

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from forcegp.atomic_files import write_text
+from forcegp.atomic_files import unreadable, write_text
 from forcegp.cli.arguments import COMMANDS, command_class, parsed
 from forcegp.cli.command import Command, options_of
 from forcegp.cli.terminal import Terminal, facts
-from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, spreadsheet_cell
+from forcegp.errors import FileFormatError, ForceGPError, InvalidInput, printable, spreadsheet_cell
 from forcegp.jobs import JOBS, Job, JobStore, run_jobs
 from forcegp.parallel import Jobs
 
@@ -134,7 +134,7 @@ def one(store: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any
             with asked.alone():
                 found = numbers_of(asked.run(terminal))
         except (ForceGPError, OSError, MemoryError) as told:
-            error = " ".join(str(told).split())
+            error = printable(" ".join(str(told).split()))
         except Exception as defect:  # one log must not cost the others theirs
             error = f"an error in forcegp itself, {type(defect).__name__}: {defect}"
     return {"error": error, "warnings": terminal.warnings, "numbers": found}
@@ -172,6 +172,8 @@ def lines_of(command: str, common: Sequence[str], path: Path, out: Path) -> dict
     """By name, the words of each line of a list. Raises InvalidInput for words of no command, and FileFormatError."""
     lines = dict[str, list[str]]()
     try:
+        if why := unreadable(path):
+            raise OSError(f"it {why}")
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise FileFormatError(f"{path} cannot be read ({error}); give a text file with a log in each line.") from None
@@ -180,8 +182,7 @@ def lines_of(command: str, common: Sequence[str], path: Path, out: Path) -> dict
             given = shlex.split(line, comments=True)
             if not given:
                 continue
-            differing = [word.partition("=")[0] for word in given if word.startswith("--")]
-            words = [*_split(common, differing)[1], *given]
+            words = [*_split(common, [word.partition("=")[0] for word in given if word.startswith("--")])[1], *given]
             asked: Any = parsed([command, *words, "--out", str(out)])
             name = (asked.logs[0] if hasattr(asked, "logs") else asked.log).name.partition(".")[0]
             while not name or name in lines or name == JOBS:  # the last is where rows are kept

@@ -23,6 +23,10 @@ Columns = Annotated[str | None, unless_given("COLUMNS", "by the names", str)]
 MappingFile = Annotated[Path | None, MAPPING, unless_given("FILE.yaml", "log.yaml or forcegp.yaml beside it", Path)]
 Text = Annotated[str | None, unless_given("TEXT", "none", str)]
 Seconds = Annotated[float | None, unless_given("S", "all", float)]
+REPAIRED = {
+    "repeated_stamps_dropped": "rows dropped for a repeated time stamp",
+    "rows_in_stretches_too_short": "rows left out in stretches of fewer than 5",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,8 +181,7 @@ class ColumnOptions:
                 terminal.note(f"the columns are mapped by {path}")
         if path is None:
             return self._stated()
-        names = [item.name for item in fields(forcegp.recordings.ColumnMapping)]
-        stored = forcegp.recordings.read_mapping(path, names)
+        stored = forcegp.recordings.read_mapping(path, [item.name for item in fields(forcegp.recordings.ColumnMapping)])
         left = {name: value for name, value in stored.items() if getattr(self, name) in (None, False)}
         try:
             return replace(self, **left)._stated()
@@ -276,12 +279,6 @@ class Import(Command):
             )
         dataset = forcegp.Dataset.load(path)
         return replace(dataset, model=self.robot.chosen_model(dataset, path))
-
-
-REPAIRED = {
-    "repeated_stamps_dropped": "rows dropped for a repeated time stamp",
-    "rows_in_stretches_too_short": "rows left out in stretches of fewer than 5",
-}
 
 
 def _imported(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> str:

@@ -32,8 +32,6 @@ def parse_arguments(words: Sequence[str]) -> Command:
 
 
 OK, INTERNAL_ERROR, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
-
-
 _REMEDIES = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "; free some space, or write elsewhere.")
 _REMEDIES |= dict.fromkeys(
     (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR), "; write to a folder where you may."
@@ -46,6 +44,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     0 ok, 2 an error that the user can mend, 130 interrupted, 1 an error in forcegp itself.
     """
+    for name in ("stdin", "stdout", "stderr"):  # one that is closed: what would be shown goes nowhere
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "r" if name == "stdin" else "w"))
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given == ["--version"]:
         from forcegp import __version__  # 30 ms that only this needs
@@ -101,5 +102,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _fail(message: str, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
-    print(f"forcegp: {printable(' '.join(message.split()))}", file=sys.stderr)
+    with contextlib.suppress(OSError):  # a full disk
+        print(f"forcegp: {printable(' '.join(message.split()))}", file=sys.stderr)
     return code

@@ -27,6 +27,8 @@ WINDOW = 0.4
 WIDER = 2.3
 """Where a base moves, times the windows of a fit: a mass needs less of what is fast than rotors do."""
 LAWS = "viscous", "gear", "offset", "rotor"
+SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
+MOST_FACTORS = 3  # of one cause that a person can look for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,8 +107,7 @@ class Payload(Command):
         title = f"payload in the frame of {content['link']}, beside {beside}; {found.estimates.rows} rows"
         own = {name: each for name, each in found.estimates.items() if name.startswith("payload.")}
         others = {name: each for name, each in found.estimates.items() if name not in own and baseline is None}
-        tables = [estimates_table("joints", others)] if others else []
-        terminal.show(estimates_table(title, own), *tables)
+        terminal.show(estimates_table(title, own), *([estimates_table("joints", others)] if others else []))
         return content
 
     def _rows(self, terminal: Terminal, path: Path, notes: list[str]) -> tuple[forcegp.Model, forcegp.Dataset]:
@@ -155,11 +156,7 @@ def calibrated(found: Any) -> forcegp.Model:
 def payload_dict(found: Any, baseline: bool) -> dict[str, Any]:
     """Payload and other numbers as plain JSON values, with the link that carries it."""
     [payload] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
-    doubts = found.settings["doubts"]
-    return {"link": payload.link, "baseline": baseline, "doubts": doubts, **found.estimates.to_dict()}
-
-
-SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
+    return {"link": payload.link, "baseline": baseline, "doubts": found.settings["doubts"], **found.estimates.to_dict()}
 
 
 def payload_text(found: Any) -> str:
@@ -182,17 +179,13 @@ def drives_of(model: forcegp.Model) -> str:
     return "" if model.robot.base == "fixed" else "thrust coefficients" if thrusters else "torques"
 
 
-MOST_FACTORS = 3  # of one cause that a person can look for
-
-
 def other_causes(payload: Mapping[str, Any]) -> dict[str, str]:
     """What would explain more than this payload, by cause; beside none, what drives and encoders alone do."""
     mass = payload.get("parameters", {}).get("payload.mass", {"value": 1.0, "std": 0.0})
     doubts = [each for each in payload.get("doubts", ()) if each["about"] == "payload"]
     causes = ((cause, len(own), each["what"]) for each in doubts for cause, own in each["numbers"].items())
-    some = mass["value"] > mass["std"]
     return {
         cause: what
         for cause, factors, what in causes
-        if factors <= MOST_FACTORS and (some or cause not in ("lengths", "masses"))
+        if factors <= MOST_FACTORS and (mass["value"] > mass["std"] or cause not in ("lengths", "masses"))
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -13,9 +12,9 @@ from tyro.conf import UseAppendAction, arg
 import forcegp
 import forcegp.mechanics
 import forcegp.posterior
-from forcegp.atomic_files import SUMS, require_unchanged
+from forcegp.atomic_files import SUMS, require_unchanged, unreadable
 from forcegp.cli.command import FIELDS, IDENTIFIED, URDF, listed, numbers_of, split_list, unless_given
-from forcegp.errors import FileFormatError, InvalidInput
+from forcegp.errors import LARGEST, FileFormatError, InvalidInput
 
 SYSTEM_FILE = "system.json"  # where a folder that `forcegp fit` wrote holds robot and known forces
 
@@ -79,8 +78,7 @@ class RobotOptions(RobotFileOptions):
         else:
             assert recorded is not None, "there is one of both"
             text, source = recorded.robot.urdf_text, recorded.robot.source
-            changed = forcegp.Robot.from_urdf_text(text, source=source, inertias=self.inertias, **changes)
-            own = forcegp.Model(changed)
+            own = forcegp.Model(forcegp.Robot.from_urdf_text(text, source=source, inertias=self.inertias, **changes))
         # robots with other joints are refused by their names: clearer than an armature of the wrong length
         if recorded is None or own.robot.joint_names != recorded.robot.joint_names:
             return own
@@ -90,8 +88,7 @@ class RobotOptions(RobotFileOptions):
             robot = robot.with_armature(rotors | changes.get("armature", {}))
         model = recorded.with_robot(robot)
         if self.robot is not None:  # its damping, dry friction and springs
-            there = model.laws
-            new = (law for law in own.laws if not any(law.takes_the_place_of(each) for each in there))
+            new = (law for law in own.laws if not any(law.takes_the_place_of(each) for each in model.laws))
             model = model.with_forces(*new)
         return model
 
@@ -117,8 +114,8 @@ class RobotOptions(RobotFileOptions):
         if not path.exists() and (place / "model.json").exists():
             return identified_system(forcegp.posterior.load_posterior(place).model)  # that of `save_posterior`
         try:
-            if path.is_fifo():  # to open it would wait for a writer for ever
-                raise OSError("it is not a regular file")
+            if why := unreadable(path):
+                raise OSError(f"it {why}")
             return forcegp.Model.from_json(path.read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError) as error:
             raise FileFormatError(
@@ -157,9 +154,9 @@ def _named(words: Sequence[str], option: str, syntax: str) -> dict[str, float]:
             raise InvalidInput(f"{option} {word} is not {syntax}.")
         if name in out:
             raise InvalidInput(f"{option} names {name} twice; give each joint once.")
-        complaint = f"{option} {word}: {text!r} is not a finite number."
+        complaint = f"{option} {word}: {text!r} is not a finite number of at most {LARGEST:g} in SI units."
         [out[name]] = numbers_of(text, complaint, one=True)
-        if not math.isfinite(out[name]):
+        if not abs(out[name]) <= LARGEST:
             raise InvalidInput(complaint)
     return out
 

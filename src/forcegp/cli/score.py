@@ -20,7 +20,7 @@ from forcegp.cli.command import THERE, Command, listed, unless_given
 from forcegp.cli.logs import FilterOptions, prepared_rows
 from forcegp.cli.robot_options import CandidateOptions, RobotOptions, SearchOptions, forces_of, require_same_joints
 from forcegp.cli.terminal import Terminal, columns
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, require_number
 
 IDENTIFICATION = "bodies+viscous+coulomb+rotor@accelerations, @torques:both where the base moves"
 
@@ -74,6 +74,7 @@ class Score(Command):
         """Compute what is missing, write, and show."""
         if not self.paths:
             raise InvalidInput("no LOG is given; give a dataset (.h5), and before it folders of models if wished.")
+        require_number("--guard", self.guard, "give seconds, 0 or more", 0.0)
         *runs, data = self.paths
         fits = bool(self.models.forces or self.split) or not runs
         if data.is_dir():

@@ -15,6 +15,7 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.report
+from forcegp.atomic_files import MARK, is_marked, write_text
 from forcegp.cli.command import THERE, URDF, Command, unless_given
 from forcegp.cli.robot_options import RobotFileOptions
 from forcegp.cli.terminal import Terminal, columns, shown
@@ -45,14 +46,9 @@ class Robot(Command):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Read, show, and write if asked to."""
-
-        def own(path: Path) -> bool:
-            data = path.read_bytes()
-            return b"<mujoco" in data or b"<robot" in data
-
         if self.out is not None:
             require_known("extension", self.out.suffix, "--out", (".xml", ".mjcf", ".urdf"))
-        self.require_free_file(self.out, own, "a robot file")
+        self.require_free_file(self.out, is_marked, "a robot file of forcegp")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", RobotFileWarning)
             model = forcegp.Model.from_file(self.robot, inertias=self.reading.inertias, **self.reading.changes())
@@ -63,9 +59,9 @@ class Robot(Command):
         content = _content(robot) | {"file": str(self.robot), "repaired": repaired}
         content["inputs"] = list(model.inputs)
         terminal.show(*_shown(robot, content))
-        writers = {".xml": model.to_mjcf, ".mjcf": model.to_mjcf, ".urdf": robot.to_urdf}
         if self.out is not None:
-            writers[self.out.suffix](self.out)
+            text, mark = robot.to_urdf() if self.out.suffix == ".urdf" else model.to_mjcf(), f"<!-- {MARK} -->\n"
+            write_text(self.out, text.removesuffix(mark) + mark)
             content["written"] = str(self.out)
             terminal.note(f"wrote {self.out}")
         return content
@@ -148,7 +144,7 @@ class View(Command):
         if len(self.paths) not in (1, 2):
             raise InvalidInput(f"{len(self.paths)} paths were given; give a dataset, or a model and a dataset.")
         *runs, log = self.paths
-        self.require_free_file(self.out, forcegp.report.is_page, "a report")
+        self.require_free_file(self.out, is_marked, "a report of forcegp")
         posterior = forcegp.load_posterior(runs[0]) if runs else None
         recorded = forcegp.report.recorded_scene(
             forcegp.Dataset.load(log), posterior, start=self.start, seconds=self.seconds, shapes=self.shapes

@@ -29,6 +29,11 @@ Scenario = Literal["kuka-surface", "quadruped", "quadrotor"]
 TOOL_FRICTION = arg(metavar="LAW[:COEFFICIENT]", help_behavior_hint="(default: viscous)")
 JOINT_FRICTION = arg(metavar="LAW,...", help_behavior_hint="(default: none; of quadruped stribeck)")
 OF_THE_TOOL = ("tool_friction", "surface")  # options of the scenario that has a tool
+NOISE = 0.1  # rad/s^2, as in the paper
+SEED = 21  # not 1 to 6: those trajectories served to choose the hyperprior, so they would flatter the model
+
+BEST = "S-GP + analytical mean"  # its name in the paper
+EXPERIMENTS = Path("benchmarks", "paper", "reproduction.py")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,12 +117,6 @@ def simulate_with_progress(terminal: Terminal, scenario: str, **options: Any) ->
         return forcegp.simulation.simulate(scenario, **options)
 
 
-NOISE = 0.1  # rad/s^2, as in the paper
-SEED = 21  # not 1 to 6: those trajectories served to choose the hyperprior, so they would flatter the model
-
-BEST = "S-GP + analytical mean"  # its name in the paper
-
-
 @dataclass(frozen=True, kw_only=True)
 class Demo(Command):
     """A robot arm slides its tool on a surface, and a model learns the friction of the tool.
@@ -182,9 +181,6 @@ class Demo(Command):
         return results
 
 
-EXPERIMENTS = Path("benchmarks", "paper", "reproduction.py")
-
-
 @dataclass(frozen=True, kw_only=True)
 class Reproduce(Command):
     """Compute figures of Rath, Geist, Trimpe (2021) beside the published values. Needs a clone of the repository.
@@ -222,8 +218,7 @@ class Reproduce(Command):
         with terminal.progress(f"reproducing {self.figure} ({self.preset})"):
             how: dict[str, Any] = {"command": command, "docs": None, "jobs": checked_jobs(self.jobs)}
             summaries = reproduce(experiments, self.preset, out, **how)
-        page = out / page_of(experiments)
-        terminal.show(f"{page} reports the results; figures, JSON and CSV are in {out / NAME}.")
+        terminal.show(f"{out / page_of(experiments)} reports the results; figures, JSON and CSV are in {out / NAME}.")
         return {"out": str(out), "preset": self.preset, "figures": summaries}
 
 

@@ -26,6 +26,11 @@ _ARGUMENT = re.compile(r"`([a-z_.]+)(?:=([^`]*))?`")
 
 OTHERWISE = {"contacts": "contact", "folder": "out", "locked": "lock", "model": "robot"}
 """Options whose argument has another name in Python."""
+PLAIN_SECONDS = 10.0  # between two lines about progress where there is no terminal to draw a bar on
+UNLIMITED = 10_000  # columns of a terminal that cuts nothing
+NONE = "–"
+COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}  # of doubts by their level
+PLAIN: dict[str, Any] = {"title_justify": "left", "title_style": "bold", "pad_edge": False}
 
 
 def with_option_names(message: str, options: Collection[str]) -> str:
@@ -42,12 +47,6 @@ def with_option_names(message: str, options: Collection[str]) -> str:
     return _ARGUMENT.sub(option, message)
 
 
-PLAIN_SECONDS = 10.0  # between two lines about progress where there is no terminal to draw a bar on
-
-
-UNLIMITED = 10_000  # columns of a terminal that cuts nothing
-
-
 def _console(**how: Any) -> Console:
     from rich.console import Console
     from rich.segment import Segment
@@ -59,6 +58,9 @@ def _console(**how: Any) -> Console:
             for segment in super().render(*given, **more):
                 shown = segment.control or printable(segment.text) == segment.text
                 yield segment if shown else Segment(printable(segment.text), segment.style)
+
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError  # rich would end with the code of an error
 
     return Plain(highlight=False, markup=False, emoji=False, **how)
 
@@ -178,13 +180,6 @@ class Terminal:
                 self.note(f"{what}: {done / total:.0%}{note and f', {note}'}")
 
         return report
-
-
-NONE = "–"
-
-
-COLORS = {"wrong": "bold red", "look": "yellow", "ok": "green"}  # of doubts by their level
-PLAIN: dict[str, Any] = {"title_justify": "left", "title_style": "bold", "pad_edge": False}
 
 
 def facts(title: str, values: Mapping[str, str]) -> Table:

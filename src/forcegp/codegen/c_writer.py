@@ -14,6 +14,8 @@ from math import factorial
 
 from forcegp.codegen.graph import LEAVES, Graph
 
+LANE_BY_LANE = ("tan",)
+
 
 @cache
 def c_text(module: str, file: str) -> str:
@@ -31,9 +33,6 @@ def filled(text: str, words: Mapping[str, object]) -> str:
     return re.sub("@([A-Z_0-9]+)@", lambda found: str(words[found[1]]), text)
 
 
-LANE_BY_LANE = ("tan",)
-
-
 def _horner(coefficients: list[float], variable: str) -> str:
     """A polynomial, the highest power first."""
     text = f"R({coefficients[0].hex()})"
@@ -46,8 +45,6 @@ _EXPM1 = _horner([1.0 / factorial(n) for n in range(14, 0, -1)], "r")
 _SIN = _horner([(-1.0) ** n / factorial(2 * n + 1) for n in range(7, -1, -1)], "z")
 _COS = _horner([(-1.0) ** n / factorial(2 * n) for n in range(8, -1, -1)], "z")
 _ATANH = _horner([2.0 / (2 * n + 1) for n in range(11, 0, -1)], "z")
-
-
 STATEMENTS = 500  # per part
 LONG_PART = 2500  # of dynamics, whose values are used again soon: 10-20 % faster, compiled as fast
 

@@ -30,6 +30,8 @@ COMPARED = {"less": operator.lt, "at_most": operator.le, "equal": operator.eq}
 BINARY: dict[str, Callable[[float, float], float]] = {**ARITHMETIC, "power": math.pow, "atan2": math.atan2, **COMPARED}
 COMMUTATIVE = ("add", "multiply", "equal")
 LEAVES = ("constant", "input")
+FLAT = ("less", "at_most", "equal", "look up", "input", "constant", "call")
+"""Without derivatives; a call is used through its outputs."""
 
 
 class Graph:
@@ -214,10 +216,6 @@ def interpreted(
             table = rest[:1] if operation == "look up" else []
             found[node] = functions[operation](*table, *(found[x] for x in graph.operands(node)))
     return [found[node] for node in outputs]
-
-
-FLAT = ("less", "at_most", "equal", "look up", "input", "constant", "call")
-"""Without derivatives; a call is used through its outputs."""
 
 
 def jacobian(

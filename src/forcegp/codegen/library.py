@@ -32,10 +32,14 @@ PACKAGES = (
 )
 LONGEST = 600.0
 """Seconds after which a compiler hangs: our longest program takes it a fiftieth of that."""
-
-
 WITHOUT = "or do without it: a robot itself, predictor(compile=False), export_c(unchecked=True)"
 ELSEWHERE = "choose another folder (the environment variable XDG_CACHE_HOME, robot.compile(folder=...))"
+MOST_LANES, STATES_PER_THREAD = 8, 2048  # fewer states are done before another thread has started
+NOT_FINITE, NOT_POSITIVE, RESULT_NOT_FINITE = 1, 2, 4
+"""What a program reports of its states: bits of its return value."""
+# Lanes and compiler options by the vector unit that torch found.
+VECTOR_UNITS = {"AVX512": (8, ("-mavx512f", "-mavx512dq", "-mavx512vl", "-mfma")), "AVX2": (4, ("-mavx2", "-mfma"))}
+OPTIONS = ("-std=gnu11", "-O2", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-fPIC", "-shared")
 
 
 def compiler() -> list[str]:
@@ -94,11 +98,6 @@ def require_plain(tensors: Iterable[Tensor], what: str, remedy: str) -> None:
     if transformed or dual:
         kind = "transforms of torch.func (vmap, grad, jacrev, ...)" if transformed else "forward-mode differentiation"
         raise InvalidInput(f"{what} does not support {kind}; {remedy}.")
-
-
-# Lanes and compiler options by the vector unit that torch found.
-VECTOR_UNITS = {"AVX512": (8, ("-mavx512f", "-mavx512dq", "-mavx512vl", "-mfma")), "AVX2": (4, ("-mavx2", "-mfma"))}
-OPTIONS = ("-std=gnu11", "-O2", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-fPIC", "-shared")
 
 
 def vector_unit() -> tuple[int, tuple[str, ...]]:
@@ -184,11 +183,6 @@ def own_file(path: Path, *, parent: bool = False) -> None:
             f"{path} can be written to by others than you, {danger}; take that away (chmod go-w "
             f"{shlex.quote(str(path))}), or {ELSEWHERE}."
         )
-
-
-MOST_LANES, STATES_PER_THREAD = 8, 2048  # fewer states are done before another thread has started
-NOT_FINITE, NOT_POSITIVE, RESULT_NOT_FINITE = 1, 2, 4
-"""What a program reports of its states: bits of its return value."""
 
 
 class RowFunction:

@@ -29,6 +29,10 @@ from forcegp.posterior.preparation import rows_for
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, real_tensor, whole_number
 
+LOOKED_AT, SLOPE, SLOW = 50, 1e-4, 1.0
+"""Training states at which rates are looked at, the change of q and v for them, and the largest rate times a step for
+which rk4 is taken: it diverges beyond 2.8."""
+
 
 class Controller:
     """Limits the torques of a call, and raises where it cannot compute any.
@@ -297,11 +301,6 @@ class HybridForce(TrackingController):
         u = torques_for(self.predictor, q, v_d, at.M @ a - at.A.mT @ self.wanted, self.last, at, self.past)
         # where that finds none with shorter steps, or its error
         return self.predictor.inverse_dynamics(q, v_d, a, self.wanted, self.past.z).mean if u is None else u
-
-
-LOOKED_AT, SLOPE, SLOW = 50, 1e-4, 1.0
-"""Training states at which rates are looked at, the change of q and v for them, and the largest rate times a step for
-which rk4 is taken: it diverges beyond 2.8."""
 
 
 def usual_integrator(predictor: Predictor, dt: float) -> str:

@@ -15,6 +15,13 @@ from forcegp.errors import ContactError, ForceGPError
 FARTHEST = 5e-3  # m
 ALONG_NORMAL, CREEP = 0.02, 2e-3
 """Velocity along the normal relative to that along the surface, and in m/s, that is none."""
+MOST_ROWS, FEWEST_ROWS = 240, 10
+FAR = 0.01  # m
+HARDLY_ANY = 0.2  # share of rows that move along a surface, below which it is another one
+BROKEN, NOISE = 0.2, 3.0
+"""|A a - b| relative to the acceleration of the point, and to its noise, beyond which the contact does not hold."""
+
+LEAVE_OUT = "leave the contact out (`contacts=none`)."
 
 
 def rows_in_contact(dataset: Dataset) -> Dataset:
@@ -28,15 +35,6 @@ def rows_in_contact(dataset: Dataset) -> Dataset:
     if off or not touching.any():
         raise ContactError(str(off[0]) if off else "the points of the contacts never move along their surfaces.")
     return dataset.rows(touching)
-
-
-MOST_ROWS, FEWEST_ROWS = 240, 10
-FAR = 0.01  # m
-HARDLY_ANY = 0.2  # share of rows that move along a surface, below which it is another one
-BROKEN, NOISE = 0.2, 3.0
-"""|A a - b| relative to the acceleration of the point, and to its noise, beyond which the contact does not hold."""
-
-LEAVE_OUT = "leave the contact out (`contacts=none`)."
 
 
 def contact_doubts(dataset: Dataset, model: forcegp.Model | None = None) -> Doubts:

@@ -25,6 +25,8 @@ from forcegp.summary import Summary, listed, rounded
 
 ROTATION = {"q": "rad", "v": "rad/s", "u": "Nm", "a": "rad/s^2"}  # units of a revolute or continuous joint
 TRANSLATION = {"q": "m", "v": "m/s", "u": "N", "a": "m/s^2"}  # units of a prismatic joint
+SENSORS = FORCE, IMU, TORQUE = "force.", "imu.", "torque."
+"""Begin names of measured forces and what accelerometers measure, by frame, and of torques at links, by joint."""
 
 
 def units_for(robot: forcegp.robots.Robot) -> dict[str, Any]:
@@ -33,6 +35,11 @@ def units_for(robot: forcegp.robots.Robot) -> dict[str, Any]:
     each = {name: tuple(kind[name] for kind in kinds) for name in ROTATION}
     return {name: texts[0] if len(set(texts)) == 1 else texts for name, texts in each.items()} | {"time": "s"}
 
+
+LARGEST_MEASURED = 1e15
+"""Whatever its SI unit, no sensor measures more; squares of squares of it are finite."""
+BEYOND = f"above {LARGEST_MEASURED:g}: of another unit, or of another register."
+SHORTEST_STEP = 1e-9  # s
 
 ORDER = "a", "lambda", "Q_U"
 TRUTH = re.compile(r"a|lambda|Q_U|(Q_U|force)\.[a-zA-Z0-9-]*[a-zA-Z0-9][a-zA-Z0-9-]*")
@@ -109,7 +116,7 @@ class Dataset(Summary):
         put("noise_std", _noise_std(self.noise_std, names))
         if self.strokes is not None:
             past = real_array("strokes", self.strokes, "fiu", DatasetError).astype(np.float64)
-            if past.ndim != 3 or past.shape[:2] != self.v.shape or not np.isfinite(past).all():
+            if past.ndim != 3 or past.shape[:2] != self.v.shape or not (np.abs(past) <= LARGEST_MEASURED).all():
                 raise DatasetError(f"strokes have shape {past.shape}; give finite numbers ({rows}, {len(names)}, k).")
             put("strokes", _read_only(past))
         put("measured", _measured(self.measured, rows, robot))
@@ -222,10 +229,6 @@ def _noise_std(given: object, joint_names: tuple[str, ...]) -> np.ndarray | None
     return values
 
 
-SENSORS = FORCE, IMU, TORQUE = "force.", "imu.", "torque."
-"""Begin names of measured forces and what accelerometers measure, by frame, and of torques at links, by joint."""
-
-
 def imu_place(name: str) -> tuple[str, list[float], Float[np.ndarray, "3 3"]]:
     """Frame, point [m] and axes of "imu.FRAME@x,y,z,roll,pitch,yaw", of which the end may lack. Raises InvalidInput."""
     frame, at, numbers = name.removeprefix(IMU).partition("@")
@@ -286,16 +289,11 @@ def finite_columns(
         raise DatasetError(f"{name} has {len(values)} {what}; expected {rows}.")
     if values.shape[0] == 0:
         raise DatasetError(f"{name} has no {what}; at least one is needed.")
-    bad = ~np.isfinite(values)
-    if bad.any():
-        position = np.argwhere(bad)[0]
-        column = ""
-        if columns is not None:
-            column = f", column {position[1]}" + (f" ({columns[position[1]]})" if columns else "")
-        raise DatasetError(
-            f"{name} is {values[tuple(position)]} at row {position[0]}{column}; "
-            f"{int(bad.sum())} values are not finite. Drop or repair these rows first."
-        )
+    for bad, how in (~np.isfinite(values), "not finite."), (np.abs(values) > LARGEST_MEASURED, BEYOND):
+        for row, *at in np.argwhere(bad)[:1]:
+            column = f", column {at[0]}" + (f" ({columns[at[0]]})" if columns else "") if at else ""
+            seen = f"{name} is {values[row, *at]} at row {row}{column}; {int(bad.sum())} values are {how}"
+            raise DatasetError(f"{seen} Drop or repair these rows first.")
     return _read_only(values)
 
 
@@ -308,7 +306,7 @@ def _read_only(values: np.ndarray) -> np.ndarray:
 def _first_disorder(time: np.ndarray, episode: np.ndarray) -> int | None:
     """Row whose time does not come after that of the row before it in the same episode."""
     order = np.argsort(episode, kind="stable")  # stable: keeps the order of rows inside an episode
-    wrong = (np.diff(time[order]) <= 0) & (np.diff(episode[order]) == 0)
+    wrong = (np.diff(time[order]) < SHORTEST_STEP) & (np.diff(episode[order]) == 0)
     return int(order[1:][wrong].min()) if wrong.any() else None
 
 
@@ -322,7 +320,7 @@ def _check_time(time: np.ndarray, episode: np.ndarray, ordered: bool) -> None:
         raise DatasetError(f"time {at} s occurs twice in episode {number}; drop the repeated rows.")
     raise DatasetError(
         f"time does not increase at row {row} (episode {number}, time {at} s). "
-        "Sort the rows, drop repeated time stamps, or number a new recording as a new episode."
+        "Sort the rows, drop stamps less than a nanosecond apart, or number a new recording as a new episode."
     )
 
 

@@ -22,6 +22,8 @@ Values = Float[np.ndarray, "rows *columns"]
 TRANSIENT = 1e-3  # what is left of a filter's transient at the ends of a recording; sets the length of the padding
 PASSED = 3.0  # rows in a period of a cut-off, of which more repeat their neighbours (`LowPass.memory`)
 HALF = 0.32434  # periods of a cut-off in which the autocorrelation of white noise behind it falls to one half
+JITTER = 0.01
+"""Largest deviation of a time step from the median step, relative to it, that still counts as uniform sampling."""
 
 
 @dataclass(frozen=True)
@@ -94,8 +96,7 @@ def low_pass(dataset: Dataset, cutoff: float, *, signals: Sequence[Signal] = ("q
         if name == "q":
             require_no_turns(rows, label)
             return through(rows.model.robot.space, rows.q, lambda q: smooth(q, rows.time))
-        values = getattr(rows, name)
-        forces = len(rows.model.actuators) if name == "u" else rows.nv
+        values, forces = getattr(rows, name), len(rows.model.actuators) if name == "u" else rows.nv
         return np.concatenate([smooth(values[:, :forces], rows.time), values[:, forces:]], axis=1)
 
     def all_of(rows: Dataset, label: str) -> dict[str, np.ndarray]:
@@ -122,10 +123,6 @@ def shifted(dataset: Dataset, delay: float, lag: float = 0.0, lagging: Sequence[
         return {"u": u}
 
     return replace(dataset, **by_episode(dataset, acting), truth={})
-
-
-JITTER = 0.01
-"""Largest deviation of a time step from the median step, relative to it, that still counts as uniform sampling."""
 
 
 def differentiate(
@@ -226,8 +223,7 @@ def sums_before(
     values: Float[np.ndarray, "rows k"], time: Float[np.ndarray, " rows"], seconds: float
 ) -> Float[np.ndarray, "rows k"]:
     """Sums of the rows before each, with weights exp(-age / seconds); zero for the first."""
-    sums = np.zeros_like(values)
-    keep = np.exp(-np.diff(time) / seconds)
+    sums, keep = np.zeros_like(values), np.exp(-np.diff(time) / seconds)
     for row in range(1, len(values)):
         sums[row] = keep[row - 1] * (sums[row - 1] + values[row - 1])
     return sums

@@ -64,6 +64,8 @@ def _attribute(file: h5py.File, name: str) -> Any:
 
 def is_dataset(path: Path) -> bool:
     """Whether a file is a dataset of this or another version."""
+    if not path.is_file():  # a pipe would be waited for
+        return False
     try:
         with h5py.File(path, "r") as file:
             return isinstance(kind := _attribute(file, "format"), str) and kind == FORMAT

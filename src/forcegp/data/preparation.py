@@ -31,6 +31,8 @@ from forcegp.summary import plain
 
 FEW = 2_000  # rows of a whole log
 SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
+BEYOND_BASE = 1.5
+"""The cut-off of a robot on contacts is at most so many times that of its base, whose accelerations are noise there."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,10 +136,6 @@ def preparation_report(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
     """`metadata["preparation"]` as a `Preparation` leaves it; empty for what others may have put there."""
     report = metadata.get("preparation")
     return report if isinstance(report, Mapping) and {"cutoff", "why", "rows"} <= report.keys() else {}
-
-
-BEYOND_BASE = 1.5
-"""The cut-off of a robot on contacts is at most so many times that of its base, whose accelerations are noise there."""
 
 
 def _cutoff(dataset: Dataset, source: Literal["q", "v"]) -> tuple[float | None, str]:

@@ -28,6 +28,10 @@ LEAST_RISE = 10.0
 
 LEAST_NOISE = 1e-3
 """Noise of the unfiltered acceleration, relative to its spread, below which there is nothing to filter."""
+FACTORS = 0.5, 0.7, 1.0, 1.4, 2.0  # of the cut-off that the spectrum shows
+MOST_ROWS, MOST_NUMBERS = 20_000, 2.5e7
+FOLDS = 8  # stretches of time: the odd ones judge what the even ones teach, and the other way round
+SETTLED = 2.0  # periods of the lowest cut-off at the ends of an episode that filters spoil
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -155,12 +159,6 @@ def _knee_and_floor(
     return float(knee), floor, cutoff if cutoff <= HIGHEST * frequency[-1] else np.nan
 
 
-FACTORS = 0.5, 0.7, 1.0, 1.4, 2.0  # of the cut-off that the spectrum shows
-MOST_ROWS, MOST_NUMBERS = 20_000, 2.5e7
-FOLDS = 8  # stretches of time: the odd ones judge what the even ones teach, and the other way round
-SETTLED = 2.0  # periods of the lowest cut-off at the ends of an episode that filters spoil
-
-
 def held_out_cutoff(
     dataset: Dataset, cutoff: float, source: Literal["q", "v"] = "q"
 ) -> tuple[float, dict[float, float]]:
@@ -194,8 +192,7 @@ def _judged(dataset: Dataset, cutoff: float, source: Literal["q", "v"]) -> tuple
 
     delay = np.nan_to_num(estimate_delay(behind(cutoff), cutoff).common)  # the best guess, sure or not
     log = shifted(log, float(delay))
-    away = SETTLED / tried[0] + abs(delay)
-    times = [rows.time for _, rows, _ in episodes_in_order(log)]
+    away, times = SETTLED / tried[0] + abs(delay), [rows.time for _, rows, _ in episodes_in_order(log)]
     inner = np.concatenate([(time >= time[0] + away) & (time <= time[-1] - away) for time in times])
     sides = [np.concatenate(np.array_split(np.arange(int(inner.sum())), FOLDS)[first::2]) for first in (0, 1)]
     sharp = torque_columns(behind(tried[-1]))

@@ -114,8 +114,7 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
     episodes = [order[dataset.episode[order] == number] for number in dataset.episodes]
     motion, asked = _motion_and_force(dataset, model, names)
     speed, force = (np.empty((len(dataset), len(names))) for _ in range(2))
-    noise = np.empty(len(names))
-    times = [dataset.time[rows] for rows in episodes]
+    noise, times = np.empty(len(names)), [dataset.time[rows] for rows in episodes]
     widths = [2 * int(0.5 * WINDOW / np.median(np.diff(t))) + 1 if len(t) > 1 else 1 for t in times]
     for k, (own, needed) in enumerate(zip(motion, asked, strict=True)):
         smooth = np.empty_like(own)
@@ -207,8 +206,7 @@ def _bearing(force: np.ndarray, moves: np.ndarray, quiet: bool = True) -> Float[
         if cost < best and means[1] - means[0] > APART * widths.sum():
             between = np.linspace(means[0], means[1], 200)
             density = np.log(shares / widths) - 0.5 * np.square((between[:, None] - means) / widths)
-            likelier = density[:, 1] - density[:, 0]
-            sure = np.log(CERTAIN)
+            likelier, sure = density[:, 1] - density[:, 0], np.log(CERTAIN)
             if (likelier < -sure).any() and (likelier > sure).any():
                 best, limits = cost, np.exp([between[likelier < -sure][-1], between[likelier > sure][0]])
     if not (limits[0] <= BEARS * standing and (few or np.median(force[moves]) < limits[1])):
@@ -218,8 +216,7 @@ def _bearing(force: np.ndarray, moves: np.ndarray, quiet: bool = True) -> Float[
 
 def _between(flags: np.ndarray, time: Float[np.ndarray, " rows"]) -> np.ndarray:
     """Open rows with what was decided before and after them, where that is the same; rows near others are open."""
-    rows = np.arange(len(flags))
-    filled = flags.copy()
+    rows, filled = np.arange(len(flags)), flags.copy()
     for own, out in zip(flags.T, filled.T, strict=True):
         decided = np.flatnonzero(np.isfinite(own))
         if len(decided):

@@ -21,6 +21,18 @@ Select = Callable[[Dataset, int], Int[np.ndarray, " chosen"]]
 BLOCK = 4096  # rows
 EVEN_STEPS = 1e-3  # of a duration: rounding
 LEAP = 0.3  # median step of a position over its standard deviation, from which rows are no motion (random states: 0.95)
+RESTS, IDLE = 0.01, 0.1
+"""Share of its whole range within which a joint rests; of the largest range, which counts for idle joints."""
+STILL, SHORTEST, OFTEN, ALONE = 1e-3, 0.3, 0.25, 0.95
+"""Share of its range within which a joint stays for the shortest rest [s]; shares of rests in postures, and alone."""
+CLIPPED_RATIO = 8.0  # rows at the extreme value over rows in the next thousandth of the range: a smooth peak has 2.4
+CLIPPED_ROWS = 10
+FORGOTTEN = 3.0
+"""Way times sigma after which what a joint remembered before an episode counts for less than a twentieth."""
+GAP = 1.5  # a pause of more than this many median steps is a gap, over which no motion goes
+MOTION = 1.5  # ratio of noise as seen by third and by fourth differences above which they see motion instead
+FEWEST_DIFFERENCES, MOST_DIFFERENCES = 30, 3000
+ROUNDING = 1e-13  # standard deviation, relative to the largest entry, below which a column is constant but for rounding
 
 
 def tensors(rows: Dataset, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -56,18 +68,11 @@ def consecutive(dataset: Dataset) -> Bool[np.ndarray, " rows"]:
 
 def move_on(dataset: Dataset) -> bool:
     """Whether rows that follow each other belong to one motion; a sample of rows or of random states leaps about."""
-    steps = np.abs(np.diff(dataset.q, axis=0))[consecutive(dataset)[:-1]]
-    spread = dataset.q.std(axis=0)
+    steps, spread = np.abs(np.diff(dataset.q, axis=0))[consecutive(dataset)[:-1]], dataset.q.std(axis=0)
     moving = spread > 0.0
     if not len(steps) or not moving.any():
         return bool(len(steps))
     return bool((np.median(steps, axis=0)[moving] < LEAP * spread[moving]).any())
-
-
-RESTS, IDLE = 0.01, 0.1
-"""Share of its whole range within which a joint rests; of the largest range, which counts for idle joints."""
-STILL, SHORTEST, OFTEN, ALONE = 1e-3, 0.3, 0.25, 0.95
-"""Share of its range within which a joint stays for the shortest rest [s]; shares of rests in postures, and alone."""
 
 
 def postures(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
@@ -146,10 +151,6 @@ def runs(marked: Bool[np.ndarray, " rows"]) -> Int[np.ndarray, "runs 2"]:
     return np.flatnonzero(np.diff(marked, prepend=False, append=False)).reshape(-1, 2)
 
 
-CLIPPED_RATIO = 8.0  # rows at the extreme value over rows in the next thousandth of the range: a smooth peak has 2.4
-CLIPPED_ROWS = 10
-
-
 def resolution(values: Float[np.ndarray, " rows"]) -> float:
     """The least step between two values of a channel that is not constant."""
     return float(np.diff(np.unique(np.round(values / np.ptp(values), 9))).min() * np.ptp(values))
@@ -203,10 +204,6 @@ def with_memory(dataset: Dataset, model: Model) -> Dataset:
     first = model.memory_column
     u = np.concatenate([bare[:, :first], columns, bare[:, first:]], axis=1)
     return replace(dataset, u=u, model=replace(dataset.model, forces=model.laws))
-
-
-FORGOTTEN = 3.0
-"""Way times sigma after which what a joint remembered before an episode counts for less than a twentieth."""
 
 
 def past_known(dataset: Dataset, model: Model) -> Bool[np.ndarray, " rows"]:
@@ -287,9 +284,6 @@ def recorded_motions(dataset: Dataset, starts: int | Sequence[int], seconds: flo
     return RecordedMotions(tuple(chosen.tolist()), dt, dataset.q[index], dataset.v[index], dataset.u[index[:, :-1]])
 
 
-GAP = 1.5  # a pause of more than this many median steps is a gap, over which no motion goes
-
-
 def median_step(recording: Dataset) -> float:
     """Of time, in s; infinite where every episode has one row."""
     pauses = np.diff(recording.time)[consecutive(recording)[:-1]]
@@ -311,8 +305,7 @@ def all_motions(dataset: Dataset, seconds: float, longest_step: float) -> tuple[
     """
     dt, before = _even_steps(dataset)
     stride = max(1, int(longest_step / dt * (1.0 + EVEN_STEPS)))
-    steps = stride * max(1, round(seconds / dt / stride))
-    starts = list[int]()
+    steps, starts = stride * max(1, round(seconds / dt / stride)), list[int]()
     for number in dataset.episodes:
         rows = np.flatnonzero(dataset.episode == number)
         firsts = rows[: len(rows) - steps : steps]
@@ -333,10 +326,6 @@ def _even_steps(dataset: Dataset) -> tuple[float, Int[np.ndarray, " rows"]]:
         raise InvalidInput("every episode has one row only; a rollout is compared with a motion of several rows.")
     dt = float(np.median(own))
     return dt, np.concatenate([[0], np.cumsum(np.abs(pauses - dt) > JITTER * dt)])
-
-
-MOTION = 1.5  # ratio of noise as seen by third and by fourth differences above which they see motion instead
-FEWEST_DIFFERENCES, MOST_DIFFERENCES = 30, 3000
 
 
 def white_noise(log: Dataset, width: int = 1, signal: str = "a") -> Float[np.ndarray, " nv"] | None:
@@ -367,9 +356,6 @@ def repeated_rows(trained: tuple[np.ndarray, np.ndarray, np.ndarray], test: Data
     return np.array([number for number, row in enumerate(rows) if row.tobytes() in found], dtype=np.int64)
 
 
-ROUNDING = 1e-13  # standard deviation, relative to the largest entry, below which a column is constant but for rounding
-
-
 def farthest_point_sampling(
     points: Float[np.ndarray, "rows features"], count: int, *, start: int = 0
 ) -> Int[np.ndarray, " count"]:
@@ -385,8 +371,7 @@ def farthest_point_sampling(
     columns = columns / np.maximum(np.abs(columns).max(axis=1, keepdims=True), 1e-300)  # so that std cannot overflow
     centred, spread = columns - columns.mean(axis=1, keepdims=True), columns.std(axis=1, keepdims=True)
     columns = np.where(spread >= ROUNDING, centred / np.maximum(spread, ROUNDING), 0.0)
-    distance = np.full(rows, np.inf)
-    chosen = np.empty(count, dtype=np.int64)
+    distance, chosen = np.full(rows, np.inf), np.empty(count, dtype=np.int64)
     chosen[0] = whole_number("start", start, 0, rows - 1, "the last row")
     for position in range(count):
         if position:

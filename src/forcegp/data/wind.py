@@ -208,8 +208,7 @@ def _first_winds(forces: _Forces, own: np.ndarray, count: int) -> np.ndarray:
     slopes[:, [0, 1], [0, 1]] = -forces.velocity[:, :2]
     X = np.concatenate([slopes, constant[:, :2, :, :2].reshape(len(own), 2, -1)], axis=-1)
     found = np.linalg.lstsq(X.reshape(-1, X.shape[-1]), forces.wrench[:, :2].ravel(), rcond=1e-8)[0]
-    drag = max(float(found[:2].mean()), 1e-3)
-    wind = np.zeros((count, 3))
+    drag, wind = max(float(found[:2].mean()), 1e-3), np.zeros((count, 3))
     wind[:, :2] = found[2:].reshape(count, 2) / drag
     return np.clip(wind, -0.5 * STRONGEST, 0.5 * STRONGEST)
 

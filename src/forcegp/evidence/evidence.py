@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 from typing import ClassVar, Literal
 
 from forcegp.data.dataset import FORCE, IMU, TORQUE, Dataset
-from forcegp.errors import InvalidInput, require_known, require_number, usable_arguments
+from forcegp.errors import LARGEST, InvalidInput, require_known, require_number, usable_arguments
 from forcegp.forces.registry import called
 
 
@@ -81,7 +81,7 @@ class Motions(Evidence):
 
     @usable_arguments("Motions")
     def __post_init__(self) -> None:
-        require_number("Motions seconds", self.seconds, "give the length of windows in s, a positive number")
+        require_number("Motions seconds", self.seconds, "give the length of windows in s, above 0", below=LARGEST)
 
     @staticmethod
     def refuse(unknown_forces: Sequence[object]) -> None:

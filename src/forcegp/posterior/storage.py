@@ -24,6 +24,7 @@ from forcegp.inference import OptimizationResult, engine_from_dict
 from forcegp.model import Model
 from forcegp.posterior.fitted import Estimates
 from forcegp.posterior.posterior import Posterior
+from forcegp.robots.urdf_file import read_text
 
 KIND = "forcegp posterior"
 FORMAT_VERSION = 1
@@ -125,7 +126,7 @@ def load_posterior(path: str | Path) -> Posterior:
 
 
 def _model(urdf: Path, stored: Mapping[str, Any]) -> Model:
-    return Model.from_dict({**stored, "urdf": urdf.read_bytes().decode("utf-8")})
+    return Model.from_dict({**stored, "urdf": read_text(urdf)})
 
 
 def _rows(prefix: str, tensors: Mapping[str, torch.Tensor], model: Model) -> TrainingData:

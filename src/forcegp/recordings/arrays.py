@@ -4,6 +4,7 @@ import fnmatch
 import json
 import math
 import re
+import tempfile
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -14,7 +15,6 @@ from typing import Any
 
 import h5py
 import numpy as np
-import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.lib import format as npy
 from pyarrow import parquet, types
@@ -22,6 +22,8 @@ from typing_extensions import override
 
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput
 from forcegp.recordings.source import (
+    HARMLESS,
+    LARGEST_EXPANSION,
     LONGEST_VECTOR,
     Columns,
     Source,
@@ -32,10 +34,14 @@ from forcegp.recordings.source import (
     require_plausible_size,
 )
 from forcegp.recordings.tables import seconds_of
+from forcegp.robots.sandbox import MEMORY, SECONDS, read_apart
 from forcegp.summary import listed
 
 SEPARATOR = "/"
 MOST_NAMES = 12  # of arrays in a message
+NUMPY, HDF5, MATLAB, PARQUET = "a NumPy archive", "an HDF5 file", "a MATLAB file", "a Parquet file"
+INTERNAL = "#"  # begins names under which MATLAB keeps the contents of cells
+REFERENCE = np.dtype(object)
 
 Arrays = Mapping[str, tuple[tuple[int, ...], Callable[[], np.ndarray]]]
 """By full name, shape and content of every array of numbers in a file."""
@@ -110,18 +116,15 @@ class ArrayFile(Source):
         return {name: tables[own] if at is None else tables[own][:, at] for name, (own, at) in places.items()}
 
 
-NUMPY = "a NumPy archive", zipfile.BadZipFile, NotImplementedError
-
-
 def numpy_arrays(path: Path) -> Arrays:
     """Of an .npz file. What it claims to hold is compared with its size before anything is expanded."""
 
     def content(name: str) -> np.ndarray:
-        with reading(path, *NUMPY), np.load(path, allow_pickle=False) as archive:
+        with reading(path, NUMPY), np.load(path, allow_pickle=False) as archive:
             return archive[name]
 
     found = {}
-    with reading(path, *NUMPY), zipfile.ZipFile(path) as archive:
+    with reading(path, NUMPY), zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         require_plausible_size(path, "the archive", sum(x.file_size for x in members), path.stat().st_size)
         for member in members:
@@ -144,9 +147,6 @@ def numpy_arrays(path: Path) -> Arrays:
             if dtype.kind in "fiu":
                 found[name] = shape, lambda name=name: content(name)
     return found
-
-
-HDF5 = "an HDF5 file"
 
 
 def hdf5_arrays(path: Path) -> Arrays:
@@ -181,11 +181,6 @@ def _stored(path: Path, group: h5py.Group, prefix: str) -> Iterator[tuple[str, t
             yield full, tuple(item.shape)
 
 
-MATLAB = "a MATLAB file"
-INTERNAL = "#"  # begins names under which MATLAB keeps the contents of cells
-REFERENCE = np.dtype(object)
-
-
 def matlab_arrays(path: Path) -> Arrays:
     """Of a .mat file: its matrices, and those in structs, called `struct/field`, and in cells. Vectors lie either way.
 
@@ -202,14 +197,16 @@ def matlab_arrays(path: Path) -> Arrays:
             name: (shape, lambda name=name, shape=shape: arrays[name][1]().T.reshape(shape))
             for name, shape in upright.items()
         }
-    from scipy.io import loadmat, matlab
-
-    with reading(path, MATLAB, matlab.MatReadError, NotImplementedError, MemoryError, IndexError):
-        size = path.stat().st_size
-        for name, shape, _ in matlab.whosmat(str(path)):
-            require_plausible_size(path, repr(name), 8 * math.prod(shape), size)
-        content = loadmat(str(path), simplify_cells=True)
-        return _lists({name: value for name, value in content.items() if not name.startswith("__")})
+    with reading(path, MATLAB), tempfile.TemporaryDirectory() as folder:
+        kept, size = Path(folder, "kept.npz"), path.stat().st_size
+        asked = {"path": str(path), "kept": str(kept), "most": max(HARMLESS, LARGEST_EXPANSION * size)}
+        asked |= {"seconds": SECONDS + (size >> 22), "memory": MEMORY + 50 * size}
+        answer = read_apart("matlab", str(path), asked, FileFormatError, "save it again, as arrays of numbers")
+        if "refused" in answer:
+            raise ValueError(answer["refused"])
+        with np.load(kept, allow_pickle=False) as arrays:
+            restored = {name: arrays[name] for name in arrays.files}
+        return _lists(json.loads(answer["content"], object_hook=lambda own: restored[own["#"]] if "#" in own else own))
 
 
 def _referred(file: h5py.File, item: Any) -> Any:
@@ -256,7 +253,7 @@ def _numbers(value: Any, name: str) -> Iterator[tuple[str, np.ndarray]]:
             yield from _numbers(dict(zip(names, inside, strict=True)) if named else inside, f"{name}/{key}")
         return
     array = seconds_of([value])[0] if isinstance(value, str) else value
-    with suppress(TypeError, ValueError):
+    with suppress(TypeError, ValueError, OverflowError):  # an integer of 400 digits
         array = np.array(array)
         array = np.array(value, dtype=np.float64) if array.dtype == object else array
         if array.dtype.kind in "fiub" and not (isinstance(value, str) and np.isnan(array)):
@@ -273,15 +270,11 @@ def _numbers(value: Any, name: str) -> Iterator[tuple[str, np.ndarray]]:
                 yield from ((f"{name}/{number}{key}", own) for key, own in part.items())
 
 
-PARQUET = "a Parquet file"
-LISTS = (types.is_list, types.is_large_list, types.is_fixed_size_list)
-
-
 def parquet_arrays(path: Path) -> Arrays:
     """Of a Parquet file: numeric columns, and columns of lists of equal length, that of the first row."""
 
     def content(name: str, width: int | None) -> np.ndarray:
-        with reading(path, PARQUET, pa.ArrowException), parquet.ParquetFile(path, pre_buffer=False) as file:
+        with reading(path, PARQUET), parquet.ParquetFile(path, pre_buffer=False) as file:
             column = file.read(columns=[name]).column(name).combine_chunks()
             if width is None:
                 return arrow_numbers(column)
@@ -294,14 +287,17 @@ def parquet_arrays(path: Path) -> Arrays:
             return arrow_numbers(column.flatten()).reshape(len(column), width)
 
     widths: dict[str, int | None] = {}
-    with reading(path, PARQUET, pa.ArrowException), parquet.ParquetFile(path, pre_buffer=False) as file:
-        rows = file.metadata.num_rows
+    with reading(path, PARQUET), parquet.ParquetFile(path, pre_buffer=False) as file:
+        rows, stored = file.metadata.num_rows, file.metadata
         if not rows:
             raise FileFormatError(f"{path} has columns but no rows.")
+        groups = (stored.row_group(index) for index in range(stored.num_row_groups))
+        values = sum(group.column(index).num_values for group in groups for index in range(stored.num_columns))
+        require_plausible_size(path, "a column", 8 * values, path.stat().st_size)  # equal numbers take no space
         for field in file.schema_arrow:
             if types.is_floating(field.type) or types.is_integer(field.type):
                 widths[field.name] = None
-            elif any(is_list(field.type) for is_list in LISTS):
+            elif types.is_list(field.type) or types.is_large_list(field.type) or types.is_fixed_size_list(field.type):
                 first = next(file.iter_batches(1, columns=[field.name])).column(0)[0]
                 kind = field.type.value_type
                 if first.is_valid and len(first) and (types.is_floating(kind) or types.is_integer(kind)):

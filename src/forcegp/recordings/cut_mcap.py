@@ -27,7 +27,7 @@ def is_cut(path: Path) -> bool:
 def whole_copy(path: Path, folder: Path) -> Path:
     """A copy of the records that are whole, those in the chunk at the cut among them. Raises FileFormatError."""
     copy = folder / path.name
-    with reading(path, "a bag", Exception), path.open("rb") as file, copy.open("wb") as made:
+    with reading(path, "a bag"), path.open("rb") as file, copy.open("wb") as made:
         made.write(file.read(len(MAGIC)))
         for kind, content, record in _records(file):
             size, name = int.from_bytes(content[16:24], "little"), int.from_bytes(content[28:32], "little")

@@ -285,7 +285,7 @@ def _kind(path: Path) -> str:
             return "ros2"
         raise FileFormatError(f"{path} is a folder, but no ROS 2 bag (metadata.yaml); give the files in it.")
     if not path.is_file():
-        raise FileFormatError(f"{path} does not exist; give the path of a log.")
+        raise FileFormatError(f"{path} does not exist, or is not a regular file; give the path of a log.")
     suffixes = [suffix.lower() for suffix in path.suffixes]
     kind = suffixes[-1] if suffixes else ""
     if kind == ".gz" and suffixes[-2:-1] and suffixes[-2] in TEXT:

@@ -21,6 +21,23 @@ from forcegp.doubts import stated_as
 from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
 from forcegp.recordings.source import Source
 
+UNIT_OF_A_NAME = re.compile(r"[\[(]([^\d\[(]+)[\])]$|_([A-Za-z]{2,})$")
+COMMA = re.compile(r",(?![^{\[]*[}\]])(?=(?:[^`]*`[^`]*`)*[^`]*$)")
+EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body", "force": "foot=fx,fy,fz"}
+OF_IMU, OF_LINKS = "imu", "torque"  # before the frame of an IMU, and the joint of a torque, in `force`
+BRACES = re.compile(r"\{([^{}]*)\}")
+RANGE = re.compile(r"(\d+)\.\.(\d+)")
+LONGEST_LIST = 4096
+JOINTS = "joints"
+WORDS = {
+    "q": {"q", "pos", "position", "positions", "angle", "angles", "joint_pos", "joint_position"},
+    "v": {"v", "qd", "dq", "vel", "velocity", "velocities", "joint_vel", "joint_velocity"},
+    "u": {"u", "tau", "torque", "torques", "effort", "efforts", "eff", "joint_torque", "joint_effort"},
+    "a": {"a", "qdd", "ddq", "acc", "acceleration", "accelerations"},
+    "time": {"t", "time", "timestamp", "stamp", "time_s", "seconds"},
+}
+"""What the rest of a column's name, beside that of the joint, must mean."""
+
 
 @dataclass(frozen=True)
 class LogUnit:
@@ -67,9 +84,6 @@ def log_unit(quantity: str, name: str) -> LogUnit:
     meant = {known.lower(): known for known in units}
     require_known("unit", spelled, f"the units of {quantity}", units, synonyms=meant)
     return units[spelled]
-
-
-UNIT_OF_A_NAME = re.compile(r"[\[(]([^\d\[(]+)[\])]$|_([A-Za-z]{2,})$")
 
 
 def named_unit(quantity: str, column: str) -> str | None:
@@ -148,8 +162,7 @@ class ColumnMapping:
         if self.orientation not in (None, *ORIENTATIONS):
             raise InvalidInput(f"orientation is {self.orientation!r}; give {', '.join(ORIENTATIONS)}.")
         for signal, names in self.axes.items():
-            known = AXES.get(signal, ())
-            if not 1 <= len(names) <= 2 or not set(names) <= set(known) or names[1:] == ("imu",):
+            if not 1 <= len(names) <= 2 or not set(names) <= set(AXES.get(signal, ())) or names[1:] == ("imu",):
                 raise InvalidInput(
                     f"axes of {signal} are {','.join(names)}; give v body or world, a body, world or imu, or two of "
                     "them: of the linear and of the angular part, which no `imu` measures as an acceleration."
@@ -179,8 +192,7 @@ class ColumnMapping:
         places = [joints.index(name) for name in self.joints or joints]
 
         def in_order(values: Sequence[Any]) -> tuple[Any, ...]:
-            alike = len(set(values)) == 1
-            return (values[0],) if alike else tuple(values[place] for place in places)
+            return (values[0],) if len(set(values)) == 1 else tuple(values[place] for place in places)
 
         sign = dict(self.sign)
         for signal, values in correction.get("sign", {}).items():
@@ -214,10 +226,6 @@ class ColumnMapping:
         return {name: value for name, value in found.items() if value not in (None, (), {}, False)}
 
 
-EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body", "force": "foot=fx,fy,fz"}
-OF_IMU, OF_LINKS = "imu", "torque"  # before the frame of an IMU, and the joint of a torque, in `force`
-
-
 def by_quantity(flag: str, text: str) -> dict[str, tuple[str, ...]]:
     """`q=deg,m,time=ms` as {"q": ("deg", "m"), "time": ("ms",)}: what follows a name up to the next is its list."""
     found: dict[str, tuple[str, ...]] = {}
@@ -233,12 +241,6 @@ def by_quantity(flag: str, text: str) -> dict[str, tuple[str, ...]]:
             raise InvalidInput(f"--{flag} is {text!r}; write for example {flag} {EXAMPLES[flag]}.")
         found[name] = (*found.get(name, ()), part.strip())
     return found
-
-
-BRACES = re.compile(r"\{([^{}]*)\}")
-RANGE = re.compile(r"(\d+)\.\.(\d+)")
-LONGEST_LIST = 4096
-JOINTS = "joints"
 
 
 def expanded(pattern: str, joints: Sequence[str], names: Collection[str] = ()) -> list[str]:
@@ -263,9 +265,6 @@ def expanded(pattern: str, joints: Sequence[str], names: Collection[str] = ()) -
     if math.prod(map(len, choices)) > LONGEST_LIST:
         raise InvalidInput(f"{pattern!r} stands for more than {LONGEST_LIST} columns.")
     return written(product(*choices))
-
-
-COMMA = re.compile(r",(?![^{\[]*[}\]])(?=(?:[^`]*`[^`]*`)*[^`]*$)")
 
 
 def listed(text: str) -> list[str]:
@@ -293,16 +292,6 @@ def _choices(pattern: str, inside: str, joints: Sequence[str]) -> list[str]:
     if len(choices) > 1 and all(choices):
         return choices
     raise InvalidInput(f"{pattern!r}: write {{1..7}}, {{a,b}} or {{joints}} in braces, not {{{inside}}}.")
-
-
-WORDS = {
-    "q": {"q", "pos", "position", "positions", "angle", "angles", "joint_pos", "joint_position"},
-    "v": {"v", "qd", "dq", "vel", "velocity", "velocities", "joint_vel", "joint_velocity"},
-    "u": {"u", "tau", "torque", "torques", "effort", "efforts", "eff", "joint_torque", "joint_effort"},
-    "a": {"a", "qdd", "ddq", "acc", "acceleration", "accelerations"},
-    "time": {"t", "time", "timestamp", "stamp", "time_s", "seconds"},
-}
-"""What the rest of a column's name, beside that of the joint, must mean."""
 
 
 def named_after(joint: str) -> re.Pattern[str]:
@@ -344,8 +333,7 @@ def _says(signal: str, around: tuple[str, str]) -> bool:
     """Do the last word before the joint's name or the first after it name the signal?"""
     before = re.split(r"[^A-Za-z_]+", around[0].rstrip("_.:/ -["))[-1]
     after = re.split(r"[^A-Za-z_]+", around[1].lstrip("_.:/ -]"))[0]
-    words = {word.strip("_").lower() for word in (before, after)} - {""}
-    return bool(words & WORDS[signal])
+    return bool(({word.strip("_").lower() for word in (before, after)} - {""}) & WORDS[signal])
 
 
 TOKEN = (

@@ -12,6 +12,8 @@ from forcegp.recordings.source import reading
 
 LARGEST = 2**20  # bytes
 OF_FOLDER = "forcegp.yaml"
+KINDS = {"step": (float, "seconds"), "ned": (bool, "true or false"), "side_by_side": (bool, "true or false")}
+"""What is no text, and its name."""
 
 
 class _OnceLoader(yaml.SafeLoader):
@@ -30,10 +32,6 @@ class _OnceLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-KINDS = {"step": (float, "seconds"), "ned": (bool, "true or false"), "side_by_side": (bool, "true or false")}
-"""What is no text, and its name."""
-
-
 def read_mapping(path: Path, known: Sequence[str]) -> dict[str, Any]:
     """What the file states of the `known` options: a truth, a number or a text for each, lists joined by commas.
 
@@ -41,7 +39,7 @@ def read_mapping(path: Path, known: Sequence[str]) -> dict[str, Any]:
     """
     if not path.is_file():
         raise FileFormatError(f"{path} is not a file; give `mapping` a YAML file.")
-    with reading(path, "YAML", yaml.YAMLError, AttributeError, IndexError):  # !!timestamp x, !!int ''
+    with reading(path, "YAML"):
         if path.stat().st_size > LARGEST:
             raise FileFormatError(f"{path} is larger than 1 MiB; that is no mapping of columns.")
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_OnceLoader)  # a SafeLoader
@@ -73,5 +71,5 @@ def _words(path: Path, key: str, value: Any) -> Any:
 
 def beside(log: Path) -> Path | None:
     """The mapping that belongs to a log: STEM.yaml beside it, or forcegp.yaml in its folder."""
-    own = log.with_name(f"{log.name.split('.')[0]}.yaml")
+    own = log.parent / f"{log.name.split('.')[0]}.yaml"  # also of a folder such as '.', which has no name
     return next((path for path in (own, log.parent / OF_FOLDER) if path.is_file()), None)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import forcegp.robots
 from forcegp.data.configurations import following
-from forcegp.data.dataset import SENSORS
+from forcegp.data.dataset import BEYOND, LARGEST_MEASURED, SENSORS
 from forcegp.data.views import ends_of_range
 from forcegp.errors import DatasetError, FileFormatError, MistakenUnit
 from forcegp.recordings.ros_bag import Read, read_on_one_clock
@@ -23,6 +23,22 @@ from forcegp.robots.manifold import POSITIONS, TURN, ConfigurationSpace
 
 Jumps = tuple[Int[np.ndarray, " jumps"], str, str]
 """Rows before which something moves too far, what was seen, and what to do."""
+LARGEST_ERROR = 0.01  # of the length of a quaternion: more is no rounding
+ROUNDED = 1e-9  # differences from length 1 beyond this are reported
+MARGIN = 0.1
+"""Of its range: how far a position may be beyond the limits of the URDF. Stops give way, and zeros are set by hand."""
+
+TURNS = 4.0 * np.pi  # rad: positions of a joint beyond this whose unit is not stated as rad are taken for degrees
+REPEATED = 0.05
+"""Of the median step: a stamp that comes sooner after another is the same one again; nothing is sampled so unevenly."""
+
+GAP = 10.0
+"""Median steps. A cubic spline through samples g apart misses at most 5/384 (2 pi f g)^4 of the amplitude of a sine of
+frequency f (Hall & Meyer 1976): over 10 steps at 1 kHz 0.013 % at 5 Hz, 3 % at 20 Hz. Longer pauses end episodes."""
+
+FEWEST_ROWS = 5  # of an episode: two derivatives by central differences need so many
+SLOWEST, FASTEST = 2.0, 2e5
+"""Rows per second beyond which a log of a robot is taken for one whose time is in another unit."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +90,10 @@ def read_recording(
     columns = read.columns
     rows = len(columns[plan.columns[0]])
     values = np.stack([item.value(columns, rows) for item in plan.signals], axis=1)
+    for row, column in np.argwhere((np.abs(values) > LARGEST_MEASURED) & np.isfinite(values))[:1]:
+        item, where = plan.signals[column], f"{values[row, column]:g} at {source.place(int(row))}"
+        seen = f"{source.path}: column {item.expression.text!r} ({item.signal} of joint {item.joint!r}) is {where}"
+        raise DatasetError(f"{seen}, {BEYOND} Map another column, state its `unit`, or repair these rows.")
     lost = _lost(label, plan, columns, values, skip=options.bad_rows == "skip")
     skipped = [f"rows left out because they lack a value: {lost.sum()} of {rows}"] if lost.any() else []
     skipped += _at_ends(plan, values, lost)
@@ -181,10 +201,6 @@ def _continued(plan: SignalPlan, values: np.ndarray, begins: np.ndarray, unwrap:
     return jumps
 
 
-LARGEST_ERROR = 0.01  # of the length of a quaternion: more is no rounding
-ROUNDED = 1e-9  # differences from length 1 beyond this are reported
-
-
 def read_poses(
     space: ConfigurationSpace,
     orientation: str,
@@ -267,12 +283,6 @@ def _episodes(column: np.ndarray, source: Source) -> Int[np.ndarray, "n 2"]:
     return np.stack([own, starts], axis=1)
 
 
-BEYOND = 0.1
-"""Of its range: how far a position may be beyond the limits of the URDF. Stops give way, and zeros are set by hand."""
-
-TURNS = 4.0 * np.pi  # rad: positions of a joint beyond this whose unit is not stated as rad are taken for degrees
-
-
 def _require_plausible_positions(
     label: str,
     values: Float[np.ndarray, "rows signals"],
@@ -287,7 +297,7 @@ def _require_plausible_positions(
             continue
         low, high = float(column.min()), float(column.max())
         lower, upper = limits.get(item.joint, (-np.inf, np.inf))
-        margin = BEYOND * (upper - lower) if np.isfinite(upper - lower) else 0.0
+        margin = MARGIN * (upper - lower) if np.isfinite(upper - lower) else 0.0
         least, most = lower - margin, upper + margin
         degrees = item.unit.name == "rad" and max(-low, high) > TURNS
         other = (
@@ -307,18 +317,6 @@ def _require_plausible_positions(
             raise MistakenUnit(f"{where}, more than two turns. {hint}", "q", units)
 
 
-REPEATED = 0.05
-"""Of the median step: a stamp that comes sooner after another is the same one again; nothing is sampled so unevenly."""
-
-GAP = 10.0
-"""Median steps. A cubic spline through samples g apart misses at most 5/384 (2 pi f g)^4 of the amplitude of a sine of
-frequency f (Hall & Meyer 1976): over 10 steps at 1 kHz 0.013 % at 5 Hz, 3 % at 20 Hz. Longer pauses end episodes."""
-
-FEWEST_ROWS = 5  # of an episode: two derivatives by central differences need so many
-SLOWEST, FASTEST = 2.0, 2e5
-"""Rows per second beyond which a log of a robot is taken for one whose time is in another unit."""
-
-
 def _stretches(
     label: str, source: Source, time: Float[np.ndarray, " rows"], episodes: np.ndarray, read: Read, options: Any
 ) -> tuple[tuple[tuple[int, np.ndarray], ...], float, float, dict[str, Any]]:
@@ -326,8 +324,7 @@ def _stretches(
 
     Of rows with the same stamp the first is kept. DatasetError for time that runs backwards and impossible rates.
     """
-    begins = episodes[:, 1]
-    steps = np.diff(time)
+    begins, steps = episodes[:, 1], np.diff(time)
     steps[begins[begins > 0] - 1] = np.nan
     backwards = np.flatnonzero(steps < 0)
     if backwards.size:
@@ -356,8 +353,7 @@ def _stretches(
     paused = read.paused(options.gap, GAP)
     used = np.flatnonzero(kept & ~paused)
     number = np.searchsorted(begins, used, side="right") - 1
-    same = np.diff(number) == 0
-    between = np.diff(time[used])
+    same, between = np.diff(number) == 0, np.diff(time[used])
     step = float(np.median(between[same])) if same.any() else typical
     limit = GAP * step if options.gap is None else options.gap
     inside = same & (between <= limit) & (np.diff(np.cumsum(paused)[used]) == 0)

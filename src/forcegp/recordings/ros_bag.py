@@ -34,6 +34,8 @@ TWICE = re.compile(r"(pose|twist|accel)\.\1$")
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 NANOSECONDS = 10**9
 NUMBER, ARRAY = (int, float), (np.ndarray, list)  # a union written at the call would be made for every field
+MOST_WHOLE = 0.5
+"""Of the rows of a table: where more have all columns, the others were lost, and no topics stand side by side."""
 
 
 class RosBag(Source):
@@ -72,8 +74,7 @@ class RosBag(Source):
         reader_of = required_extra("rosbags.highlevel", "logs", "reading bags").AnyReader
         types = required_extra("rosbags.typesys", "logs", "reading bags")
         known = types.get_typestore(types.Stores.ROS1_NOETIC if self.ros1 else types.Stores.LATEST)
-        # Exception: rosbags meets damaged files with whatever its parsers, sqlite, zstd and lz4 raise
-        with reading(self.path, "a bag", Exception), reader_of(self._read, default_typestore=known) as reader:
+        with reading(self.path, "a bag"), reader_of(self._read, default_typestore=known) as reader:
             # rosbags 0.11 does not publish its list of MCAP chunks; a version without it reads them unchecked
             for storage in (getattr(bag, "storage", None) for bag in reader.readers):
                 for store in getattr(storage, "storages", [storage]):  # a directory has several, a file is one
@@ -344,10 +345,6 @@ def _stamp_beside(source: Source, topic: str, wanted: str) -> str:
     if found is None:
         raise InvalidInput(f"{source.path}: {topic} has no {wanted}; name as `time` a {LOG_TIME}.")
     return found
-
-
-MOST_WHOLE = 0.5
-"""Of the rows of a table: where more have all columns, the others were lost, and no topics stand side by side."""
 
 
 def _topics(columns: Columns, plan: SignalPlan) -> tuple[dict[str, str], dict[str, Bool[np.ndarray, " rows"]]]:

@@ -45,6 +45,9 @@ LACKING = Expression("derive", {}, ast.Constant(0.0), ())
 LACKS = re.compile(r"derive\d*")
 EPISODE = "episode_index"  # numbers the episodes where nothing else is stated, as in datasets of LeRobot
 MOST_NAMES = 40  # of columns in a message
+PLACE_WORDS = {"", "p", "pos", "position", "base", "body", "trunk", "torso", "root", "pelvis"}
+TURN_WORDS = {"q", "quat", "quaternion", "orientation", "rotation", "rot"}
+"""The last word before x, y, z, and before the parts of a turn, in columns of the pose of a base."""
 
 
 @dataclass(frozen=True)
@@ -235,11 +238,6 @@ def signal_plan(
     )
 
 
-PLACE_WORDS = {"", "p", "pos", "position", "base", "body", "trunk", "torso", "root", "pelvis"}
-TURN_WORDS = {"q", "quat", "quaternion", "orientation", "rotation", "rot"}
-"""The last word before x, y, z, and before the parts of a turn, in columns of the pose of a base."""
-
-
 def guessed_pose(parts: Sequence[str], source: Source) -> tuple[str, ...] | None:
     """Columns of a base by `parts`: x, y, z and qx, ..., or roll, ...; None where none or several may be meant."""
     known = {column.lower(): column for column in source.columns()}
@@ -405,8 +403,7 @@ def columns_of(
     """
     robot, own = model.robot, model.robot.single_joint_names
     kinds = {joint.name: TRANSLATION if joint.type == "prismatic" else ROTATION for joint in robot.joints}
-    of_log = dict(zip(own, joints, strict=True))
-    driven = tuple(model.actuation.names) == own
+    of_log, driven = dict(zip(own, joints, strict=True)), tuple(model.actuation.names) == own
     switches = model.inputs[len(model.actuators) :]
 
     def unit(signal: str, name: str) -> str | None:

@@ -1,8 +1,8 @@
 """`Source`: a log file as a table of named columns of numbers; how much a compressed one may hold."""
 
 import re
-import zlib
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +18,10 @@ Columns = dict[str, np.ndarray]
 LONGEST_VECTOR = 4096  # columns of a table in one array; wider ones are pictures and the like, not signals of joints
 MOST_LOST = 0.05  # of the rows: a driver loses single messages; what lacks more is another topic, sensor or log
 ELEMENT = re.compile(r"(?P<vector>.*)\[\d+\]$", re.DOTALL)
+LARGEST_EXPANSION = 200
+"""Logs of sensors shrink by a factor of 2 to 20, numbers written as text with all digits by 50 at most."""
+
+HARMLESS = 100 * 2**20  # Bytes; what expands to no more than this is never refused
 
 
 class Source(ABC):
@@ -84,7 +88,7 @@ class Source(ABC):
 
 def require_distinct(path: Path, names: Sequence[str]) -> None:
     """Refuse column names that repeat or are empty. Raises FileFormatError naming the column."""
-    repeated = sorted({name for name in names if names.count(name) > 1})
+    repeated = sorted(name for name, count in Counter(names).items() if count > 1)
     if repeated:
         places = [str(index + 1) for index, name in enumerate(names) if name == repeated[0]]
         raise FileFormatError(
@@ -105,27 +109,18 @@ def arrow_numbers(column: Any) -> np.ndarray:
 
 
 @contextmanager
-def reading(path: Path, what: str, *errors: type[BaseException]) -> Iterator[None]:
-    """Turn what a library meets in a damaged file into a FileFormatError that names the path.
-
-    `what` names the expected format ("a Parquet file"); `errors` are those of the library beyond the usual ones.
-    """
+def reading(path: Path, what: str) -> Iterator[None]:
+    """Turn whatever a library meets in a damaged file into a FileFormatError; `what` is the format expected."""
     try:
         yield
-    except ForceGPError:
+    except (ForceGPError, MemoryError):
         raise
-    except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, zlib.error, *errors) as error:
+    except Exception as error:  # parsers raise what their authors did not think of: a TokenError for a header of NumPy
         reason = " ".join(str(error).split()) or type(error).__name__
         raise FileFormatError(
             f"{path} cannot be read as {what}: {reason.rstrip('.')}. It may be truncated or of another format; "
             "copy or write it again."
         ) from error
-
-
-LARGEST_EXPANSION = 200
-"""Logs of sensors shrink by a factor of 2 to 20, numbers written as text with all digits by 50 at most."""
-
-HARMLESS = 100 * 2**20  # Bytes; what expands to no more than this is never refused
 
 
 def require_plausible_size(path: Path, what: str, declared: int, stored: int) -> None:

@@ -63,6 +63,11 @@ class DelimitedText(Source):
         super().__init__(path)
         if headerless is not None and headerless < 1:
             raise InvalidInput(f"headerless is {headerless}; give the number of columns, at least 1.")
+        self._compressed = path.suffix.lower() == ".gz"
+        if self._compressed:
+            with reading(path, "text"), gzip.open(path) as stream:  # the size that it states is that of its last part
+                while stream.read(BLOCK):
+                    require_plausible_size(path, "what is compressed", stream.tell(), path.stat().st_size)
         with reading(path, "text"), self._opened() as stream:
             self._notes = ["its letters are taken for cp1252"] if self.encoding == "cp1252" else []
             self._no_numbers: list[str] = []
@@ -70,18 +75,8 @@ class DelimitedText(Source):
 
     def _opened(self) -> Any:
         """The bytes of the file, expanded if it is called .gz. Raises FileFormatError for bytes that are no text."""
-        path, compressed = self.path, self.path.suffix.lower() == ".gz"
-        if compressed:
-            size = path.stat().st_size
-            with path.open("rb") as file:
-                if file.read(2) != b"\x1f\x8b":
-                    raise FileFormatError(
-                        f"{path} is called .gz but is not compressed with gzip; rename or compress it."
-                    )
-                file.seek(max(size - 4, 0))
-                declared = int.from_bytes(file.read(4), "little")  # RFC 1952: ISIZE, modulo 2^32
-            require_plausible_size(path, "what is compressed", declared, size)
-        raw: Any = gzip.GzipFile(path, "rb") if compressed else io.FileIO(path)
+        path = self.path
+        raw: Any = gzip.GzipFile(path, "rb") if self._compressed else io.FileIO(path)
         stream = io.BufferedReader(raw, 2**20)
         first = b""
         try:
@@ -166,7 +161,7 @@ class DelimitedText(Source):
     def _fields(self, line: str) -> list[str]:
         if self._delimiter == BLANKS:
             return line.split()
-        with reading(self.path, "text with a delimiter", csv.Error):  # a field of more than 131,072 letters, say
+        with reading(self.path, "text with a delimiter"):  # a field of more than 131,072 letters, say
             row = next(csv.reader([line], delimiter=self._delimiter), [])
         return [field.strip() for field in row]
 

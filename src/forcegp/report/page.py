@@ -11,7 +11,7 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 
 from forcegp import __version__
-from forcegp.atomic_files import atomic_file
+from forcegp.atomic_files import MARK, atomic_file
 from forcegp.data import Dataset
 from forcegp.data.views import decided
 from forcegp.errors import MissingExtra
@@ -42,14 +42,6 @@ class Page:
     """What to do next, and the command for it."""
     details: Mapping[str, Any] = field(default_factory=dict)
     """The resolved configuration, for those who want to repeat it."""
-
-
-MARK = "Written by forcegp"
-
-
-def is_page(path: Path) -> bool:
-    """Whether the file was written by `write_page`."""
-    return MARK in path.read_text(encoding="utf-8", errors="replace")
 
 
 def write_page(path: str | Path, page: Page, *, overwrite: bool = True) -> None:

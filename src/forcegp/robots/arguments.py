@@ -17,6 +17,8 @@ from forcegp.errors import ForceGPError, InvalidInput, RobotFileWarning, RobotMo
 
 LARGEST = 2**63 - 1
 """Of the integers that every library takes."""
+LISTED = 12
+"""Problems of one kind that a message lists; the error has all of them."""
 
 
 def is_sequence(given: object) -> TypeGuard[Iterable[Any]]:
@@ -171,10 +173,6 @@ def locked_positions(locked: Mapping[str, float | int]) -> dict[str, float]:
         if not np.isfinite(out[name]):
             raise InvalidInput(f"locked[{name!r}] is {position!r}; give a finite position in rad or m.")
     return out
-
-
-LISTED = 12
-"""Problems of one kind that a message lists; the error has all of them."""
 
 
 class Problems:

@@ -29,6 +29,13 @@ ROTOR = r".*(rotor|propeller)s?"
 BODY = r"pelvis|flying|drone|uav|quadrotor|.*copter"
 ENOUGH = {LIMB: 2, ROTOR: 3, BODY: 1}
 """So many tell. Rotors count on the links that stand still: motors of arms have some in other places."""
+WORLD = -1
+BASE = "base"
+"""Name of the joint between the world and a base that moves."""
+OUTSIDE = "(world)"
+"""What carries such a base; no link of the robot."""
+MOST_BODIES = 1000
+"""Matrices of all pairs of bodies are kept for a robot."""
 
 
 def check_base(description: RobotDescription, standing: Sequence[str], problems: Problems) -> None:
@@ -113,15 +120,6 @@ def with_followers(
             sums = {key: getattr(whole[name], key) + by * getattr(body, key) for key, by in factors.items()}
             whole[name] = replace(whole[name], **sums)
     return tuple(whole.values())
-
-
-WORLD = -1
-BASE = "base"
-"""Name of the joint between the world and a base that moves."""
-OUTSIDE = "(world)"
-"""What carries such a base; no link of the robot."""
-MOST_BODIES = 1000
-"""Matrices of all pairs of bodies are kept for a robot."""
 
 
 @dataclass(frozen=True)
@@ -211,13 +209,11 @@ def lay_out(
     below = [joint for link in still if hung for joint in children[link] if joint.name not in held]
     own = {joint.name for joint in below if joint.type == "floating"}  # the file's own hold of its base
     if base == "floating" and not own:
-        links = {OUTSIDE: Placement(WORLD, np.eye(4))}
-        stack = [free_joint(BASE, OUTSIDE, root)]
+        links, stack = {OUTSIDE: Placement(WORLD, np.eye(4))}, [free_joint(BASE, OUTSIDE, root)]
     while stack:
         joint = stack.pop()
         above = links[joint.parent]
-        offset = above.offset @ joint.origin
-        free = joint.type == "floating"
+        offset, free = above.offset @ joint.origin, joint.type == "floating"
         bolted = joint.name in own and base == "fixed"
         if bolted or joint.type == "fixed" or joint.name in held:
             still = np.eye(4) if free else joint_motion(joint, held.get(joint.name, 0.0))

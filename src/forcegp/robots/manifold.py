@@ -16,13 +16,13 @@ from forcegp.errors import InvalidInput
 
 LARGEST_NORM_ERROR = 1e-4
 """By so much the length of a quaternion may differ from 1: logs are rounded."""
-
-
 QUATERNION = ("qx", "qy", "qz", "qw")
 POSITIONS = ("x", "y", "z", *QUATERNION)
 VELOCITIES = ("x", "y", "z", "rx", "ry", "rz")
 TURN = slice(3, 7)
 NEUTRAL = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+_BERNOULLI = (1 / 2, 1 / 12, 0.0, -1 / 720, 0.0, 1 / 30240, 0.0, -1 / 1209600, 0.0, 1 / 47900160)
+"""Of x / (1 - exp(-x)), from the first power on."""
 
 
 @dataclass(frozen=True)
@@ -209,8 +209,7 @@ def difference(start: Float[Tensor, "*batch 7"], end: Float[Tensor, "*batch 7"])
     sines = (turn[..., :3] ** 2).sum(-1, keepdim=True)
     arc = _smooth(sines, _ARCSINE, lambda sine: torch.atan2(sine, turn[..., 3:]) / sine, small=1e-3)  # over its sine
     angular = 2.0 * arc * turn[..., :3]
-    square = (angular * angular).sum(-1, keepdim=True)
-    linear = (first.mT @ (to - from_)[..., None])[..., 0]
+    square, linear = (angular * angular).sum(-1, keepdim=True), (first.mT @ (to - from_)[..., None])[..., 0]
     once = torch.linalg.cross(angular, linear)
     linear = linear - 0.5 * once + _cotangent(square) * torch.linalg.cross(angular, once)
     return torch.cat([linear, angular], -1)
@@ -225,10 +224,6 @@ def chart_velocity(step: Float[Tensor, "*#batch 6"], v: Float[Tensor, "*#batch 6
         if coefficient:
             total = total + coefficient * torch.cat(moved, -1)
     return total
-
-
-_BERNOULLI = (1 / 2, 1 / 12, 0.0, -1 / 720, 0.0, 1 / 30240, 0.0, -1 / 1209600, 0.0, 1 / 47900160)
-"""Of x / (1 - exp(-x)), from the first power on."""
 
 
 def quaternion_product(left: Float[Tensor, "*batch 4"], right: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
@@ -254,8 +249,7 @@ def _smooth(
     square: Tensor, series: Sequence[float], closed: Callable[[Tensor], Tensor], small: float = SMALL
 ) -> Tensor:
     """A function of t^2 that is smooth at 0: `closed` of t, or below `small` the power series in t^2."""
-    large = square > small
-    total = torch.full_like(square, series[-1])
+    large, total = square > small, torch.full_like(square, series[-1])
     for coefficient in reversed(series[:-1]):
         total = total * square + coefficient
     # the branch that is not taken has a finite gradient, too

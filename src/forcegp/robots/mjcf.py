@@ -13,6 +13,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from forcegp.atomic_files import unreadable
 from forcegp.errors import RobotModelError, required_extra
 from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import inverse, transform
@@ -25,6 +26,9 @@ from forcegp.robots.urdf_file import read_text
 
 DEEPEST = 20
 """Files that include files; each is read by a function that calls itself."""
+SMALLEST = 2e-15
+"""kg m^2; MuJoCo takes no smaller inertia, so that ideal rods and points get this one."""
+KINDS = {"floating": "free", "prismatic": "slide", "revolute": "hinge", "continuous": "hinge"}
 
 
 def is_mjcf(text: str) -> bool:
@@ -60,11 +64,12 @@ def _meshes_outside(text: str, path: Path | None, source: str) -> list[str]:
     folder = Path() if path is None else path.parent
     roots = [] if path is None else [folder.resolve(), path.resolve().parent]
     shapes, done, left, places = list[tuple[str, Path, str]](), set[Path](), MOST_TAGS, {""}
-    outside = "{}: names the file {!r}, which is not below the folder of the robot's file; move it there."
+    outside = "{}: names the file {!r}, a pipe or device, or not below the folder of the robot's file; move it there."
 
     def is_inside(at: Path, name: str) -> bool:
         named, real = Path(name.replace("\\", "/")), (at / name).resolve()
-        return ".." not in named.parts and not named.is_absolute() and any(map(real.is_relative_to, roots))
+        inside = ".." not in named.parts and not named.is_absolute() and any(map(real.is_relative_to, roots))
+        return inside and unreadable(real, math.inf) is None
 
     def walk(text: str, source: str, at: Path, above: tuple[Path, ...]) -> None:
         nonlocal left
@@ -99,11 +104,6 @@ def _meshes_outside(text: str, path: Path | None, source: str) -> list[str]:
     for name in (name for tag, name in apart if tag == "flexcomp"):  # is opened before it is known whether it is needed
         raise RobotModelError(outside.format(source, name))
     return [name for _, name in apart]
-
-
-SMALLEST = 2e-15
-"""kg m^2; MuJoCo takes no smaller inertia, so that ideal rods and points get this one."""
-KINDS = {"floating": "free", "prismatic": "slide", "revolute": "hinge", "continuous": "hinge"}
 
 
 class MjcfWriter:

@@ -74,8 +74,7 @@ class CompiledModel:
                 body = self.bodies[self.model.site_bodyid[site]]
                 frame = self._named(name, self.links)
                 self._fixed(body, frame, self._pose(self.model.site_pos[site], self.model.site_quat[site]))
-        loops = tuple(self._loops())
-        motors = self._motors() if self.for_system else ()
+        loops, motors = tuple(self._loops()), self._motors() if self.for_system else ()
         self._note_losses(bool(motors))
         disabled = self.model.opt.disableflags & int(self.mujoco.mjtDisableBit.mjDSBL_GRAVITY)
         gravity = np.zeros(3) if disabled else np.array(self.model.opt.gravity)

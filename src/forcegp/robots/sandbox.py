@@ -1,21 +1,23 @@
-"""Readers of robot files that others wrote, MuJoCo's and xacro's, in a process of their own with limits.
+"""Readers of files that others wrote, those of MuJoCo, xacro and MATLAB, in a process of their own with limits.
 
 What crashes, hangs or takes all memory there is an error here. `python -m forcegp.robots.sandbox` is that process: it
 takes one request as JSON and gives one answer as JSON; it imports neither torch nor the rest of forcegp.
 """
 
 import base64
+import contextlib
 import importlib
 import json
 import math
 import os
 import subprocess
 import sys
+import sysconfig
 import warnings
 from pathlib import Path
 from typing import Any
 
-from forcegp.errors import RobotModelError
+from forcegp.errors import ForceGPError, RobotModelError
 
 SECONDS = 30
 """CPU time of one file, and half of its wall time: whole robots with meshes take two."""
@@ -28,31 +30,36 @@ ACTS = ("subprocess", "os", "socket", "ctypes", "shutil")
 """First words of Python's audit events that no macro needs."""
 
 
-def read_apart(reader: str, source: str, request: dict[str, Any]) -> dict[str, Any]:
-    """The answer of a reader ("mujoco" or "xacro") to a request; `refused` in it is the reason of one that failed.
+def read_apart(
+    reader: str,
+    source: str,
+    request: dict[str, Any],
+    error: type[ForceGPError] = RobotModelError,
+    remedy: str = "give the file of one robot, without copies in great number",
+) -> dict[str, Any]:
+    """The answer of a reader ("mujoco", "xacro" or "matlab"); `refused` in it is the reason of one that failed.
 
-    Raises RobotModelError where there is no answer: the reader crashed, or needed more than `SECONDS` or `MEMORY`.
+    Raises the `error` where there is no answer: the reader crashed, or needed more than `SECONDS` or `MEMORY`, or
+    those of the request.
     """
     path = os.pathsep.join(folder for folder in sys.path if folder)
     ones = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MALLOC_ARENA_MAX", "PYTHONDONTWRITEBYTECODE")
     settings = dict.fromkeys(ones, "1") | {"PYTHONPATH": path, "PYTHONWARNINGS": "ignore", "MUJOCO_GL": "disable"}
-    asked = json.dumps({"reader": reader, "seconds": SECONDS, "memory": MEMORY, "largest": LARGEST} | request)
+    asked = {"reader": reader, "seconds": SECONDS, "memory": MEMORY, "largest": LARGEST} | request
     try:
         process = subprocess.run(
             [sys.executable, "-P", "-m", __name__],
-            input=asked.encode(),
+            input=json.dumps(asked).encode(),
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             env=os.environ | settings,
-            timeout=2 * SECONDS,
+            timeout=2 * asked["seconds"],
             check=False,
         )
         return json.loads(process.stdout)
     except (subprocess.TimeoutExpired, ValueError):
-        raise RobotModelError(
-            f"{source}: {reader} crashed at it, or needed more than {SECONDS} s or {MEMORY >> 20} MiB; give the file "
-            "of one robot, without copies in great number."
-        ) from None
+        limits = f"{asked['seconds']} s or {asked['memory'] >> 20} MiB"
+        raise error(f"{source}: {reader} crashed at it, or needed more than {limits}; {remedy}.") from None
 
 
 def _answer(request: dict[str, Any]) -> dict[str, Any]:
@@ -61,22 +68,25 @@ def _answer(request: dict[str, Any]) -> dict[str, Any]:
 
         for limit, value in ((resource.RLIMIT_CPU, request["seconds"]), (resource.RLIMIT_AS, request["memory"])):
             resource.setrlimit(limit, (value, value))
-    return {"mujoco": _compiled, "xacro": _expanded}[request["reader"]](request)
+    return {"mujoco": _compiled, "xacro": _expanded, "matlab": _variables}[request["reader"]](request)
 
 
 def _expanded(request: dict[str, Any]) -> dict[str, Any]:
     """The text of a .xacro file, whose expressions open files below its folder and of ROS packages only."""
-    xacro = importlib.import_module("xacro")
-    importlib.import_module("yaml")  # xacro loads it when a file asks
+    for name in ("yaml", "ament_index_python.packages"):  # which xacro loads when a file asks
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
+    xacro, library = importlib.import_module("xacro"), sysconfig.get_paths()
     packages = os.pathsep.join(os.environ.get(name, "") for name in ("AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH"))
-    shown = [Path(request["path"]).parent, *(each for each in (*packages.split(os.pathsep), *sys.path) if each)]
-    allowed = [Path(each).resolve() for each in (*shown, request["path"] + "/..")]
+    shown = [Path(request["path"]).parent, request["path"] + "/..", library["stdlib"], library["platstdlib"]]
+    allowed = [Path(each).resolve() for each in (*shown, *filter(None, packages.split(os.pathsep)))]
 
     def watch(event: str, given: tuple[Any, ...]) -> None:
         refused = event.split(".")[0] in ACTS and event not in ("os.listdir", "os.scandir")
         if event == "open" and not isinstance(given[0], int):
             real = Path(os.fsdecode(given[0])).resolve()
             refused = given[2] & (os.O_WRONLY | os.O_RDWR) or not any(real.is_relative_to(each) for each in allowed)
+            refused = refused or (real.exists() and not real.is_file())  # a pipe would be waited for
         if refused:
             raise PermissionError(f"its expressions only read below its folder: {event} {given[:1]}")
 
@@ -85,6 +95,30 @@ def _expanded(request: dict[str, Any]) -> dict[str, Any]:
         return {"text": xacro.process_file(request["path"]).toxml()}
     except (Exception, SystemExit) as error:  # whatever the expressions of the file raise
         return {"refused": " ".join(str(error).split())}
+
+
+def _variables(request: dict[str, Any]) -> dict[str, Any]:
+    """The variables of a MATLAB file: arrays of numbers are in the file `kept`, and {"#": name} stands for each."""
+    io, numpy = importlib.import_module("scipy.io"), importlib.import_module("numpy")
+    kept: dict[str, Any] = {}
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, numpy.ndarray) and value.dtype.kind in "fiub":
+            kept[name := f"a{len(kept)}"] = value
+            return {"#": name}
+        found = value.tolist() if isinstance(value, numpy.ndarray | numpy.generic) else None
+        return found if type(found) in (list, str, int, float, bool) else ""  # what has no numbers
+
+    try:
+        sizes = (8 * math.prod(shape) for _, shape, _ in io.whosmat(request["path"]))
+        if (claimed := sum(sizes)) > request["most"]:
+            return {"refused": f"it claims {claimed >> 20} MiB, more than it can hold"}
+        content = io.loadmat(request["path"], simplify_cells=True)
+        text = json.dumps({name: each for name, each in content.items() if not name.startswith("__")}, default=plain)
+        numpy.savez(request["kept"], **kept)
+        return {"content": text}
+    except Exception as error:  # whatever scipy meets in a damaged file
+        return {"refused": f"{type(error).__name__}: {error}"}
 
 
 def _compiled(request: dict[str, Any]) -> dict[str, Any]:
@@ -102,7 +136,7 @@ def _compiled(request: dict[str, Any]) -> dict[str, Any]:
         needed = _without_appearance(mujoco, spec)
         meshes = next((mesh.file for mesh in spec.meshes if mesh.file in request["outside"]), None)
         if meshes is not None:
-            return {"refused": f"mesh {meshes!r} is not below the folder of the file", "meshes": needed}
+            return {"refused": f"mesh {meshes!r} is a pipe, or not below the folder of the file", "meshes": needed}
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")
             model = spec.compile()

@@ -19,6 +19,9 @@ from forcegp.robots.manifold import ConfigurationSpace, Group, pose
 from forcegp.robots.urdf import Joint, Link, RobotDescription
 from forcegp.summary import Summary, listed
 
+MASSLESS = Link(0.0, np.zeros(3), np.zeros((3, 3)))
+DOWN = ("down_x", "down_y", "down_z")
+
 
 @dataclass(frozen=True, eq=False)
 class Tree:
@@ -67,8 +70,7 @@ class Tree:
 
 def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndarray) -> Tree:
     """Batched constants for :mod:`forcegp.robots.kinematics`, on the CPU."""
-    n = len(layout.bodies)
-    revolute = np.array([joint.type != "prismatic" for joint in layout.bodies])
+    n, revolute = len(layout.bodies), np.array([joint.type != "prismatic" for joint in layout.bodies])
     rest, sine, cosine, slide = np.zeros((4, n, 4, 4))
     own, positions = np.eye(n), np.arange(len(layout.joints))
     for group in layout.groups:
@@ -135,10 +137,6 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
         has_armature=bool(armature.any()),
         **{name: torch.tensor(array, dtype=torch.float64) for name, array in constants.items()},
     )
-
-
-MASSLESS = Link(0.0, np.zeros(3), np.zeros((3, 3)))
-DOWN = ("down_x", "down_y", "down_z")
 
 
 class RigidBodyDynamics(ABC):

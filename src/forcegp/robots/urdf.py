@@ -22,6 +22,9 @@ MECHANICS = ("inertial", "origin", "parent", "child", "axis", "limit", "dynamics
 """Parts of a link or joint that are read."""
 DEFINITIONS = ("}arg", "}property", "}macro")
 """Elements of xacro that add nothing by themselves."""
+FARTHEST = 1e9  # m; squares of larger numbers overflow
+LIGHTEST = 1e-20  # kg; what is lighter is a slip, and divides badly
+MOVABLE = ("revolute", "continuous", "prismatic")
 
 
 def parse_xml(text: str, source: str) -> Element:
@@ -66,11 +69,6 @@ def refuse_xacro(root: Element, source: str) -> None:
             f"{source}: is an unexpanded xacro file (see <{element.tag.rsplit('}', 1)[-1]}>); "
             "name it .xacro, or run xacro first: xacro robot.urdf.xacro > robot.urdf."
         )
-
-
-FARTHEST = 1e9  # m; squares of larger numbers overflow
-LIGHTEST = 1e-20  # kg; what is lighter is a slip, and divides badly
-MOVABLE = ("revolute", "continuous", "prismatic")
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,8 +304,8 @@ def _joint(at: _Part, name: str, links: dict[str, Link | None]) -> Joint:
         at.problems.note("the <mimic> of a fixed joint is ignored", at.owner)
     elif mimic.element is not None:
         ratio = mimic.number("multiplier", 1.0), mimic.number("offset", 0.0)
-        if not np.isfinite(ratio).all():
-            raise RobotModelError(f"{at}: <mimic> holds numbers that are not finite; correct multiplier and offset.")
+        if not np.abs(ratio).max() <= FARTHEST:
+            raise RobotModelError(f"{at}: <mimic> holds numbers not finite or above {FARTHEST:g}; correct them.")
         mimics = Mimic(mimic.text("joint"), *ratio)
     return Joint(
         name=name,

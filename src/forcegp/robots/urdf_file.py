@@ -9,6 +9,7 @@ import numpy as np
 from defusedxml import minidom
 from jaxtyping import Float
 
+from forcegp.atomic_files import unreadable
 from forcegp.errors import LARGEST, InvalidInput, NonPhysicalInertia, RobotModelError, UnknownName, required_extra
 from forcegp.robots.arguments import Problems, Vector, by_joint, finite_vector
 from forcegp.robots.inertia import physical_objection
@@ -20,19 +21,22 @@ HEAVIEST = 1e9
 """kg and kg m^2, of one link: far from where products of inertias overflow."""
 LARGEST_FILE = 16 << 20
 """Bytes; robot files have some hundred thousand."""
+IN_THE_FILE = (
+    ". Correct its <inertial> element (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>)"
+)
+InertiaChoice = Literal["strict", "nearest"]
+"""What to do about a link with an inertia that no body has: refuse it, or replace it by the nearest possible."""
+
+MARGIN = 1e-3
+"""Smallest second moment of a repaired body as a fraction of their sum: 3 % of its size thick, not a plate."""
 
 
 def read_text(path: str | Path) -> str:
     """Decode a URDF file; :class:`RobotModelError` where there is none or it is not text."""
     path = Path(path)
-    if path.is_fifo():  # to open it would wait for a writer for ever
-        raise RobotModelError(f"{path}: is not a regular file; give the path of a URDF file.")
+    if why := unreadable(path, LARGEST_FILE):
+        raise RobotModelError(f"{path}: {why}; give the URDF file of one robot.")
     try:
-        if path.is_file() and path.stat().st_size > LARGEST_FILE:
-            raise RobotModelError(
-                f"{path}: holds {path.stat().st_size >> 20} MiB, more than the {LARGEST_FILE >> 20} MiB that a robot "
-                "file may have; give the URDF file of one robot."
-            )
         data = path.read_bytes()
     except FileNotFoundError:
         raise RobotModelError(f"{path}: no such file; give the path of a URDF file.") from None
@@ -147,13 +151,6 @@ def inertial_element(mass: float, center_of_mass: Iterable[float], inertia: np.n
     return f'<inertial>{origin}<mass value="{float(mass)!r}"/><inertia {moments}/></inertial>'
 
 
-InertiaChoice = Literal["strict", "nearest"]
-"""What to do about a link with an inertia that no body has: refuse it, or replace it by the nearest possible."""
-
-MARGIN = 1e-3
-"""Smallest second moment of a repaired body as a fraction of their sum: 3 % of its size thick, not a plate."""
-
-
 def nearest_inertia(inertia: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
     """The inertia (kg m^2) of the body whose second moments are nearest, and at least `MARGIN` of their sum."""
     moments, axes = np.linalg.eigh(inertia)
@@ -214,11 +211,6 @@ def with_chosen_inertias(
         if inertial is not None and name not in layout.moving and np.isnan(inertial.inertia).all():
             links[name] = replace(inertial, inertia=np.zeros((3, 3)))  # of a link that never moves
     return text, replace(description, links=links)
-
-
-IN_THE_FILE = (
-    ". Correct its <inertial> element (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>)"
-)
 
 
 def read_robot_file(path: str | Path) -> str:
