@@ -205,6 +205,9 @@ class RecordedRows:
     def _sensing(self) -> tuple[Float[np.ndarray, "rows k nv"], Float[np.ndarray, "rows k"]]:
         """What makes sensed forces of A^T lambda, and those that were measured."""
         model = self.space.model
+        if alone := self.sensed.keys() - {contact.frame for contact in model.contacts}:
+            where = f"a force was measured at {', '.join(sorted(alone))}, where the model has no contact"
+            raise InvalidInput(f"{where}: accelerations cannot teach numbers beside it; give Torques().")
         A, b, normals = model.constraint(self.state)
         M = torch.eye(A.shape[-1]).to(A)
         parts = ConstrainedDynamics(

@@ -68,8 +68,10 @@ def identify(recording: Dataset, expression: str) -> tuple[str, Posterior]:
     forces, _, evidence = expression.partition("@")
     given = parse_evidence(evidence)
     identified = learn(named_model(recording.model, summands(forces)), recording, given)[0]
+    # sensors that did not teach are no forces beside those that were found: a tool would count twice
+    alone = recording if any(isinstance(each, Sensor) for each in given) else replace(recording, measured={})
     pushed = recording.model.robot.space.is_vector_space and "spring" not in summands(forces)
-    if not pushed or not pushed_where_they_are(recording, identified.model):
+    if not pushed or not pushed_where_they_are(alone, identified.model):
         return expression, identified
     forces = f"{forces}+spring"
     return f"{forces}@{evidence}", learn(named_model(recording.model, summands(forces)), recording, given)[0]
@@ -381,8 +383,9 @@ def identified_model(name: str, model: Model, rows: Dataset, before: Posterior |
     `before`: what they made of the same rows already, or of more of the same recording.
     """
     opened, evidence = checked_identification(name, model, rows)
+    rows = replace(rows, measured={})  # none of which is among the evidence
     if before is None:
         opened, _ = with_friction_chosen(opened, rows, evidence)  # once, for all parts of the rows
     found: Any = fit(opened, rows, evidence) if before is None else before
     opened = with_choice_of(opened, found)
-    return replace(found.model, noise=held_out_noise(opened, replace(rows, measured={}), evidence))
+    return replace(found.model, noise=held_out_noise(opened, rows, evidence))
