@@ -9,6 +9,7 @@ mass and its center, beside an offset. What torques need beyond the masses of th
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import permutations, product
 from re import compile
 from typing import Any
@@ -19,7 +20,7 @@ from jaxtyping import Float
 
 from forcegp.data import Dataset
 from forcegp.data.dataset import FORCE, IMU
-from forcegp.data.imu import SECONDS, SHIFTS, delay_doubts, expected, late_doubts, short_means
+from forcegp.data.imu import SECONDS, SHIFTS, expected, late_doubts, short_means
 from forcegp.data.views import tensors
 from forcegp.doubts import Doubt, look, ok, wrong
 from forcegp.evidence import torque_regressor
@@ -87,26 +88,32 @@ def force_sensor_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         needed = (missing + (J @ F[..., None])[..., 0])[..., None]
         columns = dataset.metadata.get("import", {}).get("columns", {}).get(f"{FORCE}{frame}", ())
         sensor = _Sensor(frame, F, R, [each for each in columns if NAME.fullmatch(each)])
-        if frame not in dict(held) and (tool := _Tool.of(dataset, model, sensor)):
+        tool = None if frame in dict(held) else _Tool.of(dataset, model, sensor)
+        if tool is not None:
             at_center = rows.kinematics.frame_jacobian(frame, tool.center)[..., :3, :].mT.cpu().numpy()
             x, y = (unexplained(each, of_file)[:, 0] for each in (at_center @ R @ tool.measured[..., None], needed))
-            if _fitted(-x, y)[0] > FOLLOWS:  # else torques need this sign: it is no weight
-                yield tool.doubt(model, *_fitted(x, y))
-                yield from delay_doubts(dataset, sensor.name, tool.measured - tool.offset, tool.expected)
-                continue
-        doubt = _beside(sensor, J, needed, unexplained)
+            tool = tool if _fitted(-x, y)[0] > FOLLOWS else None  # torques need the other sign: it is no weight
+        if tool is not None:
+            doubt, values, left_of = tool.doubt(model, *_fitted(x, y)), tool.measured, tool.left_of
+        else:
+            doubt, values = _beside(sensor, J, needed, unexplained), F
+            left_of = partial(_left, unexplained(needed)[:, 0], J, unexplained)
         yield doubt
-        if doubt.numbers.get("left", 1.0) < FOLLOWS and len(dataset.episodes) == 1 and dataset.time_ordered:
-            y, time = unexplained(needed)[:, 0], dataset.time
-            moved = (np.stack([np.interp(time + s, time, x) for x in F.T], axis=1)[..., None] for s in SHIFTS)
-            left = [_fitted(unexplained(J @ each)[:, 0], y)[0] ** 0.5 for each in moved]
-            yield from late_doubts(sensor.name, left, float(np.median(np.diff(time))))
+        follows = tool is not None or doubt.numbers.get("left", 1.0) < FOLLOWS
+        if follows and len(dataset.episodes) == 1 and dataset.time_ordered:
+            moved = (np.stack([np.interp(dataset.time + s, dataset.time, x) for x in values.T], axis=1) for s in SHIFTS)
+            yield from late_doubts(sensor.name, [*map(left_of, moved)], float(np.median(np.diff(dataset.time))))
 
 
 def _fitted(x: Float[np.ndarray, " rows"], y: Float[np.ndarray, " rows"]) -> tuple[float, float]:
     """What a positive multiple of x leaves of the power of y, and the factor of least squares."""
     power, shared = float(x @ x) + 1e-300, float(x @ y)
     return max(0.0, 1.0 - max(shared, 0.0) ** 2 / (power * float(y @ y) + 1e-300)), shared / power
+
+
+def _left(y: Float[np.ndarray, " rows"], J: Float[np.ndarray, "rows nv 3"], unexplained: Shown, F: np.ndarray) -> float:
+    """What forces leave of y, as a root mean square over that of y."""
+    return _fitted(unexplained(J @ F[..., None])[:, 0], y)[0] ** 0.5
 
 
 def _by_axes(arms: Float[np.ndarray, "rows k 3"], columns: Float[np.ndarray, "rows 3"]) -> np.ndarray:
@@ -166,7 +173,7 @@ class _Sensor:
 class _Tool:
     """What hangs from a sensor, m and m c, by the sensor alone, and how to read its axes for that.
 
-    `left` of its power, so and as it is stated; `measured` and `expected` along the frame, the former with an offset.
+    `left` of its power, so and as it is stated; `measured` along the frame, with this offset.
     """
 
     sensor: _Sensor
@@ -174,9 +181,9 @@ class _Tool:
     along: str
     Q: Float[np.ndarray, "3 3"]
     left: tuple[float, float]
-    offset: Float[np.ndarray, " 3"]
     measured: Float[np.ndarray, "rows 3"]
-    expected: Float[np.ndarray, "rows 3"]
+    offset: Float[np.ndarray, " 3"]
+    left_of: Callable[[Float[np.ndarray, "rows 3"]], float]
 
     @classmethod
     def of(cls, dataset: Dataset, model: Model, sensor: _Sensor) -> "_Tool | None":
@@ -184,23 +191,35 @@ class _Tool:
         points = ("0,0,0", "1,0,0", "0,1,0", "0,0,1")
         still, *ends = (expected(dataset, model, f"{IMU}{sensor.frame}@{point}") for point in points)
         hangs = -np.stack([still, *(end - still for end in ends)], axis=-1)
-        B, found = np.stack(short_means(dataset, *hangs.swapaxes(0, 1))), []
+
+        def means(values: Float[np.ndarray, "rows 3 k"]) -> Float[np.ndarray, "windows 3 k"]:
+            return short_means(dataset, values.reshape(len(values), -1))[0].reshape(-1, *values.shape[1:])
+
+        B = means(hangs)
+        moves = (B - B.mean(axis=0)).reshape(-1, 4)
+
+        def fitted(y: Float[np.ndarray, "windows 3"]) -> tuple[float, np.ndarray]:
+            """What such a tool leaves of the power beside an offset, and its numbers."""
+            y = (y - y.mean(axis=0)).ravel()
+            numbers = np.linalg.lstsq(moves, y)[0]
+            left = np.square(y - moves @ numbers).sum() / (y @ y + 1e-300)
+            return float(left) if numbers[0] > 0.0 else 1.0, numbers
+
+        found = []
         for along, (turn, columns) in sensor.readings.items():
-            X = np.stack(short_means(dataset, *_by_axes(sensor.R.mT @ turn, columns).swapaxes(0, 1)))
-            for Q in AXES:
-                y, moves = X @ Q.ravel(), (B - B.mean(1, keepdims=True)).reshape(-1, 4)
-                y = (y - y.mean(1, keepdims=True)).ravel()
-                numbers = np.linalg.lstsq(moves, y)[0]
-                left = np.square(y - moves @ numbers).sum() / (y @ y + 1e-300) if numbers[0] > 0.0 else 1.0
-                found.append((float(left), along, Q, numbers))
+            values = _by_axes(sensor.R.mT @ turn, columns)
+            if not along or np.linalg.norm(columns.std(axis=0)) > OFF * sensor.rms:  # else a dead one would be a weight
+                X = means(values)
+                found += [(*fitted(X @ Q.ravel()), along, Q, values) for Q in AXES]
         least = min(each[0] for each in found)
-        left, along, Q, numbers = next(each for each in found if each[0] <= 1.1 * least + 1e-3)
+        left, numbers, along, Q, values = next(each for each in found if each[0] <= 1.1 * least + 1e-3)
         if least > CARRIES:
             return None
-        turn, columns = sensor.readings[along]
-        measured = _by_axes(sensor.R.mT @ turn, columns) @ Q.ravel()
+        measured = values @ Q.ravel()
         offset = (measured - hangs @ numbers).mean(axis=0)
-        return cls(sensor, numbers, along, Q, (left, found[0][0]), offset, measured, hangs @ numbers)
+        return cls(
+            sensor, numbers, along, Q, (left, found[0][0]), measured, offset, lambda x: fitted(means(x))[0] ** 0.5
+        )
 
     @property
     def center(self) -> tuple[float, ...]:
@@ -221,8 +240,8 @@ class _Tool:
             kind, says = look, f"carries {mass * UNITS[unit]:.3g} {where} if it is in {unit}, as torques need it"
             do = f"State its unit: forcegp import --unit force={unit}."
         elif left < FOLLOWS:
-            says = f"agrees with torques and motion: it carries {mass:.3g} {where}"
-        elif (beyond := _beyond(model, self.sensor.frame)) > 0.5 * mass:
+            says = f"{says}, and torques need {factor:.3g} times that"
+        elif (beyond := _beyond(model, self.sensor.frame)) > 0.5 * mass and factor < 0.5:  # nearer to 0 than to 1
             kind, says = look, f"carries {mass:.3g} {where}; the file has {beyond:.3g} kg from there on"
             do = "Where both hold the same tool it counts twice: leave it out of one of them."
         if kind is ok and np.linalg.norm(self.offset) > OFF * self.sensor.rms:
