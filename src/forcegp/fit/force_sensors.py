@@ -91,10 +91,16 @@ def force_sensor_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         tool = None if frame in dict(held) else _Tool.of(dataset, model, sensor)
         if tool is not None:
             at_center = rows.kinematics.frame_jacobian(frame, tool.center)[..., :3, :].mT.cpu().numpy()
-            x, y = (unexplained(each, of_file)[:, 0] for each in (at_center @ R @ tool.measured[..., None], needed))
+            both = np.concatenate([at_center @ R @ tool.expected[..., None], needed], axis=-1)
+            noise = np.square(unexplained(needed).reshape(robot.nv, -1)).mean(axis=1) ** 0.5  # of friction, mostly
+            each = (
+                unexplained(both, of_file).T.reshape(2, robot.nv, -1) / np.maximum(noise, 0.05 * noise.max())[:, None]
+            )
+            x, y = each.reshape(2, -1)
             tool = tool if _fitted(-x, y)[0] > FOLLOWS else None  # torques need the other sign: it is no weight
         if tool is not None:
-            doubt, values, left_of = tool.doubt(model, *_fitted(x, y)), tool.measured, tool.left_of
+            as_stated = float(np.square(y - x).sum() / (y @ y + 1e-300))
+            doubt, values, left_of = tool.doubt(model, *_fitted(x, y), as_stated), tool.measured, tool.left_of
         else:
             doubt, values = _beside(sensor, J, needed, unexplained), F
             left_of = partial(_left, unexplained(needed)[:, 0], J, unexplained)
@@ -173,7 +179,7 @@ class _Sensor:
 class _Tool:
     """What hangs from a sensor, m and m c, by the sensor alone, and how to read its axes for that.
 
-    `left` of its power, so and as it is stated; `measured` along the frame, with this offset.
+    `left` of its power, so and as it is stated; `measured` and `expected` along the frame.
     """
 
     sensor: _Sensor
@@ -182,7 +188,7 @@ class _Tool:
     Q: Float[np.ndarray, "3 3"]
     left: tuple[float, float]
     measured: Float[np.ndarray, "rows 3"]
-    offset: Float[np.ndarray, " 3"]
+    expected: Float[np.ndarray, "rows 3"]
     left_of: Callable[[Float[np.ndarray, "rows 3"]], float]
 
     @classmethod
@@ -215,19 +221,21 @@ class _Tool:
         left, numbers, along, Q, values = next(each for each in found if each[0] <= 1.1 * least + 1e-3)
         if least > CARRIES:
             return None
-        measured = values @ Q.ravel()
-        offset = (measured - hangs @ numbers).mean(axis=0)
-        return cls(
-            sensor, numbers, along, Q, (left, found[0][0]), measured, offset, lambda x: fitted(means(x))[0] ** 0.5
-        )
+        known = sensor, numbers, along, Q, (left, found[0][0]), values @ Q.ravel(), hangs @ numbers
+        return cls(*known, lambda each: fitted(means(each))[0] ** 0.5)
+
+    @property
+    def offset(self) -> Float[np.ndarray, " 3"]:
+        """Along the frame [N]."""
+        return (self.measured - self.expected).mean(axis=0)
 
     @property
     def center(self) -> tuple[float, ...]:
         """Of mass, in the frame [m]."""
         return tuple((self.numbers[1:] / self.numbers[0]).tolist())
 
-    def doubt(self, model: Model, left: float, factor: float) -> Doubt:
-        """Beside torques, of which it leaves so much beyond the masses of the file and needs this factor."""
+    def doubt(self, model: Model, left: float, factor: float, as_stated: float) -> Doubt:
+        """Beside torques beyond the file's masses, of which it leaves so much with this factor, and without one."""
         mass, factors = float(self.numbers[0]), {"mass": float(self.numbers[0]), "factor": factor}
         where = f"kg at ({', '.join(f'{1e3 * x:.0f}' for x in self.center)}) mm"
         if self.left[0] < OTHER * self.left[1]:
@@ -236,12 +244,12 @@ class _Tool:
             fits = f"what {mass:.3g} {where} need there"
             return self.sensor.in_other_axes(fits, self.along, self.Q, turned, **factors)
         kind, says, do = ok, f"agrees with the motion: it carries {mass:.3g} {where}", ""
-        if left < FOLLOWS and (unit := _unit_of(factor)):
+        if left < OTHER * as_stated and (unit := _unit_of(factor)):
             kind, says = look, f"carries {mass * UNITS[unit]:.3g} {where} if it is in {unit}, as torques need it"
             do = f"State its unit: forcegp import --unit force={unit}."
         elif left < FOLLOWS:
             says = f"{says}, and torques need {factor:.3g} times that"
-        elif (beyond := _beyond(model, self.sensor.frame)) > 0.5 * mass and factor < 0.5:  # nearer to 0 than to 1
+        elif OTHER * as_stated > 1.0 and (beyond := _beyond(model, self.sensor.frame)) > 0.5 * mass:
             kind, says = look, f"carries {mass:.3g} {where}; the file has {beyond:.3g} kg from there on"
             do = "Where both hold the same tool it counts twice: leave it out of one of them."
         if kind is ok and np.linalg.norm(self.offset) > OFF * self.sensor.rms:
