@@ -47,11 +47,7 @@ def answer_lines(
     deviation = max(each["largest_deviation_of_a_step"] for each in done["recordings"])
     jitter = f", steps up to {deviation:.0%} off (evened out)" if done["resampled_to_step"] is not None else ""
     doubts = [*done["stops"], *(x for x in content["check"]["doubts"] if not is_explained(x, scores, best))]
-    seen = dict[str, str]()
-    for x in (x for x in doubts if x["about"] in TOLD and (x["level"] != "ok" or x["about"] == "force sensor")):
-        passes = "seconds" in x["numbers"] and x["about"] in FIRST
-        about = "push" if passes else "sensor" if x["level"] == "ok" else x["about"]
-        seen[about] = f"{seen.get(about, '')} {x['what']} {x['do']}".strip()
+    seen = seen_in(doubts)
     unsettled = FIRST & {*seen}
     held += "; settle what is said above first" if unsettled else ""
     flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
@@ -120,6 +116,16 @@ def answer_lines(
         ("record next", command + (f" (least is known of {weak})" if weak else "")),
         ("wrote", f"{out}/report.html, {out}/model, {out}/identified.urdf, {out}/validation/report.md"),
     ]  # fmt: skip
+
+
+def seen_in(doubts: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """What the answer repeats of doubts, by subject: what passes is called a push, a force sensor that is right so."""
+    seen = dict[str, str]()
+    for x in (x for x in doubts if x["about"] in TOLD and (x["level"] != "ok" or x["about"] == "force sensor")):
+        passes = "seconds" in x["numbers"] and x["about"] in FIRST
+        about = "push" if passes else "sensor" if x["level"] == "ok" else x["about"]
+        seen[about] = f"{seen.get(about, '')} {x['what']} {x['do']}".strip()
+    return seen
 
 
 def is_explained(doubt: Mapping[str, Any], scores: forcegp.scores.Scores, best: str) -> bool:

@@ -92,11 +92,8 @@ def force_sensor_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         if tool is not None:
             at_center = rows.kinematics.frame_jacobian(frame, tool.center)[..., :3, :].mT.cpu().numpy()
             both = np.concatenate([at_center @ R @ tool.expected[..., None], needed], axis=-1)
-            noise = np.square(unexplained(needed).reshape(robot.nv, -1)).mean(axis=1) ** 0.5  # of friction, mostly
-            each = (
-                unexplained(both, of_file).T.reshape(2, robot.nv, -1) / np.maximum(noise, 0.05 * noise.max())[:, None]
-            )
-            x, y = each.reshape(2, -1)
+            noise = np.square(unexplained(needed).reshape(robot.nv, -1)).mean(axis=1) ** 0.5 + 1e-12  # of friction
+            x, y = unexplained(both / np.maximum(noise, 0.05 * noise.max())[:, None], of_file).T
             tool = tool if _fitted(-x, y)[0] > FOLLOWS else None  # torques need the other sign: it is no weight
         if tool is not None:
             as_stated = float(np.square(y - x).sum() / (y @ y + 1e-300))
