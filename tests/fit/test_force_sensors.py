@@ -139,7 +139,7 @@ OF_TOOLS = {
     ),
     "not tared": (lambda F, R: F + in_hand(R, [0.7, 0.0, -0.4]), "look", r"off by \(0\.7\d*, -?\S+, -0\.4\d*\) N"),
     "dead": (lambda F, R: in_hand(R, [0.0, 0.0, 3.0]), "ok", "hardly notice"),
-    "it touches": (lambda F, R: F + 0.35 * recorded()[1], "look", "does not follow"),
+    "it touches": (lambda F, R: F + 0.2 * recorded()[1], "look", "does not follow"),
 }
 
 

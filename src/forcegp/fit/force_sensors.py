@@ -7,7 +7,7 @@ Any masses also explain a tool that hangs from a sensor. Its motion alone shows 
 mass and its center, beside an offset. What torques need beyond the masses of the robot's file shows the unit.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations, product
@@ -88,21 +88,18 @@ def force_sensor_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         needed = (missing + (J @ F[..., None])[..., 0])[..., None]
         columns = dataset.metadata.get("import", {}).get("columns", {}).get(f"{FORCE}{frame}", ())
         sensor = _Sensor(frame, F, R, [each for each in columns if NAME.fullmatch(each)])
-        tool = None if frame in dict(held) else _Tool.of(dataset, model, sensor)
-        if tool is not None:
+        doubt, values, left_of = None, F, partial(_left, unexplained(needed)[:, 0], J, unexplained)
+        if frame not in dict(held) and (tool := _Tool.of(dataset, model, sensor)):
             at_center = rows.kinematics.frame_jacobian(frame, tool.center)[..., :3, :].mT.cpu().numpy()
             both = np.concatenate([at_center @ R @ tool.expected[..., None], needed], axis=-1)
             noise = np.square(unexplained(needed).reshape(robot.nv, -1)).mean(axis=1) ** 0.5 + 1e-12  # of friction
             x, y = unexplained(both / np.maximum(noise, 0.05 * noise.max())[:, None], of_file).T
-            tool = tool if _fitted(-x, y)[0] > FOLLOWS else None  # torques need the other sign: it is no weight
-        if tool is not None:
-            as_stated = float(np.square(y - x).sum() / (y @ y + 1e-300))
-            doubt, values, left_of = tool.doubt(model, *_fitted(x, y), as_stated), tool.measured, tool.left_of
-        else:
-            doubt, values = _beside(sensor, J, needed, unexplained), F
-            left_of = partial(_left, unexplained(needed)[:, 0], J, unexplained)
+            if _fitted(-x, y)[0] > FOLLOWS:  # else torques need the other sign: it is no weight
+                doubt, values, left_of = tool.doubt(model, x, y), tool.measured, tool.left_of
+        if doubt is None:
+            doubt = _beside(sensor, J, needed, unexplained)
         yield doubt
-        follows = tool is not None or doubt.numbers.get("left", 1.0) < FOLLOWS
+        follows = values is not F or doubt.numbers.get("left", 1.0) < FOLLOWS
         if follows and len(dataset.episodes) == 1 and dataset.time_ordered:
             moved = (np.stack([np.interp(dataset.time + s, dataset.time, x) for x in values.T], axis=1) for s in SHIFTS)
             yield from late_doubts(sensor.name, [*map(left_of, moved)], float(np.median(np.diff(dataset.time))))
@@ -231,28 +228,32 @@ class _Tool:
         """Of mass, in the frame [m]."""
         return tuple((self.numbers[1:] / self.numbers[0]).tolist())
 
-    def doubt(self, model: Model, left: float, factor: float, as_stated: float) -> Doubt:
-        """Beside torques beyond the file's masses, of which it leaves so much with this factor, and without one."""
+    def doubt(self, model: Model, x: Float[np.ndarray, " rows"], y: Float[np.ndarray, " rows"]) -> Doubt:
+        """Beside torques: y of what they need beyond the masses of the file, of which it makes x."""
+        (left, factor), as_stated = _fitted(x, y), np.square(y - x).sum() / (y @ y + 1e-300)
         mass, factors = float(self.numbers[0]), {"mass": float(self.numbers[0]), "factor": factor}
-        where = f"kg at ({', '.join(f'{1e3 * x:.0f}' for x in self.center)}) mm"
+        sensor, where = self.sensor, f"kg at {_vector(1e3 * self.numbers[1:] / mass, '.0f')} mm"
         if self.left[0] < OTHER * self.left[1]:
             turned = "that is, give the columns with a minus, for the force on the robot."
             factors["mass"] *= 1.0 if np.trace(self.Q) > -3.0 else -1.0
-            fits = f"what {mass:.3g} {where} need there"
-            return self.sensor.in_other_axes(fits, self.along, self.Q, turned, **factors)
+            return sensor.in_other_axes(f"what {mass:.3g} {where} need there", self.along, self.Q, turned, **factors)
         kind, says, do = ok, f"agrees with the motion: it carries {mass:.3g} {where}", ""
         if left < OTHER * as_stated and (unit := _unit_of(factor)):
             kind, says = look, f"carries {mass * UNITS[unit]:.3g} {where} if it is in {unit}, as torques need it"
             do = f"State its unit: forcegp import --unit force={unit}."
         elif left < FOLLOWS:
             says = f"{says}, and torques need {factor:.3g} times that"
-        elif OTHER * as_stated > 1.0 and (beyond := _beyond(model, self.sensor.frame)) > 0.5 * mass:
+        elif OTHER * as_stated > 1.0:
+            beyond = _beyond(model, sensor.frame)
             kind, says = look, f"carries {mass:.3g} {where}; the file has {beyond:.3g} kg from there on"
             do = "Where both hold the same tool it counts twice: leave it out of one of them."
-        if kind is ok and np.linalg.norm(self.offset) > OFF * self.sensor.rms:
-            off = ", ".join(f"{x:.3g}" for x in self.offset)
-            kind, says, do = look, f"{says}, and is off by ({off}) N along its own axes", self.sensor.tare
-        return self.sensor.said(kind, says, do, **factors, offset=self.offset.tolist())
+        if kind is ok and np.linalg.norm(self.offset) > OFF * sensor.rms:
+            kind, says, do = look, f"{says}, and is off by {_vector(self.offset)} N along its own axes", sensor.tare
+        return sensor.said(kind, says, do, **factors, offset=self.offset.tolist())
+
+
+def _vector(values: Iterable[float], form: str = ".3g") -> str:
+    return f"({', '.join(f'{x:{form}}' for x in values)})"
 
 
 def _unit_of(factor: float) -> str:
@@ -282,9 +283,8 @@ def _beside(sensor: _Sensor, J: np.ndarray, needed: np.ndarray, unexplained: Sho
             kind, says = look, f"fits what is needed there in {unit}, or torques are off by that factor"
             do = f"State its unit: forcegp import --unit force={unit}."
         elif far > OFF * sensor.rms:
-            parts = (f"({', '.join(f'{x:.3g}' for x in each)}) N" for each in (offset, drift))
-            kind, says = look, "is off by {}, and drifts by {} over the log, along its own axes".format(*parts)
-            do = sensor.tare
+            off = f"is off by {_vector(offset)} N, and drifts by {_vector(drift)} N over the log, along its own axes"
+            kind, says, do = look, off, sensor.tare
         return sensor.said(kind, says, do, **numbers)
     if np.square(unexplained(J @ F)).sum() < FELT**2 * len(y):
         return sensor.said(ok, "shows what torques would hardly notice")
