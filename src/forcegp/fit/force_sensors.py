@@ -7,7 +7,7 @@ Any masses also explain a tool that hangs from a sensor. Its motion alone shows 
 mass and its center, beside an offset. What torques need beyond the masses of the robot's file shows the unit.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import permutations, product
@@ -39,10 +39,10 @@ Shown = Callable[..., Float[np.ndarray, "windows k"]]
 UNITS = {"kN": 1e3, "mN": 1e-3, "kgf": 9.80665, "lbf": 4.4482216152605}  # N
 AXES = sorted(_EVERY, key=lambda Q: (abs(np.trace(Q)) < 3.0, -np.trace(Q), -np.linalg.det(Q)))
 """As it is, turned altogether, other axes; then those that are no rotation."""
-Readings = Mapping[str, tuple[Float[np.ndarray, "rows 3 3"], Float[np.ndarray, "rows 3"]]]
-"""By what an import states of the axes: what turns columns into the world's axes, and the columns."""
-WORDS = {"": "", "own": " along the axes of the frame", "body": " along the axes of the frame"}
-WORDS |= {"world": " along the axes of the world"}
+TARE = "Tare it; or take it off the columns, as in forcegp import --force 'FRAME=FX-1.2,FY,FZ'."
+WORDS = {"": "", "own": " along the axes of the frame"}
+WORDS |= {"body": WORDS["own"], "world": " along the axes of the world"}
+"""By the axes that a sensor has: those stated, also in its frame; its frame's for stated ones of the world; or these."""
 
 
 def force_sensor_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
@@ -82,27 +82,26 @@ def force_sensor_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         means = short_means(dataset, *(torques * weight[:, None]).swapaxes(0, 1))
         return np.concatenate([each - basis @ (basis.T @ each) for each, basis in zip(means, bases, strict=True)])
 
+    def beside_file(force: np.ndarray, R: np.ndarray, frame: str, center: np.ndarray, needed: np.ndarray) -> np.ndarray:
+        """What a force along the frame makes there, and what torques need beyond the masses of the file."""
+        J = rows.kinematics.frame_jacobian(frame, tuple(center.tolist()))[..., :3, :].mT.cpu().numpy()
+        noise = np.square(unexplained(needed).reshape(robot.nv, -1)).mean(axis=1) ** 0.5 + 1e-12  # of friction
+        both = np.concatenate([J @ R @ force[..., None], needed], axis=-1)
+        return unexplained(both / np.maximum(noise, 0.05 * noise.max())[:, None], of_file).T
+
     for frame, F in sensed.items():
         J = arm(rows.kinematics, model, frame).cpu().numpy()
         R = rows.kinematics.frame_pose(frame)[..., :3, :3].cpu().numpy()
         needed = (missing + (J @ F[..., None])[..., 0])[..., None]
         columns = dataset.metadata.get("import", {}).get("columns", {}).get(f"{FORCE}{frame}", ())
         sensor = _Sensor(frame, F, R, [each for each in columns if NAME.fullmatch(each)])
-        doubt, values, left_of = None, F, partial(_left, unexplained(needed)[:, 0], J, unexplained)
-        if frame not in dict(held) and (tool := _Tool.of(dataset, model, sensor)):
-            at_center = rows.kinematics.frame_jacobian(frame, tool.center)[..., :3, :].mT.cpu().numpy()
-            both = np.concatenate([at_center @ R @ tool.expected[..., None], needed], axis=-1)
-            noise = np.square(unexplained(needed).reshape(robot.nv, -1)).mean(axis=1) ** 0.5 + 1e-12  # of friction
-            x, y = unexplained(both / np.maximum(noise, 0.05 * noise.max())[:, None], of_file).T
-            if _fitted(-x, y)[0] > FOLLOWS:  # else torques need the other sign: it is no weight
-                doubt, values, left_of = tool.doubt(model, x, y), tool.measured, tool.left_of
-        if doubt is None:
-            doubt = _beside(sensor, J, needed, unexplained)
+        found = None if frame in dict(held) else _of_tool(dataset, model, sensor, partial(beside_file, needed=needed))
+        doubt, values, left_of = found or _of_torques(sensor, J, needed, unexplained)
         yield doubt
-        follows = values is not F or doubt.numbers.get("left", 1.0) < FOLLOWS
-        if follows and len(dataset.episodes) == 1 and dataset.time_ordered:
+        if left_of is not None and len(dataset.episodes) == 1 and dataset.time_ordered:
             moved = (np.stack([np.interp(dataset.time + s, dataset.time, x) for x in values.T], axis=1) for s in SHIFTS)
-            yield from late_doubts(sensor.name, [*map(left_of, moved)], float(np.median(np.diff(dataset.time))))
+            late = [*map(left_of, moved)]
+            yield from late_doubts(f"force sensor at {frame}", late, float(np.median(np.diff(dataset.time))))
 
 
 def _fitted(x: Float[np.ndarray, " rows"], y: Float[np.ndarray, " rows"]) -> tuple[float, float]:
@@ -111,14 +110,13 @@ def _fitted(x: Float[np.ndarray, " rows"], y: Float[np.ndarray, " rows"]) -> tup
     return max(0.0, 1.0 - max(shared, 0.0) ** 2 / (power * float(y @ y) + 1e-300)), shared / power
 
 
-def _left(y: Float[np.ndarray, " rows"], J: Float[np.ndarray, "rows nv 3"], unexplained: Shown, F: np.ndarray) -> float:
-    """What forces leave of y, as a root mean square over that of y."""
-    return _fitted(unexplained(J @ F[..., None])[:, 0], y)[0] ** 0.5
+def _unit_of(factor: float) -> str:
+    """The unit in which values times this factor are N; empty for none."""
+    return next((name for name, size in UNITS.items() if factor > 0.0 and abs(np.log(factor / size)) < NEAR), "")
 
 
-def _by_axes(arms: Float[np.ndarray, "rows k 3"], columns: Float[np.ndarray, "rows 3"]) -> np.ndarray:
-    """What each column along each axis makes (rows, k, 9), times the entries of Q."""
-    return (arms[..., None] * columns[:, None, None]).reshape(*arms.shape[:2], 9)
+def _vector(values: Iterable[float], form: str = ".3g") -> str:
+    return f"({', '.join(f'{x:{form}}' for x in values)})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,29 +129,36 @@ class _Sensor:
     columns: Sequence[str]
 
     @property
-    def name(self) -> str:
-        """With its frame."""
-        return f"force sensor at {self.frame}"
-
-    @property
-    def tare(self) -> str:
-        """What to do about an offset."""
-        return f"Tare it; or take it off the columns, as in forcegp import --force '{self.frame}=FX-1.2,FY,FZ'."
-
-    @property
     def rms(self) -> float:
         """What it measures [N]."""
         return float(np.sqrt(np.square(self.F).sum(1).mean()))
 
     @property
-    def readings(self) -> Readings:
-        """As stated, along the frame as well, only in truth along the frame, and only as stated."""
-        one, own = np.broadcast_to(np.eye(3), self.R.shape), (self.R.mT @ self.F[..., None])[..., 0]
-        return {"": (one, self.F), "own": (self.R, own), "body": (self.R, self.F), "world": (one, own)}
+    def own(self) -> Float[np.ndarray, "rows 3"]:
+        """Its forces along the frame."""
+        return (self.R.mT @ self.F[..., None])[..., 0]
+
+    def by_axes(self, arms: Float[np.ndarray, "rows k 3"], along: str) -> Float[np.ndarray, "rows k 9"]:
+        """What each column along each axis makes, times the entries of Q."""
+        columns = self.own if along in ("own", "world") else self.F
+        arms = arms @ self.R if along in ("own", "body") else arms
+        return (arms[..., None] * columns[:, None, None]).reshape(*arms.shape[:2], 9)
+
+    def read(
+        self, arms: np.ndarray, means: Shown, leaves: Callable[[np.ndarray], float]
+    ) -> tuple[float, float, str, Any]:
+        """What its forces leave as they are stated, and what at least, with the axes to read them along for that."""
+        turns = np.linalg.norm(self.own.std(axis=0)) > OFF * self.rms  # a dead one would be a weight along the world
+        ways = {along: means(self.by_axes(arms, along)) for along in WORDS if turns or along != "world"}
+        found = [(leaves(X @ Q.ravel()), along, Q) for along, X in ways.items() for Q in AXES]
+        least = min(each[0] for each in found)
+        along, Q = next(each[1:] for each in found if each[0] <= 1.1 * least + 1e-3)
+        return found[0][0], least, along, Q
 
     def said(self, kind: Callable[..., Doubt], says: str, do: str = "", **numbers: Any) -> Doubt:
         """A doubt about it."""
-        what = f"the {self.name} {says}; it measures about {self.rms:.3g} N."
+        what = f"the force sensor at {self.frame} {says}; it measures about {self.rms:.3g} N."
+        do = do.replace("FRAME", self.frame)
         return kind(about="force sensor", what=what, do=do, numbers={"frame": self.frame, **numbers})
 
     def in_other_axes(self, fits: str, along: str, Q: np.ndarray, turned: str, **numbers: Any) -> Doubt:
@@ -162,142 +167,92 @@ class _Sensor:
         signs, known = ", ".join(f"{sign}{'xyz'[k]}" for k, sign in places), len(self.columns) == 3
         order = ",".join(f"{sign}{self.columns[k]}" for k, sign in places) if known else "X,Y,Z"
         axes = "" if along in ("", "own") else f"--axes force={along} "
-        do = f"forcegp import {axes}--force {self.frame}={order}"
-        do = f"Give the columns {'so' if axes or known else 'in this order, with these signs'}: {do}"
-        do = f"{do}, {turned}" if np.trace(Q) == -3.0 else f"{do}."
+        do = f"Give the columns {'so' if axes or known else 'in this order, with these signs'}: forcegp import {axes}"
+        do = f"{do}--force FRAME={order}{f', {turned}' if np.trace(Q) == -3.0 else '.'}"
         numbers |= {"axes": (Q @ [1.0, 2.0, 3.0]).tolist()}
         return self.said(wrong, f"fits {fits} as ({signs}){WORDS[along]}", do, **numbers)
 
 
-@dataclass(frozen=True, eq=False)
-class _Tool:
-    """What hangs from a sensor, m and m c, by the sensor alone, and how to read its axes for that.
-
-    `left` of its power, so and as it is stated; `measured` and `expected` along the frame.
-    """
-
-    sensor: _Sensor
-    numbers: Float[np.ndarray, " 4"]
-    along: str
-    Q: Float[np.ndarray, "3 3"]
-    left: tuple[float, float]
-    measured: Float[np.ndarray, "rows 3"]
-    expected: Float[np.ndarray, "rows 3"]
-    left_of: Callable[[Float[np.ndarray, "rows 3"]], float]
-
-    @classmethod
-    def of(cls, dataset: Dataset, model: Model, sensor: _Sensor) -> "_Tool | None":
-        """None where the sensor feels more than that."""
-        points = ("0,0,0", "1,0,0", "0,1,0", "0,0,1")
-        still, *ends = (expected(dataset, model, f"{IMU}{sensor.frame}@{point}") for point in points)
-        hangs = -np.stack([still, *(end - still for end in ends)], axis=-1)
-
-        def means(values: Float[np.ndarray, "rows 3 k"]) -> Float[np.ndarray, "windows 3 k"]:
-            return short_means(dataset, values.reshape(len(values), -1))[0].reshape(-1, *values.shape[1:])
-
-        B = means(hangs)
-        moves = (B - B.mean(axis=0)).reshape(-1, 4)
-
-        def fitted(y: Float[np.ndarray, "windows 3"]) -> tuple[float, np.ndarray]:
-            """What such a tool leaves of the power beside an offset, and its numbers."""
-            y = (y - y.mean(axis=0)).ravel()
-            numbers = np.linalg.lstsq(moves, y)[0]
-            left = np.square(y - moves @ numbers).sum() / (y @ y + 1e-300)
-            return float(left) if numbers[0] > 0.0 else 1.0, numbers
-
-        found = []
-        for along, (turn, columns) in sensor.readings.items():
-            values = _by_axes(sensor.R.mT @ turn, columns)
-            if not along or np.linalg.norm(columns.std(axis=0)) > OFF * sensor.rms:  # else a dead one would be a weight
-                X = means(values)
-                found += [(*fitted(X @ Q.ravel()), along, Q, values) for Q in AXES]
-        least = min(each[0] for each in found)
-        left, numbers, along, Q, values = next(each for each in found if each[0] <= 1.1 * least + 1e-3)
-        if least > CARRIES:
-            return None
-        known = sensor, numbers, along, Q, (left, found[0][0]), values @ Q.ravel(), hangs @ numbers
-        return cls(*known, lambda each: fitted(means(each))[0] ** 0.5)
-
-    @property
-    def offset(self) -> Float[np.ndarray, " 3"]:
-        """Along the frame [N]."""
-        return (self.measured - self.expected).mean(axis=0)
-
-    @property
-    def center(self) -> tuple[float, ...]:
-        """Of mass, in the frame [m]."""
-        return tuple((self.numbers[1:] / self.numbers[0]).tolist())
-
-    def doubt(self, model: Model, x: Float[np.ndarray, " rows"], y: Float[np.ndarray, " rows"]) -> Doubt:
-        """Beside torques: y of what they need beyond the masses of the file, of which it makes x."""
-        (left, factor), as_stated = _fitted(x, y), np.square(y - x).sum() / (y @ y + 1e-300)
-        mass, factors = float(self.numbers[0]), {"mass": float(self.numbers[0]), "factor": factor}
-        sensor, where = self.sensor, f"kg at {_vector(1e3 * self.numbers[1:] / mass, '.0f')} mm"
-        if self.left[0] < OTHER * self.left[1]:
-            turned = "that is, give the columns with a minus, for the force on the robot."
-            factors["mass"] *= 1.0 if np.trace(self.Q) > -3.0 else -1.0
-            return sensor.in_other_axes(f"what {mass:.3g} {where} need there", self.along, self.Q, turned, **factors)
-        kind, says, do = ok, f"agrees with the motion: it carries {mass:.3g} {where}", ""
-        if left < OTHER * as_stated and (unit := _unit_of(factor)):
-            kind, says = look, f"carries {mass * UNITS[unit]:.3g} {where} if it is in {unit}, as torques need it"
-            do = f"State its unit: forcegp import --unit force={unit}."
-        elif left < FOLLOWS:
-            says = f"{says}, and torques need {factor:.3g} times that"
-        elif OTHER * as_stated > 1.0:
-            beyond = _beyond(model, sensor.frame)
-            kind, says = look, f"carries {mass:.3g} {where}; the file has {beyond:.3g} kg from there on"
-            do = "Where both hold the same tool it counts twice: leave it out of one of them."
-        if kind is ok and np.linalg.norm(self.offset) > OFF * sensor.rms:
-            kind, says, do = look, f"{says}, and is off by {_vector(self.offset)} N along its own axes", sensor.tare
-        return sensor.said(kind, says, do, **factors, offset=self.offset.tolist())
+Found = tuple[Doubt, np.ndarray, Callable[[np.ndarray], float] | None]
+"""A doubt; and forces, with what such forces leave when they are shifted in time."""
 
 
-def _vector(values: Iterable[float], form: str = ".3g") -> str:
-    return f"({', '.join(f'{x:{form}}' for x in values)})"
+def _of_tool(dataset: Dataset, model: Model, sensor: _Sensor, beside_file: Shown) -> Found | None:
+    """A sensor that a tool alone explains, by its mass and center; None where it feels more than that."""
+    points = ("0,0,0", "1,0,0", "0,1,0", "0,0,1")
+    still, *ends = (expected(dataset, model, f"{IMU}{sensor.frame}@{point}") for point in points)
+    hangs = -np.stack([still, *(end - still for end in ends)], axis=-1)
+
+    def means(values: Float[np.ndarray, "rows 3 *k"]) -> Float[np.ndarray, "windows 3 *k"]:
+        each = short_means(dataset, values.reshape(len(values), -1))[0].reshape(-1, *values.shape[1:])
+        return each - each.mean(axis=0)  # beside any offset
+
+    moves = means(hangs).reshape(-1, 4)
+
+    def numbers_of(y: Float[np.ndarray, "windows 3"]) -> np.ndarray:
+        return np.linalg.lstsq(moves, y.ravel())[0]
+
+    def leaves(y: Float[np.ndarray, "windows 3"]) -> float:
+        left = np.square(y.ravel() - moves @ numbers_of(y)).sum() / (np.square(y).sum() + 1e-300)
+        return float(left) if numbers_of(y)[0] > 0.0 else 1.0
+
+    stated, least, along, Q = sensor.read(sensor.R.mT, means, leaves)
+    measured = sensor.by_axes(sensor.R.mT, along) @ Q.ravel()
+    numbers = numbers_of(means(measured))
+    mass, center = float(numbers[0]), numbers[1:] / numbers[0]
+    x, y = beside_file(hangs @ numbers, sensor.R, sensor.frame, center)
+    (left, factor), as_stated = _fitted(x, y), np.square(y - x).sum() / (y @ y + 1e-300)
+    if least > CARRIES or _fitted(-x, y)[0] < FOLLOWS:  # torques need the other sign: it is no weight
+        return None
+    offset = (measured - hangs @ numbers).mean(axis=0)
+    known, where = {"mass": mass, "factor": factor}, f"kg at {_vector(1e3 * center, '.0f')} mm"
+    kind, says, do = ok, f"agrees with the motion: it carries {mass:.3g} {where}", ""
+    if least < OTHER * stated:
+        known["mass"] *= 1.0 if np.trace(Q) > -3.0 else -1.0
+        turned = "that is, give the columns with a minus, for the force on the robot."
+        doubt = sensor.in_other_axes(f"what {mass:.3g} {where} need there", along, Q, turned, **known)
+        return doubt, measured, None
+    if left < OTHER * as_stated and (unit := _unit_of(factor)):
+        kind, says = look, f"carries {mass * UNITS[unit]:.3g} {where} if it is in {unit}, as torques need it"
+        do = f"State its unit: forcegp import --unit force={unit}."
+    elif left < FOLLOWS:
+        says = f"{says}, and torques need {factor:.3g} times that"
+    elif OTHER * as_stated > 1.0:
+        kind, says = look, f"carries {mass:.3g} {where}, and torques need no more than the masses of the file"
+        do = "The file has it as well, so it counts twice: leave it out of one of them."
+    if kind is ok and np.linalg.norm(offset) > OFF * sensor.rms:
+        kind, says, do = look, f"{says}, and is off by {_vector(offset)} N along its own axes", TARE
+    doubt = sensor.said(kind, says, do, **known, offset=offset.tolist())
+    return doubt, measured, lambda each: leaves(means(each)) ** 0.5
 
 
-def _unit_of(factor: float) -> str:
-    """The unit in which values times this factor are N; empty for none."""
-    return next((name for name, size in UNITS.items() if factor > 0.0 and abs(np.log(factor / size)) < NEAR), "")
-
-
-def _beside(sensor: _Sensor, J: np.ndarray, needed: np.ndarray, unexplained: Shown) -> Doubt:
-    """One that feels other forces, beside torques."""
-    y, F, R, found = unexplained(needed)[:, 0], sensor.F[..., None], sensor.R, []
-    for along, (turn, columns) in sensor.readings.items():
-        X = unexplained(_by_axes(J @ turn, columns))
-        found += [(*_fitted(X @ Q.ravel(), y), along, Q) for Q in AXES]
-    left, factor, *_ = found[0]
-    least = min(each[0] for each in found)
-    _, _, along, Q = next(each for each in found if each[0] <= 1.1 * least + 1e-3)
-    numbers: dict[str, Any] = {"left": left, "factor": factor}
-    if left < FOLLOWS and least > OTHER * left:
-        drift = R * np.linspace(-0.5, 0.5, len(F))[:, None, None]
-        X = np.c_[unexplained(J @ F), unexplained(J @ R), unexplained(J @ drift)]
-        off = np.linalg.lstsq(X, y)[0]
-        offset, drift = -off[1:4] / off[0], -off[4:] / off[0]
-        far = np.square(y - X @ off).sum() < OTHER * left * (y @ y) and max(map(np.linalg.norm, (offset, drift)))
-        numbers |= {"offset": offset.tolist(), "drift": drift.tolist()}
-        kind, says, do = ok, f"leaves {100.0 * left:.2g} % of what torques and motion need there", ""
-        if unit := _unit_of(factor):
-            kind, says = look, f"fits what is needed there in {unit}, or torques are off by that factor"
-            do = f"State its unit: forcegp import --unit force={unit}."
-        elif far > OFF * sensor.rms:
-            off = f"is off by {_vector(offset)} N, and drifts by {_vector(drift)} N over the log, along its own axes"
-            kind, says, do = look, off, sensor.tare
-        return sensor.said(kind, says, do, **numbers)
-    if np.square(unexplained(J @ F)).sum() < FELT**2 * len(y):
-        return sensor.said(ok, "shows what torques would hardly notice")
-    if least < OTHER * left:
-        return sensor.in_other_axes("what torques and motion need there", along, Q, "or turn all torques.", **numbers)
-    says, do = "does not follow what torques and motion need there", "Compare its frame and the robot."
-    return sensor.said(look, says, do, **numbers)
-
-
-def _beyond(model: Model, frame: str) -> float:
-    """Mass of the body of a frame and of all that it carries [kg]."""
-    first, _ = model.robot.frame(frame)
-    layout, inside = model.robot.layout, {first}
-    for body, parent in enumerate(layout.parents):  # after its parent
-        inside |= {body} if parent in inside else set()
-    return float(model.robot.tree.inertias[sorted(inside), 3, 3, 0].sum())
+def _of_torques(sensor: _Sensor, J: np.ndarray, needed: np.ndarray, unexplained: Shown) -> Found:
+    """Any other, beside torques."""
+    y, x, R = unexplained(needed)[:, 0], unexplained(J @ sensor.F[..., None])[:, 0], sensor.R
+    left, least, along, Q = sensor.read(J, unexplained, lambda each: _fitted(each, y)[0])
+    numbers: dict[str, Any] = {"left": left, "factor": _fitted(x, y)[1]}
+    if left >= FOLLOWS or least < OTHER * left:
+        if np.square(x).sum() < FELT**2 * len(y):
+            doubt = sensor.said(ok, "shows what torques would hardly notice")
+        elif least < OTHER * left:
+            fits = "what torques and motion need there"
+            doubt = sensor.in_other_axes(fits, along, Q, "or turn all torques.", **numbers)
+        else:
+            says, do = "does not follow what torques and motion need there", "Compare its frame and the robot."
+            doubt = sensor.said(look, says, do, **numbers)
+        return doubt, sensor.F, None
+    drift = R * np.linspace(-0.5, 0.5, len(R))[:, None, None]
+    X = np.c_[x, unexplained(J @ R), unexplained(J @ drift)]
+    off = np.linalg.lstsq(X, y)[0]
+    offset, drift = -off[1:4] / off[0], -off[4:] / off[0]
+    far = np.square(y - X @ off).sum() < OTHER * left * (y @ y) and max(map(np.linalg.norm, (offset, drift)))
+    numbers |= {"offset": offset.tolist(), "drift": drift.tolist()}
+    kind, says, do = ok, f"leaves {100.0 * left:.2g} % of what torques and motion need there", ""
+    if unit := _unit_of(numbers["factor"]):
+        kind, says = look, f"fits what is needed there in {unit}, or torques are off by that factor"
+        do = f"State its unit: forcegp import --unit force={unit}."
+    elif far > OFF * sensor.rms:
+        parts = f"is off by {_vector(offset)} N, and drifts by {_vector(drift)} N over the log, along its own axes"
+        kind, says, do = look, parts, TARE
+    doubt = sensor.said(kind, says, do, **numbers)
+    return doubt, sensor.F, lambda each: _fitted(unexplained(J @ each[..., None])[:, 0], y)[0] ** 0.5
