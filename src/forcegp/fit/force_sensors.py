@@ -36,13 +36,14 @@ CARRIES = 0.1
 _EVERY = [np.eye(3)[list(k)] * signs for k in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)]
 NAME = compile(r"[\w.\[\]/]+")  # of a column that stands alone
 Shown = Callable[..., Float[np.ndarray, "windows k"]]
+Leaves = Callable[[np.ndarray], float]
 UNITS = {"kN": 1e3, "mN": 1e-3, "kgf": 9.80665, "lbf": 4.4482216152605}  # N
 AXES = sorted(_EVERY, key=lambda Q: (abs(np.trace(Q)) < 3.0, -np.trace(Q), -np.linalg.det(Q)))
 """As it is, turned altogether, other axes; then those that are no rotation."""
 TARE = "Tare it; or take it off the columns, as in forcegp import --force 'FRAME=FX-1.2,FY,FZ'."
 WORDS = {"": "", "own": " along the axes of the frame"}
 WORDS |= {"body": WORDS["own"], "world": " along the axes of the world"}
-"""By the axes that a sensor has: those stated, also in its frame; its frame's for stated ones of the world; or these."""
+"""By the axes that it has: as stated, also its frame's, its frame's where the world's are stated, and reversed."""
 
 
 def force_sensor_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
@@ -69,8 +70,10 @@ def force_sensor_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         return [basis[:, values > 1e-9 * values[0]] for basis, values in parts]
 
     of_file, of_any = bases_of(laws), bases_of(np.concatenate([laws, regressor], axis=-1))
-    apart = min(1.0, float(np.median(np.diff(dataset.time))) / SECONDS) if dataset.time_ordered else 1.0
-    if any(apart * len(basis) < 2 * basis.shape[1] for basis in of_any):  # any masses would explain it
+    step = float(np.median(np.diff(dataset.time))) if dataset.time_ordered else SECONDS
+    if any(
+        min(1.0, step / SECONDS) * len(basis) < 2 * basis.shape[1] for basis in of_any
+    ):  # any masses would explain it
         yield ok(about="force sensor", what="the log is too short to compare force sensors with torques.")
         return
     size = np.sqrt(np.square(missing + rows.at_contacts).mean(axis=0)) + 1e-12
@@ -94,14 +97,14 @@ def force_sensor_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         R = rows.kinematics.frame_pose(frame)[..., :3, :3].cpu().numpy()
         needed = (missing + (J @ F[..., None])[..., 0])[..., None]
         columns = dataset.metadata.get("import", {}).get("columns", {}).get(f"{FORCE}{frame}", ())
-        sensor = _Sensor(frame, F, R, [each for each in columns if NAME.fullmatch(each)])
+        own, rms = (R.mT @ F[..., None])[..., 0], float(np.sqrt(np.square(F).sum(1).mean()))
+        sensor = _Sensor(frame, F, own, R, [each for each in columns if NAME.fullmatch(each)], rms)
         found = None if frame in dict(held) else _of_tool(dataset, model, sensor, partial(beside_file, needed=needed))
         doubt, values, left_of = found or _of_torques(sensor, J, needed, unexplained)
         yield doubt
         if left_of is not None and len(dataset.episodes) == 1 and dataset.time_ordered:
             moved = (np.stack([np.interp(dataset.time + s, dataset.time, x) for x in values.T], axis=1) for s in SHIFTS)
-            late = [*map(left_of, moved)]
-            yield from late_doubts(f"force sensor at {frame}", late, float(np.median(np.diff(dataset.time))))
+            yield from late_doubts(f"force sensor at {frame}", [*map(left_of, moved)], step)
 
 
 def _fitted(x: Float[np.ndarray, " rows"], y: Float[np.ndarray, " rows"]) -> tuple[float, float]:
@@ -121,22 +124,14 @@ def _vector(values: Iterable[float], form: str = ".3g") -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Sensor:
-    """What one measured, the axes of its frame, and names of its columns, where they stand alone."""
+    """What one measured, also along its frame, the axes of that, and names of columns that stand alone."""
 
     frame: str
     F: Float[np.ndarray, "rows 3"]
+    own: Float[np.ndarray, "rows 3"]
     R: Float[np.ndarray, "rows 3 3"]
     columns: Sequence[str]
-
-    @property
-    def rms(self) -> float:
-        """What it measures [N]."""
-        return float(np.sqrt(np.square(self.F).sum(1).mean()))
-
-    @property
-    def own(self) -> Float[np.ndarray, "rows 3"]:
-        """Its forces along the frame."""
-        return (self.R.mT @ self.F[..., None])[..., 0]
+    rms: float
 
     def by_axes(self, arms: Float[np.ndarray, "rows k 3"], along: str) -> Float[np.ndarray, "rows k 9"]:
         """What each column along each axis makes, times the entries of Q."""
@@ -144,9 +139,7 @@ class _Sensor:
         arms = arms @ self.R if along in ("own", "body") else arms
         return (arms[..., None] * columns[:, None, None]).reshape(*arms.shape[:2], 9)
 
-    def read(
-        self, arms: np.ndarray, means: Shown, leaves: Callable[[np.ndarray], float]
-    ) -> tuple[float, float, str, Any]:
+    def read(self, arms: np.ndarray, means: Shown, leaves: Leaves) -> tuple[float, float, str, Any]:
         """What its forces leave as they are stated, and what at least, with the axes to read them along for that."""
         turns = np.linalg.norm(self.own.std(axis=0)) > OFF * self.rms  # a dead one would be a weight along the world
         ways = {along: means(self.by_axes(arms, along)) for along in WORDS if turns or along != "world"}
@@ -158,8 +151,8 @@ class _Sensor:
     def said(self, kind: Callable[..., Doubt], says: str, do: str = "", **numbers: Any) -> Doubt:
         """A doubt about it."""
         what = f"the force sensor at {self.frame} {says}; it measures about {self.rms:.3g} N."
-        do = do.replace("FRAME", self.frame)
-        return kind(about="force sensor", what=what, do=do, numbers={"frame": self.frame, **numbers})
+        numbers |= {"frame": self.frame}
+        return kind(about="force sensor", what=what, do=do.replace("FRAME", self.frame), numbers=numbers)
 
     def in_other_axes(self, fits: str, along: str, Q: np.ndarray, turned: str, **numbers: Any) -> Doubt:
         """It fits so; `turned` is what to do where only its sign is wrong."""
@@ -173,7 +166,7 @@ class _Sensor:
         return self.said(wrong, f"fits {fits} as ({signs}){WORDS[along]}", do, **numbers)
 
 
-Found = tuple[Doubt, np.ndarray, Callable[[np.ndarray], float] | None]
+Found = tuple[Doubt, np.ndarray, Leaves | None]
 """A doubt; and forces, with what such forces leave when they are shifted in time."""
 
 
@@ -197,21 +190,22 @@ def _of_tool(dataset: Dataset, model: Model, sensor: _Sensor, beside_file: Shown
         return float(left) if numbers_of(y)[0] > 0.0 else 1.0
 
     stated, least, along, Q = sensor.read(sensor.R.mT, means, leaves)
+    if least > CARRIES:
+        return None
     measured = sensor.by_axes(sensor.R.mT, along) @ Q.ravel()
     numbers = numbers_of(means(measured))
     mass, center = float(numbers[0]), numbers[1:] / numbers[0]
     x, y = beside_file(hangs @ numbers, sensor.R, sensor.frame, center)
     (left, factor), as_stated = _fitted(x, y), np.square(y - x).sum() / (y @ y + 1e-300)
-    if least > CARRIES or _fitted(-x, y)[0] < FOLLOWS:  # torques need the other sign: it is no weight
+    if _fitted(-x, y)[0] < FOLLOWS:  # torques need the other sign: it is no weight
         return None
     offset = (measured - hangs @ numbers).mean(axis=0)
     known, where = {"mass": mass, "factor": factor}, f"kg at {_vector(1e3 * center, '.0f')} mm"
     kind, says, do = ok, f"agrees with the motion: it carries {mass:.3g} {where}", ""
     if least < OTHER * stated:
         known["mass"] *= 1.0 if np.trace(Q) > -3.0 else -1.0
-        turned = "that is, give the columns with a minus, for the force on the robot."
-        doubt = sensor.in_other_axes(f"what {mass:.3g} {where} need there", along, Q, turned, **known)
-        return doubt, measured, None
+        fits, turned = f"what {mass:.3g} {where} need there", "that is, give the columns with a minus."
+        return sensor.in_other_axes(fits, along, Q, turned, **known), measured, None
     if left < OTHER * as_stated and (unit := _unit_of(factor)):
         kind, says = look, f"carries {mass * UNITS[unit]:.3g} {where} if it is in {unit}, as torques need it"
         do = f"State its unit: forcegp import --unit force={unit}."
@@ -230,16 +224,14 @@ def _of_torques(sensor: _Sensor, J: np.ndarray, needed: np.ndarray, unexplained:
     """Any other, beside torques."""
     y, x, R = unexplained(needed)[:, 0], unexplained(J @ sensor.F[..., None])[:, 0], sensor.R
     left, least, along, Q = sensor.read(J, unexplained, lambda each: _fitted(each, y)[0])
-    numbers: dict[str, Any] = {"left": left, "factor": _fitted(x, y)[1]}
+    numbers, needs = dict[str, Any](left=left, factor=_fitted(x, y)[1]), "what torques and motion need there"
     if left >= FOLLOWS or least < OTHER * left:
         if np.square(x).sum() < FELT**2 * len(y):
             doubt = sensor.said(ok, "shows what torques would hardly notice")
         elif least < OTHER * left:
-            fits = "what torques and motion need there"
-            doubt = sensor.in_other_axes(fits, along, Q, "or turn all torques.", **numbers)
+            doubt = sensor.in_other_axes(needs, along, Q, "or turn all torques.", **numbers)
         else:
-            says, do = "does not follow what torques and motion need there", "Compare its frame and the robot."
-            doubt = sensor.said(look, says, do, **numbers)
+            doubt = sensor.said(look, f"does not follow {needs}", "Compare its frame and the robot.", **numbers)
         return doubt, sensor.F, None
     drift = R * np.linspace(-0.5, 0.5, len(R))[:, None, None]
     X = np.c_[x, unexplained(J @ R), unexplained(J @ drift)]
@@ -247,7 +239,7 @@ def _of_torques(sensor: _Sensor, J: np.ndarray, needed: np.ndarray, unexplained:
     offset, drift = -off[1:4] / off[0], -off[4:] / off[0]
     far = np.square(y - X @ off).sum() < OTHER * left * (y @ y) and max(map(np.linalg.norm, (offset, drift)))
     numbers |= {"offset": offset.tolist(), "drift": drift.tolist()}
-    kind, says, do = ok, f"leaves {100.0 * left:.2g} % of what torques and motion need there", ""
+    kind, says, do = ok, f"leaves {100.0 * left:.2g} % of {needs}", ""
     if unit := _unit_of(numbers["factor"]):
         kind, says = look, f"fits what is needed there in {unit}, or torques are off by that factor"
         do = f"State its unit: forcegp import --unit force={unit}."

@@ -378,10 +378,7 @@ def checked_identification(name: str, model: Model, rows: Dataset) -> tuple[Mode
 
 
 def identified_model(name: str, model: Model, rows: Dataset, before: Posterior | None = None) -> Model:
-    """The model that laws and bodies of this name make of these rows, with the noise of rows that are held out.
-
-    `before`: what they made of the same rows already, or of more of the same recording.
-    """
+    """The model that this name makes of these rows, or made `before`, with the noise of rows that are held out."""
     opened, evidence = checked_identification(name, model, rows)
     rows = replace(rows, measured={})  # none of which is among the evidence
     if before is None:
