@@ -119,8 +119,7 @@ def test_the_printed_command_keeps_every_option():
         "--accept --overwrite --cutoff 9 --every 3 --lock finger=0.1 --gravity=-9.81,0,0 --link tool --without 1,2.5"
     )
     others += " --forces given --forces gp:joint,viscous --out here"
-    words = ["auto", "a.txt", "b.txt", *columns.split(), *others.split()]
-    command = parse_arguments(words)
+    command = parse_arguments(["auto", "a.txt", "b.txt", *columns.split(), *others.split()])
     mapping = command.columns.mapped([], Terminal(json=False))
     assert parse_arguments(shlex.split(command._command(mapping, command.robot))[1:]) == command
 

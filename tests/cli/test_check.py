@@ -102,8 +102,7 @@ def test_laws_of_a_saved_posterior_belong_to_the_torques_that_are_expected(force
     sprung = replace(data, u=data.u + 40.0 * data.q, truth={})
     sprung.save(folder / "sprung.h5")
     assert "0 wrong, 0 to look at" not in forcegp("check", "sprung.h5", folder=folder).stdout
-    found = fit(data.model.with_forces(Spring()), sprung, Torques())
-    save_posterior(found, folder / "springs")
+    save_posterior(fit(data.model.with_forces(Spring()), sprung, Torques()), folder / "springs")
     done = forcegp("check", "sprung.h5", "--identified", "springs", "--strict", folder=folder)
     assert done.returncode == 0, done.stderr
     assert "0 wrong, 0 to look at" in done.stdout, done.stdout

@@ -27,8 +27,7 @@ def folder(tmp_path_factory):
     """pendulum.h5 and test.h5 with dry friction of 0.4 Nm and viscous friction of 0.2 Nms; arm.h5."""
     place = tmp_path_factory.mktemp("fit")
     for name, seed, seconds in (("pendulum", 1, 10.0), ("test", 2, 3.0)):
-        data = double_pendulum(seconds, seed, noise=0.05)
-        data.rows(slice(None, None, 4)).save(place / f"{name}.h5")
+        double_pendulum(seconds, seed, noise=0.05).rows(slice(None, None, 4)).save(place / f"{name}.h5")
     arm_data(40, seed=0).save(place / "arm.h5")
     return place
 

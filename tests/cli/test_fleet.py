@@ -72,8 +72,7 @@ def test_an_estimate_is_one_column():
     estimate = Estimate("viscous.elbow", "Nms/rad", 0.4, 0.1, 0.0, 1.0, "log", "")
     content = {"estimates": {estimate.name: estimate.to_dict()}, "value": {"interval": 3, "value": 2}}
     content["settings"] = {"a": 1}
-    found = {"estimates.viscous.elbow": 0.4, "value.interval": 3, "value.value": 2}
-    assert numbers_of(content) == found
+    assert numbers_of(content) == {"estimates.viscous.elbow": 0.4, "value.interval": 3, "value.value": 2}
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,7 @@ def folder(tmp_path_factory):
     data = clean(two_links(), 0, seconds=5.0)
     data.save(place / "clean.h5")
     column(at(data, "q", [1.0, 1.0]), "u", 1, np.negative).save(place / "sign.h5")
-    line = on_a_line(0, seconds=5.0)
-    line.save(place / "line.h5")
+    on_a_line(0, seconds=5.0).save(place / "line.h5")
     return place
 
 

@@ -12,8 +12,7 @@ from forcegp.cli.main import main
 
 def saved(path, given):
     q, v, u = given
-    a = np.gradient(v, DT, axis=0)
-    Dataset(q=q, v=v, u=u, a=a, time=DT * np.arange(len(q)), model=URDF_ALONE).save(path)
+    Dataset(q=q, v=v, u=u, a=np.gradient(v, DT, axis=0), time=DT * np.arange(len(q)), model=URDF_ALONE).save(path)
 
 
 @pytest.fixture(scope="module")

@@ -49,8 +49,7 @@ def test_in_a_figure():
 
 
 def test_in_tables(urdf, tmp_path):
-    motion = excitation(Robot.from_urdf_text(urdf), seconds=4.0, seed=0, motions=3)
-    motion.save_csv(tmp_path / "x.csv")
+    excitation(Robot.from_urdf_text(urdf), seconds=4.0, seed=0, motions=3).save_csv(tmp_path / "x.csv")
     with (tmp_path / "x.csv").open(encoding="utf-8", newline="") as file:
         header, first, *_ = csv.reader(file)
     assert header == ["t", *(f"{what}_{name}" for what in "qvau" for name in NAMES)]

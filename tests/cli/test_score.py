@@ -81,8 +81,7 @@ def test_the_same_command_resumes_and_another_is_refused(forcegp, found, folder)
     told = json.loads(done.stdout)
     for name in found["models"]:
         assert told["models"][name]["scores"] == found["models"][name]["scores"]
-    changed = [39 if word == 40 else word for word in QUICK]
-    done = forcegp(*words, *changed, "--out", "results", folder=folder)
+    done = forcegp(*words, *[39 if word == 40 else word for word in QUICK], "--out", "results", folder=folder)
     assert (done.returncode, done.stdout) == (2, "")
     assert "holds results with another points" in done.stderr
     assert done.stderr.count("\n") == 1
@@ -118,8 +117,7 @@ def test_runs_alone_are_scored_on_the_whole_log(forcegp, folder):
     np.testing.assert_allclose(scores["acceleration"]["mae"]["each"], expected.columns("mae"), rtol=1e-6)
     told = forcegp("score", "friction", "test.h5", "--every", 2, "--json", folder=folder)
     scores = json.loads(told.stdout)["models"]["friction"]["scores"]
-    rows = Dataset.load(folder / "test.h5").rows(slice(None, None, 2))
-    expected = score(load_posterior(folder / "friction"), rows)
+    expected = score(load_posterior(folder / "friction"), Dataset.load(folder / "test.h5").rows(slice(None, None, 2)))
     np.testing.assert_allclose(scores["acceleration"]["mae"]["each"], expected.columns("mae"), rtol=1e-6)
 
 

@@ -33,8 +33,7 @@ def test_gymnasiums_own_checks_find_nothing(settings):
     env = gymnasium.make("forcegp/Robot-v0", **settings, max_episode_steps=5)
     check_env(env.unwrapped, skip_render_check=True)
     env.reset(seed=1)
-    ends = [env.step(env.action_space.sample())[3] for _ in range(5)]
-    assert ends == [False] * 4 + [True]
+    assert [env.step(env.action_space.sample())[3] for _ in range(5)] == [False] * 4 + [True]
     assert gymnasium.make_vec("forcegp/Robot-v0", num_envs=4, **settings).reset(seed=0)[0].shape == (4, 2)
 
 

@@ -79,8 +79,7 @@ def test_a_broken_sample_is_an_error_and_no_alarm_later(monitor):
         monitor(q[k], v[k], u[k])
     with pytest.raises(InvalidInput, match="give finite numbers"):
         monitor(np.full(2, np.nan), v[50], u[50])
-    later = [bool(monitor(q[k], v[k], u[k]).alarm) for k in range(51, 90)]
-    assert not any(later)
+    assert not any([bool(monitor(q[k], v[k], u[k]).alarm) for k in range(51, 90)])
 
 
 def test_distances_are_mahalanobis_of_a_covariance_that_moves_with_the_inertia(monitor):

@@ -153,8 +153,7 @@ def test_friction_that_remembers_is_that_of_the_positions_seen(touching):
     M, A, b = (x.numpy() for x in (at.M, at.A, at.b))
     inverse = np.linalg.inv(M)
     a = inverse @ A.T @ np.linalg.solve(A @ inverse @ A.T, b)
-    expected = posterior.predictor(covariance="none").inverse_dynamics(q + step, v, a, [7.0], memory=z).mean
-    assert_close(u, expected)
+    assert_close(u, posterior.predictor(covariance="none").inverse_dynamics(q + step, v, a, [7.0], memory=z).mean)
 
 
 def test_models_with_and_without_contacts(touching):

@@ -45,8 +45,7 @@ LAG = 0.02
 def test_a_sine_comes_out_with_the_gain_of_the_filter(smooth, gain, accuracy, frequency):
     wave = np.exp(2j * np.pi * frequency * TIME)
     real, imaginary = (smooth(x[:, None], TIME)[:, 0] for x in (wave.real, wave.imag))
-    found = ((real + 1j * imaginary) / wave)[INNER]
-    np.testing.assert_allclose(found, gain(frequency), atol=accuracy)
+    np.testing.assert_allclose(((real + 1j * imaginary) / wave)[INNER], gain(frequency), atol=accuracy)
 
 
 def test_the_memory_of_noise_is_where_its_autocorrelation_is_one_half():

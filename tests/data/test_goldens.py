@@ -111,8 +111,7 @@ def test_contacts():
 def test_wind():
     log = flight([(4.0, 1.0, 0.0), (-2.0, 5.0, 0.0)], episodes=2, noise=0.3)
     law, wind = find_wind(log)
-    found = {"law": law, "wind": wind, "before": law.wind_before(log, 0.5)}
-    assert_unchanged("data/wind", found, rtol=1e-4)
+    assert_unchanged("data/wind", {"law": law, "wind": wind, "before": law.wind_before(log, 0.5)}, rtol=1e-4)
 
 
 def test_imus(arm):

@@ -125,18 +125,10 @@ TURNED = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 OF_TOOLS = {
     "none": (lambda F, R: F, "ok", r"carries 0\.6 kg at \(20, -10, 50\) mm, and torques need 0\.9[78]\d* times"),
     "sign": (lambda F, R: -F, "wrong", HANGS + r"\(-x, -y, -z\);(.|\n)*give the columns with a minus"),
-    "turned": (
-        lambda F, R: in_hand(R, in_hand(R.mT, F) @ TURNED),
-        "wrong",
-        r"as \(y, -x, z\) along the axes of the",
-    ),
+    "turned": (lambda F, R: in_hand(R, in_hand(R.mT, F) @ TURNED), "wrong", r"as \(y, -x, z\) along the axes of the"),
     "of the hand": (lambda F, R: in_hand(R.mT, F), "wrong", HANGS + r"\(x, y, z\) (.|\n)*--axes force=body --force"),
     "turned twice": (lambda F, R: in_hand(R, F), "wrong", HANGS + r"\(x, y, z\) (.|\n)*--axes force=world --force"),
-    "kgf": (
-        lambda F, R: F / 9.80665,
-        "look",
-        r"0\.6 kg at \(20, -10, 50\) mm if it (.|\n)*--unit force=kgf\.",
-    ),
+    "kgf": (lambda F, R: F / 9.80665, "look", r"0\.6 kg at \(20, -10, 50\) mm if it (.|\n)*--unit force=kgf\."),
     "not tared": (lambda F, R: F + in_hand(R, [0.7, 0.0, -0.4]), "look", r"off by \(0\.7\d*, -?\S+, -0\.4\d*\) N"),
     "dead": (lambda F, R: in_hand(R, [0.0, 0.0, 3.0]), "ok", "hardly notice"),
     "it touches": (lambda F, R: F + 0.2 * recorded()[1], "look", "does not follow"),
@@ -157,8 +149,7 @@ def test_a_tool_shows_a_delay_and_columns_keep_their_names(monkeypatch):
     _, late = told(in_hand(R, np.roll(in_hand(R.mT, force), 5, axis=0)), log)
     assert late.numbers["delay"] == pytest.approx(0.02, abs=0.002)
     monkeypatch.setitem(force_sensor_doubts.__globals__, "MOST_ROWS", 2000)
-    named = {"import": {"columns": {"force.hand": ["F[0]", "F[1]", "F[2]"]}}}
-    [doubt] = told(-force, replace(log, metadata=named))
+    [doubt] = told(-force, replace(log, metadata={"import": {"columns": {"force.hand": ["F[0]", "F[1]", "F[2]"]}}}))
     assert "hand=-F[0],-F[1],-F[2]," in doubt.do
 
 
@@ -208,7 +199,6 @@ def test_a_real_leg(shared, sign, level):
     time, *columns = np.loadtxt(realdata / "hopper" / "hopper_A.csv.gz", delimiter=",", skiprows=1).T
     q, u, force = (np.array(columns[k : k + 3]).T for k in (0, 3, 6))
     model = Model(Robot.from_urdf(realdata / "hopper" / "teststand.urdf"), fixed_point("contact"))
-    measured = {"force.contact": sign * force}
-    raw = Dataset(q=q, v=0.0 * q, u=u, a=0.0 * q, time=time, model=model, measured=measured)
+    raw = Dataset(q=q, v=0.0 * q, u=u, a=0.0 * q, time=time, model=model, measured={"force.contact": sign * force})
     log = Preparation(cutoff=20.0, every=5, trim=0.2).apply(raw)
     assert [each.level for each in force_sensor_doubts(log, model)] == [level]

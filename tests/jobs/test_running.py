@@ -45,15 +45,13 @@ def test_a_relative_folder_is_that_of_the_caller_not_of_the_processes(results, t
     run_jobs(results, [square(3), square(4)], at_once=2)  # processes begin in the folder of now
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    kept = JobStore.open(Path("kept"), "a test", {})
-    run_jobs(kept, [square(5), square(6)], at_once=2)
+    run_jobs(JobStore.open(Path("kept"), "a test", {}), [square(5), square(6)], at_once=2)
     assert (tmp_path / "elsewhere" / "kept" / "jobs" / "square" / "5" / "note.txt").exists()
 
 
 def test_a_failure_stops_only_what_needs_it(results):
     bad = Job("bad", f"{TOY}:fail", {})
-    after = Job("after", f"{TOY}:square", {"before": "next/bad"}, ("next/bad",))
-    jobs = [bad, next_to(bad), after, square(2)]
+    jobs = [bad, next_to(bad), Job("after", f"{TOY}:square", {"before": "next/bad"}, ("next/bad",)), square(2)]
     with pytest.raises(FitError, match=r"bad failed.*no luck.*1 of \d jobs are kept"):
         run_jobs(results, jobs)
     assert results.result("square/2")["value"] == 4

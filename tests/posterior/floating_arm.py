@@ -26,8 +26,7 @@ def satellite(viscous: float = 0.2, dry: float = 0.3, mass: float = 8.0, switch:
         Viscous(torch.cat([none, none.new_tensor([viscous])])),
         Coulomb(torch.cat([none, none.new_tensor([dry])]), switch),
     )
-    thrusters = Thrusters("hull", PLACES, 1.0, 0.0, AXES)
-    return Model(robot, (), (Actuation(), thrusters, RigidBodies(), *friction))
+    return Model(robot, (), (Actuation(), Thrusters("hull", PLACES, 1.0, 0.0, AXES), RigidBodies(), *friction))
 
 
 def recording(seed: int, seconds: float, given: Model, bump: float = 1.0) -> Dataset:

@@ -140,8 +140,7 @@ def test_the_torques_for_a_motion_and_every_force_are_those_of_the_model(frictio
         np.testing.assert_allclose(u, wanted[k], rtol=1e-10, atol=1e-10)
         bits, (force, deviation) = call(library.arm_forces_deviation, [6, 6], *(x[k] for x in states))
         assert bits == 0
-        rows = np.stack([force.reshape(-1, 3), deviation.reshape(-1, 3)], axis=1)
-        found = dict(zip(parts, rows, strict=True))
+        found = dict(zip(parts, np.stack([force.reshape(-1, 3), deviation.reshape(-1, 3)], axis=1), strict=True))
         for name, part in parts.items():
             np.testing.assert_allclose(found[name][0], part.joint_force.mean[k], rtol=1e-9, atol=1e-12)
             exact = part.joint_force.covariance[k].diagonal().clamp_min(0.0).sqrt().numpy()
@@ -211,8 +210,7 @@ def test_friction_that_remembers_and_a_monitor_of_contacts(tmp_path, options):
         made = export_c(laws, tmp_path / type(model).__name__, monitor=known)
         assert made.differences["arm_monitor_step"] < 1e-9
     if shutil.which("c++"):
-        memory = "{0.3, -0.9, 1.0}"
-        (tmp_path / "arm" / "main.cpp").write_text(CPP.replace("MEMORY", memory).replace("PARTS", "2"))
+        (tmp_path / "arm" / "main.cpp").write_text(CPP.replace("MEMORY", "{0.3, -0.9, 1.0}").replace("PARTS", "2"))
         strict = ["-std=c++17", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror"]
         for command in (["cc", "-std=c99", "-c", "arm.c"], ["c++", *strict, "main.cpp", "arm.o", "-o", "x"]):
             subprocess.run([*command, *options], cwd=tmp_path / "arm", check=True)

@@ -130,8 +130,7 @@ def test_compiled_motions_stay_on_the_manifold(case, integrator):
     u = u[:3, None].expand(-1, 6, -1).clone()
     predictor = posterior.predictor(covariance="none")
     found = assert_motions_of_torch(predictor, posterior, (q[:3], v[:3], u, 0.004), integrator)
-    space = posterior.model.robot.space
-    close(space.normalized(found.q[:, 1:].contiguous()), found.q[:, 1:], 1e-14)
+    close(posterior.model.robot.space.normalized(found.q[:, 1:].contiguous()), found.q[:, 1:], 1e-14)
     assert isinstance(predictor._made.get((integrator, 0, 0)), list) == (integrator != "implicit-midpoint")
     q_next, v_next = predictor.step(q[:3], v[:3], u[:, 0], 0.004, integrator)
     close(q_next, found.q[:, 1], 1e-9)
@@ -230,8 +229,7 @@ def test_an_arm_with_a_switch(integrator, tmp_path):
         change = torch.eye(3, dtype=torch.float64)[j] * size
         ends = [torch.cat(predictor.step(q, v, u + sign * change, dt, integrator), -1) for sign in (1.0, -1.0)]
         close(step.B[..., j], (ends[0] - ends[1]) / (2 * size), 1e-7)
-    written = export_c(posterior, tmp_path / "c", steps=dt, integrator=integrator)
-    assert max(written.differences.values()) < 1e-8
+    assert max(export_c(posterior, tmp_path / "c", steps=dt, integrator=integrator).differences.values()) < 1e-8
 
 
 def test_redundant_contacts_have_right_derivatives():

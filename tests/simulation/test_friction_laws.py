@@ -83,8 +83,7 @@ def test_a_law_of_ones_own_acts_in_plants(monkeypatch):
     monkeypatch.setitem(FORCES, "quadratic", Quadratic)
     v = np.linspace(-1.0, 1.0, 7)
     np.testing.assert_allclose(joint_law("quadratic")(v), -0.3 * np.abs(v) * v - D * v)
-    twice = joint_law("quadratic:drag=0.6,viscous:0")
-    np.testing.assert_allclose(twice(v), -0.6 * np.abs(v) * v, atol=1e-14)
+    np.testing.assert_allclose(joint_law("quadratic:drag=0.6,viscous:0")(v), -0.6 * np.abs(v) * v, atol=1e-14)
     with pytest.raises(InvalidInput, match="joint_friction is 'payload:l7'; give laws of joints"):
         joint_law("payload:l7")
 
