@@ -77,10 +77,7 @@ def atomic_folder(path: str | Path, *, overwrite: bool = True) -> Iterator[Path]
 
 
 def require_writable(path: str | Path) -> None:
-    """Write a little where `path` will be, and delete it: full and read-only disks are noticed before the work.
-
-    Raises OSError.
-    """
+    """Write a little where `path` will be, and delete it: disks that are full are noticed first. Raises OSError."""
     target = _target(path)
     with _beside(next(folder for folder in target.parents if folder.exists()) / target.name) as temporary:
         temporary.write_bytes(bytes(TRIAL))
@@ -90,10 +87,7 @@ def require_writable(path: str | Path) -> None:
 def require_replaceable(
     folder: Path, writer: str, ours: Callable[[Path], object], *, overwrite: bool, own: Iterable[str] = ()
 ) -> None:
-    """Refuse what exists, but empty folders, and with `overwrite` what is `ours` and has no files of others.
-
-    Raises FileFormatError; where `ours` does, it is not.
-    """
+    """Refuse what exists, but empty folders, and with `overwrite` what is `ours` alone. Raises FileFormatError."""
     known: object = False
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
@@ -263,10 +257,7 @@ def write_digests(folder: Path) -> None:
 
 
 def require_unchanged(folder: Path, remedy: str) -> None:
-    """Raises FileFormatError, which ends in the remedy, where a file is not as written, or nothing says what was.
-
-    Files that were added are no concern of this.
-    """
+    """Raises FileFormatError, with the remedy, where a file is not as written; those that were added do not matter."""
     sums = folder / SUMS
     if not sums.exists():
         raise FileFormatError(f"{folder} is incomplete: it has no {SUMS}; {remedy}")

@@ -113,10 +113,7 @@ def digests(jobs: Sequence[Job]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class JobStore:
-    """Results by name in `folder/jobs/<name>/job.json`, each beside the files that its task wrote.
-
-    kind: the command that owns the folder, for messages.
-    """
+    """Results by name in `folder/jobs/<name>/job.json`, beside files of the task; kind: the command that owns it."""
 
     folder: Path
     kind: str = "forcegp"

@@ -252,10 +252,7 @@ class Model(Summary):
         return self.robot.nq, self.robot.nv, len(self.inputs)
 
     def state(self, q: Tensor, v: Tensor, u: Tensor) -> State:
-        """Checked and broadcast states (q, v, u), each with its own size.
-
-        Raises InvalidInput for wrong shapes, dtypes or devices.
-        """
+        """Checked, broadcast states (q, v, u), each of its size. InvalidInput for wrong shapes, dtypes, devices."""
         robot, by = self.loaded_robot, None if self._u_is_delivered else self._delivered
         q, v = robot.checked_input("q", q), robot.checked_input("v", v)
         meaning = f"one value per input: {', '.join(self.inputs)}"
@@ -346,10 +343,7 @@ class Model(Summary):
         return violation, violation / (1.0 + dynamics.b.abs())
 
     def to(self, device: torch.device | str) -> "Model":
-        """The same with its robot and the numbers of its forces on `device`, for instance "cuda".
-
-        Raises InvalidInput for a device that is not there.
-        """
+        """The same on `device`, for instance "cuda". Raises InvalidInput for a device that is not there."""
         return replace(self, robot=self.robot.to(device))  # forces are bound to the robot's device again
 
     def with_robot(self, robot: Robot) -> "Model":
@@ -361,10 +355,7 @@ class Model(Summary):
         return replace(self, contacts=contacts)  # type: ignore[arg-type]  # the constructor makes a tuple, or refuses
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything as plain JSON values, the robot as URDF text.
-
-        Raises ContactError for a surface that holds code.
-        """
+        """All as plain JSON values, the robot as URDF text. Raises ContactError for a surface that holds code."""
         return {
             "format": FORMAT_VERSION,
             **self.robot.to_stored(),

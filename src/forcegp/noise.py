@@ -51,10 +51,7 @@ class Noise:
                 object.__setattr__(self, name, tuple(values.tolist()) if values.dim() else float(values))
 
     def parameters(self, nv: int, device: torch.device | None = None) -> dict[str, Float[Tensor, "nv"]]:
-        """Logarithms of the standard deviations, one per joint.
-
-        Raises InvalidInput for a wrong number of values, and where only a dataset states the level.
-        """
+        """Logarithms of deviations by joint. InvalidInput for a wrong number, and where only a dataset has it."""
         if self.acceleration is None:
             raise InvalidInput(
                 "Noise(None) takes the noise of the acceleration from the dataset of a fit; give a number here."

@@ -74,10 +74,7 @@ def mapped(function: Callable[[Any], Outcome], arguments: Iterable[Any], jobs: J
 
 
 def submit(executor: Executor, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-    """Begin a task, whose outcome `outcome_of` returns. Functions without a module travel too.
-
-    Raises BackendError for what cannot travel, and where a process has died.
-    """
+    """Begin a task for `outcome_of`. BackendError for what cannot travel, and where a process has died."""
     if isinstance(executor, ThisProcess):
         return executor.submit(function, *arguments)
     import cloudpickle

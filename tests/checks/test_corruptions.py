@@ -28,8 +28,7 @@ from forcegp.checks import check, quick_check
 from forcegp.checks.check_input import CheckInput
 from forcegp.checks.explanations import _units
 from forcegp.checks.search import search
-from forcegp.checks.torque_doubts import _remembered
-from forcegp.checks.torque_doubts import held_points
+from forcegp.checks.torque_doubts import _remembered, held_points
 from forcegp.data import Dataset
 from forcegp.model import Model
 from forcegp.robots import Robot

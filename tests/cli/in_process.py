@@ -29,8 +29,7 @@ def run_here(*arguments: object, folder: Path | None = None, columns: int = 100)
     with contextlib.ExitStack() as undo:
         undo.callback(torch.set_num_threads, torch.get_num_threads())
         undo.enter_context(contextlib.chdir(folder or Path.cwd()))
-        environment = undo.enter_context(pytest.MonkeyPatch.context())
-        environment.setenv("COLUMNS", str(columns))
+        undo.enter_context(pytest.MonkeyPatch.context()).setenv("COLUMNS", str(columns))
         undo.enter_context(warnings.catch_warnings())
         warnings.simplefilter("default")
         for category in PYTHON_FILTERS:

@@ -15,12 +15,13 @@ from tests.goldens.compare import assert_unchanged
 from tests.simulation.pendulum import double_pendulum
 
 from forcegp import Dataset, Robot, load_posterior
-from forcegp.cli.answer import is_explained, verdict
+from forcegp.cli.answer import FIRST, is_explained, seen_in, verdict
 from forcegp.cli.auto import default_models
 from forcegp.cli.logs import prepared_rows
 from forcegp.cli.main import parse_arguments
 from forcegp.cli.terminal import Terminal
 from forcegp.data import Preparation
+from forcegp.doubts import look, ok
 from forcegp.evidence import motion_residuals
 from forcegp.scores import Scores
 
@@ -197,6 +198,26 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
     assert told([0.1] * 3, None).endswith("but its motions diverge: do not simulate with it.")
     assert told([0.1] * 3, covered=0.57).endswith("Do not trust its intervals: those of 95 % hold 57 %.")
     assert "intervals" not in told([0.1] * 3, covered=0.81)
+
+
+def test_the_answer_repeats_what_concerns_sensors_and_velocities():
+    found = [
+        look(about="velocity", what="v is late.", do="Shift it."),
+        ok(about="force sensor", what="one agrees."),
+        look(about="force sensor", what="one is in kgf.", do="State it."),
+        look(about="force sensor", what="one is off.", do="Tare it."),
+        ok(about="velocity", what="v is dq/dt."),
+        look(about="unknown cause", what="a push.", numbers={"seconds": [1.0, 2.0]}),
+    ]
+    seen = seen_in([doubt.to_dict() for doubt in found])
+    wrong = "one is in kgf. State it. one is off. Tare it."
+    assert seen == {
+        "velocity": "v is late. Shift it.",
+        "sensor": "one agrees.",
+        "force sensor": wrong,
+        "push": "a push.",
+    }
+    assert FIRST & {*seen} == {"force sensor"}
 
 
 @pytest.mark.usefixtures("unchecked")  # a stand-in for a posterior

@@ -59,8 +59,7 @@ def test_score_prints_exactly_one_json_object(workshop, forcegp):
     medians = {name: {score: (each["all"] or {}).get("median") for score, each in own.items()}
                for name, own in scores.items()}  # fmt: skip
     assert_unchanged("cli/scores", {"scores": medians, "told": numbers_in(done.stderr)}, rtol=1e-2)
-    rows = Dataset.load(workshop / "train.h5").rows(slice(None, None, 4))
-    expected = score(load_posterior(workshop / "run"), rows)
+    expected = score(load_posterior(workshop / "run"), Dataset.load(workshop / "train.h5").rows(slice(None, None, 4)))
     np.testing.assert_allclose(scores["acceleration"]["mae"]["each"], expected.columns("mae"), rtol=1e-6)
     (warning,) = [each for each in content["warnings"] if "training rows" in each]
     assert re.search(r"\d of 120 test rows have the very \(q, v, u\) of training rows", warning)

@@ -117,8 +117,7 @@ def test_runs_alone_are_scored_on_the_whole_log(forcegp, folder):
     np.testing.assert_allclose(scores["acceleration"]["mae"]["each"], expected.columns("mae"), rtol=1e-6)
     told = forcegp("score", "friction", "test.h5", "--every", 2, "--json", folder=folder)
     scores = json.loads(told.stdout)["models"]["friction"]["scores"]
-    rows = Dataset.load(folder / "test.h5").rows(slice(None, None, 2))
-    expected = score(load_posterior(folder / "friction"), rows)
+    expected = score(load_posterior(folder / "friction"), Dataset.load(folder / "test.h5").rows(slice(None, None, 2)))
     np.testing.assert_allclose(scores["acceleration"]["mae"]["each"], expected.columns("mae"), rtol=1e-6)
 
 

@@ -84,8 +84,7 @@ def test_what_is_expected_is_what_an_update_gives_whatever_is_measured(posterior
     rows = Dataset(q=motion.q[some], v=motion.v[some], u=motion.u[some], a=a, time=np.arange(20) * 0.1, model=FREE)
     measured, at = posterior.update(rows), arm_data(30, 5, FREE)
     after, before = (x.predict(at.q, at.v, at.u) for x in (chosen.expected, posterior))
-    expected = measured.predict(at.q, at.v, at.u)
-    np.testing.assert_allclose(after.covariance, expected.covariance, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(after.covariance, measured.predict(at.q, at.v, at.u).covariance, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(after.mean, before.mean, rtol=1e-6, atol=1e-7)
     assert (chosen.spread[1] < chosen.spread[0]).all()
 

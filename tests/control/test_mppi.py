@@ -31,8 +31,8 @@ def predictor():
 
 
 def cost(q, v, u):
-    state, weights = torch.cat([q, v], dim=-1), torch.tensor(STATE_COST)
-    return ((state @ weights) * state).sum((-1, -2)) + TORQUE_COST * u.square().sum((-1, -2))
+    state = torch.cat([q, v], dim=-1)
+    return ((state @ torch.tensor(STATE_COST)) * state).sum((-1, -2)) + TORQUE_COST * u.square().sum((-1, -2))
 
 
 def controller(predictor, **changes):
@@ -96,8 +96,7 @@ def test_motions_are_implicit_where_a_step_is_long_beside_the_rates(damping, wan
     forces = (Viscous(damping), JointFriction())
     posterior = fit(model.with_forces(*forces, noise=Noise(0.01, learn=False)), rows, restarts=1)
     assert usual_integrator(posterior.predictor(covariance="none"), 0.1) == wanted
-    control = MPPI(posterior.predictor(covariance="none"), cost, dt=0.1, steps=3, torque_limits=9.0)
-    assert control.integrator == wanted
+    assert MPPI(posterior.predictor(covariance="none"), cost, dt=0.1, steps=3, torque_limits=9.0).integrator == wanted
 
 
 @pytest.mark.parametrize(

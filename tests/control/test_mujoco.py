@@ -79,8 +79,7 @@ def test_known_friction_and_joints_in_another_order_act_too():
 def test_threads_do_not_change_a_bit(predictor):
     model = model_of()
     model.opt.timestep = 0.002
-    size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-    begin, data = np.zeros((16, size)), mujoco.MjData(model)
+    begin, data = np.zeros((16, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))), mujoco.MjData(model)
     for row, (q, v, _) in zip(begin, zip(*states(16), strict=True), strict=True):
         data.qpos[:], data.qvel[:] = q, v
         mujoco.mj_getState(model, data, row, mujoco.mjtState.mjSTATE_FULLPHYSICS)

@@ -20,8 +20,7 @@ TWO_JOINTS = """<robot name="slider">
 
 def model(elbow: str = "revolute") -> Model:
     """A robot with the joints `NAMES`, the second one revolute or prismatic, that touches nothing."""
-    text = TWO_JOINTS.format(one=LINK.format("one"), two=LINK.format("two"), elbow=elbow)
-    return Model(Robot.from_urdf_text(text))
+    return Model(Robot.from_urdf_text(TWO_JOINTS.format(one=LINK.format("one"), two=LINK.format("two"), elbow=elbow)))
 
 
 def columns(rows: int = 40, nv: int = 2, seed: int = 0) -> dict[str, np.ndarray]:

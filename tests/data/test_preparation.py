@@ -32,8 +32,7 @@ def noisy(seconds: float = 12.0, seed: int = 0, sigma: float = SIGMA, rate: floa
     time = np.arange(round(seconds * rate)) / rate
     q, _, a = swings(time, seed)
     measured = q + sigma * np.random.default_rng(seed + 100).normal(size=q.shape)
-    raw = Dataset(q=measured, v=0 * q, u=0 * q, a=0 * q, time=time, model=model("continuous"))
-    return differentiated(raw, "q"), a
+    return differentiated(Dataset(q=measured, v=0 * q, u=0 * q, a=0 * q, time=time, model=model("continuous")), "q"), a
 
 
 def arm_log(delay: float = 0.0, seconds: float = 8.0, seed: int = 1, noise: float = 0.02) -> Dataset:

@@ -146,8 +146,7 @@ def test_rows_before_a_joint_has_moved_are_left_out():
     for share, said in ((0.09, False), (0.11, True)):
         assert bool(list(doubts_of_past(model, log, np.arange(1000) >= 1000 * share))) is said
     for rows, left_out in ((60 * first, True), (30 * first, False)):
-        found = fit(model, log.rows(slice(0, rows)), Torques(), rows=500)
-        assert ("rows_before_a_past" in found.settings) is left_out
+        assert ("rows_before_a_past" in fit(model, log.rows(slice(0, rows)), Torques(), rows=500).settings) is left_out
     assert FORGOTTEN / 500.0 - 0.005 < np.abs(np.diff(q[: first + 1, 1])).sum() < FORGOTTEN / 500.0 + 0.005
     q[:, 1] = q[0, 1]  # a joint that never moves keeps its rows
     assert past_known(with_strokes(log_of(q, v, a, a, log.time)), model).all()

@@ -8,7 +8,7 @@ mujoco = untyped
 START = np.array([0.0, 0.6, 0.7])
 
 
-def followed(prepare, seconds, rate, substeps, taken=lambda q, v: 0.0):
+def followed(prepare, seconds, rate, substeps, taken=lambda q, v: 0.0, seed=0):
     """q, v, u, a (rows, 3), and sensors (rows, k), of a model that `prepare` compiles of the arm's spec.
 
     `taken` is what does not arrive of the torques u.
@@ -17,7 +17,7 @@ def followed(prepare, seconds, rate, substeps, taken=lambda q, v: 0.0):
     spec.option.timestep, spec.option.integrator = 1.0 / (substeps * rate), mujoco.mjtIntegrator.mjINT_RK4
     model = prepare(spec)
     model.dof_damping[:], model.dof_frictionloss[:] = [0.8, 0.7, 0.5], 0.0
-    data, rng, out = mujoco.MjData(model), np.random.default_rng(0), []
+    data, rng, out = mujoco.MjData(model), np.random.default_rng(seed), []
     f, shift = rng.uniform(0.2, 1.1, (3, 4)), rng.uniform(0.0, 6.0, (3, 4))
     size = np.array([[0.25], [0.15], [0.2]]) / f**0.7
     for k in range(seconds * rate * substeps):

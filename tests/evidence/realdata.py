@@ -89,8 +89,7 @@ def panda(folder: Path, model: Model) -> tuple[Dataset, Dataset]:
     rows = Preparation(cutoff=5.0, every=20).apply(resample(raw, 0.001))
     block = rows.time[-1] / 5.0
     test = np.isin(np.minimum((rows.time / block).astype(int), 4), (2, 4))
-    near = (abs(rows.time[:, None] - block * np.array([2, 3, 4])) <= 0.25).any(1)
-    return rows.rows(~test & ~near), rows.rows(test)
+    return rows.rows(~test & ~(abs(rows.time[:, None] - block * np.array([2, 3, 4])) <= 0.25).any(1)), rows.rows(test)
 
 
 def emps(folder: Path) -> tuple[Dataset, Dataset]:

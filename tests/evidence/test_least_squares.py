@@ -21,8 +21,7 @@ def problem(rows=200, seed=0):
 
     def residual(x):
         zero = np.zeros_like(t)
-        jacobian = [[t * np.exp(x[0] * t), zero + 1.0, zero], [zero, t**2, t]]
-        return y - model(x), -np.array(jacobian).transpose(2, 0, 1)
+        return y - model(x), -np.array([[t * np.exp(x[0] * t), zero + 1.0, zero], [zero, t**2, t]]).transpose(2, 0, 1)
 
     return residual
 
@@ -42,8 +41,7 @@ def test_the_minimum_is_that_of_scipy_at_the_same_weights(bounds):
     theirs = least_squares(
         lambda x: (residual(x)[0] / fit.noise).ravel(), np.clip(TRUTH, *bounds) + 1e-3, bounds=bounds, xtol=1e-12
     )
-    spread = np.sqrt(np.diag(np.linalg.inv(fit.information)))
-    np.testing.assert_allclose((fit.x - theirs.x) / spread, 0.0, atol=0.05)
+    np.testing.assert_allclose((fit.x - theirs.x) / np.sqrt(np.diag(np.linalg.inv(fit.information))), 0.0, atol=0.05)
     np.testing.assert_allclose(fit.noise, np.sqrt((fit.residual**2).mean(0)), rtol=0.05)
 
 
@@ -102,10 +100,8 @@ def test_correlation_time_of_an_autoregressive_process():
     series = np.random.default_rng(1).normal(size=(20_000, 2))
     for row in range(1, len(series)):
         series[row, 0] += 0.8 * series[row - 1, 0]
-    times = correlation_time(series, np.zeros(len(series), dtype=int))
-    np.testing.assert_allclose(times, [9.0, 1.0], rtol=0.2)
-    alone = correlation_time(series, np.arange(len(series)))
-    np.testing.assert_allclose(alone, 1.0)
+    np.testing.assert_allclose(correlation_time(series, np.zeros(len(series), dtype=int)), [9.0, 1.0], rtol=0.2)
+    np.testing.assert_allclose(correlation_time(series, np.arange(len(series))), 1.0)
 
 
 def test_levels_of_few_rows_are_drawn_towards_the_one_that_joints_share():
@@ -118,5 +114,4 @@ def test_levels_of_few_rows_are_drawn_towards_the_one_that_joints_share():
     bounds = np.full(1, -1.0), np.ones(1)
     fit = weighted_least_squares(lambda x: (r, np.zeros((3, 2, 1))), prior, np.zeros(1), bounds, sizes=sizes)
     share = 0.5 * 0.3**2
-    expected = [(3 * 9.0 + 2 * share * 100.0) / 5, (2 * share) / 5]
-    np.testing.assert_allclose(fit.noise**2, expected, rtol=1e-3)
+    np.testing.assert_allclose(fit.noise**2, [(3 * 9.0 + 2 * share * 100.0) / 5, (2 * share) / 5], rtol=1e-3)

@@ -77,7 +77,6 @@ def test_rows_that_are_left_out_are_warned_of():
 @SAID
 def test_all_rows_are_taken_where_no_number_is_given():
     """Hyper-parameters come from rows that lie apart; as many of these as are asked for."""
-    model = arm_model(0).with_forces(JointForces())
-    posterior = fit(model, filtered(), restarts=1, options=QUICK, learning_points=25)
+    posterior = fit(arm_model(0).with_forces(JointForces()), filtered(), restarts=1, options=QUICK, learning_points=25)
     assert posterior.settings["points"] == 480
     assert posterior.settings["learning_points"] == 25

@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.evidence.arm_in_mujoco import followed
-from tests.posterior.arm import arm_model
+from tests.posterior.arm import URDF, arm_model
 
-from forcegp import ContactForces, Dataset, Model, Robot, Torques, check, fit
+from forcegp import Accelerations, ContactForces, Dataset, Model, Robot, Torques, check, fit
 from forcegp.data import Preparation
 from forcegp.errors import InvalidInput
+from forcegp.fit import held_out_noise
 from forcegp.fit.force_sensors import force_sensor_doubts
 from forcegp.forces import Actuation, Viscous
 from forcegp.mechanics import fixed_frame, fixed_point
+from forcegp.scores.models import identified_model, identify
 
 mujoco = untyped
 DRY, RATE = np.array([0.3, 0.4, 0.2]), 250
@@ -27,7 +29,7 @@ def pushes(q):
 
 
 @cache
-def recorded(pushed=True):
+def recorded(pushed=True, seed=0):
     """The log, the force on the hand, the axes of the hand, and what a sensor at the wrist measures of the hand."""
     plant = []
 
@@ -48,7 +50,7 @@ def recorded(pushed=True):
         mujoco.mj_jacBody(model, data, J, None, model.body("hand").id)
         return DRY * np.tanh(v / 0.01) - pushed * J.T @ pushes(q)
 
-    (q, v, u, a, sensed), rng = followed(prepare, 12, RATE, 4, taken)
+    (q, v, u, a, sensed), rng = followed(prepare, 12, RATE, 4, taken, seed)
     force = pushed * np.array([*map(pushes, q)]) + 0.02 * rng.standard_normal(q.shape)
     R = Rotation.from_quat(sensed[:, [4, 5, 6, 3]]).as_matrix()
     model = replace(arm_model(0), contacts=())
@@ -111,6 +113,69 @@ def test_a_late_sensor_and_a_weight_that_counts_twice():
     assert "hardly notice" in doubt.what
 
 
+def carrying(seed=0):
+    """A log whose file has no hand: a light tool under gears that stick; the sensor there, and its axes."""
+    log, noise, R, held = recorded(False, seed)
+    bare = Robot.from_urdf_text(URDF.replace('mass value="0.6"', 'mass value="0.01"'))
+    return replace(log, model=log.model.with_robot(bare)), noise - held, R
+
+
+HANGS = r"0\.6 kg at \(20, -10, 50\) mm need there as "
+TURNED = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+OF_TOOLS = {
+    "none": (lambda F, R: F, "ok", r"carries 0\.6 kg at \(20, -10, 50\) mm, and torques need 0\.9[78]\d* times"),
+    "sign": (lambda F, R: -F, "wrong", HANGS + r"\(-x, -y, -z\);(.|\n)*give the columns with a minus"),
+    "turned": (lambda F, R: in_hand(R, in_hand(R.mT, F) @ TURNED), "wrong", r"as \(y, -x, z\) along the axes of the"),
+    "of the hand": (lambda F, R: in_hand(R.mT, F), "wrong", HANGS + r"\(x, y, z\) (.|\n)*--axes force=body --force"),
+    "turned twice": (lambda F, R: in_hand(R, F), "wrong", HANGS + r"\(x, y, z\) (.|\n)*--axes force=world --force"),
+    "kgf": (lambda F, R: F / 9.80665, "look", r"0\.6 kg at \(20, -10, 50\) mm if it (.|\n)*--unit force=kgf\."),
+    "not tared": (lambda F, R: F + in_hand(R, [0.7, 0.0, -0.4]), "look", r"off by \(0\.7\d*, -?\S+, -0\.4\d*\) N"),
+    "dead": (lambda F, R: in_hand(R, [0.0, 0.0, 3.0]), "ok", "hardly notice"),
+    "it touches": (lambda F, R: F + 0.2 * recorded()[1], "look", "does not follow"),
+}
+
+
+@pytest.mark.parametrize("mistake", OF_TOOLS)
+def test_a_tool_shows_what_is_wrong_by_its_motion(mistake):
+    change, level, words = OF_TOOLS[mistake]
+    log, force, R = carrying()
+    doubt, *others = told(change(force, R), log)
+    assert (doubt.level, others) == (level, [])
+    assert re.search(words, str(doubt)), str(doubt)
+
+
+def test_a_tool_shows_a_delay_and_columns_keep_their_names(monkeypatch):
+    log, force, R = carrying()
+    _, late = told(in_hand(R, np.roll(in_hand(R.mT, force), 5, axis=0)), log)
+    assert late.numbers["delay"] == pytest.approx(0.02, abs=0.002)
+    monkeypatch.setitem(force_sensor_doubts.__globals__, "MOST_ROWS", 2000)
+    [doubt] = told(-force, replace(log, metadata={"import": {"columns": {"force.hand": ["F[0]", "F[1]", "F[2]"]}}}))
+    assert "hand=-F[0],-F[1],-F[2]," in doubt.do
+
+
+@pytest.mark.parametrize("seed", range(1, 5))
+def test_a_right_sensor_gets_no_false_word(seed):
+    log, force, R = carrying(seed)
+    noise = np.random.default_rng(seed).normal(size=force.shape)
+    for F in (force, force + 0.5 * noise):
+        assert [doubt.level for doubt in told(F, log)] == ["ok"]
+    [doubt] = told(force - in_hand(R, force[0]), log)
+    assert (doubt.level, "is off by" in doubt.what) == ("look", True)
+
+
+def test_a_sensor_that_does_not_teach_is_no_force():
+    log, force, _ = carrying()
+    rows = replace(log, measured={"force.hand": force}).rows(np.arange(0, 3000, 6))
+    words = "bodies+viscous+gear"
+    with_sensor, without = (
+        identified_model(f"{words}@accelerations", log.model, each).noise for each in (rows, replace(rows, measured={}))
+    )
+    assert with_sensor == without
+    assert identify(rows, f"{words}@torques")[0] == f"{words}@torques"  # no spring explains it
+    with pytest.raises(InvalidInput, match="where the model has no contact"):
+        held_out_noise(log.model.with_forces(Viscous()), rows, Accelerations())
+
+
 def test_short_logs_and_two_points_tell_nothing_and_known_gains_count():
     log, force, _, _ = recorded()
     held = log.model.with_contacts(fixed_frame("hand"))
@@ -134,7 +199,6 @@ def test_a_real_leg(shared, sign, level):
     time, *columns = np.loadtxt(realdata / "hopper" / "hopper_A.csv.gz", delimiter=",", skiprows=1).T
     q, u, force = (np.array(columns[k : k + 3]).T for k in (0, 3, 6))
     model = Model(Robot.from_urdf(realdata / "hopper" / "teststand.urdf"), fixed_point("contact"))
-    measured = {"force.contact": sign * force}
-    raw = Dataset(q=q, v=0.0 * q, u=u, a=0.0 * q, time=time, model=model, measured=measured)
+    raw = Dataset(q=q, v=0.0 * q, u=u, a=0.0 * q, time=time, model=model, measured={"force.contact": sign * force})
     log = Preparation(cutoff=20.0, every=5, trim=0.2).apply(raw)
     assert [each.level for each in force_sensor_doubts(log, model)] == [level]

@@ -208,8 +208,7 @@ def test_normal_equations_are_those_of_weighted_least_squares(noise):
         chosen, sign_of = (parts, at[0]) if j == 0 else ((), regression.at[j])
         s = np.tanh(log.v[:, j] / (-sign_of * regression.speed[j]))
         more = [np.sqrt(np.abs(log.v[:, j])) * s, np.abs(log.v[:, j])] if chosen else []
-        own = [log.v[:, j], s, np.ones(600), *more]
-        columns.append(np.stack(own, axis=-1)[:, None] * np.eye(3)[j][:, None])
+        columns.append(np.stack([log.v[:, j], s, np.ones(600), *more], axis=-1)[:, None] * np.eye(3)[j][:, None])
     X, y = L @ np.concatenate(columns, axis=-1), L @ torque[..., None]
     rows, left = np.arange(600) * 10 // 600, {}
     for k in range(-1, 10):  # all rows, then without a stretch
@@ -219,8 +218,7 @@ def test_normal_equations_are_those_of_weighted_least_squares(noise):
     joints = slice(None) if noise else 0
     for held_out in (False, True):
         expected = [left[k if held_out else -1][rows == k][:, joints].sum() for k in range(10)]
-        found = regression._residuals(0, parts, at, held_out)
-        np.testing.assert_allclose(found, expected, rtol=1e-3)
+        np.testing.assert_allclose(regression._residuals(0, parts, at, held_out), expected, rtol=1e-3)
 
 
 def gains(share: float, errors: float) -> tuple[np.ndarray, np.ndarray]:

@@ -154,8 +154,7 @@ def test_forces_that_are_left_out_are_those_of_least_squares_with_them_as_unknow
     for row in range(rows):
         lambdas[nv * row : nv * row + nv, 2 * row : 2 * row + 2] = -(held[row] / fit.noise).T
     dense = np.concatenate([(J / fit.noise[:, None]).reshape(-1, k), lambdas], 1)
-    wanted = np.linalg.lstsq(dense, (y / fit.noise).ravel(), rcond=1e-10)[0][:k]
-    assert_allclose(fit.x, wanted, atol=1e-3)
+    assert_allclose(fit.x, np.linalg.lstsq(dense, (y / fit.noise).ravel(), rcond=1e-10)[0][:k], atol=1e-3)
     hidden = np.linalg.qr(lambdas[:, lambdas.any(0)])[0]
     left = dense[:, :k] - hidden @ (hidden.T @ dense[:, :k])
     own = left.T @ left
@@ -284,8 +283,7 @@ def test_a_payload_on_the_trunk_of_a_walker(walker):
     mass = found["payload.mass"]
     assert mass.value == pytest.approx(0.8, abs=3.0 * mass.std)
     assert mass.std < 0.2
-    center = [found[f"payload.center_of_mass.{axis}"].value for axis in "xyz"]
-    assert_allclose(center, [0.05, 0.0, 0.1], atol=0.1)
+    assert_allclose([found[f"payload.center_of_mass.{axis}"].value for axis in "xyz"], [0.05, 0.0, 0.1], atol=0.1)
 
 
 def test_noise_under_constraints_is_that_of_the_rows(walker):

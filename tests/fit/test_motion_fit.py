@@ -95,8 +95,7 @@ def test_friction_is_recovered_from_positions(along_the_law):
         assert found[name].value == pytest.approx(truth, abs=max(4.0 * error, 0.02 * truth))
         assert 0.0 < error < 0.1 * truth
     assert motion_error(after, along_the_law) < 1e-3 < 0.05 * motion_error(before, along_the_law)
-    named = {type(force): force for force in after.model.forces}
-    assert float(named[Viscous].damping) == found["viscous.x"].value
+    assert float({type(force): force for force in after.model.forces}[Viscous].damping) == found["viscous.x"].value
     assert after.model.robot.link("cart").mass == 5.0
     assert float(before.model.forces[2].damping) == 1.0  # the one that was given stays as it is
 
@@ -105,8 +104,7 @@ def test_a_number_that_a_prior_knows_stays(along_the_law):
     """Both evidence in one fit: a standard deviation of 0 holds a number in all of it."""
     model = slide(1.0, 1.0).with_forces(Viscous(Normal(2.0, 0.0)), Coulomb())
     found = fit_model(model, along_the_law, (Torques(), Motions(1.0, bodies=False)))
-    named = {type(force): force for force in found.model.forces}
-    assert float(named[Viscous].values["damping"]) == 2.0
+    assert float({type(force): force for force in found.model.forces}[Viscous].values["damping"]) == 2.0
     assert "viscous.x" not in found.parameters
     assert found.parameters["coulomb.level.x"].value > 4.0
 
@@ -126,8 +124,7 @@ def test_what_is_stored_predicts_the_same(along_the_law, tmp_path):
     here, there = better.predict(*rows), again.predict(*rows)
     torch.testing.assert_close(there.mean, here.mean, rtol=1e-10, atol=1e-10)
     assert again.settings["motions"] == better.settings["motions"]
-    predictor = better.predictor(compile=False)
-    torch.testing.assert_close(predictor.mean(*rows), here.mean, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(better.predictor(compile=False).mean(*rows), here.mean, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("contacts", [0, 1])

@@ -393,7 +393,6 @@ def test_two_joints_in_one_body_have_no_mass_between_them():
     held = Found(data, link="fore")
     assert held.mass == pytest.approx(0.5, rel=1e-3)
     assert held.center_of_mass[:2] == pytest.approx([0.05, 0.0], abs=1e-3)
-    bodies = RigidBodies(dict.fromkeys(("upper", "fore"), Body(1e-6)))
-    identified = fit(model.with_forces(bodies), data, Torques())
+    identified = fit(model.with_forces(RigidBodies(dict.fromkeys(("upper", "fore"), Body(1e-6)))), data, Torques())
     assert body_names(model.robot) == ("upper", "fore")
     np.testing.assert_allclose(motion_residuals(data, identified.model)[0], 0.0, atol=1e-3)

@@ -116,8 +116,7 @@ def test_a_joint_that_never_moves_teaches_nothing_of_its_own(data, prior, messag
     with pytest.raises(InvalidInput, match=message) as caught:
         fit(stuck, prior)
     assert "give data in which it changes, or leave this prior (or this joint) out" in str(caught.value)
-    others = JointFriction(("pan", "bend"))
-    fit(stuck, others)
+    fit(stuck, JointFriction(("pan", "bend")))
 
 
 @pytest.mark.parametrize("prior", [ToolForces(), ContactFriction()], ids=["tool", "contact"])
@@ -182,8 +181,7 @@ def test_a_joint_that_something_pushes_teaches_nothing(force, found):
     needed = held().robot.kinematics(*tensors(log, "q", "v")).inverse_dynamics(torch.tensor(log.a)).numpy()
     push = np.zeros((100, 3))
     push[:, 1] = force * PUSHED * np.sqrt((needed[:, 1] ** 2).mean())
-    at = truth.dynamics(*tensors(log, "q", "v", "u"))
-    log = replace(log, a=at.acceleration(torch.tensor(push)).numpy())
+    log = replace(log, a=truth.dynamics(*tensors(log, "q", "v", "u")).acceleration(torch.tensor(push)).numpy())
     unseen = Unseen.of(held(), log, typical_sizes(held(), [log])["force"])
     assert tuple(log.joint_names[j] for j in unseen.pushed) == found
     if found:

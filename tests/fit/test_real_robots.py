@@ -32,8 +32,7 @@ def test_eleven_parameters_of_a_driven_pendulum_from_accelerations(shared):
     train = dfki(folder, model, 143524, 143601, 143704, 144115)
     test = dfki(folder, model, 143339, 143747)
     laws = RigidBodies("all"), Viscous(), Coulomb(), open_rotors(model)
-    found = fit(model.with_forces(*laws), train, Accelerations(), rows=2000)
-    _, residual = motion_residuals(test, found.model)
+    _, residual = motion_residuals(test, fit(model.with_forces(*laws), train, Accelerations(), rows=2000).model)
     nrmse = np.sqrt((residual**2).mean(0)) / test.a.std(0)
     assert (nrmse < [0.157, 0.112]).all()
 
@@ -102,8 +101,7 @@ def test_an_axis_with_more_friction_is_followed(shared):
     for name, posterior in (("fit", found), ("seen", found.update(first))):
         whole, errors[name] = np.ones(len(rest), dtype=bool), []
         for horizons in ((0.1, 0.25, 0.5, 1.0), (4.0,)):
-            motions = held_out_motions(rest, whole, horizons, 50)
-            table, _ = motion_scores(posterior, motions, "implicit-midpoint")
+            table, _ = motion_scores(posterior, held_out_motions(rest, whole, horizons, 50), "implicit-midpoint")
             errors[name].append(table[f"position after {horizons[-1]:g} s"]["rmse"][0])
             inside = [table[f"position after {h:g} s"]["coverage_95"][0] for h in horizons]
             assert min(inside) >= 0.88, (name, inside)

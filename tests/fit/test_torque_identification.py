@@ -211,8 +211,7 @@ def test_springs_and_where_they_rest():
     """Torques from Pinocchio's inverse dynamics in other tests; here of a joint with a spring that no file states."""
     data = recorded(200, 50, torque_noise=0.05)
     stiffness, rest = np.array([2.0, 0.0, 1.0]), np.array([0.3, 0.0, -0.5])
-    sprung = replace(data, u=data.u + stiffness * (data.q - rest))
-    found = fit(data.model.with_forces(Spring()), sprung).parameters
+    found = fit(data.model.with_forces(Spring()), replace(data, u=data.u + stiffness * (data.q - rest))).parameters
     for joint, (k, q_0) in {"pan": (2.0, 0.3), "bend": (1.0, -0.5)}.items():
         assert found[f"spring.stiffness.{joint}"].value == pytest.approx(k, rel=0.05)
         assert found[f"spring.rest.{joint}"].value == pytest.approx(q_0, abs=0.05)

@@ -105,8 +105,7 @@ def test_most_functions_have_most_states_inside(fitted):
     drawn = torch.einsum("nkc,snc->snk", W, values - posterior.latent.mean(features))
 
     def share(std):
-        inside = (drawn.abs() <= 1.96 * std).double().mean((1, 2))
-        return float((inside >= widening.CONTENT).double().mean())
+        return float(((drawn.abs() <= 1.96 * std).double().mean((1, 2)) >= widening.CONTENT).double().mean())
 
     assert share(wide.covariance.diagonal(dim1=-2, dim2=-1).sqrt()) > 0.985
     assert share(prediction.covariance.diagonal(dim1=-2, dim2=-1).sqrt()) < 0.985

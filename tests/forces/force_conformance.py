@@ -127,8 +127,7 @@ class UnknownConformance:
         states = some_states(4)
         single = torch.stack([self.values(model, *(x[row] for x in states)) for row in range(4)])
         assert_close(self.values(model, *states), single, 1e-12)
-        mapped = torch.func.vmap(lambda *given: self.values(model, *given))(*states)
-        assert_close(mapped, single, 1e-12)
+        assert_close(torch.func.vmap(lambda *given: self.values(model, *given))(*states), single, 1e-12)
 
     def test_derivatives_in_the_state(self, model):
         states = some_states()

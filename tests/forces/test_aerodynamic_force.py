@@ -43,7 +43,6 @@ def test_rotors_of_a_body_that_does_not_fly():
     model = Model(robot)
     q, v = robot.neutral()[None], torch.full((1, robot.nv), 0.3, dtype=torch.float64)
     dynamics = model.dynamics(q, v, torch.full((1, len(model.inputs)), 2.0, dtype=torch.float64))
-    prior = AerodynamicForce("blade", ("velocity", "rotor-drag"))
-    velocity, drag = prior.features(dynamics)[0].split(3, dim=-1)
+    velocity, drag = AerodynamicForce("blade", ("velocity", "rotor-drag")).features(dynamics)[0].split(3, dim=-1)
     root = (dynamics.state.delivered.norm() ** 2 + 1e-4) ** 0.25
     torch.testing.assert_close(drag, root * velocity)

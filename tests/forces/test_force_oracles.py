@@ -110,8 +110,7 @@ class TestToolForces:
             count = len(prior.latent_names(model.robot))
             assert torch.equal(prior.direction(free), torch.zeros(ROWS, model.robot.nv, count).double())
             assert torch.equal(prior.point_force(free), torch.zeros(ROWS, 3, count).double())
-            shapes = [z.shape for z in prior.features(model.dynamics(*rows))]
-            assert [z.shape for z in prior.features(free)] == shapes
+            assert [z.shape for z in prior.features(free)] == [z.shape for z in prior.features(model.dynamics(*rows))]
 
 
 class TestContactFriction:

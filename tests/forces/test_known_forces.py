@@ -114,8 +114,7 @@ def test_each_against_its_formula(make_and_formula):
 def test_the_sum_is_what_is_listed_and_nothing_else():
     q, v, u = states(4, 6)
     parts = [make() for make, _ in FORMULAS.values()]
-    together = known(*parts).dynamics(q, v, u).Q_K
-    assert_close(together, sum(formula(q, v, u) for _, formula in FORMULAS.values()), 1e-10)
+    assert_close(known(*parts).dynamics(q, v, u).Q_K, sum(formula(q, v, u) for _, formula in FORMULAS.values()), 1e-10)
     assert not known().dynamics(q, v, u).Q_K.any()
     listed = known(Actuation(), RigidBodies()).dynamics(q, v, u).Q_K
     assert_close(listed, u - pinocchio_bias(q, v), 1e-10)  # without the damping of the URDF
@@ -148,8 +147,7 @@ def test_armature_adds_to_the_diagonal_and_to_that_of_the_robot():
     added = torch.diag(TENSOR + torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64))
     dynamics = geared.dynamics(q, v, u)
     assert_close(dynamics.M, plain.M + added, 1e-13)
-    nothing = torch.zeros_like(u)
-    assert_close(dynamics.acceleration(nothing), torch.linalg.solve(plain.M + added, plain.Q_K), 1e-10)
+    assert_close(dynamics.acceleration(torch.zeros_like(u)), torch.linalg.solve(plain.M + added, plain.Q_K), 1e-10)
 
 
 # ---------------------------------------------------------------- one number per joint

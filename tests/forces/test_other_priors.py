@@ -27,8 +27,7 @@ def test():
 
 
 def test_accelerations_are_mixed_by_the_projection_onto_the_constraint(train):
-    states = [torch.tensor(x) for x in (train.q, train.v, train.u)]
-    dynamics = train.model.dynamics(*states)
+    dynamics = train.model.dynamics(*[torch.tensor(x) for x in (train.q, train.v, train.u)])
     W = dynamics.H @ JointAccelerations().direction(dynamics)
     M, A = dynamics.M.numpy(), dynamics.A.numpy()
     M_inverse = np.linalg.inv(M)

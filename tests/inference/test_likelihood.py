@@ -36,8 +36,7 @@ def assert_same_value_and_gradients(given_problem: Problem, noise_of=lambda prob
         torch.autograd.grad(-2.5 * value, list(data.values()), retain_graph=True) for value in (result, expected)
     )
     for name, gradient, reference in zip(data, gradients, expected_gradients, strict=True):
-        error = float((gradient - reference).abs().max())
-        assert error <= RELATIVE * max(1.0, float(reference.abs().max())), name
+        assert float((gradient - reference).abs().max()) <= RELATIVE * max(1.0, float(reference.abs().max())), name
 
 
 @pytest.mark.parametrize(("panel_bytes", "inner"), [(4 * 2**20, 256), (5000, 7), (1, 1)], ids=PANELS)

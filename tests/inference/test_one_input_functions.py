@@ -49,8 +49,7 @@ def summed(given, s: torch.Tensor) -> torch.Tensor:
 
 def points(centers: torch.Tensor) -> torch.Tensor:
     """In their range and beyond it, at centres and near zero."""
-    spread = centers.abs().max()
-    return torch.cat([torch.linspace(-3, 3, 61) * spread, centers, torch.tensor([0.0, 1e-9, -1e-9])])
+    return torch.cat([torch.linspace(-3, 3, 61) * centers.abs().max(), centers, torch.tensor([0.0, 1e-9, -1e-9])])
 
 
 def close(found: torch.Tensor, expected: torch.Tensor, relative: float) -> None:
@@ -96,8 +95,7 @@ def test_slopes_are_those_of_the_sums(expression):
     given = latents(expression, normal(30, seed=3))
     form = one_input_form(given, 0)
     s = torch.linspace(-2, 2, 101, dtype=torch.float64)  # no centres: kinks have no slope
-    expected = value_and_slope(lambda s: summed(given, s)[:, None], s)[1]
-    close(value_and_slope(form.values, s)[1], expected, 1e-11)
+    close(value_and_slope(form.values, s)[1], value_and_slope(lambda s: summed(given, s)[:, None], s)[1], 1e-11)
 
 
 def test_what_has_no_form():
@@ -114,8 +112,7 @@ def posterior(expression: str, dimension: int = 1) -> ExactPosterior:
     kernels.requires_grad_(False)
     W = torch.ones(12, 1, 1, dtype=torch.float64)
     noise = torch.full((12, 1), 0.01, dtype=torch.float64)
-    terms = Terms([normal(12, dimension, seed=2)], W, normal(12, 1, seed=1), noise)
-    return ExactPosterior.condition(kernels, terms)
+    return ExactPosterior.condition(kernels, Terms([normal(12, dimension, seed=2)], W, normal(12, 1, seed=1), noise))
 
 
 @pytest.mark.parametrize("expression", ["friction", "linear + friction", "matern-1/2 + constant"])

@@ -212,5 +212,4 @@ def test_a_search_without_hope_of_reaching_an_earlier_one_ends_and_says_so():
     assert not behind.converged
     k = len(behind.history) - 1
     pace = [alone.history[i - 5] - alone.history[i] for i in range(5, k + 1)]
-    hopeless = [alone.history[i] + 100.0 > 2.0 * pace[i - 5] for i in range(5, k + 1)]
-    assert hopeless == [False] * (k - 5) + [True]
+    assert [alone.history[i] + 100.0 > 2.0 * pace[i - 5] for i in range(5, k + 1)] == [False] * (k - 5) + [True]

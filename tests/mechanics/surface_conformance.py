@@ -58,8 +58,7 @@ class SurfaceConformance:
 
     def test_everything_is_differentiable_in_the_points(self):
         for name in ("value", "gradient", "hessian"):
-            p = self.points(2).requires_grad_()
-            assert torch.autograd.gradcheck(getattr(self.surface, name), (p,)), name
+            assert torch.autograd.gradcheck(getattr(self.surface, name), (self.points(2).requires_grad_(),)), name
 
     def test_a_signed_distance_has_unit_normals(self):
         p = self.points(20)

@@ -53,8 +53,7 @@ class Weight(Unknown):
         return -9.81 * dynamics.state.kinematics.frame_jacobian(self.frame, (0.0, 0.0, 0.0))[..., 2, :, None]
 
     def point_force(self, dynamics):
-        column = torch.tensor([[0.0], [0.0], [-9.81]], dtype=torch.float64)
-        return column.expand(*dynamics.state.q.shape[:-1], 3, 1)
+        return torch.tensor([[0.0], [0.0], [-9.81]], dtype=torch.float64).expand(*dynamics.state.q.shape[:-1], 3, 1)
 
     def features(self, dynamics):
         return (dynamics.state.v[..., :0],)

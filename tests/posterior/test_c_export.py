@@ -209,8 +209,7 @@ def test_friction_that_remembers_and_a_monitor_of_contacts(tmp_path, options):
         made = export_c(laws, tmp_path / type(model).__name__, monitor=known)
         assert made.differences["arm_monitor_step"] < 1e-9
     if shutil.which("c++"):
-        memory = "{0.3, -0.9, 1.0}"
-        (tmp_path / "arm" / "main.cpp").write_text(CPP.replace("MEMORY", memory).replace("PARTS", "2"))
+        (tmp_path / "arm" / "main.cpp").write_text(CPP.replace("MEMORY", "{0.3, -0.9, 1.0}").replace("PARTS", "2"))
         strict = ["-std=c++17", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror"]
         for command in (["cc", "-std=c99", "-c", "arm.c"], ["c++", *strict, "main.cpp", "arm.o", "-o", "x"]):
             subprocess.run([*command, *options], cwd=tmp_path / "arm", check=True)

@@ -115,8 +115,7 @@ def test_the_likelihood_is_that_of_contrasts():
 def test_records_that_differ_are_learned_from_them():
     parts = [recording(seed, level=level, seconds=12.0) for seed, level in ((1, -0.2), (2, 0.0), (3, 0.2), (4, 0.0))]
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("q", "v", "u", "a", "time")}
-    log = Dataset(**arrays, episode=np.repeat(np.arange(4), len(parts[0])), model=parts[0].model)
-    drift = drift_of(fitted(log))
+    drift = drift_of(fitted(Dataset(**arrays, episode=np.repeat(np.arange(4), len(parts[0])), model=parts[0].model)))
     assert (drift.rate, drift.records) == ([0.0], 4)
     assert 0.08 < drift.between[0] < 0.3
 
@@ -200,8 +199,7 @@ def test_motions_that_go_on_in_the_record_have_its_level(steady):
     walking = posterior.with_settings(drift={**drift, "rate": [0.02]})
     assert in_its_record(walking, [until + 4.0]).settings["drift"]["std"] == [pytest.approx(0.04)]
     rows = recording(7, seconds=20.0)
-    later = replace(rows, time=rows.time + until + 0.1)
-    motions = held_out_motions(later, np.ones(len(rows), dtype=bool), (0.5,), 5)
+    motions = held_out_motions(replace(rows, time=rows.time + until + 0.1), np.ones(len(rows), dtype=bool), (0.5,), 5)
     assert motions.of(posterior)[0].settings["drift"]["here"] == "fit"
 
 

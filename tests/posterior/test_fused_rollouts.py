@@ -84,8 +84,7 @@ def test_batches_broadcast_and_threads_change_nothing(predictor, starts):
 
 
 def test_without_a_compiler_torch_does_the_same(friction, predictor, starts):
-    eager = friction.predictor(covariance="none", compile=False)
-    close(eager.rollouts(*starts, DT), predictor.rollouts(*starts, DT))
+    close(friction.predictor(covariance="none", compile=False).rollouts(*starts, DT), predictor.rollouts(*starts, DT))
 
 
 def test_rollouts_of_a_posterior_are_compiled_where_they_are_long(friction, starts, monkeypatch):

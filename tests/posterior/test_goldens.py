@@ -69,8 +69,7 @@ def test_widths_of_motions_grow_with_the_last_horizon(spread):
     numbers = np.random.default_rng(0).uniform(0.5, 2.0, (4, 2, 3, 2, 2))
     widths = MotionIntervals(np.array([0.1, 0.4, 1.0]), numbers[0, 0], numbers[1], (), numbers[2])
     time, given = torch.linspace(0.0, 2.0, 9).double(), None if spread is None else torch.full((9, 2), spread).double()
-    found = {name: widths.half_width(name, time, given) for name in ("q", "v")}
-    assert_unchanged(f"posterior/widths {spread}", found)
+    assert_unchanged(f"posterior/widths {spread}", {name: widths.half_width(name, time, given) for name in ("q", "v")})
 
 
 def test_the_interval_is_that_of_student_with_19_degrees_of_freedom():

@@ -78,8 +78,7 @@ def test_equals_dense_gaussian_conditioning(posterior, train, test):
 
     def parts(data):
         dynamics = train.model.dynamics(*map(torch.tensor, (data.q, data.v, data.u)))
-        z = torch.cat([torch.tensor(x) for x in (data.q, data.v, data.u)], -1)
-        (scaled, *_) = model.standardization([z] * 3)
+        (scaled, *_) = model.standardization([torch.cat([torch.tensor(x) for x in (data.q, data.v, data.u)], -1)] * 3)
         return dynamics.H, dynamics.acceleration_map().offset, scaled
 
     H, m, z = parts(train)

@@ -58,10 +58,7 @@ def number(about: str, what: str, joint: int, value: float, cost: float = NUMBER
 
 
 def changed(signals: str = "", order: np.ndarray | None = None, factor: np.ndarray | float = 1.0) -> Change:
-    """Every joint's signals from another column, times a factor.
-
-    Without forces, truth and metadata, which belong to the log as it was.
-    """
+    """Signals of every joint from another column, times a factor; without forces, truth and metadata."""
 
     def change(dataset: Dataset) -> Dataset:
         places = np.arange(dataset.nv) if order is None else order

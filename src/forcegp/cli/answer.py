@@ -25,10 +25,10 @@ def short_name(name: str) -> str:
     return f"{learned} learned" if learned else plain.get(name, name)
 
 
-FIRST = {"unknown cause", "joint zero", "gear ratio", "torque constant", "torque unit"}
+FIRST = {"unknown cause", "joint zero", "gear ratio", "torque constant", "torque unit", "force sensor"}
 """Subjects of doubts that change all that follows."""
-TOLD = FIRST | {"stop", "push", "spring", "drift", "elastic joint"}
-"""Those that the answer repeats."""
+TOLD = FIRST | {"stop", "push", "spring", "drift", "elastic joint", "velocity", "sensor delay", "torque sensor", "imu"}
+"""Those that the answer repeats; of what is right only what a force sensor carries."""
 
 
 def answer_lines(
@@ -49,9 +49,8 @@ def answer_lines(
     deviation = max(each["largest_deviation_of_a_step"] for each in done["recordings"])
     jitter = f", steps up to {deviation:.0%} off (evened out)" if done["resampled_to_step"] is not None else ""
     doubts = [*done["stops"], *(x for x in content["check"]["doubts"] if not is_explained(x, scores, best))]
-    told = [x if "seconds" not in x["numbers"] or x["about"] not in FIRST else {**x, "about": "push"} for x in doubts]
-    seen = [(x["about"], f"{x['what']} {x['do']}") for x in told if x["about"] in TOLD]
-    unsettled = FIRST & {about for about, _ in seen}
+    seen = seen_in(doubts)
+    unsettled = FIRST & {*seen}
     held += "; settle what is said above first" if unsettled else ""
     flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
     mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
@@ -85,7 +84,7 @@ def answer_lines(
         ("dry friction", friction_in_words(identified.model, recording, force, still) + but_for(still)),
         ("viscous", each("viscous", f"{force} per {q}/s")),
         ("rotors", each("rotor", inertia)),
-        *[("springs", each(x, f"{force} per {q}")) for x in ["spring.stiffness"] if f"{x}.{joints[0]}" in values],
+        *(("springs", each(x, f"{force} per {q}")) for x in ["spring.stiffness"] if f"{x}.{joints[0]}" in values),
     ] if joints else []  # fmt: skip
     (mass, error), causes = values.total_mass, {} if unsettled else other_causes(content["payload"] or {})
     if "gains" in causes:  # what it changes of a payload, it changes of all
@@ -106,7 +105,7 @@ def answer_lines(
         ("log", f"{len(dataset)} rows, {seconds:.3g} s at {rate:.4g} Hz, {freedoms}{jitter}"),
         *(("by name", each) for each in ["; ".join(done["guessed"])] if each),
         ("corrected", mistakes),
-        *seen,
+        *seen.items(),
         ("timing", f"{shifted}; {filtered}"),
         *([("stance", stance_text(prepared))] if "stance" in prepared else []),
         *of_joints,
@@ -119,6 +118,16 @@ def answer_lines(
         ("record next", command + (f" (least is known of {weak})" if weak else "")),
         ("wrote", f"{out}/report.html, {out}/model, {out}/identified.urdf, {out}/validation/report.md"),
     ]  # fmt: skip
+
+
+def seen_in(doubts: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """What the answer repeats of doubts, by subject: what passes is called a push, a force sensor that is right so."""
+    seen = dict[str, str]()
+    for x in (x for x in doubts if x["about"] in TOLD and (x["level"] != "ok" or x["about"] == "force sensor")):
+        passes = "seconds" in x["numbers"] and x["about"] in FIRST
+        about = "push" if passes else "sensor" if x["level"] == "ok" else x["about"]
+        seen[about] = f"{seen.get(about, '')} {x['what']} {x['do']}".strip()
+    return seen
 
 
 def is_explained(doubt: Mapping[str, Any], scores: forcegp.scores.Scores, best: str) -> bool:

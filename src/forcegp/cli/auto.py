@@ -308,6 +308,7 @@ def default_models(
         return "given", "identified", "gp:joint-friction+gp:aerodynamic" if friction else "gp:aerodynamic"
     models = ["given", "identified", *(["identified+gp:joint-friction"] if friction else [])]
     if model.robot.space.is_vector_space and not model.contacts and not still:
+        rows = replace(rows, measured={})  # identified without them
         left, missed = (x.std(axis=0) for x in forcegp.evidence.motion_residuals(rows, identified.model))
         share, some = (missed < USABLE * rows.a.std(axis=0)).mean(), (left > EXPLAINED * rows.u.std(axis=0)).any()
         models += [f"identified@{'accelerations' if share == 1.0 else 'torques:both'}"] if share > 0.5 and some else []

@@ -62,10 +62,7 @@ def compiler() -> list[str]:
 
 
 def compile_library(source: str, options: Iterable[str], library: Path, function: str) -> ctypes.CDLL:
-    """Compile a C text to the shared library ``library``, and load it.
-
-    CompilerError where ``function`` is not there.
-    """
+    """Compile a C text to the shared library ``library``, and load it. CompilerError where ``function`` lacks."""
     command = compiler()
     whole = [*command, *options, "-x", "c", "-", "-o", str(library), "-lm"]
     try:

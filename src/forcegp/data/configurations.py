@@ -21,10 +21,7 @@ Positions = Float[np.ndarray, "rows nq"]
 
 
 def continuous(space: ConfigurationSpace, q: Positions) -> Positions:
-    """The same positions with quaternions that change sign nowhere.
-
-    Raises DatasetError where a body turns by more than a quarter of a turn between two rows.
-    """
+    """The same with quaternions that change sign nowhere. DatasetError for a quarter of a turn between two rows."""
     for group in space.groups:
         turn = slice(group.place + TURN.start, group.place + TURN.stop)
         followed, jumped = following(q[:, turn], q[0, turn])
@@ -50,10 +47,7 @@ def following(
 def through(
     space: ConfigurationSpace, q: Positions, change: Callable[[np.ndarray], np.ndarray]
 ) -> Float[np.ndarray, "_ nq"]:
-    """Positions behind a linear filter or interpolation `change` (rows, nq) -> (any rows, nq).
-
-    Raises DatasetError for turns faster than the filter passes.
-    """
+    """Positions behind a linear filter `change`. Raises DatasetError for turns faster than the filter passes."""
     if space.is_vector_space:
         return change(q)
     changed = change(continuous(space, q))

@@ -99,10 +99,7 @@ _INERTIA = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 class Bodies:
-    """Coordinates of n bodies, 0 at the reference pseudo-inertias (4, 4) each, which are definite.
-
-    Ten of each: alpha, d1-3, s12, s23, s13, t1-3.
-    """
+    """Coordinates of n bodies, 0 at reference pseudo-inertias (4, 4): alpha, d1-3, s12, s23, s13, t1-3 of each."""
 
     def __init__(self, references: Sequence[Float[np.ndarray, "4 4"]], priors: Sequence[Body]) -> None:
         self.priors = tuple(priors)

@@ -267,10 +267,7 @@ class MarginalLikelihood:
         return LatentKernels(kernels).to(variances.device)
 
     def __call__(self, kernels: LatentKernels, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
-        """The negative log marginal likelihood, exact and differentiable in every parameter.
-
-        Raises InvalidInput for a parameter of a name that means nothing here.
-        """
+        """The exact, differentiable negative log marginal likelihood. Raises InvalidInput for unknown names."""
         return self.of_terms(*self.checked_terms(kernels, parameters))
 
     def checked_terms(
@@ -296,10 +293,7 @@ class MarginalLikelihood:
         *,
         at_parameters: bool = False,
     ) -> LatentPosterior:
-        """The posterior of the latent functions at fixed parameters.
-
-        Kernels that are `at_parameters` hold them already, and are not copied.
-        """
+        """The posterior of latent functions at fixed parameters; kernels that are `at_parameters` are not copied."""
         kernels = kernels if at_parameters else kernels.at(parameters)
         with torch.no_grad():
             return (engine or Exact()).condition(kernels, self.terms(parameters))

@@ -170,10 +170,7 @@ class ParameterSpace:
         return tuple(out)
 
     def numbers(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " n"]:
-        """What people read: mass, centre of mass and inertia about it of bodies, then coefficients, in SI units.
-
-        Rotor inertias include those that the robot has.
-        """
+        """What people read: mass, center and inertia of bodies, then coefficients, in SI units; whole rotors."""
         of_bodies, of_terms = self.split(x)
         values = [self.bodies.numbers(of_bodies, self._frames)]
         for own, term in zip(of_terms, self.terms, strict=True):
@@ -277,10 +274,7 @@ class ParameterSpace:
         known: Float[np.ndarray, "rows nv"],
         slopes: Float[np.ndarray, "rows nv t"],
     ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv t"]]:
-        """Torques of the actuators and their derivatives, where gains may be estimated; `slopes` are those of `torque`.
-
-        They are `known` where no gain is.
-        """
+        """Torques of actuators and their derivatives, by `slopes` of `torque`; those `known` where no gain is free."""
         values, of_gain, column = self.values(x), np.zeros(slopes.shape[-1], dtype=bool), 0
         for term in self.terms:
             if isinstance(law := self.model.laws[term.law], Actuation):
@@ -314,10 +308,7 @@ def force_title(law: Law) -> str:
 def _derivatives(
     law: Law, values: Mapping[str, Tensor], terms: Sequence[Term], features: tuple[Tensor, ...], B: Tensor | None
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The force (rows, nv) and, of minus that, derivatives in every entry of each term.
-
-    They are (rows, nv, k), or (rows, nv) where entry j acts on joint j alone.
-    """
+    """The force (rows, nv), and slopes of minus that by entry: (rows, nv, k), or (rows, nv) for joints alone."""
     rows, wanted = features[0].shape[:-1], {term.name for term in terms}
     numbers = {
         name: value.expand(*rows, *value.shape).clone().requires_grad_(name in wanted) for name, value in values.items()

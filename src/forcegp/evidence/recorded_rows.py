@@ -205,6 +205,9 @@ class RecordedRows:
     def _sensing(self) -> tuple[Float[np.ndarray, "rows k nv"], Float[np.ndarray, "rows k"]]:
         """What makes sensed forces of A^T lambda, and those that were measured."""
         model = self.space.model
+        if alone := self.sensed.keys() - {contact.frame for contact in model.contacts}:
+            where = f"a force was measured at {', '.join(sorted(alone))}, where the model has no contact"
+            raise InvalidInput(f"{where}: accelerations cannot teach numbers beside it; give Torques().")
         A, b, normals = model.constraint(self.state)
         M = torch.eye(A.shape[-1]).to(A)
         parts = ConstrainedDynamics(
@@ -238,10 +241,7 @@ class RecordedRows:
         return self.space.torque(x, state, a, self._caches[load])
 
     def in_torque(self, x: np.ndarray, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray, Response]:
-        """Residual (rows, equations), derivatives in standard parameters and in x of the laws, and du/dz of forces.
-
-        Equations are those of joints, then those at links with a torque sensor.
-        """
+        """Residual (rows, equations), slopes in standard parameters and in x of laws, and du/dz of forces."""
         nv, parameters = motion.a.shape[1], self.space.standard_parameters(x)
         rigid = motion.fixed + motion.regressor.reshape(*motion.fixed.shape, -1) @ parameters.ravel()
         joints, regressor, law = rigid[:, :nv], motion.regressor, self.space.under_load
@@ -307,10 +307,7 @@ class RecordedRows:
         return r, (by @ Y.reshape(*shape, -1)).reshape(*r.shape, *Y.shape[2:]), by @ in_x
 
     def rough_noise(self, x: np.ndarray, a: Rows) -> NoiseLevels:
-        """With which all residuals are noise of accelerations.
-
-        So starts of all searches are: forces that nothing measures would explain any mass of a base there.
-        """
+        """Noise of accelerations alone, where searches start: with forces any mass of a base would be explained."""
         predicted, M, _ = self.acceleration(x)
         residual = a - predicted
         force = FIRST * np.sqrt(((M @ residual[..., None]) ** 2).mean((0, 2))).clip(1e-12)

@@ -85,10 +85,7 @@ def warn_of_contacts(model: Model, dataset: Dataset) -> None:
 
 
 def refuse_what_has_no_answer(model: Model) -> None:
-    """Before any search: raise InvalidInput for a law that is listed twice.
-
-    What else a log does not tell apart, or does not show, its estimates say (`Estimate.why`).
-    """
+    """Raise InvalidInput for a law that is listed twice. What else no log shows is in `Estimate.why`."""
     titles = [force_title(law) for law in model.laws if law.learned]
     if twice := [title for title in dict.fromkeys(titles) if titles.count(title) > 1]:
         raise InvalidInput(f"forces hold {twice[0]!r} twice, which no log tells apart; leave one of them out.")

@@ -348,10 +348,7 @@ class _Functions:
     def _search(
         self, rows: Dataset, dataset: Dataset, beside: Callable[[MarginalLikelihood], FreeNumbers] | None = None
     ) -> Posterior:
-        """One search on these rows of the log with the model as it is, and the exact posterior there.
-
-        `beside` gives the likelihood in which numbers are free.
-        """
+        """One search on these rows with this model, and its posterior; `beside` gives a likelihood of numbers."""
         noise = resolved_noise(self.model.noise, rows)
         noise = noise if self.unseen is None else self.unseen.with_pushes(noise, len(rows))
         model = replace(self.model, noise=noise)

@@ -54,10 +54,7 @@ class Unknowns:
 
     @classmethod
     def of(cls, posterior: Posterior, dataset: Dataset, bodies: bool, stated: Model | None = None) -> "Unknowns":
-        """Laws of the joints that the model lists, bodies where asked for.
-
-        Numbers that the laws of `stated` know by a standard deviation of 0 stay.
-        """
+        """Laws of the model's joints, bodies where asked for; numbers of `stated` without a deviation stay."""
         given = {} if stated is None else {type(law): law for law in stated.laws if isinstance(law, JointLaw)}
         robot, _ = thickened(posterior.model.robot)
         model = posterior.model.with_robot(robot) if bodies else posterior.model
@@ -219,10 +216,7 @@ class MotionFit:
         return here, damping
 
     def solved(self, x: Tensor) -> tuple[_Point, Tensor, Tensor]:
-        """The minimum that is reached from x, the noise and sigma that residuals have there.
-
-        Raises NumericalError where no motion is found near the recorded one.
-        """
+        """The minimum reached from x, with noise and sigma there. Raises NumericalError where no motion is near."""
         one = torch.ones(self.q.shape[-1], dtype=x.dtype)
         here, damping = self.at(x, self.start, one, one, None), 1e-3
         if not math.isfinite(here.cost):

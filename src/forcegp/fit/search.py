@@ -48,10 +48,7 @@ QUIET = 1e-3
 
 
 def resolved_noise(noise: Noise | None, rows: Dataset) -> Noise:
-    """The noise given, else the level that the training rows state, else one that is learned, with a warning.
-
-    With `Noise(None, learn=True)` nothing is warned of.
-    """
+    """The noise given, else that of the rows, else one that is learned, with a warning unless `learn` is True."""
     if noise is not None and noise.acceleration is not None:
         return noise
     level = rows.noise_std
@@ -210,10 +207,7 @@ def with_variance_priors(kernels: LatentKernels) -> LatentKernels:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """How a fit searches for hyper-parameters, documented at `forcegp.fit`.
-
-    Raises InvalidInput for numbers out of range.
-    """
+    """How a fit searches for hyper-parameters, as `forcegp.fit` documents. InvalidInput for numbers out of range."""
 
     jobs: Jobs
     restarts: int | None

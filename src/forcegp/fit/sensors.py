@@ -39,7 +39,8 @@ def with_sensors(dataset: Dataset, model: Model, rest: Evidence, sensors: Sequen
     """The log with the sensors that teach, IMUs named as they are mounted, and the model with their noise."""
     measured, levels = dict[str, np.ndarray](), dict[str, list[float]]()
     looked = torque_sensor_doubts(dataset, model) if any(isinstance(each, JointTorques) for each in sensors) else ()
-    forces = {doubt.numbers["frame"]: doubt for doubt in force_sensor_doubts(dataset, model) if doubt.level == "wrong"}
+    felt = force_sensor_doubts(dataset, model) if any(isinstance(each, ContactForces) for each in sensors) else ()
+    forces = {doubt.numbers["frame"]: doubt for doubt in felt if doubt.level == "wrong"}
     links = {doubt.joints: doubt for doubt in looked if doubt.level == "wrong"}
     for each in sensors:
         each.check(dataset)

@@ -44,10 +44,7 @@ nobody calibrated, and friction (10 to 16 % and 10 % on that leg, 9.5 % on a UR1
 
 @dataclass(frozen=True, eq=False)
 class Unseen:
-    """Joints that something pushes, with how strongly (nv,) [N or Nm], and what contacts hide of every torque (nv,).
-
-    `typical` are sizes of joint forces in the log.
-    """
+    """Joints that something pushes, how strongly, and what contacts hide of torques; `typical` joint forces."""
 
     typical: Float[np.ndarray, " nv"]
     pushed: tuple[int, ...]

@@ -233,10 +233,7 @@ class Law(Force):
         return forces if self.transmission is None else _times(torch.as_tensor(self.transmission).mT, forces)
 
     def inertia_basis(self, robot: Robot) -> Float[Tensor, "k nv nv"] | None:
-        """What one unit of each entry of the first coefficient adds to the mass matrix; None for laws without inertia.
-
-        Such a law has no amplitude of its own.
-        """
+        """What one unit of each first coefficient adds to the mass matrix, beside no amplitude; else None."""
         return None
 
     def added_inertia(self, robot: Robot) -> Float[Tensor, "nv nv"] | None:

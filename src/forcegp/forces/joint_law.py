@@ -23,10 +23,7 @@ Transmission = str | Sequence[Sequence[float]] | np.ndarray | Tensor | None
 
 
 class PerJointLaw(Law):
-    """A law whose coefficients have one value per joint; the amplitude of a joint depends on those of that joint alone.
-
-    `features` are (..., nv) each.
-    """
+    """A law with one coefficient per joint, on which its amplitude depends alone. `features`: (..., nv) each."""
 
     def _bound(self, name: str, robot: Robot) -> Any:
         given, coefficient = getattr(self, name), self.coefficients[name]

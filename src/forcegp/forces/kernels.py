@@ -167,10 +167,7 @@ class _WeightKernel(Kernel):
 
 
 class SmoothSignKernel(_WeightKernel, _WidthKernel):
-    """k = tanh(s / w) tanh(s' / w) of one feature s: a function that is a multiple of a smoothed sign of s.
-
-    At s = w, 76 % of the friction is developed.
-    """
+    """k = tanh(s / w) tanh(s' / w): multiples of a smoothed sign of s, of which 76 % are there at s = w."""
 
     def weight_features(self, z: Tensor) -> Tensor:
         """phi (n, 1), with k = phi phi^T."""

@@ -61,10 +61,7 @@ class Unknown(Force):
         return ("Nm or N",) * len(self.latent_names(robot))
 
     def point_force(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch 3 C"] | None:
-        """Force in N along the axes of the world that one unit of each latent exerts on a point of the robot.
-
-        None for priors of joint forces only.
-        """
+        """Force [N, world axes] that one unit of each latent exerts on a point; None for priors of joint forces."""
         return None
 
 

@@ -67,10 +67,7 @@ class Engine(ABC):
 
     @abstractmethod
     def condition(self, kernels: LatentKernels, terms: Terms) -> LatentPosterior:
-        """The posterior given the data.
-
-        Raises NotEnoughMemory before anything large is allocated, NumericalError where the engine fails.
-        """
+        """The posterior given the data. Raises NotEnoughMemory beforehand, NumericalError where the engine fails."""
 
     def require_memory(self, size: ProblemSize, device: torch.device) -> None:
         """Raise NotEnoughMemory where conditioning needs more memory than is free."""

@@ -106,10 +106,7 @@ class ExactPosterior(LatentPosterior):
         return self.system.deflation.through(index, self.kernels.dense[index].cross(z, self.features[index]).mT)
 
     def joint_covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "Cn Cn"]:
-        """Cov(f_c(z_i), f_d(z_j)) of all latents at all of n points, the points of one latent after the other.
-
-        Rasmussen & Williams 2006, eq. 2.26.
-        """
+        """Cov(f_c(z_i), f_d(z_j)) at all of n points, by latent. Rasmussen & Williams 2006, eq. 2.26."""
         C = torch.cat([self.data_covariance(index, z) for index, z in enumerate(features)], dim=-1)
         V = self.system.factor.solve_lower(C)
         prior = torch.block_diag(*[kernel.matrix(z) for kernel, z in zip(self.kernels.dense, features, strict=True)])

@@ -202,10 +202,7 @@ class JointForces(NamedTuple):
 
 
 def state_rows(model: Model, q: Array, v: Array, u: Array, past: bool = True) -> tuple[list[Tensor], torch.Size]:
-    """States as float64 rows on the model's device, and their batch; without `past` u lacks what laws remember.
-
-    InvalidInput for shapes, and values that are not finite.
-    """
+    """States as float64 rows, and their batch; without `past` u lacks what laws remember. Raises InvalidInput."""
     nq, nv, nu = model.sizes
     named = zip("qvu", (q, v, u), (nq, nv, nu if past else nu - len(model.memory.names)), strict=True)
     given = [state_tensor(name, values, size, model.robot.device) for name, values, size in named]

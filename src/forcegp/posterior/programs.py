@@ -138,10 +138,7 @@ class Traced(NamedTuple):
 
 @dataclass(eq=False)
 class Programs:
-    """The programs of a posterior in a model; `example` is one state (1, size).
-
-    InvalidInput for what no graph holds.
-    """
+    """The programs of a posterior in a model; `example`: one state (1, size). InvalidInput for what no graph holds."""
 
     physics: Physics
     example: Sequence[Tensor]

@@ -45,10 +45,7 @@ class Page:
 
 
 def write_page(path: str | Path, page: Page, *, overwrite: bool = True) -> None:
-    """Write the page to a temporary name and rename it.
-
-    Raises InvalidInput if the folder does not exist, or the file does and may not be replaced.
-    """
+    """Write the page. Raises InvalidInput if the folder does not exist, or the file may not be replaced."""
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters["base64"] = lambda png: base64.b64encode(png).decode()
     template = environment.from_string(files("forcegp.report").joinpath("page.html").read_text(encoding="utf-8"))

@@ -68,8 +68,10 @@ def identify(recording: Dataset, expression: str) -> tuple[str, Posterior]:
     forces, _, evidence = expression.partition("@")
     given = parse_evidence(evidence)
     identified = learn(named_model(recording.model, summands(forces)), recording, given)[0]
+    # sensors that did not teach are no forces beside those that were found: a tool would count twice
+    alone = recording if any(isinstance(each, Sensor) for each in given) else replace(recording, measured={})
     pushed = recording.model.robot.space.is_vector_space and "spring" not in summands(forces)
-    if not pushed or not pushed_where_they_are(recording, identified.model):
+    if not pushed or not pushed_where_they_are(alone, identified.model):
         return expression, identified
     forces = f"{forces}+spring"
     return f"{forces}@{evidence}", learn(named_model(recording.model, summands(forces)), recording, given)[0]
@@ -376,13 +378,11 @@ def checked_identification(name: str, model: Model, rows: Dataset) -> tuple[Mode
 
 
 def identified_model(name: str, model: Model, rows: Dataset, before: Posterior | None = None) -> Model:
-    """The model that laws and bodies of this name make of these rows, with the noise of rows that are held out.
-
-    `before`: what they made of the same rows already, or of more of the same recording.
-    """
+    """The model that this name makes of these rows, or made `before`, with the noise of rows that are held out."""
     opened, evidence = checked_identification(name, model, rows)
+    rows = replace(rows, measured={})  # none of which is among the evidence
     if before is None:
         opened, _ = with_friction_chosen(opened, rows, evidence)  # once, for all parts of the rows
     found: Any = fit(opened, rows, evidence) if before is None else before
     opened = with_choice_of(opened, found)
-    return replace(found.model, noise=held_out_noise(opened, replace(rows, measured={}), evidence))
+    return replace(found.model, noise=held_out_noise(opened, rows, evidence))

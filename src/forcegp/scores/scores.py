@@ -287,10 +287,7 @@ class Scores(Summary):
 
     @cached_property
     def winner(self) -> Winner | None:
-        """The best parametric model, unless another is shown to be better, or is usable in more joints.
-
-        None where no model was scored.
-        """
+        """The best parametric model, unless another is better, or usable in more joints; None where none was scored."""
         for criterion in CRITERIA:
             simple, other = (self.best_of(kinds, criterion) for kinds in (PARAMETRIC, LEARNED))
             if simple is not None and other is not None:

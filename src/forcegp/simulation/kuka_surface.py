@@ -118,10 +118,7 @@ class PointFriction:
 
 
 class ContactForces(NamedTuple):
-    """What acts at the tool during a step: normal force [N], friction (3,) [N, world axes] and its joint torques.
-
-    `push` are the joint torques of all of it.
-    """
+    """What acts at the tool: normal force [N], friction (3,) [N, world axes] and joint torques, `push` all of these."""
 
     multiplier: float
     tool_force: Float[np.ndarray, "3"]
@@ -146,10 +143,7 @@ class IdealContact:
     touched: bool = False
 
     def forces(self, state: ArmState, applied: Float[np.ndarray, " nv"]) -> ContactForces:
-        """Those under the torques of actuators and joint friction [Nm].
-
-        Raises SimulationError where friction is so strong that the normal force is not determined.
-        """
+        """Those under these torques [Nm]. SimulationError where friction leaves the normal force undetermined."""
         point = torch.from_numpy(state.position)
         distance = float(self.table.value(point))
         self.touched = self.touched or distance <= 0.0
