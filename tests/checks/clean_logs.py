@@ -19,8 +19,7 @@ from forcegp.robots import Robot
 
 def with_motion(robot: Robot, q: np.ndarray, rate: float, seed: int, noise: float = 0.05) -> Dataset:
     """A log of positions given as smooth functions: noise on `a` alone."""
-    generator = np.random.default_rng(seed)
-    time = np.arange(len(q)) / rate
+    generator, time = np.random.default_rng(seed), np.arange(len(q)) / rate
     v = np.gradient(q, time, axis=0, edge_order=2)
     a = np.gradient(v, time, axis=0, edge_order=2)
     u = robot.inverse_dynamics(*(torch.tensor(x) for x in (q, v, a))).numpy() + 0.05 * v + 0.1 * np.tanh(v / 0.02)
@@ -34,8 +33,7 @@ def rests(robot: Robot, seed: int, noise: float = 0.05, jitter: float = 0.0) -> 
     generator = np.random.default_rng(seed)
     points = np.cumsum(generator.uniform(-0.7, 0.7, (8, robot.nv)), axis=0) * 0.6
     rise = np.linspace(0.0, 1.0, 200)
-    blend = 10 * rise**3 - 15 * rise**4 + 6 * rise**5
-    pieces = []
+    blend, pieces = 10 * rise**3 - 15 * rise**4 + 6 * rise**5, []
     for start, stop in pairwise(points):
         pieces += [start + blend[:, None] * (stop - start), np.repeat(stop[None], 150, axis=0)]
     data = with_motion(robot, np.concatenate(pieces), 200.0, seed, noise)

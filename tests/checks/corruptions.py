@@ -62,8 +62,7 @@ ROBOTS: Mapping[str, Callable[[], Robot]] = {
 
 def clean(robot: Robot, seed: int, *, rate: float = 250.0, seconds: float = 8.0, noise: str = "a") -> Dataset:
     """Sums of sines with friction that nobody modelled; noise on `a` alone (simulated), or on q, v and u (logged)."""
-    generator = np.random.default_rng(seed)
-    time = np.arange(round(seconds * rate)) / rate
+    generator, time = np.random.default_rng(seed), np.arange(round(seconds * rate)) / rate
     omega = 2 * np.pi * generator.uniform(0.1, 1.0, (5, 1, 2))
     size, phase = generator.uniform(0.1, 0.3, (5, 1, 2)), generator.uniform(0, 2 * np.pi, (5, 1, 2))
     angle = omega * time[:, None] + phase
@@ -88,8 +87,7 @@ POINT = (0.0, 0.0, -0.3)
 
 def on_a_line(seed: int, *, rate: float = 250.0, seconds: float = 8, noise: float = 0.1, push: float = 8) -> Dataset:
     """A planar arm whose tip stays on the line x = 0.35 m, pushed against it, with friction along the line."""
-    robot = two_links()
-    generator = np.random.default_rng(seed)
+    robot, generator = two_links(), np.random.default_rng(seed)
     time = np.arange(round(seconds * rate)) / rate
     omega, phase = 2 * np.pi * generator.uniform(0.15, 0.8, (4, 1)), generator.uniform(0, 2 * np.pi, (4, 1))
     size = generator.uniform(0.02, 0.05, (4, 1))
@@ -182,8 +180,7 @@ def recorded_under(data: Dataset, gravity: tuple[float, float, float]) -> Datase
 
 def dropped(data: Dataset, names: str, share: float, seed: int = 0) -> Dataset:
     """A share of the rows set to zero, in bursts of a few rows."""
-    generator = np.random.default_rng(seed)
-    lost = np.zeros(len(data), dtype=bool)
+    generator, lost = np.random.default_rng(seed), np.zeros(len(data), dtype=bool)
     while lost.mean() < share:
         start = generator.integers(1, len(data) - 4)
         lost[start : start + generator.integers(1, 4)] = True
@@ -216,8 +213,7 @@ def moved(data: Dataset, by: tuple[float, float, float]) -> Dataset:
 def invented(data: Dataset) -> Dataset:
     """A contact through which the middle of the motion passes."""
     assert data.model is not None
-    robot = data.model.robot
-    q = torch.tensor(data.q)
+    robot, q = data.model.robot, torch.tensor(data.q)
     pose = robot.kinematics(q, 0 * q).frame_pose("link2").numpy()
     offset = float(np.median((pose[:, :3, :3] @ np.array(POINT) + pose[:, :3, 3])[:, 0]))
     return replace(data, model=data.model.with_contacts([Contact("link2", POINT, Plane((1.0, 0.0, 0.0), offset))]))

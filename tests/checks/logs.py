@@ -35,14 +35,12 @@ def pendulum() -> Model:
 def clean(seed: int, model: Model | None = None, *, seconds: float = 7.0, noise: float = 1.0) -> Dataset:
     """Sums of sines; torques of inverse dynamics, viscous and dry friction; white noise on q, v and u."""
     model = model or arm()
-    generator = np.random.default_rng(seed)
-    nv = model.robot.nv
+    generator, nv = np.random.default_rng(seed), model.robot.nv
     time = np.arange(round(seconds * RATE)) / RATE
     omega = 2 * np.pi * generator.uniform(0.1, 1.2, (6, 1, nv))
     size, phase = generator.uniform(0.05, 0.2, (6, 1, nv)), generator.uniform(0, 2 * np.pi, (6, 1, nv))
     angle = omega * time[:, None] + phase
-    q = (size * np.sin(angle)).sum(0)
-    v = (size * omega * np.cos(angle)).sum(0)
+    q, v = (size * np.sin(angle)).sum(0), (size * omega * np.cos(angle)).sum(0)
     a = (-size * omega**2 * np.sin(angle)).sum(0)
     u = model.robot.inverse_dynamics(*(torch.tensor(x) for x in (q, v, a))).numpy()
     u = u + 0.1 * v + 0.2 * np.tanh(v / 0.05)

@@ -49,8 +49,7 @@ def test_velocities_are_compared_of_joints_that_move(share, level):
 
 def stopped(torque):
     """A motion that rests in the middle, on torques that lack so much [Nm] of what the posture needs."""
-    data = clean(4, arm())
-    rows = np.r_[:700, np.repeat(700, 200), 700:1400]
+    data, rows = clean(4, arm()), np.r_[:700, np.repeat(700, 200), 700:1400]
     still, time = slice(700, 900), np.arange(len(rows)) / RATE
     moved = {name: getattr(data, name)[rows] for name in "qvua"}
     moved["v"][still], moved["a"][still] = 0.0, 0.0
@@ -217,8 +216,7 @@ def test_rows_at_rest_show_no_torque():
     """Stiction holds any torque there: a tilt of 25 degrees was no cause that was tried, beside rests of teaching."""
     model, path = arm(), clean(0, noise=0.0)
     pace = np.maximum(np.sin(2.0 * np.pi * path.time / 1.4), 0.0) ** 2
-    way = CubicSpline(path.time, path.q)
-    s = np.cumsum(pace) / RATE
+    way, s = CubicSpline(path.time, path.q), np.cumsum(pace) / RATE
     q, v = way(s), way(s, 1) * pace[:, None]
     a = way(s, 2) * pace[:, None] ** 2 + way(s, 1) * np.gradient(pace, path.time)[:, None]
     held = np.random.default_rng(0).uniform(-2.0, 2.0, (20, 3))[(path.time / 1.4).astype(int)]

@@ -72,8 +72,7 @@ def test_a_contact_is_not_sought_where_velocities_are_wrong(monkeypatch):
 
 
 def test_noise_of_the_acceleration_is_no_cause():
-    data = clean(two_links(), 0, noise="none")
-    noise = np.array([30.0, 30.0])
+    data, noise = clean(two_links(), 0, noise="none"), np.array([30.0, 30.0])
     noisy = replace(data, a=data.a + noise * np.random.default_rng(0).normal(size=data.a.shape))
     assert data.model is not None
     stated = CheckInput.quick(replace(noisy, noise_std=noise, time_ordered=False), data.model)

@@ -130,8 +130,7 @@ def test_a_base_that_does_not_fall_although_nothing_acts_on_it(log):
 @pytest.mark.parametrize(("order", "shift"), [("wxyz", -1), ("xyzw", 1)])
 def test_the_order_of_quaternions_of_a_robot_that_stays_upright(order, shift):
     """Its rates are a small part of its speed, and either order of the log may have been stated."""
-    time = np.arange(2000) / 200
-    robot = Robot.from_urdf_text(BODY, base="floating")
+    time, robot = np.arange(2000) / 200, Robot.from_urdf_text(BODY, base="floating")
     v, q = np.zeros((2000, 6)), [robot.neutral()]
     for k in range(6):
         v[:, k] = (1.0 if k < 3 else 0.1) * np.sin((k + 2) * time)

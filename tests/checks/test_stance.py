@@ -20,8 +20,7 @@ def of(dataset, subject="contact flag"):
 
 
 def flagged(log, foot, change):
-    u = log.u.copy()
-    place = log.model.inputs.index(foot)
+    u, place = log.u.copy(), log.model.inputs.index(foot)
     u[:, place] = change(u[:, place])
     return replace(log, u=u, truth={})
 

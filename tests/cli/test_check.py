@@ -16,8 +16,7 @@ from forcegp.data import resample
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A clean log, one with two defects, and what is left of others."""
-    place = tmp_path_factory.mktemp("check")
-    data = clean(1)
+    place, data = tmp_path_factory.mktemp("check"), clean(1)
     data.save(place / "clean.h5")
     column(late(data, 0.02), "u", 1, np.negative).save(place / "defects.h5")
     noisy = replace(data, q=data.q + 1e-4 * np.random.default_rng(0).normal(size=data.q.shape))

@@ -31,8 +31,7 @@ def test_a_model_becomes_a_program(forcegp, folder):
     words = ("export", "run", "--to", "c", "--out", "deployed", "--steps", 0.02)
     done = forcegp(*words, "--json", folder=folder)
     assert done.returncode == 0, done.stderr
-    summary = json.loads(done.stdout)
-    out = folder / "deployed"
+    summary, out = json.loads(done.stdout), folder / "deployed"
     assert set(summary["files"]) == FILES
     assert {file.name for file in out.iterdir()} == FILES | {"config.json", "SHA256SUMS"}
     assert set(summary["differences"]) == {"arm_mean", "arm_step", "arm_inverse_dynamics", "arm_forces"}

@@ -109,8 +109,7 @@ def test_processes_are_those_of_the_words_unless_others_are_given(listed, monkey
 
 @pytest.mark.nightly  # tests/parallel has executors, and a process that is killed
 def test_a_cluster_whose_worker_is_killed_gives_the_same_rows(listed):
-    distributed = pytest.importorskip("distributed")
-    alone = fleet(words("alone"))
+    distributed, alone = pytest.importorskip("distributed"), fleet(words("alone"))
     with (
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
         distributed.Client(cluster) as client,

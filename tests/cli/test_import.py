@@ -26,8 +26,7 @@ def test_what_cannot_be_imported_is_one_line_and_leaves_nothing(forcegp, folder,
     broken = BROKEN[name]
     if "bag" in name or "mcap" in name or "topic" in name or "unknown compression" in name:
         pytest.importorskip("rosbags")
-    log = broken.make(folder)
-    before = sorted(folder.rglob("*"))
+    log, before = broken.make(folder), sorted(folder.rglob("*"))
     done = forcegp("import", log.relative_to(folder), *broken.words.split(), "--out", "log_out.h5", folder=folder)
     lines = [line for line in done.stderr.splitlines() if not line.startswith("the columns are mapped by")]
     assert done.returncode == 2, done.stderr

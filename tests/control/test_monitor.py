@@ -47,8 +47,7 @@ def test_it_is_the_momentum_observer():
     push[300:] = 2.0, -1.0
     q, v, u = motion(1.0, 2, push, noise=0.0, dt=dt)
     observer = ContactMonitor(TRUE, dt=dt, bandwidth=bandwidth).calibrate([motion(55.0, 1, dt=dt)])
-    found = observer.run(q, v, u).torque.numpy()
-    model = pinocchio.buildModelFromXML(URDF)
+    found, model = observer.run(q, v, u).torque.numpy(), pinocchio.buildModelFromXML(URDF)
     data, K = model.createData(), 2.0 * math.pi * bandwidth
     r, total, first = np.zeros(2), np.zeros(2), None
     for k in range(len(q) - 1):

@@ -32,8 +32,7 @@ def raw(seed, noise, late=0.0, seconds=10.0):
 
 def test_a_spectrum_that_shows_too_low_a_cutoff_is_overruled():
     """From a tenth of the right cut-off the search comes to where friction is not smeared."""
-    rows = raw(2, 1e-5, seconds=30.0)
-    low = 1.2
+    rows, low = raw(2, 1e-5, seconds=30.0), 1.2
     best, shares = held_out_cutoff(rows, low)
     assert best > 1.9 * low
     assert shares[min(shares)] > 2.0 * shares[best] == 2.0 * min(shares.values())

@@ -92,8 +92,7 @@ def test_stance_as_short_as_what_a_filter_smears_is_never_called_swing(rate, sta
     log, _ = hop("floating", rate, stands, (0.0, 0.0, -9.81))
     rows = Preparation(cutoff=cutoff).apply(log)
     found = estimate_stance(rows).flags[:, 0]
-    decided = np.isfinite(found)
-    t = rows.time % (0.5 + stands)
+    decided, t = np.isfinite(found), rows.time % (0.5 + stands)
     assert (found == (t >= 0.5))[decided].all()
     assert decided.mean() > 0.5
 

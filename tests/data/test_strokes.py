@@ -64,8 +64,7 @@ def test_steps_of_an_encoder_are_no_reversals():
     coarse = log_of(np.round((q + noise) / step) * step, v, a, a, time)
     assert encoder_step(coarse, coarse.q[:, 0]) == pytest.approx(step)
     assert encoder_step(log_of(q, v, a, a, time), q[:, 0]) == 0.0
-    smooth = strokes(log_of(q, v, a, a, time))
-    sigma = torch.tensor(0.1 / step)
+    smooth, sigma = strokes(log_of(q, v, a, a, time)), torch.tensor(0.1 / step)
     apart = after_strokes(torch.tensor(strokes(coarse)), sigma) - after_strokes(torch.tensor(smooth), sigma)
     assert float(apart.abs().mean()) < 0.05
     jitter = np.array([0.0, 1.0, 0.0, 1.0, 0.0, 1.0, 2.0, 3.0, 2.0, 3.0, 9.0, 2.0])

@@ -46,8 +46,7 @@ def used(place: Path) -> int:
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_a_full_disk_leaves_the_old_output(inputs, disk, name):
-    command = COMMANDS[name]
-    place = disk("size=256m")
+    command, place = COMMANDS[name], disk("size=256m")
     out = place / "out"
     code, errors = run(command.line(out), inputs)
     assert code == 0, errors
@@ -82,8 +81,7 @@ def test_a_full_disk_leaves_the_old_output(inputs, disk, name):
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_a_read_only_disk_is_one_line(inputs, disk, name):
-    command = COMMANDS[name]
-    place = disk("size=64m")
+    command, place = COMMANDS[name], disk("size=64m")
     (place / "deep").mkdir()
     disk("ro")
     for out in (place / "out", place / "deep" / "er" / "out"):

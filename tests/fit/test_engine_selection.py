@@ -43,8 +43,7 @@ def test_enough_inducing_points_predict_what_the_exact_engine_does(data, states)
 
 
 def test_parameters_come_from_some_rows_and_the_posterior_from_all(data, states):
-    some = fit(data, learning_points=30, points=60)
-    first = fit(data, points=30)
+    some, first = fit(data, learning_points=30, points=60), fit(data, points=30)
     for name, value in first.hyperparameters.items():
         torch.testing.assert_close(some.hyperparameters[name], value)
     assert len(some.training.q) == 60

@@ -60,8 +60,7 @@ def walker():
 
 def rows_of(model, count, seed=0, switches=2):
     """Random states; feet stand and swing at random."""
-    generator = torch.Generator().manual_seed(seed)
-    robot = model.robot
+    generator, robot = torch.Generator().manual_seed(seed), model.robot
     v, u = (torch.randn(count, n, dtype=torch.float64, generator=generator) for n in model.sizes[1:])
     u[:, u.shape[1] - switches :] = torch.randint(0, 2, (count, switches), generator=generator).double()
     return random_positions(robot, generator, count), v, u
@@ -288,8 +287,7 @@ def test_a_payload_on_the_trunk_of_a_walker(walker):
 
 def test_noise_under_constraints_is_that_of_the_rows(walker):
     q, v, u = rows_of(walker, 400)
-    dynamics = walker.dynamics(q, v, u)
-    rng = np.random.default_rng(0)
+    dynamics, rng = walker.dynamics(q, v, u), np.random.default_rng(0)
     force, acceleration = np.full(9, 0.5), np.full(9, 0.2)
     moved = (dynamics.H.numpy() @ (force * rng.normal(size=(400, 9)))[..., None])[..., 0]
     residual = moved + acceleration * rng.normal(size=(400, 9))

@@ -144,8 +144,7 @@ def test_joint_friction_beside_it_counts_for_the_normal_force():
 
 
 def test_an_expectation_that_was_given_stays():
-    data = sliding_data(20, 0)
-    given = ContactFriction(load=True, expected=0.1)
+    data, given = sliding_data(20, 0), ContactFriction(load=True, expected=0.1)
     posterior = fit(data.model.with_forces(given), data, restarts=1, options=OPTIONS)
     assert posterior.model.unknown_forces == (given,)
     assert "load_refinements" not in posterior.settings

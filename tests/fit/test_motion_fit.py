@@ -136,8 +136,7 @@ def test_derivatives_in_every_unknown(contacts):
     data = replace(data, v=0.2 * data.v, u=0.3 * data.u, truth={})
     unknowns = Unknowns.of(posterior, data, True)
     recorded, stride = all_motions(replace(data, q=data.q[:1].repeat(24, 0)), 0.05, 0.01)
-    fit = MotionFit(recorded, stride, unknowns)
-    generator = torch.Generator().manual_seed(0)
+    fit, generator = MotionFit(recorded, stride, unknowns), torch.Generator().manual_seed(0)
     x = torch.as_tensor(unknowns.space.start) + 0.05 * torch.rand(
         unknowns.space.size, generator=generator, dtype=torch.float64
     )

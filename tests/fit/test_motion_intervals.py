@@ -43,8 +43,7 @@ def test_they_hold_in_another_recording(calibrated, samples):
         inside = (low <= getattr(fresh, name)) & (getattr(fresh, name) <= high)
         for horizon in HORIZONS:
             assert 0.8 <= inside[:, round(horizon / fresh.dt)].mean() <= 1.0
-    half = found.interval("q")[1] - found.q
-    error = np.abs(found.q.numpy() - fresh.q)
+    half, error = found.interval("q")[1] - found.q, np.abs(found.q.numpy() - fresh.q)
     assert float(half[:, -1].mean()) < 4.0 * np.sqrt(np.square(error[:, -1]).mean()), "and are no wider than they need"
 
 

@@ -175,8 +175,7 @@ def test_no_residual_at_all_is_refused(data):
 
 @pytest.mark.parametrize(("force", "found"), [(1.3, ("lift",)), (0.7, ())])
 def test_a_joint_that_something_pushes_teaches_nothing(force, found):
-    truth = held(Actuation(gain=[0.8, 1.0, 1.0]))
-    log = measured(held(), held(), rows=100)
+    truth, log = held(Actuation(gain=[0.8, 1.0, 1.0])), measured(held(), held(), rows=100)
     log = replace(log, u=log.u * [1.0, 0.0, 1.0], measured={})
     needed = held().robot.kinematics(*tensors(log, "q", "v")).inverse_dynamics(torch.tensor(log.a)).numpy()
     push = np.zeros((100, 3))

@@ -79,8 +79,7 @@ def test_exact_data_give_the_truth(evidence):
 
 def test_what_predicts_is_what_is_written_down():
     found = identified(recorded(60, 2, noise=0.1), given(), *LAWS, Rotor())
-    again = Model.from_json(found.model.to_json())
-    test = recorded(20, 3)
+    again, test = Model.from_json(found.model.to_json()), recorded(20, 3)
     force, acceleration = motion_residuals(test, again)
     np.testing.assert_allclose(missing(found, test), force, atol=1e-9)
     np.testing.assert_allclose(test.a - found.predict(test.q, test.v, test.u).mean.numpy(), acceleration, atol=1e-7)

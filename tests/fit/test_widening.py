@@ -115,8 +115,7 @@ def test_everything_with_a_spread_is_widened_and_no_mean_moves(fitted):
     posterior, data = fitted
     states = data.q[:4], data.v[:4], data.u[:4]
     posterior = posterior.with_settings(hidden_force=None)  # what contacts hide is no part of what was learned
-    plain = posterior.with_settings(widening=1.0)
-    factor = posterior.widening
+    plain, factor = posterior.with_settings(widening=1.0), posterior.widening
     assert factor > 1.0
     narrow, wide = plain.predict(*states), posterior.predict(*states)
     parts = ((p, p.multiplier, p.contact_force, p.unknown_force) for p in (wide, narrow))

@@ -101,8 +101,7 @@ def check_words(case: Line, folder: Path) -> None:
     """A command, or InvalidInput of one line."""
     line = [word for word in words_of(case) if word not in ("--help", "-h", "--version")]
     try:
-        command = parse_arguments(line)
-        before = Path.cwd()
+        command, before = parse_arguments(line), Path.cwd()
         try:
             os.chdir(folder)
             command.check_paths()

@@ -46,8 +46,7 @@ def make(folder: Path) -> None:
     """train.h5, test.h5, arm.urdf, the models, logs of two joints with their mappings."""
     import numpy as np
 
-    data = arm_data(14, 5)
-    free = arm_data(80, 6, arm_model(0))
+    data, free = arm_data(14, 5), arm_data(80, 6, arm_model(0))
     structured = fit(
         data.model.with_forces(JointForces(), JointFriction(), noise=Noise(0.05, 0.02, learn=True)),
         data,

@@ -87,8 +87,7 @@ def states() -> list[np.ndarray]:
 
 
 def test_every_function_computes_what_the_model_does(posterior, library, states):
-    predicted = posterior.predict(*states)
-    reference = posterior.predictor(compile=False)
+    predicted, reference = posterior.predict(*states), posterior.predictor(compile=False)
     covariance, linear = reference(*states)[1], reference.linearize(*states)
     step = reference.linearize_step(*states, DT, "rk4")
     for k in range(5):
@@ -175,8 +174,7 @@ def test_friction_that_remembers_and_a_monitor_of_contacts(tmp_path, options):
     monitor = ContactMonitor(posterior.predictor(), dt=0.01).calibrate([(q, v, u)])
     made = export_c(posterior, tmp_path / "arm", covariance=True, monitor=monitor)
     assert max(made.differences[f"arm_monitor_{what}"] for what in ("step", "place")) < 1e-9
-    library = compiled(tmp_path / "arm", "arm.c")
-    z = [0.3, -0.9, 1.0]
+    library, z = compiled(tmp_path / "arm", "arm.c"), [0.3, -0.9, 1.0]
     wanted = posterior.predictor(covariance="none").inverse_dynamics(q[7], v[7], u[7], memory=z).mean
     bits, (found,) = call(library.arm_inverse_dynamics, [3], q[7], v[7], u[7], [], z)
     assert bits == 0

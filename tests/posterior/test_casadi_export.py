@@ -65,8 +65,7 @@ def test_its_own_code_compiles_to_the_same(posterior, states, tmp_path, monkeypa
     function.generate("arm.c", {"with_header": False})
     source, library = (tmp_path / "arm.c").read_text(encoding="utf-8"), tmp_path / "arm.so"
     compile_library(source, ("-O1", "-fPIC", "-shared"), library, "arm")
-    external = casadi.external("arm", str(library))
-    state = [x[2].numpy() for x in states]
+    external, state = casadi.external("arm", str(library)), [x[2].numpy() for x in states]
     assert_allclose(np.array(external(*state)), np.array(function(*state)), rtol=1e-12)
 
 

@@ -143,8 +143,7 @@ def test_a_linear_step_is_that_of_differences(case, integrator):
     q, v, u = (x[:2] for x in states)
     predictor, robot, size, dt = posterior.predictor(covariance="none"), posterior.model.robot, 1e-5, 0.02
     step = predictor.linearize_step(q, v, u, dt, integrator)
-    nv = robot.nv
-    x = torch.cat([torch.zeros_like(v), v], -1)
+    nv, x = robot.nv, torch.cat([torch.zeros_like(v), v], -1)
     exact = (step.A @ x[..., None] + step.B @ u[..., None])[..., 0] + step.c
     close(exact, torch.cat([torch.zeros_like(v), step.v], -1))
     for j in range(2 * nv):

@@ -133,8 +133,7 @@ def test_a_surface_that_no_row_touches_is_refused(train):
 
 
 def test_a_surface_that_most_rows_miss_is_pointed_out(train):
-    low = arm_data(20, 5, train.model)
-    high = arm_data(40, 6, arm_model(contacts=0))
+    low, high = arm_data(20, 5, train.model), arm_data(40, 6, arm_model(contacts=0))
     mixed = {name: np.concatenate([getattr(low, name), getattr(high, name)]) for name in ("q", "v", "u", "a")}
     data = Dataset(**mixed, time=np.arange(60.0), model=train.model, noise_std=train.noise_std)
     with pytest.warns(DataWarning, match=r"half of the training points .* rows in contact only"):

@@ -100,8 +100,7 @@ def write_bag1(path: Path, data: dict[str, np.ndarray], compression: str | None 
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
 
-    store = get_typestore(Stores.ROS1_NOETIC)
-    bag = Writer(path)
+    store, bag = get_typestore(Stores.ROS1_NOETIC), Writer(path)
     if compression is not None:
         bag.set_compression(Writer.CompressionFormat[compression])
     with bag:

@@ -46,8 +46,7 @@ def controller(names, positions):
     own = {name: np.zeros(0) for name in ("velocities", "accelerations", "effort")}
     past = ROS2.types["builtin_interfaces/msg/Duration"](sec=0, nanosec=0)
     point = ROS2.types["trajectory_msgs/msg/JointTrajectoryPoint"](positions=positions, time_from_start=past, **own)
-    header = joint_state((), ()).header
-    kind = ROS2.types["any_msgs/msg/Controller"]
+    header, kind = joint_state((), ()).header, ROS2.types["any_msgs/msg/Controller"]
     return kind(header=header, joint_names=list(names), points=[point], feedback=point)
 
 

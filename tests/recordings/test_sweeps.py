@@ -102,13 +102,11 @@ def test_values(imported):
 
 def test_turns_of_a_base():
     space, found = Robot.from_urdf_text(urdf("knee"), base="floating").space, {}
-    q = np.zeros((12, 8))
-    angle = np.linspace(0.0, 2.0, 12)
+    q, angle = np.zeros((12, 8)), np.linspace(0.0, 2.0, 12)
     q[:, 3], q[:, 6] = np.sin(0.5 * angle), np.cos(0.5 * angle)
     for error in (1e-10, 1e-8, 0.009, 0.011):
         for jump in (1.5, 1.64, 3.2):
-            own = q.copy()
-            turned = angle + jump * (np.arange(12) > 6)
+            own, turned = q.copy(), angle + jump * (np.arange(12) > 6)
             own[:, 3], own[:, 6] = np.sin(0.5 * turned), np.cos(0.5 * turned)
             own[8, 3:7] *= 1.0 + error
             try:

@@ -67,8 +67,7 @@ class Oracle:
         """Jacobians (nv, nv) of the acceleration with respect to q, v and tau."""
         args = self.configuration(q), self._theirs(v), self._theirs(tau)
         pin.computeABADerivatives(self.model, self.data, *args)
-        square = np.ix_(self.columns, self.columns)
-        inverse = np.triu(self.data.Minv)
+        square, inverse = np.ix_(self.columns, self.columns), np.triu(self.data.Minv)
         inverse = inverse + np.triu(inverse, 1).T
         return self.data.ddq_dq[square], self.data.ddq_dv[square], inverse[square]
 

@@ -79,8 +79,7 @@ def test_mass_matrix_bias_and_both_dynamics(pair, compiled, how):
     M, bias = of.mass_matrix_and_bias(pair.q, pair.v)
     tau = of.inverse_dynamics(pair.q, pair.v, pair.a)
     a = of.forward_dynamics(pair.q, pair.v, pair.tau)
-    gravity = of.gravity_forces(pair.q)
-    order = pair.to_v
+    gravity, order = of.gravity_forces(pair.q), pair.to_v
     for k, q, v, acceleration, force in pair.states():
         expected = pin.crba(pair.model, pair.data, q)
         expected = np.triu(expected) + np.triu(expected, 1).T

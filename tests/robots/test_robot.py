@@ -168,8 +168,7 @@ def test_pseudo_inertia_of_standard_parameters():
 
 @pytest.mark.parametrize("model", MODELS)
 def test_the_regressor_times_any_parameters_is_the_joint_force(model):
-    robot = Robot.from_urdf_text(MODELS[model]())
-    rng = np.random.default_rng(1)
+    robot, rng = Robot.from_urdf_text(MODELS[model]()), np.random.default_rng(1)
     q, v, a = torch.tensor(rng.normal(size=(3, 4, robot.nv)))
     parameters = torch.tensor(rng.normal(size=(robot.nv, 10)))
     kinematics = robot.kinematics(q, v)

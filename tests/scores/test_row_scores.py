@@ -43,8 +43,7 @@ def test_torques_are_those_of_inverse_dynamics_beside_the_recorded_ones():
     urdf = pinocchio.buildModelFromXML(model.robot.urdf_text)
     each = zip(data.q, data.v, data.a, strict=True)
     needed = np.array([pinocchio.rnea(urdf, urdf.createData(), *row) for row in each]) + 0.01 * data.a
-    error = np.sqrt(np.square(needed - data.u).mean(0))
-    found = scored(posterior, data)
+    error, found = np.sqrt(np.square(needed - data.u).mean(0)), scored(posterior, data)
     np.testing.assert_allclose(found.columns("rmse", "torque"), error, rtol=1e-9)
     np.testing.assert_allclose(found.columns("share", "torque"), error / data.u.std(0), rtol=1e-9)
 

@@ -274,7 +274,7 @@ def _all_turned(root: Explanation, inputs: CheckInput) -> tuple[Explanation, lis
         return None  # no masses explain them under any sign
     laws = Actuation(), RigidBodies("all"), *(Law() for Law in (Viscous, Coulomb, Offset, Rotor))
     for sign in (1.0, -1.0):
-        rows = replace(log.rows, u=sign * log.rows.u, model=Model(log.robot, (), laws))
+        rows = replace(log.rows, u=sign * log.rows.u, model=Model(log.robot, (), laws), measured={})
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of numbers that these rows do not show
             found = fit(rows.model, rows, Torques())
