@@ -159,9 +159,12 @@ class _Sensor:
         places = [(int(np.abs(row).argmax()), "-" * int(row.sum() < 0)) for row in Q]
         signs, known = ", ".join(f"{sign}{'xyz'[k]}" for k, sign in places), len(self.columns) == 3
         order = ",".join(f"{sign}{self.columns[k]}" for k, sign in places) if known else "X,Y,Z"
-        axes = "" if along in ("", "own") else f"--axes force={along} "
-        do = f"Give the columns {'so' if axes or known else 'in this order, with these signs'}: forcegp import {axes}"
-        do = f"{do}--force FRAME={order}{f', {turned}' if np.trace(Q) == -3.0 else '.'}"
+        given = "" if along in ("", "own") else along
+        command = f"forcegp import --axes force={given} --force" if given else "forcegp import --force"
+        do = (
+            f"Give the columns {'so' if given or known else 'in this order, with these signs'}: {command} FRAME={order}"
+        )
+        do += f", {turned}" if np.trace(Q) == -3.0 else "."
         numbers |= {"axes": (Q @ [1.0, 2.0, 3.0]).tolist()}
         return self.said(wrong, f"fits {fits} as ({signs}){WORDS[along]}", do, **numbers)
 
