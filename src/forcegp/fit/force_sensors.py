@@ -164,7 +164,7 @@ class _Sensor:
         do = (
             f"Give the columns {'so' if given or known else 'in this order, with these signs'}: {command} FRAME={order}"
         )
-        do += f", {turned}" if np.trace(Q) == -3.0 else "."
+        do += f", {turned}" if np.trace(Q) == -3.0 else f"{order}."
         numbers |= {"axes": (Q @ [1.0, 2.0, 3.0]).tolist()}
         return self.said(wrong, f"fits {fits} as ({signs}){WORDS[along]}", do, **numbers)
 
