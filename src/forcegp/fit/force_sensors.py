@@ -161,10 +161,8 @@ class _Sensor:
         order = ",".join(f"{sign}{self.columns[k]}" for k, sign in places) if known else "X,Y,Z"
         given = "" if along in ("", "own") else along
         command = f"forcegp import --axes force={given} --force" if given else "forcegp import --force"
-        do = (
-            f"Give the columns {'so' if given or known else 'in this order, with these signs'}: {command} FRAME={order}"
-        )
-        do += f", {turned}" if np.trace(Q) == -3.0 else f"{order}."
+        do = f"Give the columns {'so' if given or known else 'in this order, with these signs'}: {command} FRAME="
+        do += f"{order}, {turned}" if np.trace(Q) == -3.0 else f"{order}."
         numbers |= {"axes": (Q @ [1.0, 2.0, 3.0]).tolist()}
         return self.said(wrong, f"fits {fits} as ({signs}){WORDS[along]}", do, **numbers)
 
