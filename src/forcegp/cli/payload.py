@@ -183,7 +183,7 @@ def other_causes(payload: Mapping[str, Any]) -> dict[str, str]:
     """What would explain more than this payload, by cause; beside none, what drives and encoders alone do."""
     mass = payload.get("parameters", {}).get("payload.mass", {"value": 1.0, "std": 0.0})
     doubts = [each for each in payload.get("doubts", ()) if each["about"] == "payload"]
-    causes = ((cause, len(own), each["what"]) for each in doubts for cause, own in each["numbers"].items())
+    causes = ((cause, len(own), f"{x['what']} {x['do']}") for x in doubts for cause, own in x["numbers"].items())
     return {
         cause: what
         for cause, factors, what in causes

@@ -71,9 +71,8 @@ def force_sensor_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
 
     of_file, of_any = bases_of(laws), bases_of(np.concatenate([laws, regressor], axis=-1))
     step = float(np.median(np.diff(dataset.time))) if dataset.time_ordered else SECONDS
-    if any(
-        min(1.0, step / SECONDS) * len(basis) < 2 * basis.shape[1] for basis in of_any
-    ):  # any masses would explain it
+    apart = min(1.0, step / SECONDS)
+    if any(apart * len(basis) < 2 * basis.shape[1] for basis in of_any):  # any masses would explain it
         yield ok(about="force sensor", what="the log is too short to compare force sensors with torques.")
         return
     size = np.sqrt(np.square(missing + rows.at_contacts).mean(axis=0)) + 1e-12

@@ -119,8 +119,16 @@ CAUSES = {
     "gains": (0.2, "torques of the log times", "Check these drives; `gain` among the forces estimates them."),
     "lengths": (0.1, "lengths before the joints times", "Compare the URDF's lengths with the robot."),
     "masses": (0.2, "masses of the links times", "Give a baseline (a log without the payload), or identify all links."),
-    "gear ratio": (0.2, "positions and velocities of the log times", "Compare the gear's ratio with its data sheet."),
-    "joint zero": (0.1, "positions of the log plus", "Compare the joint's zero with that of the URDF."),
+    "gear ratio": (
+        0.2,
+        "positions and velocities of the log times",
+        "Correct it, as in forcegp import --q 'X * 1.2'.",
+    ),
+    "joint zero": (
+        0.1,
+        "positions of the log plus",
+        "Correct it, or the URDF, as in forcegp import --q 'X + 0.1'.",
+    ),
 }
 """Usual deviations of the logarithms of factors (of zeros in rad or m), what they are of, and what to do. All factors
 of a cause are tried, and each alone. Of two the first is named, unless the other explains a tenth more: what it
