@@ -21,10 +21,11 @@ PACKAGES = {
     "summary": set(),
     "doubts": {"errors"},
     "atomic_files": {"errors"},
+    "sandbox": {"errors"},
     "codegen": {"errors", "atomic_files"},
     "parallel": {"errors"},
     "jobs": {"errors", "atomic_files", "parallel"},
-    "robots": {"errors", "summary", "atomic_files", "codegen"},
+    "robots": {"errors", "summary", "atomic_files", "sandbox", "codegen"},
     "mechanics": {"errors", "robots"},
     "forces": {"errors", "robots", "mechanics"},
     "noise": {"errors"},
@@ -33,7 +34,7 @@ PACKAGES = {
 MODEL = {"errors", "summary", "doubts", "robots", "mechanics", "forces", "noise", "model"}
 PACKAGES |= {
     "data": MODEL | {"atomic_files"},
-    "recordings": MODEL | {"atomic_files", "data"},
+    "recordings": MODEL | {"atomic_files", "sandbox", "data"},
     "inference": {"errors", "codegen"},
     "integration": {"errors", "robots", "mechanics", "model"},
     "evidence": MODEL | {"data", "inference"},

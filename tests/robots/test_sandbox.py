@@ -4,9 +4,8 @@ import os
 
 import pytest
 
-from forcegp import Robot
+from forcegp import Robot, sandbox
 from forcegp.errors import RobotModelError
-from forcegp.robots import sandbox
 
 BODY = '<body name="a"><joint/><geom size=".1"/></body>'
 BODIES = '<body><geom size=".1"/></body>' * 30

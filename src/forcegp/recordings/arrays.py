@@ -34,7 +34,7 @@ from forcegp.recordings.source import (
     require_plausible_size,
 )
 from forcegp.recordings.tables import seconds_of
-from forcegp.robots.sandbox import MEMORY, SECONDS, read_apart
+from forcegp.sandbox import MEMORY, SECONDS, read_apart
 from forcegp.summary import listed
 
 SEPARATOR = "/"

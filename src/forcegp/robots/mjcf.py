@@ -19,10 +19,10 @@ from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import inverse, transform
 from forcegp.robots.layout import BASE, OUTSIDE, followed, joint_motion
 from forcegp.robots.mjcf_model import CompiledModel, Translation
-from forcegp.robots.sandbox import read_apart
 from forcegp.robots.structure import RobotStructure
 from forcegp.robots.urdf import MOST_TAGS, Joint, free_joint, numbers, parse_xml
 from forcegp.robots.urdf_file import read_text
+from forcegp.sandbox import read_apart
 
 DEEPEST = 20
 """Files that include files; each is read by a function that calls itself."""

@@ -14,8 +14,8 @@ from forcegp.errors import LARGEST, InvalidInput, NonPhysicalInertia, RobotModel
 from forcegp.robots.arguments import Problems, Vector, by_joint, finite_vector
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import Layout
-from forcegp.robots.sandbox import read_apart
 from forcegp.robots.urdf import RobotDescription, numbers, parse_urdf, with_prefixes
+from forcegp.sandbox import read_apart
 
 HEAVIEST = 1e9
 """kg and kg m^2, of one link: far from where products of inertias overflow."""

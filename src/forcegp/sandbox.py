@@ -1,6 +1,6 @@
 """Readers of files that others wrote, those of MuJoCo, xacro and MATLAB, in a process of their own with limits.
 
-What crashes, hangs or takes all memory there is an error here. `python -m forcegp.robots.sandbox` is that process: it
+What crashes, hangs or takes all memory there is an error here. `python -m forcegp.sandbox` is that process: it
 takes one request as JSON and gives one answer as JSON; it imports neither torch nor the rest of forcegp.
 """
 
