@@ -111,3 +111,28 @@ def test_what_no_filter_can_follow_is_refused():
     found = Preparation(delay="auto").resolved(replace(log, model=Model(log.model.robot), u=log.u[:, :3]))
     assert found.delay == 0.0
     assert found.why["delay"].startswith("u is taken to be on time: a delay is found from the torque of every joint")
+
+
+def by_sensors(factor=1.0):
+    """A base that tumbles: noise of .5 mm and .8 mrad on its pose, of sensors on v and a, which has a bias, too."""
+    log, noise = tumbling(), np.random.default_rng(3).normal
+    steps = noise(size=(len(log), 9)) * ([5e-4] * 3 + [8e-4] * 3 + [0.0] * 3)
+    q = log.model.robot.integrate(torch.tensor(log.q), torch.tensor(steps)).numpy()
+    a = np.where(np.arange(9) < 6, factor * log.a + 0.2 + 0.08 * noise(size=log.a.shape), log.a)
+    return replace(log, q=q, v=log.v + 0.01 * noise(size=log.v.shape), a=a)
+
+
+def test_a_base_keeps_what_sensors_measured_where_its_pose_is_noisier():
+    raw, true, chosen = by_sensors(), low_pass(tumbling(), 20.0), Preparation(cutoff=20.0, trim=0.5)
+    alone = replace(raw, **{name: getattr(differentiated(raw, "q"), name) for name in "va"})
+    errors = {}
+    for name, log in (("sensors", raw), ("pose", alone)):
+        found = chosen.apply(log)
+        left = true.rows(np.searchsorted(true.time, found.time))
+        errors[name] = np.stack([found.v - left.v, found.a - left.a])[:, :, :6]
+    assert (errors["sensors"].std(1) < [[0.0048], [0.11]]).all()  # twice the frequency of SLOW leaves .005 and .2
+    assert (errors["pose"].std(1) > 2.5 * errors["sensors"].std(1)).all()
+    assert np.abs(errors["sensors"][1].mean(0)).max() < 0.01  # of a bias of .2
+    wrong = by_sensors(1.6)  # as its v measured it, once a does not follow the pose
+    expected = chosen.apply(replace(wrong, a=differentiated(wrong, "v").a)).a
+    np.testing.assert_allclose(chosen.apply(wrong).a[:, :3], expected[:, :3], rtol=0.0, atol=0.02)

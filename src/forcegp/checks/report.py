@@ -176,7 +176,8 @@ def _of_single_joints(dataset: Dataset, robot: Robot, inputs_of: Inputs) -> Iter
     if not robot.space.single_rows or not dataset.time_ordered:
         return
     own = _chain(robot.joint_names)
-    alone = replace(dataset, model=own, q=as_vectors(dataset), u=np.zeros_like(dataset.v), truth={}, noise_std=None)
+    bare: dict[str, Any] = {"measured": {}, "truth": {}, "noise_std": None}  # of frames that the chain lacks
+    alone = replace(dataset, model=own, q=as_vectors(dataset), u=np.zeros_like(dataset.v), **bare)
     with contextlib.suppress(InvalidInput):  # too short
         inputs = replace(inputs_of(alone, own), rotates=dataset.turns)
         yield from motion_doubts(inputs, robot.space.single_rows)  # gaps may be rows whose feet are not known

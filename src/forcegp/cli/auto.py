@@ -108,8 +108,9 @@ class Auto(Command):
         if bad and not self.accept:
             terminal.show(doubts_table(bad, terminal.worded))
             raise DatasetError(f"something is wrong with the log ({bad.subjects}); correct it, or add --accept.")
+        early = {"unknown cause"} | ({"contact flag"} if done["open_switches"] else set())  # flags of its own
         for doubt in report.doubts.at("look"):  # what is known already, while the rest takes minutes
-            if doubt.about != "unknown cause":  # which a model may explain
+            if doubt.about not in early:  # a model may explain what has no cause
                 terminal.note(f"{doubt.about}: {doubt.what}")
         dataset = forcegp.checks.without_pushes(dataset, report.doubts)
         self.out.mkdir(parents=True, exist_ok=True)

@@ -31,6 +31,9 @@ from forcegp.summary import plain
 
 FEW = 2_000  # rows of a whole log
 SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
+EXPLAINED, SLOW = 1.2, 0.25
+"""Times the noise of positions by which a sensor of a base may differ from them; of the cut-off, below which they hold.
+"""
 BEYOND_BASE = 1.5
 """The cut-off of a robot on contacts is at most so many times that of its base, whose accelerations are noise there."""
 
@@ -46,7 +49,9 @@ class Preparation:
     lag: time constant of the actuators [s], of thrusters where a base has them: T u_a' + u_a = u.
     every: keep every so many rows.
     trim: seconds to drop at both ends of each episode, where a filter has samples of one side only.
-    differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities.
+    differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities. With "q", a
+        base that moves keeps what its gyroscope, accelerometer or v measured above a quarter of the cut-off, where it
+        is far quieter than positions differentiated twice.
     stance: "auto" sets the switches of contacts in u to what motion and forces show (`estimate_stance`), after the
         filter, .5 where they leave it open; "log" keeps what u has.
     why: reasons for the numbers in place of "auto", of a preparation that was `resolved`.
@@ -170,13 +175,45 @@ def _filtered(chosen: Preparation, dataset: Dataset) -> Dataset:
             # A filter lets joints creep while they rest, by more than friction remembers. In motion without rests
             # filtered positions fit filtered torques better: raw ones made a rotor 10 % too small.
             dataset = with_strokes(dataset)
-        signals: tuple[Signal, ...] = ("q", "u") if chosen.differentiate == "q" else ("q", "v", "u")
-        dataset = low_pass(dataset, float(chosen.cutoff), signals=signals)
-        dataset = differentiated(dataset, chosen.differentiate)
+        low = low_pass(dataset, float(chosen.cutoff))
+        if chosen.differentiate == "v":
+            dataset = differentiated(low, "v")
+        else:
+            dataset = _with_sensors_of_base(differentiated(low, "q"), low, dataset, float(chosen.cutoff))
     if not chosen.delay and not chosen.lag:
         return dataset
     pushing = [*thruster_columns(dataset.model)]  # joints beside them do not follow so
     return shifted(dataset, float(chosen.delay), float(chosen.lag), pushing or None)
+
+
+def _with_sensors_of_base(derived: Dataset, measured: Dataset, raw: Dataset, cutoff: float) -> Dataset:
+    """v and a of a base that moves, from sensors that differ from positions by no more than the noise of those explains.
+
+    Below `SLOW` of the cut-off all are those of positions, which have neither bias nor tilt.
+    """
+    groups = raw.model.robot.space.groups
+    if not groups or max(np.bincount(np.unique(raw.episode, return_inverse=True)[1])) < FEWEST_ROWS:
+        return derived
+    noise, by_v = motion_spectrum(raw, "q").acceleration_noise(LowPass(cutoff)), differentiated(measured, "v").a
+    least = np.zeros(raw.nv)
+    for part in (slice(group.row + k, group.row + k + 3) for group in groups for k in (0, 3)):
+        if np.isfinite(noise[part]).any():  # fast motion hides that of an axis
+            least[part] = EXPLAINED * np.nanmedian(noise[part])
+
+    def quieter(a: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.square(a - derived.a).mean(0)) < least
+
+    def raised(values: np.ndarray, slow: np.ndarray) -> np.ndarray:
+        """What filtered values have above the slow part."""
+        return values - low_pass(replace(derived, a=values - slow), SLOW * cutoff, signals=("a",)).a
+
+    by_sensors = np.where(quieter(measured.a), measured.a, by_v)
+    try:
+        v = np.where(quieter(by_v), raised(measured.v, derived.v), derived.v)
+        a = np.where(quieter(by_sensors), raised(by_sensors, derived.a), derived.a)
+    except DatasetError:  # episodes too short for so slow a filter
+        return derived
+    return replace(derived, v=v, a=a)
 
 
 def _kept(chosen: Preparation, dataset: Dataset) -> np.ndarray:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from warnings import warn
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -32,6 +33,8 @@ CERTAIN, APART = 20.0, 1.5
 """How much likelier one class of forces is than the other; distance of their means over the sum of their widths."""
 FALLS, SURE = 0.2, 0.1
 """Of the weight: nothing bears this while a robot falls, something where it stands; noise up to which it decides."""
+LIFTED = 0.004
+"""m above or below the place where a foot stood last or stands next, from which on it does not drag, or noises."""
 FEW = 10
 MANY_OPEN = 0.25  # share of open rows that more than changes of stance leave
 
@@ -101,8 +104,9 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
 
     What clearly moves is free if it does not bear; what rests stands if it bears, and is free if it bears nothing. Up
     to 0.1 s in between follow decided rows on both sides that agree; all else is open (NaN), with 30 ms about it and
-    about a change; so are rows in which what stands contradicts the weight that is borne. Rest is slower than 1 cm/s or
-    2.3 times the noise of v. Raises ContactError without contacts that have a switch.
+    about a change; so are rows in which what stands contradicts the weight that is borne, or in which what is free has
+    the height, to 4 mm, at which it stood last or stands next: a foot that drags bears a little. Rest is slower than
+    1 cm/s or 2.3 times the noise of v. Raises ContactError without contacts that have a switch.
     """
     model = dataset.model if model is None else model
     if not (names := model.switches):
@@ -112,7 +116,8 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
         )
     order = np.argsort(dataset.time, kind="stable")
     episodes = [order[dataset.episode[order] == number] for number in dataset.episodes]
-    motion, asked = _motion_and_force(dataset, model, names)
+    motion, asked, height = _motion_and_force(dataset, model, names)
+    drags = LIFTED + DEVIATIONS * np.array([_noise(z[:, None], episodes, [1] * len(episodes)) for z in height.T])
     speed, force = (np.empty((len(dataset), len(names))) for _ in range(2))
     noise, times = np.empty(len(names)), [dataset.time[rows] for rows in episodes]
     widths = [2 * int(0.5 * WINDOW / np.median(np.diff(t))) + 1 if len(t) > 1 else 1 for t in times]
@@ -130,7 +135,8 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
     flags = np.full(force.shape, np.nan)
     flags[~moves & bears], flags[unloaded] = 1.0, 0.0
     for rows in episodes:
-        flags[rows] = _between(flags[rows], dataset.time[rows])
+        own = _between(flags[rows], dataset.time[rows])
+        flags[rows] = np.where((own == 0.0) & _as_low(own, height[rows], drags), np.nan, own)
     flags[moves & bears] = np.nan
     robot, whole, weight = model.robot, np.sum(asked, axis=0), 0.0
     if robot.base == "floating" and all(contact.switch for contact in model.contacts):  # which alone hold the robot up
@@ -153,10 +159,12 @@ def _mean(values: Float[np.ndarray, "rows k"], width: int) -> Float[np.ndarray, 
 
 def _motion_and_force(
     dataset: Dataset, model: forcegp.Model, names: tuple[str, ...]
-) -> tuple[list[Float[np.ndarray, "rows m"]], list[Float[np.ndarray, "rows 3"]]]:
-    """A v of the contacts of every switch, and the force that the rows ask of them."""
+) -> tuple[list[Float[np.ndarray, "rows m"]], list[Float[np.ndarray, "rows 3"]], Float[np.ndarray, "rows switches"]]:
+    """A v of the contacts of every switch, the force that the rows ask of them, and how high they are."""
     of = [[k for k, contact in enumerate(model.contacts) if contact.switch == name] for name in names]
     places = [model.inputs.index(name) for name in names]
+    up, at = -model.robot.gravity / model.robot.gravity.norm().clamp(min=1e-9), [model.contacts[own[0]] for own in of]
+    held = [(each, torch.tensor([*each.point, 1.0]).to(up)) for each in at]
 
     def found(q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, ...]:
         u[:, places] = 1.0
@@ -164,10 +172,12 @@ def _motion_and_force(
         white = dynamics.inverse_lower @ (dynamics.M @ a[..., None] - dynamics.Q_K[..., None])
         forces = dynamics.normals * (dynamics.pseudo_inverse.mT @ white)
         rates = (dynamics.A @ v[..., None])[..., 0]
-        return *(rates[:, rows] for rows in of), *(forces[:, rows].sum(1) for rows in of)
+        poses = [dynamics.state.kinematics.frame_pose(each.frame) @ points[..., None] for each, points in held]
+        high = torch.stack([pose[..., :3, 0] @ up for pose in poses], -1)
+        return *(rates[:, rows] for rows in of), *(forces[:, rows].sum(1) for rows in of), high
 
-    both = in_blocks(dataset, found, model.robot.device)
-    return both[: len(names)], both[len(names) :]
+    *both, height = in_blocks(dataset, found, model.robot.device)
+    return both[: len(names)], both[len(names) :], height
 
 
 def _noise(values: Float[np.ndarray, "rows m"], episodes: list[np.ndarray], strides: list[int]) -> float:
@@ -212,6 +222,20 @@ def _bearing(force: np.ndarray, moves: np.ndarray, quiet: bool = True) -> Float[
     if not (limits[0] <= BEARS * standing and (few or np.median(force[moves]) < limits[1])):
         return np.full(2, np.nan)
     return usual if few else np.array([min(limits[0], np.quantile(force[moves], FREE)), limits[1]])
+
+
+def _as_low(
+    flags: Float[np.ndarray, "rows switches"], height: Float[np.ndarray, "rows switches"], least: np.ndarray
+) -> Bool[np.ndarray, "rows switches"]:
+    """Where a contact is hardly above or below where it acted last, or acts next."""
+    rows, low = np.arange(len(flags)), np.zeros(flags.shape, bool)
+    for own, z, out, lift in zip(flags.T, height.T, low.T, least, strict=True):
+        stood = np.flatnonzero(own == 1.0)
+        if len(stood):
+            after = stood[np.minimum(np.searchsorted(stood, rows), len(stood) - 1)]
+            before = stood[np.maximum(np.searchsorted(stood, rows, side="right") - 1, 0)]
+            out[:] = np.minimum(np.abs(z - z[before]), np.abs(z - z[after])) < lift
+    return low
 
 
 def _between(flags: np.ndarray, time: Float[np.ndarray, " rows"]) -> np.ndarray:
