@@ -135,6 +135,24 @@ def test_what_no_cause_explains_is_said_with_its_place_and_without_a_remedy():
         assert (spring.about, spring.numbers["value"]) == ("spring", pytest.approx(stiff, rel=0.05))
 
 
+@pytest.mark.parametrize(("pull", "told"), [("positions", True), ("velocities", False)])
+def test_an_unknown_force_of_positions_alone_is_said_to_be_one(pull, told):
+    """A cable of constant tension from a post to the second link, by differences of its length; and a drag like it."""
+    data = clean(two_links(), 4, noise="qvu")
+    frame = data.model.robot.layout.bodies[-1].child
+
+    def length(q):
+        pose = data.model.robot.kinematics(torch.tensor(q)).frame_pose(frame).numpy()
+        return np.linalg.norm(pose[:, :3, 3] + 0.3 * pose[:, :3, 0] - [0.5, 0.4, 0.6], axis=1)
+
+    at, h = data.q if told else np.roll(data.q, 300, axis=0), 1e-6
+    pulls = np.stack([(length(at + h * e) - length(at - h * e)) / (2.0 * h) for e in np.eye(2)], axis=1)
+    tension = 3.0 * data.u.std() / pulls.std()
+    found = check(replace(data, u=data.u + tension * pulls)).doubts.of("unknown cause")
+    assert found
+    assert ("a cable" in found[0].what) == told
+
+
 @pytest.mark.parametrize(("times", "about"), [(1.0, "dry friction"), (5.0, "unknown cause")])
 def test_gears_that_stick_are_no_unknown_cause_and_more_than_they_hold_is_one(times, about):
     """LuGre friction (Canudas de Wit et al. 1995) of a joint that waits while another moves; a brake holds more."""

@@ -1,6 +1,7 @@
 """What the torques that an identified robot leaves depend on."""
 
 import numpy as np
+from jaxtyping import Float
 
 from forcegp.data import Dataset
 from forcegp.evidence import motion_residuals
@@ -17,12 +18,30 @@ def pushed_where_they_are(rows: Dataset, model: Model) -> tuple[str, ...]:
     for name, q, u, missed in zip(rows.joint_names, rows.q.T, rows.u.T, (left - left.mean(axis=0)).T, strict=False):
         knots = np.unique(np.quantile(q, np.linspace(0.0, 1.0, KNOTS)))
         hats = np.stack([np.interp(q, knots, each) for each in np.eye(len(knots))], axis=1)
-        remains = 0.0
-        for part in np.array_split(np.arange(len(rows)), BLOCKS):
-            others = np.setdiff1d(np.arange(len(rows)), part)
-            level = np.linalg.lstsq(hats[others], missed[others], rcond=1e-6)[0]
-            remains += float(np.square(missed[part] - hats[part] @ level).sum())
         power = float(np.square(missed).sum())
-        if remains < ASKED * power and power > LEAST * len(u) * float(u.var()) > 0.0:  # passive joints have rounding
+        enough = power > LEAST * len(u) * float(u.var()) > 0.0  # passive joints have rounding
+        if enough and _left(hats, missed) < ASKED * power:
             found.append(name)
     return tuple(found)
+
+
+def left_by_positions(
+    q: Float[np.ndarray, "rows nv"], columns: Float[np.ndarray, "rows k"], u: Float[np.ndarray, " rows"]
+) -> tuple[float, float]:
+    """Shares of a torque that these columns leave, and the same with products of two positions, which pull anywhere."""
+    x = q[:, np.ptp(q, axis=0) > 0.0]
+    x, ones = (x - x.mean(axis=0)) / x.std(axis=0), np.ones((len(u), 1))
+    alone = np.concatenate([columns, ones], axis=1)
+    beside = np.concatenate([alone, x, *(x[:, [k]] * x[:, k:] for k in range(x.shape[1]))], axis=1)
+    power = float(np.square(u - u.mean()).sum())
+    return _left(alone, u) / power, _left(beside, u) / power
+
+
+def _left(columns: Float[np.ndarray, "rows k"], values: Float[np.ndarray, " rows"]) -> float:
+    """Of the power of values, what linear functions leave of every block of time by the others."""
+    left = 0.0
+    for part in np.array_split(np.arange(len(values)), BLOCKS):
+        others = np.setdiff1d(np.arange(len(values)), part)
+        number = np.linalg.lstsq(columns[others], values[others], rcond=1e-6)[0]
+        left += float(np.square(values[part] - columns[part] @ number).sum())
+    return left

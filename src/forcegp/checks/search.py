@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from forcegp.checks.check_input import CheckInput
 from forcegp.checks.explanations import NUMBER, SIGN, Cause, candidates, changed
+from forcegp.checks.residuals import left_by_positions
 from forcegp.checks.torques import LEAST, WIDTHS, Comparison, positive_fit, positive_solution, stretch, torque_noise
 from forcegp.data import Dataset
 from forcegp.data.views import white_noise
@@ -375,8 +376,7 @@ def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -
 def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     """That something is wrong which is none of the causes, and where it sits."""
     bad = np.flatnonzero(root.rough > EXPLAINED)
-    sticky = [k for k in bad.tolist() if _sticks(root, k)]
-    if sticky:
+    if sticky := [k for k in bad.tolist() if _sticks(root, k)]:
         names = inputs.named(sticky)
         yield look(
             about="dry friction",
@@ -385,10 +385,10 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
             do="Friction that remembers explains it; forcegp auto and forcegp fit --forces gear choose it.",
             joints=names,
         )
-    bad = np.setdiff1d(bad, sticky)
-    if not len(bad):
+    if not len(bad := np.setdiff1d(bad, sticky)):
         return
-    rows, shares = root.log.rows, ", ".join(f"{inputs.names[k]} {100.0 * root.rough[k]:.0f} %" for k in bad)
+    rows, tau, friction = root.log.rows, root.log.tau, root.log.friction
+    shares = ", ".join(f"{inputs.names[k]} {100.0 * root.rough[k]:.0f} %" for k in bad)
     numbers: dict[str, object] = {"unexplained": root.rough[bad].tolist(), "rows": len(rows)}
     do = "Look at these joints there: contacts, brakes, cables, another robot, or a channel that is not a torque."
     where, seconds, left = _where(root, int(bad[np.argmax(root.rough[bad])]), inputs)
@@ -396,6 +396,12 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         where += f", and elsewhere at most {100.0 * left:.2g} % stays: a contact, or a load, in these seconds"
         numbers["seconds"] = [float(x) for x in seconds.split(",")]
         do = f"Leave them out by forcegp import --without {seconds}, as forcegp auto does."
+    else:
+        fits = ((k, left_by_positions(rows.q, np.c_[tau[:, k], friction[:, k]], rows.u[:, k])) for k in bad.tolist())
+        if names := inputs.named([k for k, (alone, beside) in fits if beside < EXPLAINED < alone]):
+            where += f"; positions alone explain that of {listed(names)}: a cable, a hose, a balancer, or a spring"
+            do = "Give the robot what pulls there, or learn it: forcegp score --forces identified,gp:joint:inputs=q."
+            numbers["positions"] = names
     yield look(
         about=UNKNOWN,
         what="something is wrong that is none of the causes that were tried (signs, units, orders, zeros, gears, "

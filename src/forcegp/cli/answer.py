@@ -136,7 +136,7 @@ def is_explained(doubt: Mapping[str, Any], scores: forcegp.scores.Scores, best: 
 
     quantity, left = scores.left(best)
     shares = [left.get(name) for name in doubt["joints"]]
-    everywhere = doubt["about"] == UNKNOWN and "seconds" not in doubt["numbers"]
+    everywhere = doubt["about"] == UNKNOWN and not {"seconds", "positions"} & doubt["numbers"].keys()
     return everywhere and quantity == TORQUE and all(x is not None and x * x <= EXPLAINED for x in shares)
 
 

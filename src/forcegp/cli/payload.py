@@ -28,6 +28,7 @@ WIDER = 2.3
 """Where a base moves, times the windows of a fit: a mass needs less of what is fast than rotors do."""
 LAWS = "viscous", "gear", "offset", "rotor"
 SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
+FAR = 0.01  # m of half an interval, from which on a coordinate of a centre is shown with it
 MOST_FACTORS = 3  # of one cause that a person can look for
 
 
@@ -163,11 +164,12 @@ def payload_text(found: Any) -> str:
     """Mass with its 95 % interval and place; or that there is none."""
     parts = {name: found.estimates[f"payload.{name}"] for name in ("mass", *(f"center_of_mass.{x}" for x in "xyz"))}
     mass, *center = parts.values()
-    error = 0.5 * (mass.interval[1] - mass.interval[0])
+    error, *widths = (0.5 * (each.interval[1] - each.interval[0]) for each in parts.values())
     if mass.value < max(SURE * mass.std, LEAST_PAYLOAD):
         size = f"{mass.value:.2g} ± {error:.1g} kg"
         return f"none, or {size}" if mass.value > mass.std else f"none ({size})"
-    place = ", ".join(f"{1e3 * each.value:.0f}" for each in center)
+    both = zip(center, widths, strict=True)
+    place = ", ".join(f"{1e3 * x.value:.0f}" + f" ± {1e3 * width:.0f}" * (width > FAR) for x, width in both)
     [held] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
     links = f"if the URDF's links{' and ' * bool(drives := drives_of(found.model))}{drives} are right"
     return f"{mass.value:.3g} ± {error:.1g} kg at ({place}) mm of {held.link}, {links}"

@@ -13,7 +13,6 @@ from forcegp.data.delay import estimate_delay, torques_of_joints
 from forcegp.data.filters import (
     PASSED,
     LowPass,
-    Signal,
     differentiated,
     episodes_in_order,
     low_pass,
@@ -49,9 +48,9 @@ class Preparation:
     lag: time constant of the actuators [s], of thrusters where a base has them: T u_a' + u_a = u.
     every: keep every so many rows.
     trim: seconds to drop at both ends of each episode, where a filter has samples of one side only.
-    differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities. With "q", a
-        base that moves keeps what its gyroscope, accelerometer or v measured above a quarter of the cut-off, where it
-        is far quieter than positions differentiated twice.
+    differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities. With "q"
+        a base that moves keeps, above a quarter of the cut-off, what v, a gyroscope or an accelerometer measured, where
+        that is quieter than positions differentiated.
     stance: "auto" sets the switches of contacts in u to what motion and forces show (`estimate_stance`), after the
         filter, .5 where they leave it open; "log" keeps what u has.
     why: reasons for the numbers in place of "auto", of a preparation that was `resolved`.
@@ -187,7 +186,7 @@ def _filtered(chosen: Preparation, dataset: Dataset) -> Dataset:
 
 
 def _with_sensors_of_base(derived: Dataset, measured: Dataset, raw: Dataset, cutoff: float) -> Dataset:
-    """v and a of a base that moves, from sensors that differ from positions by no more than the noise of those explains.
+    """v and a of a base that moves, from sensors that differ from positions by no more than noise of those explains.
 
     Below `SLOW` of the cut-off all are those of positions, which have neither bias nor tilt.
     """
