@@ -29,6 +29,7 @@ TILTED = np.deg2rad(6.0)  # angle from which a direction of gravity is another
 HEAVIEST = 1.3  # times the assumed gravity, beyond which it is something else
 FACTORS = np.exp(np.linspace(-2.5, 2.5, 251))  # of lengths, its ends left out
 RATIOS = np.exp(np.linspace(-1.2, 1.2, 25))  # of gears: the steps are then divided by ten
+MOST_ENDS = 4  # links that may hold something beside a tilt
 ALL_TRIED = 8  # joints up to which every pair is exchanged; of more, those that fit badly
 
 
@@ -49,6 +50,10 @@ class Cause:
 
 Candidate = tuple[Cause, Comparison]
 URDF = "Correct the URDF; or let forcegp fit --forces bodies estimate it from this log."
+
+
+ASIDE = np.deg2rad(20.0)  # of gravity: up to which a force is that of a payload
+PULLED = "Take it off, or give the robot what pulls there; masses that are found beside it are wrong."
 
 
 def number(about: str, what: str, joint: int, value: float, cost: float = NUMBER, **more: Any) -> Cause:
@@ -236,7 +241,7 @@ def _waves(x: np.ndarray) -> np.ndarray:
 def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
     """A joint zero, a gear ratio or a length that leaves least; the best of all."""
     robot, rows, names = now.robot, now.rows, now.robot.joint_names
-    zeros, turns = 2.0 * np.pi * np.arange(5) / 5.0, np.linspace(-np.pi, np.pi, 181)
+    zeros, turns = 2.0 * np.pi * np.arange(5) / 5.0, np.linspace(-np.pi, np.pi, 1441)
     waves, parts = _waves(turns) @ np.linalg.inv(_waves(zeros)), np.array([0.5, 1.0, 2.0])
     parabolas = np.vander(FACTORS, 3) @ np.linalg.inv(np.vander(parts, 3))
     laws, found = now.tau - needed_torques(robot, rows), list[tuple[float, Cause, Callable[[], Comparison]]]()
@@ -306,22 +311,31 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
     q, tau = torch.tensor(rows.q, device=robot.device), needed_torques(robot, rows)
     with torch.no_grad():
         pulls = [with_gravity(robot, axis).gravity_forces(q).cpu().numpy() for axis in np.eye(3)]
-    yield from _gravities(now, np.stack(pulls, axis=-1))
 
-    def of_part(body: int, part: torch.Tensor) -> np.ndarray:
+    def of_part(body: int, part: torch.Tensor, robot: Robot = robot, tau: np.ndarray = tau) -> np.ndarray:
         inertias = robot.tree.inertias.clone()
         inertias[body, :, :, 0] += part
         return needed_torques(replace(robot, tree=replace(robot.tree, inertias=inertias)), rows) - tau
 
+    def of_load(body: int, robot: Robot = robot, tau: np.ndarray = tau) -> np.ndarray:
+        """Of 1 kg at the origin of a body, or of as much as it has, and of 1 kg m along each axis."""
+        parts = torch.zeros(4, 4, 4, dtype=torch.float64, device=robot.device)
+        for part, k in zip(parts, (3, 0, 1, 2), strict=True):
+            part[k, 3] = part[3, k] = float(robot.tree.inertias[body, 3, 3, 0]) or 1.0
+        return np.stack([of_part(body, part, robot, tau) for part in parts], axis=-1)
+
+    ends = [body for body in range(len(layout.bodies)) if body not in layout.parents]
+
+    def loads(tilted: Robot) -> list[np.ndarray]:
+        tau = needed_torques(tilted, rows)
+        return [of_load(body, tilted, tau) for body in ends[:MOST_ENDS]]
+
+    yield from _gravities(now, np.stack(pulls, axis=-1), loads)
     for body, (joint, drive) in enumerate(zip(layout.bodies, layout.drives, strict=True)):
         J = robot.tree.inertias[body, :, :, 0]
         size = float(J[3, 3])
-        if body not in layout.parents:
-            unit = size or 1.0
-            parts = torch.zeros_like(J).expand(4, 4, 4).clone()  # of 1 kg at the origin, and 1 kg m along each axis
-            for part, k in zip(parts, (3, 0, 1, 2), strict=True):
-                part[k, 3] = part[3, k] = unit
-            columns = np.stack([of_part(body, part) for part in parts], axis=-1)
+        if body in ends:
+            unit, columns = size or 1.0, of_load(body)
             held = solved(now, columns)
             if held is not None and held[0] > 0.0:
                 offset = np.linalg.inv(layout.child_frames[body])
@@ -341,6 +355,28 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
                 text = f"the torques fit a mass of {joint.child} of {1.0 + one[0]:.3g} times that of the URDF"
                 cause = number("masses", text, drive.joint, 1.0 + float(one[0]))
                 yield cause, replace(now, more=now.more + one[0] * column)
+    with torch.no_grad():
+        kinematics = robot.kinematics(q)
+    for joint, drive in zip(layout.bodies, layout.drives, strict=True):  # what hangs at a hose or a cable
+        J, R = (of(joint.child).cpu().numpy() for of in (kinematics.frame_jacobian, kinematics.frame_pose))
+        pull, at, columns = np.zeros(3), np.zeros(3), -J[:, :3].swapaxes(1, 2)
+        for _ in range(4):  # the force, then also the point, whose moment is that of the force before
+            if (found := solved(now, columns)) is None:
+                break
+            pull, at = found[:3], np.append(found[3:], np.zeros(3))[:3]
+            arms = np.cross(R[:, :3, :3].swapaxes(1, 2), pull)
+            turning = -np.einsum("nkj,nik->nji", J[:, 3:], arms)
+            columns = np.concatenate([-J[:, :3].swapaxes(1, 2), turning], axis=-1)
+        size, down = float(np.linalg.norm(pull)), robot.gravity.cpu().numpy()
+        if not 0.0 < size < np.inf or pull @ down > np.cos(ASIDE) * size * np.linalg.norm(down):
+            continue  # the latter is a payload
+        force, place = (", ".join(f"{x:.3g}" for x in values) for values in (pull, 1e3 * at))
+        text = (
+            f"the torques fit a constant force of ({force}) N at ({place}) mm of {joint.child}, as of a hose or a cable"
+        )
+        told = {"do": PULLED, "numbers": {"force": pull.tolist(), "point": at.tolist(), "link": joint.child}}
+        more = now.more + columns[..., :3] @ pull + columns[..., 3:] @ at
+        yield number("pull", text, drive.joint, 0.0, 3.0 * NUMBER, **told), replace(now, more=more)
     for joint in range(rows.nv):
         only = (rows.q - rows.q.mean(axis=0)) * (np.arange(rows.nv) == joint)
         found = solved(now, only[..., None])
@@ -376,8 +412,10 @@ def solved(now: Comparison, columns: Float[np.ndarray, "rows nv k"]) -> Float[np
     return number
 
 
-def _gravities(now: Comparison, pulls: Float[np.ndarray, "rows nv 3"]) -> Iterator[Candidate]:
-    """The gravity that the torques show: its direction, its size, or both."""
+def _gravities(
+    now: Comparison, pulls: Float[np.ndarray, "rows nv 3"], loads: Callable[[Robot], list[np.ndarray]]
+) -> Iterator[Candidate]:
+    """The gravity that the torques show: its direction, its size, or both, also beside a load, which would bend it."""
     nominal = now.robot.gravity.cpu().numpy()
     size = float(np.linalg.norm(nominal))
     found = solved(now, pulls)
@@ -385,30 +423,39 @@ def _gravities(now: Comparison, pulls: Float[np.ndarray, "rows nv 3"]) -> Iterat
         return
     estimate = nominal + found
     norm = float(np.linalg.norm(estimate))
-    tried = [(estimate, 2.0 * NUMBER)]
+    tried: list[tuple[np.ndarray, float, Any]] = [(estimate, 2.0 * NUMBER, 0.0)]
     if norm > 0.0 and size > 0.0:
-        tried.append((size / norm * estimate, 1.5 * NUMBER))
-    tried += [((size or 9.81) * sign * axis, NUMBER) for axis in np.eye(3) for sign in (1.0, -1.0)]
+        tried.append((size / norm * estimate, 1.5 * NUMBER, 0.0))
+        tilted = with_gravity(now.robot, size / norm * estimate)
+        leaning = now.after(changed(), tilted)
+        for columns in loads(tilted):
+            both = solved(leaning, np.concatenate([pulls, columns], axis=-1))
+            if both is not None and both[3] > 0.0:
+                again = size / norm * estimate + both[:3]
+                tried.append((size / float(np.linalg.norm(again)) * again, 4.0 * NUMBER, columns @ both[3:]))
+    tried += [((size or 9.81) * sign * axis, NUMBER, 0.0) for axis in np.eye(3) for sign in (1.0, -1.0)]
     if size > 0.0:
-        tried += [(0.0 * nominal, NUMBER), (nominal * (estimate @ nominal) / size**2, NUMBER)]
-    for gravity, cost in tried:
+        tried += [(0.0 * nominal, NUMBER, 0.0), (nominal * (estimate @ nominal) / size**2, NUMBER, 0.0)]
+    for gravity, cost, load in tried:
         own = float(np.linalg.norm(gravity))
         angle = float(np.arccos(np.clip(gravity @ nominal / (own * size), -1.0, 1.0))) if own * size > 0.0 else 0.0
         usual = own / (size or 9.81)
         if (angle < TILTED and abs(own - size) < 0.1 * max(size, own)) or usual > HEAVIEST:
             continue
         text = ", ".join(f"{x + 0.0:.3g}" for x in gravity)
+        beside = ", beside a load at the last link" if np.ndim(load) else ""
         away = f", {np.rad2deg(angle):.0f} degrees away: the base is mounted another way" if angle else ""
         cause = Cause(
             about="gravity",
-            what=f"the torques fit gravity along ({text}) m/s² of the base far better{away}",
+            what=f"the torques fit gravity along ({text}) m/s² of the base far better{beside}{away}",
             do="Give it to `Robot.from_file`.",
             numbers={"gravity": gravity.tolist(), "degrees": float(np.rad2deg(angle))},
             correction={"gravity": {"base": tuple(round(float(x), 3) + 0.0 for x in gravity)}},
             cost=cost,
             number=True,
         )
-        yield cause, now.after(changed(), with_gravity(now.robot, gravity))
+        there = now.after(changed(), with_gravity(now.robot, gravity))
+        yield cause, replace(there, more=there.more + load)
 
 
 def _places(chosen: np.ndarray) -> tuple[int, ...]:

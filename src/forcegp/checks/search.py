@@ -23,6 +23,7 @@ from forcegp.model import Model
 
 UNKNOWN = "unknown cause"
 FEWEST_ROWS = 30
+BRAKED = 1e-3  # rad or m of a joint that no row moves
 AT_REST = 0.1  # of the root mean square velocity of a joint
 GAIN = np.log(4.0)  # by which the product over all joints of what remains must fall at least
 NOISE = 3.0  # how much of the power of the noise is left to every explanation
@@ -306,6 +307,7 @@ def moving(rows: Dataset) -> Dataset:
 
 def _root(inputs: CheckInput) -> Explanation:
     rows = moving(inputs.rows())
+    rows = replace(rows, u=np.where(np.ptp(rows.q, axis=0) < BRAKED, 0.0, rows.u))  # no motor measures what brakes hold
     log = Comparison(robot=inputs.robot, laws=inputs.laws, rows=rows, given=rows).after(changed())
     seen = white_noise(inputs.mended, signal="u") if inputs.log.time_ordered else None
     noise = np.zeros(log.rows.nv) if seen is None else np.nan_to_num(seen)

@@ -137,12 +137,14 @@ def _constant(inputs: CheckInput) -> Iterator[Doubt]:
     log = inputs.log
     rests = _still(log, "v") & _still(log, "q")
     for name, quantity in QUANTITY.items():
-        values, dead = getattr(log, name), np.flatnonzero(_still(log, name))
+        rested = rests & (name in "va")  # as its position is said to
+        values, dead = getattr(log, name), np.flatnonzero(_still(log, name) & ~rested)
         if not len(dead):
             continue
         names, all_of_them = inputs.named(dead), len(dead) == log.nv
         seen = f"the {quantity} of {listed(names)} never changes (it is {values[0, dead[0]] + 0.0:.6g} in every row)."
-        remedy = "Right for a joint that was held; then lock it in the robot. Else the channel is dead."
+        places = ",".join(f"{each}={log.q[:, k].mean() + 0.0:.4g}" for each, k in zip(names, dead, strict=True))
+        remedy = f"Right for a joint that was held; then forcegp import --lock {places}. Else the channel is dead."
         passive = name == "u" and not values[:, dead].any()
         if name == "u":
             remedy = "Right for a passive mechanism; else the torque columns are missing."

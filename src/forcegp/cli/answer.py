@@ -25,10 +25,11 @@ def short_name(name: str) -> str:
     return f"{learned} learned" if learned else plain.get(name, name)
 
 
-FIRST = {"unknown cause", "joint zero", "gear ratio", "torque constant", "torque unit", "force sensor"}
+FIRST = {"unknown cause", "joint zero", "gear ratio", "torque constant", "torque unit", "force sensor", "lengths"}
 """Subjects of doubts that change all that follows."""
 TOLD = FIRST | {"stop", "push", "spring", "drift", "elastic joint", "velocity", "sensor delay", "torque sensor", "imu"}
-"""Those that the answer repeats; of what is right only what a force sensor carries."""
+TOLD |= {"constant channel"}
+"""Those that the answer repeats, and what is wrong but accepted; of what is right only what a force sensor carries."""
 
 
 def answer_lines(
@@ -123,7 +124,8 @@ def answer_lines(
 def seen_in(doubts: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     """What the answer repeats of doubts, by subject: what passes is called a push, a force sensor that is right so."""
     seen = dict[str, str]()
-    for x in (x for x in doubts if x["about"] in TOLD and (x["level"] != "ok" or x["about"] == "force sensor")):
+    told = (x for x in doubts if x["about"] in TOLD and (x["level"] != "ok" or x["about"] == "force sensor"))
+    for x in (*told, *(x for x in doubts if x["level"] == "wrong" and x["about"] not in {*TOLD, "delay"})):
         passes = "seconds" in x["numbers"] and x["about"] in FIRST
         about = "push" if passes else "sensor" if x["level"] == "ok" else x["about"]
         seen[about] = f"{seen.get(about, '')} {x['what']} {x['do']}".strip()

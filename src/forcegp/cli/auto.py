@@ -104,7 +104,9 @@ class Auto(Command):
         terminal.names_stages = True  # of minutes, most of which have nothing to count
         with terminal.progress("checking"):
             report = forcegp.check(dataset)
-        bad, still = report.doubts.at("wrong"), [x for doubt in report.doubts for x in doubt.numbers.get("still", ())]
+        mended = {"delay"} if self.filter.delay == "auto" else set()  # u is shifted below
+        bad = Doubts(doubt for doubt in report.doubts.at("wrong") if doubt.about not in mended)
+        still = [x for doubt in report.doubts for x in doubt.numbers.get("still", ())]
         if bad and not self.accept:
             terminal.show(doubts_table(bad, terminal.worded))
             raise DatasetError(f"something is wrong with the log ({bad.subjects}); correct it, or add --accept.")

@@ -234,9 +234,10 @@ def typical_sizes(model: Model, logs: Sequence[Dataset]) -> dict[str, Float[np.n
     kinematics, delivered = state.kinematics, state.delivered.cpu().numpy()
     needed = kinematics.inverse_dynamics(torch.as_tensor(a, device=model.robot.device)).cpu().numpy()
     mass = model.mass_matrix(state).diagonal(dim1=-2, dim2=-1).mean(0).cpu().numpy()
-    needed, measured, speed = (np.sqrt((x**2).mean(0)) for x in (needed, delivered, v))
-    torque, velocity = (np.maximum(x, 1e-3 * max(float(x.max()), 1e-9)) for x in (np.maximum(needed, measured), speed))
-    mass = np.maximum(mass, torque / np.maximum(np.sqrt((a**2).mean(0)), 1e-12)) if a.any() else mass
+    needed, measured, *moved = (np.sqrt((x**2).mean(0)) for x in (needed, delivered, v, a))
+    each = (np.maximum(needed, measured), *moved)  # of a joint that is still as of one that hardly moves
+    torque, velocity, change = (np.maximum(x, 1e-3 * max(float(x.max()), 1e-9)) for x in each)
+    mass = np.maximum(mass, torque / change) if a.any() else mass
     position = state.positions.cpu().numpy()
     position = np.maximum(np.sqrt((position**2).mean(0)), 1e-3)
     return {"force": torque, "velocity": velocity, "inertia": mass, "position": position}
