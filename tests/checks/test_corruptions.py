@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tests.checks.clean_logs import between_postures, clean_logs, rests, with_motion
+from tests.checks.clean_logs import between_postures, clean_logs, one_rests, rests, with_motion
 from tests.checks.corruptions import (
     CORRUPTIONS,
     ROBOTS,
@@ -22,7 +22,7 @@ from tests.checks.corruptions import (
 from tests.checks.logs import clean as filtered_log
 from tests.goldens.compare import assert_unchanged
 from tests.posterior.arm import arm_model
-from tests.robots.robot_models import with_link
+from tests.robots.robot_models import loaded, with_link
 
 from forcegp.checks import check, quick_check
 from forcegp.checks.check_input import CheckInput
@@ -135,22 +135,50 @@ def test_what_no_cause_explains_is_said_with_its_place_and_without_a_remedy():
         assert (spring.about, spring.numbers["value"]) == ("spring", pytest.approx(stiff, rel=0.05))
 
 
-@pytest.mark.parametrize(("pull", "told"), [("positions", True), ("velocities", False)])
-def test_an_unknown_force_of_positions_alone_is_said_to_be_one(pull, told):
-    """A cable of constant tension from a post to the second link, by differences of its length; and a drag like it."""
-    data = clean(two_links(), 4, noise="qvu")
-    frame = data.model.robot.layout.bodies[-1].child
+def three_joints(seed):
+    time = np.arange(0.0, 12.0, 0.01)
+    q = 0.7 * np.sin(time[:, None] * [1.7, 2.9, 4.1] + np.arange(3.0)) + 0.3 * np.sin(0.9 * time)[:, None]
+    return with_motion(arm_model(0).robot, q, 100.0, seed)
 
-    def length(q):
-        pose = data.model.robot.kinematics(torch.tensor(q)).frame_pose(frame).numpy()
-        return np.linalg.norm(pose[:, :3, 3] + 0.3 * pose[:, :3, 0] - [0.5, 0.4, 0.6], axis=1)
 
-    at, h = data.q if told else np.roll(data.q, 300, axis=0), 1e-6
-    pulls = np.stack([(length(at + h * e) - length(at - h * e)) / (2.0 * h) for e in np.eye(2)], axis=1)
-    tension = 3.0 * data.u.std() / pulls.std()
-    found = check(replace(data, u=data.u + tension * pulls)).doubts.of("unknown cause")
+@pytest.mark.parametrize("told", [True, False])
+def test_an_unknown_force_of_positions_alone_is_said_to_be_one(told):
+    """Of two other joints, as a rope over pulleys; and one that was so at another time."""
+    data = three_joints(4)
+    q = data.q if told else np.roll(data.q, 300, axis=0)
+    pulls = 1.5 * data.u[:, 1].std() * np.sin(1.3 * q[:, 0]) * np.cos(q[:, 2])
+    found = check(replace(data, u=data.u + pulls[:, None] * np.eye(3)[1])).doubts.of("unknown cause")
     assert found
     assert ("a cable" in found[0].what) == told
+
+
+def test_a_hose_that_pulls_with_a_constant_force_is_found_with_its_place():
+    data, force, point = three_joints(4), np.array([4.0, -2.0, -3.0]), (0.05, 0.02, -0.1)
+    link = data.model.robot.layout.bodies[-1].child
+    J = data.model.robot.kinematics(torch.tensor(data.q)).frame_jacobian(link, point)[:, :3].numpy()
+    for x in said(replace(data, u=data.u - np.einsum("nkj,k->nj", J, force))): print(x.about, x.what)
+    (found,) = said(replace(data, u=data.u - np.einsum("nkj,k->nj", J, force)))
+    assert (found.about, found.level) == ("pull", "look")
+    np.testing.assert_allclose(found.numbers["force"], force, atol=0.5)
+    print(found.what)
+
+
+def test_a_tilt_beside_a_load_is_as_right_as_without():
+    plain, true = clean(ROBOTS["spatial"](), 3, noise="qvu"), 9.81 * np.array([0.2, -0.1, -np.sqrt(0.95)])
+    heavy = loaded(plain.model.robot, plain.model.robot.layout.bodies[-1].child, mass=0.5)
+    motion = [torch.tensor(x) for x in (plain.q, plain.v, plain.a)]
+    u = plain.u + (heavy.inverse_dynamics(*motion) - plain.model.robot.inverse_dynamics(*motion)).numpy()
+    tilted = recorded_under(replace(plain, u=u, model=Model(heavy)), tuple(true))
+    found = said(replace(tilted, model=plain.model))[0]
+    gravity = np.array(found.numbers["gravity"])
+    assert np.rad2deg(np.arccos(gravity @ true / np.linalg.norm(gravity) / 9.81)) < 1.0
+
+
+def test_the_torque_of_a_joint_that_a_brake_holds_shows_no_constant():
+    held = one_rests(two_links(), 5)
+    found = check(replace(held, u=held.u * [1.0, 0.0] + 1e-3 * np.random.default_rng(0).normal(size=held.u.shape)))
+    assert {each.about for each in found.doubts if each.level != "ok"} == {"constant channel", "excitation"}
+    assert found.doubts.of("constant channel")[0].do.startswith("Right for a joint that was held; then forcegp import")
 
 
 @pytest.mark.parametrize(("times", "about"), [(1.0, "dry friction"), (5.0, "unknown cause")])

@@ -16,12 +16,12 @@ from tests.simulation.pendulum import double_pendulum
 
 from forcegp import Dataset, Robot, load_posterior
 from forcegp.cli.answer import FIRST, is_explained, seen_in, verdict
-from forcegp.cli.auto import default_models
+from forcegp.cli.auto import default_models, more_laws
 from forcegp.cli.logs import prepared_rows
 from forcegp.cli.main import parse_arguments
 from forcegp.cli.terminal import Terminal
 from forcegp.data import Preparation
-from forcegp.doubts import look, ok
+from forcegp.doubts import Doubts, look, ok, wrong
 from forcegp.evidence import motion_residuals
 from forcegp.scores import Scores
 
@@ -208,16 +208,21 @@ def test_the_answer_repeats_what_concerns_sensors_and_velocities():
         look(about="force sensor", what="one is off.", do="Tare it."),
         ok(about="velocity", what="v is dq/dt."),
         look(about="unknown cause", what="a push.", numbers={"seconds": [1.0, 2.0]}),
+        wrong(about="saturation", what="one is clipped."),  # but accepted
+        wrong(about="delay", what="u is shifted."),
     ]
     seen = seen_in([doubt.to_dict() for doubt in found])
-    wrong = "one is in kgf. State it. one is off. Tare it."
-    assert seen == {
-        "velocity": "v is late. Shift it.",
-        "sensor": "one agrees.",
-        "force sensor": wrong,
-        "push": "a push.",
-    }
+    off = "one is in kgf. State it. one is off. Tare it."
+    told = {"sensor": "one agrees.", "force sensor": off, "push": "a push.", "saturation": "one is clipped."}
+    assert seen == {"velocity": "v is late. Shift it.", **told}
     assert FIRST & {*seen} == {"force sensor"}
+
+
+def test_what_the_check_saw_is_estimated():
+    pull = look(about="pull", what="", numbers={"link": "hand", "point": [0.03, -0.0008, 0.05]})
+    odd = replace(pull, numbers={**pull.numbers, "link": "a+b"})
+    assert more_laws(Doubts([pull, look(about="spring", what="")])) == "+spring+pull:hand:point=0.0300/-0.0008/0.0500"
+    assert more_laws(Doubts([odd])) == ""
 
 
 @pytest.mark.usefixtures("unchecked")  # a stand-in for a posterior

@@ -17,6 +17,7 @@ from forcegp import Accelerations, Payload, RigidBodies, Torques, fit, load_post
 from forcegp.data import Dataset
 from forcegp.evidence import motion_residuals
 from forcegp.forces import JointFriction, JointLaw, Law, Viscous, force_from_dict, force_to_dict, parse_forces
+from forcegp.forces.joint_law import PerJointLaw
 from forcegp.forces.registry import force_name
 from forcegp.inference import OptimizerOptions
 from forcegp.model import Model
@@ -95,8 +96,9 @@ class LawConformance:
         assert estimates.settled
         assert all(name.startswith(force_name(self.law)) for name in estimates)
         own = self.own(found.model)
-        shown = {name: own.acts_on(name, found.model.robot) for name in opened.learned}
-        truth = torch.cat([self.law.values[name].expand(3)[shown[name]] for name in opened.learned])
+        single = not isinstance(own, PerJointLaw)
+        shown = {x: np.ones(1, bool) if single else own.acts_on(x, found.model.robot) for x in opened.learned}
+        truth = torch.cat([self.law.values[x].expand(len(own))[own] for x, own in shown.items()])
         values, reach = (np.array([getattr(each, n) for each in estimates.values()]) for n in ("value", "std"))
         np.testing.assert_array_less(abs(values - truth.numpy()), 5.0 * reach + 0.02 * truth.numpy().__abs__() + 1e-3)
         force, _ = motion_residuals(log, found.model)
@@ -129,7 +131,7 @@ class LawConformance:
         torch.testing.assert_close(again.dynamics(*states).Q_K, model.dynamics(*states).Q_K, rtol=0.0, atol=0.0)
         name = force_name(self.law)
         assert type(force_from_dict(json.loads(json.dumps(force_to_dict(self.law))))) is type(self.law)
-        (written,) = parse_forces(name)
+        (written,) = parse_forces(f"{name}:{self.law.frame}" if hasattr(self.law, "frame") else name)
         assert type(written) is type(self.law)
         assert written.learned
 

@@ -15,6 +15,7 @@ from forcegp.forces import (
     JointLaw,
     LoadFriction,
     Offset,
+    Pull,
     Spring,
     Stribeck,
     Viscous,
@@ -47,6 +48,12 @@ class TestGearsOfMotors(LawConformance):
 class TestGearFriction(LawConformance):
     law = GearFriction(THREE, 0.1, 0.2, [0.2, -0.05, 0.1], 0.0, 0.6, memory=False)
     given = ("memory", "breakaway", "stribeck_velocity")
+
+
+class TestPull(LawConformance):
+    law = Pull("hand", 3.0, -2.0, 5.0, point=(0.1, 0.02, -0.05))
+    given = ("frame", "point")
+    shows_at_rest = ("x", "y", "z")
 
 
 class TestOffset(LawConformance):

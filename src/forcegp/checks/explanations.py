@@ -53,7 +53,7 @@ URDF = "Correct the URDF; or let forcegp fit --forces bodies estimate it from th
 
 
 ASIDE = np.deg2rad(20.0)  # of gravity: up to which a force is that of a payload
-PULLED = "Take it off, or give the robot what pulls there; masses that are found beside it are wrong."
+PULLED = "Take it off, or have it estimated beside masses, by forcegp fit --forces pull, as forcegp auto does."
 
 
 def number(about: str, what: str, joint: int, value: float, cost: float = NUMBER, **more: Any) -> Cause:
@@ -317,20 +317,16 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         inertias[body, :, :, 0] += part
         return needed_torques(replace(robot, tree=replace(robot.tree, inertias=inertias)), rows) - tau
 
-    def of_load(body: int, robot: Robot = robot, tau: np.ndarray = tau) -> np.ndarray:
+    def of_load(body: int, robot: Robot = robot) -> np.ndarray:
         """Of 1 kg at the origin of a body, or of as much as it has, and of 1 kg m along each axis."""
         parts = torch.zeros(4, 4, 4, dtype=torch.float64, device=robot.device)
         for part, k in zip(parts, (3, 0, 1, 2), strict=True):
             part[k, 3] = part[3, k] = float(robot.tree.inertias[body, 3, 3, 0]) or 1.0
-        return np.stack([of_part(body, part, robot, tau) for part in parts], axis=-1)
+        needed = needed_torques(robot, rows)
+        return np.stack([of_part(body, part, robot, needed) for part in parts], axis=-1)
 
     ends = [body for body in range(len(layout.bodies)) if body not in layout.parents]
-
-    def loads(tilted: Robot) -> list[np.ndarray]:
-        tau = needed_torques(tilted, rows)
-        return [of_load(body, tilted, tau) for body in ends[:MOST_ENDS]]
-
-    yield from _gravities(now, np.stack(pulls, axis=-1), loads)
+    yield from _gravities(now, np.stack(pulls, axis=-1), ends[:MOST_ENDS], of_load)
     for body, (joint, drive) in enumerate(zip(layout.bodies, layout.drives, strict=True)):
         J = robot.tree.inertias[body, :, :, 0]
         size = float(J[3, 3])
@@ -358,15 +354,15 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
     with torch.no_grad():
         kinematics = robot.kinematics(q)
     for joint, drive in zip(layout.bodies, layout.drives, strict=True):  # what hangs at a hose or a cable
-        J, R = (of(joint.child).cpu().numpy() for of in (kinematics.frame_jacobian, kinematics.frame_pose))
-        pull, at, columns = np.zeros(3), np.zeros(3), -J[:, :3].swapaxes(1, 2)
-        for _ in range(4):  # the force, then also the point, whose moment is that of the force before
+        R = kinematics.frame_pose(joint.child)[:, :3, :3].cpu().numpy()
+        pull, at, columns = np.zeros(3), np.zeros(3), np.zeros((len(rows), rows.nv, 0))
+        for _ in range(6):  # Gauss-Newton: the force at the point of before, and how far the point moves
+            J = kinematics.frame_jacobian(joint.child, tuple(at)).cpu().numpy()
+            turning = np.einsum("nkj,nik->nji", J[:, 3:], np.cross(R.swapaxes(1, 2), pull))
+            columns = -np.concatenate([J[:, :3].swapaxes(1, 2), turning], axis=-1)
             if (found := solved(now, columns)) is None:
                 break
-            pull, at = found[:3], np.append(found[3:], np.zeros(3))[:3]
-            arms = np.cross(R[:, :3, :3].swapaxes(1, 2), pull)
-            turning = -np.einsum("nkj,nik->nji", J[:, 3:], arms)
-            columns = np.concatenate([-J[:, :3].swapaxes(1, 2), turning], axis=-1)
+            pull, at = found[:3], at + found[3:]
         size, down = float(np.linalg.norm(pull)), robot.gravity.cpu().numpy()
         if not 0.0 < size < np.inf or pull @ down > np.cos(ASIDE) * size * np.linalg.norm(down):
             continue  # the latter is a payload
@@ -375,7 +371,7 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
             f"the torques fit a constant force of ({force}) N at ({place}) mm of {joint.child}, as of a hose or a cable"
         )
         told = {"do": PULLED, "numbers": {"force": pull.tolist(), "point": at.tolist(), "link": joint.child}}
-        more = now.more + columns[..., :3] @ pull + columns[..., 3:] @ at
+        more = now.more + columns[..., :3] @ pull
         yield number("pull", text, drive.joint, 0.0, 3.0 * NUMBER, **told), replace(now, more=more)
     for joint in range(rows.nv):
         only = (rows.q - rows.q.mean(axis=0)) * (np.arange(rows.nv) == joint)
@@ -413,7 +409,10 @@ def solved(now: Comparison, columns: Float[np.ndarray, "rows nv k"]) -> Float[np
 
 
 def _gravities(
-    now: Comparison, pulls: Float[np.ndarray, "rows nv 3"], loads: Callable[[Robot], list[np.ndarray]]
+    now: Comparison,
+    pulls: Float[np.ndarray, "rows nv 3"],
+    ends: Sequence[int],
+    of_load: Callable[[int, Robot], Float[np.ndarray, "rows nv 4"]],
 ) -> Iterator[Candidate]:
     """The gravity that the torques show: its direction, its size, or both, also beside a load, which would bend it."""
     nominal = now.robot.gravity.cpu().numpy()
@@ -426,13 +425,18 @@ def _gravities(
     tried: list[tuple[np.ndarray, float, Any]] = [(estimate, 2.0 * NUMBER, 0.0)]
     if norm > 0.0 and size > 0.0:
         tried.append((size / norm * estimate, 1.5 * NUMBER, 0.0))
-        tilted = with_gravity(now.robot, size / norm * estimate)
-        leaning = now.after(changed(), tilted)
-        for columns in loads(tilted):
-            both = solved(leaning, np.concatenate([pulls, columns], axis=-1))
-            if both is not None and both[3] > 0.0:
-                again = size / norm * estimate + both[:3]
-                tried.append((size / float(np.linalg.norm(again)) * again, 4.0 * NUMBER, columns @ both[3:]))
+    for end in ends if norm > 0.0 and size > 0.0 else ():
+        along, load = size / norm * estimate, None
+        for _ in range(4):  # it weighs along the gravity that is sought
+            tilted = with_gravity(now.robot, along)
+            columns = of_load(end, tilted)
+            both = solved(now.after(changed(), tilted), np.concatenate([pulls, columns], axis=-1))
+            if both is None or both[3] <= 0.0:
+                break
+            along, load = along + both[:3], columns @ both[3:]
+            along = size / float(np.linalg.norm(along)) * along
+        else:
+            tried.append((along, 4.0 * NUMBER, load))
     tried += [((size or 9.81) * sign * axis, NUMBER, 0.0) for axis in np.eye(3) for sign in (1.0, -1.0)]
     if size > 0.0:
         tried += [(0.0 * nominal, NUMBER, 0.0), (nominal * (estimate @ nominal) / size**2, NUMBER, 0.0)]

@@ -137,8 +137,8 @@ def _constant(inputs: CheckInput) -> Iterator[Doubt]:
     log = inputs.log
     rests = _still(log, "v") & _still(log, "q")
     for name, quantity in QUANTITY.items():
-        rested = rests & (name in "va")  # as its position is said to
-        values, dead = getattr(log, name), np.flatnonzero(_still(log, name) & ~rested)
+        told = rests if name in "va" else False  # of its position
+        values, dead = getattr(log, name), np.flatnonzero(_still(log, name) & np.logical_not(told))
         if not len(dead):
             continue
         names, all_of_them = inputs.named(dead), len(dead) == log.nv
@@ -153,8 +153,8 @@ def _constant(inputs: CheckInput) -> Iterator[Doubt]:
         driven = (name == "u" or all_of_them) and _driven(inputs, dead)
         calm = (passive or all_of_them) and not driven
         level: Level = "look" if calm or rests[dead].all() else "wrong"
-        told = {"about": "constant channel", "what": seen, "do": remedy, "joints": names}
-        yield Doubt(level=level, **told, numbers={"quantity": name})
+        more = {"joints": names, "numbers": {"quantity": name}}
+        yield Doubt(level=level, about="constant channel", what=seen, do=remedy, **more)
 
 
 def _driven(inputs: CheckInput, dead: np.ndarray) -> bool:

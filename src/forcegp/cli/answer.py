@@ -28,7 +28,7 @@ def short_name(name: str) -> str:
 FIRST = {"unknown cause", "joint zero", "gear ratio", "torque constant", "torque unit", "force sensor", "lengths"}
 """Subjects of doubts that change all that follows."""
 TOLD = FIRST | {"stop", "push", "spring", "drift", "elastic joint", "velocity", "sensor delay", "torque sensor", "imu"}
-TOLD |= {"constant channel"}
+TOLD |= {"constant channel", "pull"}
 """Those that the answer repeats, and what is wrong but accepted; of what is right only what a force sensor carries."""
 
 

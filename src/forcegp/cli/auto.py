@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shlex
 import time
 from collections.abc import Mapping, Sequence
@@ -124,7 +125,7 @@ class Auto(Command):
             rows, recording = self._prepared_rows(terminal, dataset, bool(done["open_switches"]), report)
         settings = dict(rows.metadata["preparation"])
         with terminal.progress("identifying"):
-            wanted = identification(model, "+spring" if report.doubts.of("spring") else "")
+            wanted = identification(model, more_laws(report.doubts))
             expression, found = forcegp.scores.identify(recording, wanted)
         identified: Any = found
         laws = forcegp.scores.summands(expression.partition("@")[0])[1:]
@@ -290,6 +291,13 @@ class Auto(Command):
             terminal.note(f"no C program: {error}")
             return None
         return str(self.out / "c")
+
+
+def more_laws(doubts: Doubts) -> str:
+    """Beside the usual ones, what the check saw: a spring in a joint, a cable at a link."""
+    pulls = [x.numbers for x in doubts.of("pull") if re.fullmatch(r"[\w.-]+", x.numbers["link"])]
+    places = (f"+pull:{x['link']}:point={'/'.join(f'{value:.4f}' for value in x['point'])}" for x in pulls[:1])
+    return "".join(["+spring" * bool(doubts.of("spring")), *places])
 
 
 def identification(model: forcegp.Model, more: str = "") -> str:

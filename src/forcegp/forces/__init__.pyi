@@ -1,6 +1,6 @@
 from .actuation import (
     Actuation as Actuation, LinkForce as LinkForce, ObservedWind as ObservedWind, ObservedWrench as ObservedWrench,
-    Thrusters as Thrusters,
+    Pull as Pull, Thrusters as Thrusters,
 )
 from .contact_friction import ContactFriction as ContactFriction
 from .joint_law import JointLaw as JointLaw

@@ -1,7 +1,7 @@
-"""What the actuators deliver, what thrusters on a link do, and what observers estimate; what robot files state."""
+"""What actuators deliver, what thrusters and cables do to a link, what observers estimate; what robot files state."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,6 +17,7 @@ from forcegp.forces.joint_laws import Coulomb, Spring, Viscous
 from forcegp.forces.rigid_bodies import RigidBodies, WholeLaw
 from forcegp.mechanics.gauss_principle import State
 from forcegp.robots import Robot
+from forcegp.robots.arguments import finite_vector
 from forcegp.robots.mjcf_model import Translation
 
 
@@ -177,6 +178,39 @@ class Thrusters(LinkForce):
         places, axes, thrust, torque = (torch.as_tensor(x) for x in (self.places, self.axes, self.thrust, self.torque))
         turning = thrust[:, None] * torch.linalg.cross(places, axes) + torque[:, None] * axes
         return s @ torch.cat([thrust[:, None] * axes, turning], dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Pull(Law):
+    """A constant force (x, y, z) in N along the world's axes on link `frame`, at a `point` of it in m: a hose, a cable.
+
+    The joint force is J(point)^T (x, y, z). Raises InvalidInput for what does not fit.
+    """
+
+    frame: str
+    x: Number = None
+    y: Number = None
+    z: Number = None
+    point: Any = (0.0, 0.0, 0.0)
+    coefficients: ClassVar[Mapping[str, Coefficient]] = {x: Coefficient("N", 0.0, 100.0, lowest=-np.inf) for x in "xyz"}
+
+    @override
+    def bound_to(self, robot: Robot) -> "Pull":
+        robot.frame(self.frame)
+        return replace(self, point=tuple(finite_vector("Pull point", self.point, 3, " x, y, z in m").tolist()))
+
+    @override
+    def direction(self, state: State) -> Float[Tensor, "*batch nv 3"]:
+        return state.kinematics.frame_jacobian(self.frame, self.point)[..., :3, :].mT
+
+    @override
+    def features(self, state: State) -> tuple[Tensor, ...]:
+        return (state.v,)
+
+    @override
+    def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
+        rows = features[0].shape[:-1]
+        return torch.cat([parameters[axis].expand(*rows, 1) for axis in "xyz"], dim=-1)
 
 
 @dataclass(frozen=True, eq=False)

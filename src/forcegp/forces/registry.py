@@ -16,6 +16,7 @@ from forcegp.mechanics.surfaces import from_stored
 FORCES: dict[str, str | type[Force]] = {
     "actuation": "actuation.Actuation",
     "thrusters": "actuation.Thrusters",
+    "pull": "actuation.Pull",
     "observed-wrench": "actuation.ObservedWrench",
     "observed-wind": "actuation.ObservedWind",
     "rigid-bodies": "rigid_bodies.RigidBodies",
