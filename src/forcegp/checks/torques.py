@@ -157,3 +157,27 @@ def stretch(signals: Float[np.ndarray, "rows k"]) -> tuple[float, float, int, in
         best = max(told(a, best[3]) for a in range(max(best[3] - count // 2, 0), best[3]))
         best = max(told(best[2], b) for b in range(best[2] + 1, min(best[2] + count // 2, count) + 1))
     return best
+
+
+def solved(now: Comparison, columns: Float[np.ndarray, "rows nv k"]) -> Float[np.ndarray, " k"] | None:
+    """Numbers that leave least of u, every joint by the power that is left of it."""
+    parts = []
+    for joint in np.flatnonzero(np.ptp(now.rows.u, axis=0) > 0.0):
+        basis = np.linalg.qr(now.friction[:, joint])[0]
+        both = np.c_[columns[:, joint], now.rows.u[:, joint] - now.tau[:, joint]]
+        both = both - both.mean(axis=0)
+        both = both - basis @ (basis.T @ both)
+        parts.append((both, np.square(now.rows.u[:, joint] - now.rows.u[:, joint].mean()).sum()))
+    if not parts or not any(np.square(both[:, :-1]).sum() > 0.0 for both, _ in parts):
+        return None
+    weights = [1.0 / (np.square(b[:, -1]).sum() + 1e-9 * p) for b, p in parts]
+    number = np.zeros(columns.shape[-1])
+    for _ in range(4):
+        normal = np.sum([w * b.T @ b for w, (b, _) in zip(weights, parts, strict=True)], axis=0)
+        scale = np.sqrt(np.diag(normal)[:-1])
+        scale[scale == 0.0] = 1.0
+        inverse = np.linalg.pinv(normal[:-1, :-1] / np.outer(scale, scale), rcond=1e-8)
+        number = inverse @ (normal[:-1, -1] / scale) / scale
+        left = [np.square(b[:, -1] - b[:, :-1] @ number).sum() for b, _ in parts]
+        weights = [1.0 / (x + 1e-6 * p) for x, (_, p) in zip(left, parts, strict=True)]
+    return number
