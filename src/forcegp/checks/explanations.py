@@ -241,7 +241,7 @@ def _waves(x: np.ndarray) -> np.ndarray:
 def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
     """A joint zero, a gear ratio or a length that leaves least; the best of all."""
     robot, rows, names = now.robot, now.rows, now.robot.joint_names
-    zeros, turns = 2.0 * np.pi * np.arange(5) / 5.0, np.linspace(-np.pi, np.pi, 1441)
+    zeros, turns = 2.0 * np.pi * np.arange(5) / 5.0, np.linspace(-np.pi, np.pi, 721)
     waves, parts = _waves(turns) @ np.linalg.inv(_waves(zeros)), np.array([0.5, 1.0, 2.0])
     parabolas = np.vander(FACTORS, 3) @ np.linalg.inv(np.vander(parts, 3))
     laws, found = now.tau - needed_torques(robot, rows), list[tuple[float, Cause, Callable[[], Comparison]]]()
@@ -356,7 +356,7 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
     for joint, drive in zip(layout.bodies, layout.drives, strict=True):  # what hangs at a hose or a cable
         R = kinematics.frame_pose(joint.child)[:, :3, :3].cpu().numpy()
         pull, at, columns = np.zeros(3), np.zeros(3), np.zeros((len(rows), rows.nv, 0))
-        for _ in range(6):  # Gauss-Newton: the force at the point of before, and how far the point moves
+        for _ in range(4):  # Gauss-Newton: the force at the point of before, and how far the point moves
             J = kinematics.frame_jacobian(joint.child, tuple(at)).cpu().numpy()
             turning = np.einsum("nkj,nik->nji", J[:, 3:], np.cross(R.swapaxes(1, 2), pull))
             columns = -np.concatenate([J[:, :3].swapaxes(1, 2), turning], axis=-1)
@@ -403,7 +403,7 @@ def _gravities(
         tried.append((size / norm * estimate, 1.5 * NUMBER, 0.0))
     for end in ends if norm > 0.0 and size > 0.0 else ():
         along, load = size / norm * estimate, None
-        for _ in range(4):  # it weighs along the gravity that is sought
+        for _ in range(3):  # it weighs along the gravity that is sought
             tilted = with_gravity(now.robot, along)
             columns = of_load(end, tilted)
             both = solved(now.after(changed(), tilted), np.concatenate([pulls, columns], axis=-1))

@@ -1,0 +1,209 @@
+"""How well a log fits its robot once some causes are taken off it: shares of every torque that stay."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from forcegp.checks.explanations import NUMBER, SIGN, Cause, changed
+from forcegp.checks.torques import LEAST, Comparison, positive_fit, positive_solution
+
+NOISE = 3.0  # how much of the power of the noise is left to every explanation
+WORSE = 1.05  # share from which on predicting nothing is better
+BLOCKS, T_95 = 4, 3.18  # of the log, each of which is predicted from the others; Student's t of one less
+ATTENUATED = 0.01  # of a factor: noise of accelerations makes it smaller
+FREE = 4.0  # share that an explanation may leave, over what a robot with any masses and any friction would
+GOOD = 0.03  # share that a good log may leave
+EXPLAINED = 0.1  # share that a robot with rough masses leaves
+RESTS = 0.5  # share of what friction leaves that a torque must explain, for a factor of it to mean something
+ROUGH = 2.5  # factor either way that wrong masses make of a torque
+FAR, MUCH_MORE = 3.0, 30.0
+"""Factors that wrong masses do not explain: less torque than bodies need cannot be; more may be a rotor's inertia."""
+CHOICES = np.array([0.0, SIGN, NUMBER, SIGN + NUMBER])
+"""Cost of a torque as it is, turned, times a factor, and both."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A log after all `causes`, and how it fits; `floor` (nv,) is the share of each torque that is noise."""
+
+    log: Comparison
+    floor: Float[np.ndarray, " nv"]
+    causes: tuple[Cause, ...] = ()
+    turned: tuple[int, ...] = ()
+
+    @cached_property
+    def _fits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Shares (nv, 4) that remain of every choice, NaN for a constant torque, and factors (nv,) of the chosen."""
+        u, tau = (x - x.mean(axis=0) for x in (self.log.rows.u, self.log.tau))
+        every = np.concatenate([self.log.friction, tau[..., None], u[..., None]], axis=-1)
+        power = np.square(u).sum(axis=0)
+        shares, factors = np.full((u.shape[1], 4), np.nan), np.full((u.shape[1], 2), np.nan)
+        count = every.shape[-1] - 2
+        plain, last = [*range(count), count + 1], np.eye(count + 1)[[-1]]
+        sides = np.outer(*2 * (np.append(np.ones(count + 1), -1.0),))
+
+        def less(products: np.ndarray) -> np.ndarray:
+            """Of friction, and u less what is needed."""
+            cross = products[plain][:, [count]] * last
+            return products[plain][:, plain] - cross - cross.T + products[count, count] * last * last.T
+
+        for k in np.flatnonzero(np.ptp(self.log.rows.u, axis=0) > 0.0):
+            products = every[:, k].T @ every[:, k]
+            shares[k, 0] = positive_solution(less(products))[1]
+            shares[k, 1:], size = np.inf, np.sqrt(np.diag(products))
+            size[size == 0.0] = 1.0
+            scaled = products / np.outer(size, size)
+            number = np.linalg.lstsq(scaled[:-1, :-1], scaled[-1, :-1], rcond=1e-10)[0]
+            factors[k], bound = number[-1] * size[-1] / size[-2], power[k] * (1.0 - scaled[-1, :-1] @ number)
+            if bound * np.exp(SIGN) > shares[k, 0] or shares[k, 0] < LEAST * power[k]:
+                shares[k] /= power[k]
+                continue  # neither sign nor factor is worth what it costs
+            for turn, sign in enumerate((1.0, -1.0)):
+                turned = products * sides if sign < 0.0 else products
+                alone = positive_solution(turned[plain][:, plain])[1]
+                found, left = positive_solution(turned)
+                factors[k, turn] = found[-1]
+                shares[k, turn + 2] = left + power[k] * (left > (1.0 - RESTS) * alone)  # not a multiple of tau
+                shares[k, turn] = positive_solution(less(turned))[1]
+            shares[k] /= power[k]
+        return shares, factors
+
+    @cached_property
+    def chosen(self) -> Int[np.ndarray, " nv"]:
+        """Which of CHOICES explains each torque best."""
+        return np.argmin(np.nan_to_num(self._logarithms() + CHOICES), axis=1)
+
+    def _logarithms(self) -> np.ndarray:
+        return np.log(np.maximum(self._fits[0], np.maximum(LEAST, NOISE * self.floor)[:, None]))
+
+    @cached_property
+    def value(self) -> float:
+        """Logarithm of what remains, over all joints, and the costs of what was assumed."""
+        left = np.nansum((self._logarithms() + CHOICES)[np.arange(len(self.chosen)), self.chosen])
+        return float(left) + sum(cause.cost for cause in self.causes) + SIGN * len(self.turned)
+
+    @property
+    def shares(self) -> Float[np.ndarray, " nv"]:
+        """What remains of each torque if none is a multiple; 0 of a constant one."""
+        return np.nan_to_num(self._fits[0][:, 0])
+
+    @property
+    def unexplained(self) -> Float[np.ndarray, " nv"]:
+        """What remains of each torque, with a factor where that explains more; NaN of a constant one."""
+        return self._fits[0][:, [0, 2]].min(axis=1)
+
+    @property
+    def unscaled(self) -> float:
+        """The same if no torque is a multiple."""
+        left = (self._logarithms() + CHOICES)[:, :2]
+        return float(np.nansum(left.min(axis=1))) + sum(cause.cost for cause in self.causes) + SIGN * len(self.turned)
+
+    @cached_property
+    def factors(self) -> Float[np.ndarray, " nv"]:
+        """Of u over what is needed, NaN where friction alone leaves little more."""
+        shares, factors = self._fits
+        turn = np.nanargmin(np.where(np.isnan(shares[:, 2:]), np.inf, shares[:, 2:]), axis=1)
+        u = self.log.rows.u - self.log.rows.u.mean(axis=0)
+        alone = [positive_fit(each, x)[1] for each, x in zip(self.log.friction.swapaxes(0, 1), u.T, strict=True)]
+        told = shares.min(axis=1) * np.square(u).sum(axis=0) < RESTS * np.array(alone)
+        return np.where(told, factors[np.arange(len(turn)), turn], np.nan)
+
+    @property
+    def plain(self) -> float:
+        """The same as `value` of a log that nothing is assumed of."""
+        return float(np.nansum(self._logarithms()[:, 0]))
+
+    def with_signs(self) -> "Explanation":
+        """With the torques turned whose other sign fits."""
+        turned = np.flatnonzero(self.chosen % 2)
+        if not len(turned):
+            return self
+        factor = np.ones(len(self.chosen))
+        factor[turned] = -1.0
+        both = tuple(sorted({*self.turned} ^ {*turned.tolist()}))
+        return replace(self, log=self.log.with_torques(changed("u", factor=factor)), turned=both)
+
+    @cached_property
+    def rough(self) -> Float[np.ndarray, " nv"]:
+        """Share that is left of each torque if masses may be roughly wrong; without what is noise."""
+        left = np.array([self._held_out(k, rough=True) for k in range(len(self.floor))])
+        needless = (left > 1.0 - EXPLAINED) & (self.shares > WORSE)  # noise where the motion needs a torque
+        return np.where(needless, left, np.maximum(left - NOISE * self.floor, 0.0))
+
+    @cached_property
+    def exact(self) -> Float[np.ndarray, " nv"]:
+        """Share that is left of each torque by what was assumed."""
+        return np.array([self._held_out(k, rough=False) for k in range(len(self.floor))])
+
+    def _held_out(self, joint: int, rough: bool) -> float:
+        """What friction and tau, as the other blocks have them, leave of every block."""
+        u, tau, friction = self.log.rows.u[:, joint], self.log.tau[:, joint], self.log.friction[:, joint]
+        power, left = np.square(u - u.mean()).sum(), 0.0
+        if not np.ptp(u) > 0.0:
+            return 0.0
+        scaled = rough or self.chosen[joint] >= 2
+        for block in np.array_split(np.arange(len(u)), BLOCKS):
+            rest = np.setdiff1d(np.arange(len(u)), block)
+            middle = [x[rest].mean(axis=0) for x in (u, tau, friction)]
+            factor = 1.0
+            if scaled:
+                found, _ = positive_fit(np.c_[tau[rest] - middle[1], friction[rest] - middle[2]], u[rest] - middle[0])
+                factor = float(np.clip(found[0], 1.0 / ROUGH, ROUGH)) if rough and self.chosen[joint] < 2 else found[0]
+            target = u - middle[0] - factor * (tau - middle[1])
+            number, _ = positive_fit(friction[rest] - middle[2], target[rest])
+            left += np.square(target[block] - (friction[block] - middle[2]) @ number).sum()
+        return float(left / power)
+
+    def error_of_factor(self, joint: int) -> float:
+        """Half of its 95 % interval, by what each block of the log changes (jackknife)."""
+        u, tau, friction = self.log.rows.u[:, joint], self.log.tau[:, joint], self.log.friction[:, joint]
+        rows, columns = np.arange(len(u)), np.c_[tau, friction]
+        rests = [np.setdiff1d(rows, block) for block in np.array_split(rows, BLOCKS)]
+        found = [positive_fit(columns[x] - columns[x].mean(axis=0), u[x] - u[x].mean())[0][0] for x in rests]
+        return float(np.hypot(T_95 * np.std(found) * (BLOCKS - 1) ** 0.5, ATTENUATED * np.mean(found)))
+
+    @cached_property
+    def of_any_masses(self) -> Float[np.ndarray, "rows nv"]:
+        """What is left of each torque by a robot with any masses and friction."""
+        return self.left_beside(np.ones((*self.log.rows.q.shape, 1)))
+
+    def left_beside(self, more: Float[np.ndarray, "rows nv k"]) -> Float[np.ndarray, "rows nv"]:
+        """The same with these columns of each joint, too."""
+        rows, robot = self.log.rows, self.log.robot
+        q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
+        with torch.no_grad():
+            regressor = robot.kinematics(q, v).torque_regressor(a).flatten(-2).cpu().numpy()
+        left = []
+        for k, u in enumerate(rows.u.T):
+            columns = np.c_[regressor[:, k], self.log.friction[:, k], np.ones(len(u)), more[:, k]]
+            size = np.linalg.norm(columns, axis=0)
+            basis, values, _ = np.linalg.svd(columns[:, size > 0.0] / size[size > 0.0], full_matrices=False)
+            basis = basis[:, values > 1e-8 * values[0]]
+            left.append(u - basis @ (basis.T @ u))
+        return np.stack(left, axis=1)
+
+    @property
+    def free(self) -> Float[np.ndarray, " nv"]:
+        """The share that this is."""
+        return np.square(self.of_any_masses).sum(0) / np.maximum(len(self.log.rows) * self.log.rows.u.var(0), 1e-300)
+
+    @property
+    def good(self) -> np.ndarray:
+        """Whether each joint is left with what a good log leaves (nv,)."""
+        noise = np.minimum(NOISE * self.floor, WORSE)
+        return self.exact <= np.maximum(np.minimum(FREE * self.free, EXPLAINED), np.maximum(GOOD, noise))
+
+    def stands(self, root: "Explanation") -> bool:
+        """Whether all joints are left with what a good log leaves; with rough masses, if mistakes were corrected."""
+        far = {
+            *np.flatnonzero((self.chosen >= 2) & (np.abs(np.log(np.abs(self.factors) + 1e-300)) > np.log(MUCH_MORE)))
+        }
+        if far & {*self.turned, *(k for cause in self.causes for k in cause.joints)}:
+            return False  # nothing else is known of a torque in unknown units
+        if self.good.all():
+            return True
+        exactly = any(cause.number for cause in self.causes) or (self.chosen >= 2).any()
+        return not exactly and root.rough.max() > EXPLAINED and bool((self.rough <= EXPLAINED).all())
