@@ -13,6 +13,8 @@ from forcegp import Dataset, Model, Robot, check, import_recordings
 from forcegp.checks import quick_check
 from forcegp.checks.moving_base import _explained, base_doubts, carried_doubts, stance_doubts, unmeasured_base_doubts
 from forcegp.data.configurations import rates
+from forcegp.data.dataset import IMU
+from forcegp.data.imu import expected
 from forcegp.forces import Actuation, RigidBodies, Thrusters
 from forcegp.recordings import ColumnMapping
 from forcegp.simulation import QuadrupedConfig, simulate_quadruped
@@ -183,6 +185,13 @@ def flight(seed: int = 0, noise: bool = True) -> tuple[Dataset, np.ndarray]:
     v = np.hstack([(turned * jitter).inv().apply(world), turning])
     log = {"q": q, "v": v, "u": speeds, "a": np.gradient(v, time, axis=0), "time": time}
     return Dataset(**log, model=model).rows(slice(2, -2)), world[2:-2]
+
+
+def test_an_imu_of_a_robot_with_legs_is_checked():
+    log = simulate_quadruped(QuadrupedConfig(seconds=2.0, seed=0))
+    name = f"{IMU}{log.model.robot.layout.bodies[5].child}"
+    sensed = replace(log, measured={name: expected(log, log.model, name)})
+    assert [each.level for each in check(sensed).doubts.of("imu")] == ["ok"]
 
 
 def with_w_first(log: Dataset, world: np.ndarray) -> Dataset:
