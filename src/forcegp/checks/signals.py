@@ -258,11 +258,7 @@ def sampling_doubts(inputs: CheckInput) -> Iterator[Doubt]:
         what=f"{len(log)} rows in {each}, {seconds:.1f} s in all, {1.0 / median:.4g} Hz.",
         numbers={"sample_rate": 1.0 / median, "seconds": seconds, "episodes": count, "rows": len(log)},
     )
-    yield from _repeated(log, follows)
-
-
-def _repeated(log: Dataset, follows: np.ndarray) -> Iterator[Doubt]:
-    """Rows in which every position is that of the row before although velocities show that the robot moves."""
+    # rows in which every position is that of the row before although velocities show that the robot moves
     same = (np.diff(log.q, axis=0) == 0).all(axis=1) & follows
     speed = np.abs(log.v).max(axis=1)[1:]
     moves = speed > 0.1 * np.sqrt(np.square(speed).mean())
@@ -289,8 +285,10 @@ FACTORS: dict[float, tuple[str, str | None]] = {
     0.5 / np.pi: ("turns per second where q is in rad", "rev/s"),
 }
 """Ratios of v to dq/dt, what explains each, and the unit of v, where q is in rad but for that of degrees."""
+SLIDING = {0.001: FACTORS[0.001], 100.0: ("cm/s", "cm/s"), 1000.0: ("mm/s", "mm/s")}
 
 CLOSE = 0.05  # deviation from one of them, or from 1, that noise and filters explain
+SURE = 0.025  # the same for some joints alone: gears of 1:10 and 1:60 are that close to rpm and deg/s
 UNEXPLAINED = 0.3  # share of the power of v that dq/dt may leave unexplained, at the best factor and shift
 FEW = 0.05  # share below which a factor is meant seriously
 IDLE = 0.01  # of the largest of all joints, up to which what moves a joint may be noise
@@ -358,20 +356,29 @@ def _differences(
 ) -> Iterator[Doubt]:
     """One doubt for all joints in which v or a differs from the derivative in the same way."""
     step = float(np.median(np.diff(inputs.even.time)))
-    groups: dict[tuple[str, float], list[int]] = {}
+    groups: dict[tuple[str, float, str, str | None], list[int]] = {}
     for joint, (factor, shift, left) in fits.items():
         late = np.isfinite(shift) and abs(shift) > max(LEAST_SHIFT * step, 5e-4)
         sort = "sign" if factor < 0.0 else "factor" if abs(factor - 1.0) > CLOSE else "late" if late else ""
         kind = "other" if left > UNEXPLAINED else sort if left < FEW else ""
-        known = next((known for known in FACTORS if abs(factor / known - 1.0) < CLOSE), 0.0)
+        usual = FACTORS if inputs.rotates[joint] else SLIDING
+        known = next((x for x in usual if abs(factor / x - 1.0) < CLOSE and kind == "factor"), 0.0)
+        guess, unit = usual.get(known if name == "v" else 0.0, ("", None))
         if kind:
-            groups.setdefault((kind, known if kind == "factor" else 0.0), []).append(joint)
-    what = EVERY_QUANTITY[name]
-    for (kind, known), joints in groups.items():
+            groups.setdefault((kind, known, guess, unit), []).append(joint)
+    what, units = EVERY_QUANTITY[name], {x: inputs.stated_units(x) for x in "qv"}
+    for (_, known, _, unit), joints in groups.items():
+        if unit and (len(joints) == len(fits) or all(abs(fits[k][0] / known - 1.0) < SURE for k in joints)):
+            signal, word = ("q", "deg") if known == DEGREE else ("v", unit)
+            kin = {k for k in of if inputs.rotates[k] == inputs.rotates[joints[0]]}  # also those that stand still
+            alike, si = kin if kin & fits.keys() <= {*joints} else joints, inputs.unit_of_each(signal)
+            units[signal] = [word if k in alike and x == si[k] else x for k, x in enumerate(units[signal])]
+    other = {x: tuple(own) for x, own in units.items() if own != inputs.stated_units(x)}
+    for (kind, _, guess, unit), joints in groups.items():
         factor, shift, unexplained = fits[joints[0]]
         named, every = inputs.named(joints), len(joints) == len(of) > 2
         one = f"the {what} of {'all joints' if every else listed(named)} is"
-        guess, unit = FACTORS.get(known, ("", None)) if name == "v" else ("", None)
+        guess = unit if unit and inputs.stated_units("q")[joints[0]] != inputs.unit_of_each("q")[joints[0]] else guess
         level: Level = "wrong"
         if kind == "other":
             level = "look" if name == "a" else "wrong"
@@ -394,11 +401,8 @@ def _differences(
         correction: dict[str, Any] = {}
         if name == "v" and kind == "sign" and abs(factor + 1.0) < CLOSE:
             correction = {"sign": {"v": tuple(-1.0 if each in named else 1.0 for each in inputs.names)}}
-        elif level == "wrong" and unit is not None and len(joints) == len(fits):
-            signal, word = ("q", "deg") if known == DEGREE else ("v", unit)
-            alike = {k for k in of if inputs.rotates[k] == inputs.rotates[joints[0]]}  # also those that stand still
-            units = [word if k in alike else own for k, own in enumerate(inputs.unit_of_each(signal))]
-            correction = {"unit": {signal: tuple(units)}}
+        elif unit and other:
+            correction = {"unit": other}
         each = [
             {"quantity": name, "factor": f, "delay": s if np.isfinite(s) else None, "unexplained": left}
             for f, s, left in (fits[joint] for joint in joints)

@@ -190,7 +190,7 @@ class Auto(Command):
             if not found:
                 dataset, stops = forcegp.checks.without_stops(dataset)
                 return dataset, {**done, "stops": [each.to_dict() for each in stops]}, mapping, mistakes, robot
-            mistakes.append(found[0])
+            mistakes += [doubt for doubt in found if doubt.correction == found[0].correction]
             robot = replace(robot, gravity=found[0].correction.get("gravity", {}).get("base", robot.gravity))
             model = self.columns.model(robot)
             mapping = mapping.corrected_by(found[0].correction, dataset.joint_names, done["columns"])

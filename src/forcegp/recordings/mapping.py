@@ -95,6 +95,12 @@ def named_unit(quantity: str, column: str) -> str | None:
         return None
 
 
+def in_short(quantity: str, units: Sequence[str]) -> tuple[str, ...]:
+    """Units of all columns, as a mapping states them: one of each kind where those of a kind share it."""
+    once = dict.fromkeys(name for name in units if name != "1")
+    return tuple(once) if len({log_unit(quantity, name).si for name in once}) == len(once) else tuple(units)
+
+
 SIGNALS = ("q", "v", "u", "a")
 ORIENTATIONS = ("xyzw", "wxyz", "angles")
 """Quaternions with w last or first; roll, pitch and yaw with R = Rz(yaw) Ry(pitch) Rx(roll), or the yaw of a plane."""
@@ -192,14 +198,15 @@ class ColumnMapping:
         places = [joints.index(name) for name in self.joints or joints]
 
         def in_order(values: Sequence[Any]) -> tuple[Any, ...]:
-            return (values[0],) if len(set(values)) == 1 else tuple(values[place] for place in places)
+            each = values if len(values) != len(places) else [values[place] for place in places]  # once for each kind
+            return tuple(each[:1] if len(set(each)) == 1 else each)
 
         sign = dict(self.sign)
         for signal, values in correction.get("sign", {}).items():
             now = sign.get(signal, (1.0,))
             now = now * len(places) if len(now) == 1 else now
             sign[signal] = tuple(old * float(values[place]) for old, place in zip(now, places, strict=True))
-        units = {name: in_order(values) for name, values in correction.get("unit", {}).items()}
+        units = {name: in_short(name, in_order(values)) for name, values in correction.get("unit", {}).items()}
         axes = {**self.axes, **correction.get("axes", {})}
         changes: dict[str, Any] = {"unit": {**self.unit, **units}, "sign": sign, "axes": axes}
         if "orientation" in correction:
@@ -339,12 +346,7 @@ def _says(signal: str, around: tuple[str, str]) -> bool:
 TOKEN = (
     r"`(?P<quoted>[^`]*)`|(?P<name>%s)|(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?!\w))|(?P<word>[^\s+*/`()-]+)"
 )
-OPERATIONS: dict[type[ast.operator], Any] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-}
+OPERATIONS: Any = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv}
 MOST_PARTS = 500
 
 

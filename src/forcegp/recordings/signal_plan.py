@@ -26,6 +26,7 @@ from forcegp.recordings.mapping import (
     expanded,
     guessed_columns,
     guessed_time,
+    in_short,
     log_unit,
     named_after,
     named_unit,
@@ -119,6 +120,7 @@ class SignalPlan:
     """Everything that is read from a table. `signals` stand signal by signal, each in the order of `joints`."""
 
     joints: tuple[str, ...]
+    positions: tuple[str, ...]  # in the order of the log
     signals: tuple[JointSignal, ...]
     layout: Layout
     orientation: str
@@ -174,7 +176,7 @@ def signal_plan(
             if patterns is None and signal == "u" and may_lack_switches and model.actuators:
                 patterns = guessed_columns(signal, names[: len(model.actuators)], source)
             if patterns is not None:
-                guessed.append(f"{signal} = {', '.join(patterns)}")
+                guessed.append(f"{signal} = {' ... '.join(dict.fromkeys(patterns[:: max(len(patterns) - 1, 1)]))}")
                 found[signal] = [parse_expression(name, [name], str(source.path)) for name in patterns]
         elif patterns is not None:
             found[signal] = _expressions(patterns, joints, source, may_lack=signal in ("v", "a"))
@@ -215,7 +217,7 @@ def signal_plan(
     signals += tuple(item for frame in mapping.force for item in _sensor(mapping, frame, source, model))
     for name in found.keys() - mapping.unit.keys():
         if any(x.unit.per_si != 1.0 for x in signals if x.signal == name):
-            units = ",".join(x.unit.name for x in signals if x.signal == name)
+            units = ",".join(in_short(name, [x.unit.name for x in signals if x.signal == name]))
             guessed.append(f"unit {name}={units}, as the columns are called")
     lacking = {name: [x.expression is LACKING for x in signals if x.signal == name != "u"] for name in found}
     episode = mapping.episode or (EPISODE if EPISODE in source.columns() else None)
@@ -227,6 +229,7 @@ def signal_plan(
     [time_unit, *_] = mapping.unit.get("time", (usual,))
     return SignalPlan(
         joints=tuple(order["v"]),
+        positions=tuple(log["q"]),
         signals=signals,
         layout=layout_of(mapping, model, lacking, len(order["v"])),
         orientation=mapping.orientation or ORIENTATIONS[0],
