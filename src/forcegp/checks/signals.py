@@ -21,6 +21,7 @@ ROUNDING = 1e-12  # of the largest value of any joint
 HELD_STEPS = 0.5  # share of equal successive values from which on a signal moves in steps, such as a held command
 FROZEN_SECONDS = 0.1
 FROZEN_ROWS = 10
+AGREES = 0.6  # steps of the position from row to row, up to which a velocity agrees with it
 NEEDED = 0.1  # of the largest torque of the joints that have one: less is that of a wrong mass
 PASSIVE = 0.5  # of the inertial torque: a mechanism that swings by itself needs less
 MOVES = 0.2  # of its root mean square speed, above which a joint moves
@@ -189,9 +190,13 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
     moves = np.abs(speed) > MOVES * np.sqrt(np.square(speed).mean())
     if name != "u":
         others &= np.diff(log.u[:, joint]) != 0  # at rest q and v stand still together, while u is noisy or not
-    start = length = 0
+    start, length, agrees = 0, 0, np.zeros(len(held), dtype=bool)
+    if name == "v" and speed.any():  # where an encoder counts as many steps in each row, v is right to stand still
+        slope = float(values[1:] @ speed / (speed @ speed))  # whatever the unit of v is
+        agrees = np.abs(values[1:] - slope * speed) * step < AGREES * abs(slope) * resolution(log.q[:, joint])
     for begin, end in runs(held & follows).tolist():
-        if end - begin <= max(length, FROZEN_ROWS - 1) or (end - begin) * step < FROZEN_SECONDS:
+        rows = end - begin
+        if rows <= max(length, FROZEN_ROWS - 1) or rows * step < FROZEN_SECONDS or agrees[begin:end].all():
             continue
         gone = np.cumsum(speed[begin:end]) * step
         jump = abs(values[end + 1] - values[begin]) if end < len(held) else np.inf
