@@ -22,6 +22,7 @@ from forcegp.errors import InvalidInput, require_known, require_type, usable_arg
 from forcegp.recordings.source import Source
 
 UNIT_OF_A_NAME = re.compile(r"[\[(]([^\d\[(]+)[\])]$|_([A-Za-z]{2,})$")
+NUMBERED = re.compile(r"(?P<stem>(?P<word>.*?)[\[(_. ]*)(?P<number>\d{1,4})?[\])]?\s*$")
 COMMA = re.compile(r",(?![^{\[]*[}\]])(?=(?:[^`]*`[^`]*`)*[^`]*$)")
 EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body", "force": "foot=fx,fy,fz"}
 OF_IMU, OF_LINKS = "imu", "torque"  # before the frame of an IMU, and the joint of a torque, in `force`
@@ -323,6 +324,19 @@ def guessed_columns(signal: str, joints: Sequence[str], source: Source) -> tuple
         raise InvalidInput(f"{source.path}: {signal} could be {candidates}; choose with --{signal}.")
     bare = tuple(joint.removesuffix("_joint") for joint in joints)
     return fitting[0] if fitting else None if bare == tuple(joints) else guessed_columns(signal, bare, source)
+
+
+def counted_columns(signal: str, count: int, source: Source) -> tuple[str, ...] | None:
+    """`q1 ... q7`, `dq[0] ...` or `joint_torques[0] ...`, exactly `count`; None for none, and for several."""
+    found: dict[str, dict[int, str]] = {}
+    for column in source.columns():
+        name = NUMBERED.match(UNIT_OF_A_NAME.sub("", column) if named_unit(signal, column) else column)
+        word = name["word"].lower() if name else ""
+        if name and {word, word.removeprefix("joint_"), word.removeprefix("q")} & WORDS[signal]:
+            found.setdefault(name["stem"], {})[int(name["number"] or 0)] = column
+    wanted = [*range(count)], [*range(1, count + 1)]
+    fitting = [tuple(x[k] for k in sorted(x)) for x in found.values() if sorted(x) in wanted]
+    return fitting[0] if len(fitting) == 1 else None
 
 
 def guessed_time(source: Source, used: Sequence[str]) -> str | None:

@@ -23,6 +23,7 @@ from forcegp.recordings.mapping import (
     ColumnMapping,
     Expression,
     LogUnit,
+    counted_columns,
     expanded,
     guessed_columns,
     guessed_time,
@@ -160,7 +161,7 @@ def signal_plan(
     robot = model.robot
     joints = _joints(mapping, robot)
     log, order = columns_of(mapping, model, joints)
-    guessed: list[str] = []
+    guessed, by_number = list[str](), "q"
     found: dict[str, list[Expression]] = {}
     for signal in SIGNALS:
         patterns = getattr(mapping, signal)
@@ -175,6 +176,9 @@ def signal_plan(
                 patterns = tuple(found_by[name] for name in names) if len(found_by) == len(names) else None
             if patterns is None and signal == "u" and may_lack_switches and model.actuators:
                 patterns = guessed_columns(signal, names[: len(model.actuators)], source)
+            if patterns is None and signal in by_number and {*names} <= {*joints}:
+                patterns = counted_columns(signal, len(names), source)
+                by_number = "qvu" if patterns else by_number  # nothing beside columns with names of joints
             if patterns is not None:
                 guessed.append(f"{signal} = {' ... '.join(dict.fromkeys(patterns[:: max(len(patterns) - 1, 1)]))}")
                 found[signal] = [parse_expression(name, [name], str(source.path)) for name in patterns]
