@@ -1,5 +1,6 @@
 """Every corruption of a two-joint log is named by `check`, and said in one line before a fit; clean logs are not."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -100,6 +101,19 @@ def test_two_mistakes_are_both_named():
     assert {each.about for each in found} == {"torque sign", "torque unit"}
     assert found.of("torque sign")[0].joints == ("joint1",)
     assert found.of("torque unit")[0].correction == {"unit": {"u": ("mNm",)}}
+    [found] = quick_check(replace(data, u=1e3 * data.u))
+    after, before = map(float, re.findall(r"([\d.]+) %", found.what))
+    assert after < 0.1 * before  # of the log as it is, without any factor
+
+
+@pytest.mark.parametrize("x", ["1e3 9.55 mm/s,rpm", "1e3 10 mm/s,rad/s", "1e2 1 cm/s,rad/s", "1 10 ", "2 9.5 mm/s,rpm"])
+def test_units_of_velocities_are_found_joint_by_joint_and_before_those_of_torques(x):
+    rail, gear, unit = x.split(" ")
+    data = at(clean(ROBOTS["crane"](), 4, noise="qvu"), "v", [float(rail), float(gear)])
+    told = {"import": {"units": {"v": ["mm/s", "rad/s"]}} if rail == "2" else "of others"}
+    found = quick_check(replace(at(data, "u", [1e3, 1e3]), metadata=told))
+    assert {each.command for each in found.of("velocity")} >= {f"forcegp import --unit v={unit}" if unit else ""}
+    assert not found.of("torque unit")
 
 
 def test_the_factor_of_a_torque_has_an_interval():

@@ -76,6 +76,14 @@ def test_frozen_channels(rate):
     assert_unchanged(f"checks/frozen {rate:g}", found)
 
 
+@pytest.mark.parametrize(("more", "frozen"), [(0, False), (1, True)])
+def test_a_velocity_that_stands_still_while_its_encoder_counts_evenly_is_right(more, frozen):
+    v, count = 2.0 * np.cos(2.0 * np.arange(1000) / 100.0), 0.003
+    steps = np.round(v / 100.0 / count)
+    steps[501:531], v[500:531] = 5 + more * (np.arange(30) % 2), 5 * count * 100.0
+    assert (levels(signal_doubts(seen(swing(q=count * np.cumsum(steps), v=np.rad2deg(v)))), "frozen") > 0) == frozen
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_clipped_torques(sign):
     found = {}

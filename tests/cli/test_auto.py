@@ -113,6 +113,18 @@ def test_a_base_on_a_wall_is_corrected(tmp_path, forcegp, monkeypatch):
     assert Dataset.load(tmp_path / "answer" / "log.h5").model.robot.gravity.tolist() == [0.0, 9.81, 0.0]
 
 
+def test_units_per_joint_are_corrected_in_one_command_for_columns_by_number(tmp_path, forcegp, monkeypatch):
+    monkeypatch.setattr("forcegp.scores.identify", _stopped)
+    data = corruptions.clean(corruptions.ROBOTS["crane"](), 4, noise="qvu")
+    (tmp_path / "crane.urdf").write_text(data.model.robot.urdf_text)
+    units, words = np.array([1e3, np.rad2deg(1.0)]), ("auto", "log.csv", "--robot", "crane.urdf", "--out", "answer")
+    table = np.c_[data.time, data.q * units, data.v * units, data.u]
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="t,q1,q2,dq1,dq2,tau1,tau2", comments="")
+    assert "auto log.csv --unit q=mm,deg,v=mm/s,deg/s --robot" in forcegp(*words, folder=tmp_path).stdout
+    done = forcegp(*words, "--correct", folder=tmp_path).stderr
+    assert (done.count("reached"), done.count("u is taken to be on time")) == (1, 1)
+
+
 def test_the_printed_command_keeps_every_option():
     columns = "--headerless 1,2 --side-by-side --time a:c1 --q b --u 0 --sign u=1,-1 --robot arm.urdf"
     others = (

@@ -16,6 +16,8 @@ def test_units_replace_and_signs_multiply():
         {"unit": {"q": ("rad", "rad", "rad")}, "sign": {"u": (-1.0, -1.0, 1.0), "q": (1.0, 1.0, -1.0)}}, JOINTS, COLUMNS
     )
     assert found.unit == {"q": ("rad",), "time": ("ms",)}
+    kinds = {"q": ("mm", "deg", "deg"), "u": ("kN", "kNm"), "v": ("mm/s", "rpm", "rad/s")}
+    assert mapping.corrected_by({"unit": kinds}, JOINTS, COLUMNS).unit == mapping.unit | kinds | {"q": ("mm", "deg")}
     assert found.sign == {"u": (-1.0, 1.0, 1.0), "q": (1.0, 1.0, -1.0)}
     assert found.q == mapping.q
 

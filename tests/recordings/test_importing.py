@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 from tests.data.samples import model
+from tests.recordings.broken_logs import urdf
 from tests.recordings.log_files import JOINTS, STEP, motion, table, write_text
 
+from forcegp import Model, Robot
 from forcegp.data import Dataset, differentiate
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, MistakenUnit
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings
@@ -142,6 +144,14 @@ def test_joints_that_slide_are_in_metres(tmp_path):
     mapping = dataclasses.replace(mapping, unit={"q": ("rad", "mm")})
     with pytest.raises(InvalidInput, match="q of joint 'elbow' is mm, but the joint turns"):
         imported(path, mapping)
+
+
+@pytest.mark.parametrize(("share", "units"), [(0.15, "deg,rad"), (0.05, "deg")])
+def test_a_joint_that_fits_its_limits_keeps_its_unit_if_it_moves(tmp_path, share, units):
+    q = motion()["q"][:, 0]
+    path = write_text(tmp_path / "log.csv", {"t": motion()["time"], "q_shoulder": np.rad2deg(q), "q_elbow": share * q})
+    with pytest.raises(MistakenUnit, match=f"beyond its limits .* `unit` q={units}. "):
+        import_recordings([path], ColumnMapping(u=("0",)), model=Model(Robot.from_urdf_text(urdf(*JOINTS))))
 
 
 def test_files_side_by_side_are_one_recording(tmp_path):

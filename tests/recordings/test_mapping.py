@@ -1,6 +1,7 @@
 """Names, units, combinations and flags: what is understood, and what is refused."""
 
 import string
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from forcegp.errors import InvalidInput
 from forcegp.recordings import ColumnMapping, by_quantity, listed, open_source
 from forcegp.recordings.mapping import (
     UNITS,
+    counted_columns,
     expanded,
     guessed_columns,
     guessed_time,
@@ -183,6 +185,18 @@ def test_names_are_guessed_only_where_nothing_else_can_be_meant(tmp_path):
     assert guessed_columns("q", JOINTS, source) == ("/a:position.shoulder", "/a:position.elbow")
     source = open_source(write_text(tmp_path / "plot.csv", {"__time": columns["time"], "q_elbow": columns["time"]}))
     assert guessed_time(source, []) == "__time"
+    for signal, text in (text.split(":") for text in COUNTED):
+        names, found = (part.split() for part in text.split(">"))
+        assert counted_columns(signal, 2, SimpleNamespace(columns=names.copy)) == (tuple(found) or None)
+    assert counted_columns("q", 1, SimpleNamespace(columns=lambda: ("q", "q_des"))) == ("q",)
+
+
+COUNTED = (
+    "q: t q1 q2 q_des1 q_des2 dq1 dq2 > q1 q2", "q: q_1 q_2 > q_1 q_2", "q: q[1] q[0] > q[0] q[1]", "q: q1 q2 q3 >",
+    "q: pos01_deg pos02_deg > pos01_deg pos02_deg", "u: tau1 tau2 u > tau1 tau2",
+    "v: qvel[0] qvel[1] > qvel[0] qvel[1]", "v: qd[0] qd[1] a[0] > qd[0] qd[1]", "q: q0 q2 >", "q: des/q[0] des/q[1] >",
+    "u: joint_torques1 joint_torques2 > joint_torques1 joint_torques2", "q: q1 q2 position[0] position[1] >",
+)  # fmt: skip
 
 
 BODY = '<inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>'
@@ -195,12 +209,12 @@ ARM = (
 
 
 def test_joints_without_a_column_are_named_with_what_holds_them(tmp_path):
-    columns = {"time": np.arange(3.0), "pos_shoulder": np.zeros(3), "eff_shoulder": np.zeros(3)}
+    columns = {"time": np.arange(3.0), **dict.fromkeys(("pos_shoulder", "eff_shoulder", "v1"), np.zeros(3))}
     source = open_source(write_text(tmp_path / "log.csv", columns))
     with pytest.raises(InvalidInput, match=r"no columns for q .*named after finger \(`locked`"):
         signal_plan(ColumnMapping(), source, Model(Robot.from_urdf_text(ARM)))
     held = Model(Robot.from_urdf_text(ARM, locked={"finger": 0.0}))
-    assert signal_plan(ColumnMapping(), source, held).guessed[1] == "u = eff_shoulder"  # as ROS abbreviates effort
+    assert signal_plan(ColumnMapping(), source, held).guessed[1:] == ("u = eff_shoulder", "time = time")  # without v1
 
 
 def test_units_are_what_they_were():

@@ -81,6 +81,13 @@ class CheckInput:
         """The unit of a signal, one per joint."""
         return tuple((ROTATION if turns else TRANSLATION)[name] for turns in self.rotates)
 
+    def stated_units(self, name: str) -> list[str]:
+        """The same as it was imported, which a correction of some joints keeps for the others."""
+        found: Any = self.log.metadata.get("import")  # others may have put anything there
+        for key in ("units", name):
+            found = found.get(key) if isinstance(found, Mapping) else None
+        return found if isinstance(found, list) and len(found) == self.log.nv else [*self.unit_of_each(name)]
+
     def named(self, joints: Iterable[int] | np.ndarray) -> tuple[str, ...]:
         """The names of the joints with these numbers."""
         return tuple(self.names[joint] for joint in joints)

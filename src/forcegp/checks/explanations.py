@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from forcegp.checks.check_input import DEGREE, CheckInput
 from forcegp.checks.torques import Change, Comparison, needed_torques, solved, with_gravity
 from forcegp.data import Dataset
-from forcegp.doubts import Level
+from forcegp.doubts import Level, listed
 from forcegp.fit.payloads import with_length
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -96,15 +96,16 @@ def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator
     known = factors[np.isfinite(factors) & (factors > 0.0)]
     if len(known) and known.max() < 2.0 * known.min():
         common = float(np.exp(np.log(known).mean()))
-        unit, size = next(((u, s) for u, s in UNITS if abs(np.log(common / s)) < np.log(1.5)), ("", common))
-        looks = f": it looks like {unit}" if unit else " (or all masses are)"
+        less, size = next(((u, s) for u, s in UNITS if abs(np.log(common / s)) < np.log(1.5)), ("", common))
+        unit = tuple(dict.fromkeys(less + si for si in inputs.unit_of_each("u"))) if less else ()
+        looks = f": it looks like {listed(unit)}" if unit else " (or all masses are)"
         cause = Cause(
             about="torque unit",
             what=f"the measured torque of all joints is {common:.4g} times what the motion needs{looks}",
             do="Correct the unit of u, or masses and torque constants.",
             joints=tuple(range(now.rows.nv)),
             numbers={"factor": common},
-            correction={"unit": {"u": (unit,)}} if unit else {},
+            correction={"unit": {"u": unit}} if unit else {},
             cost=SIGN if unit else NUMBER,
             number=not unit,
             level="wrong" if unit else "look",
@@ -117,9 +118,7 @@ def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator
         if own.any():
             what = f"positions reach {largest:.4g}; they fit the torques far better as degrees than as radians"
             unit = {
-                name: tuple(
-                    x.replace("rad", "deg") if k in _places(own) else x for k, x in enumerate(inputs.unit_of_each(name))
-                )
+                name: tuple(x.replace("rad", "deg") if own[k] else x for k, x in enumerate(inputs.stated_units(name)))
                 for name in "qv"
             }
             told = {"joints": _places(own), "correction": {"unit": unit}}
@@ -143,7 +142,7 @@ def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator
         yield cause, now.after(change)
 
 
-UNITS = ("mNm", 1e3), ("kNm", 1e-3)
+UNITS = ("m", 1e3), ("k", 1e-3)
 SLOWEST, FASTEST = 1.0, 5500.0
 """Rates of logs [Hz] that need no other unit of time."""
 

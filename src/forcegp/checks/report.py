@@ -151,6 +151,8 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
             said = [*elastic, *said]
         if inputs.most_rows != QUICK_ROWS and not any(each.about == UNKNOWN or each.level == "wrong" for each in said):
             said = [*said, *push(found, inputs)]
+        if not moved or {"degrees", "turns", "time unit"} & {doubt.about for doubt in said}:  # torques follow
+            said = [doubt for doubt in said if doubt.about not in ("torque unit", "torque constant")]
         doubts, comparison = [*doubts, *said, *torque_doubts(inputs, found)], found
     return doubts, comparison
 

@@ -26,7 +26,7 @@ def pushed_where_they_are(rows: Dataset, model: Model) -> tuple[str, ...]:
 
 
 def left_by_positions(
-    q: Float[np.ndarray, "rows nv"], columns: Float[np.ndarray, "rows k"], u: Float[np.ndarray, " rows"]
+    q: Float[np.ndarray, "rows nq"], columns: Float[np.ndarray, "rows k"], u: Float[np.ndarray, " rows"]
 ) -> tuple[float, float]:
     """Shares of a torque that these columns leave, and the same with products of two positions, which pull anywhere."""
     x = q[:, np.ptp(q, axis=0) > 0.0]

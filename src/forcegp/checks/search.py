@@ -55,7 +55,7 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
     every.sort(key=lambda each: each.value)
     for best in every:
         near = best.value < every[0].value + 2.0 * GAIN
-        clear = (np.log(np.maximum(root.shares, LEAST) / np.maximum(best.exact, LEAST)) >= GAIN).any()
+        clear = (np.log(np.clip(root.shares, LEAST, 1.0) / np.maximum(best.exact, LEAST)) >= GAIN).any()
         if near and clear and root.plain - best.value >= GAIN and best.stands(root):
             return best, list(_said(best, root, inputs))
     signs = root.with_signs()
@@ -124,9 +124,9 @@ def _root(inputs: CheckInput) -> Explanation:
 
 def _said(best: Explanation, root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     """A doubt for every cause, in the order in which they are to be corrected."""
-    most = int(np.nanargmax(root.exact - best.exact))  # where they explain most
-    before, after = (100.0 * float(each.exact[most]) for each in (root, best))
-    then = f"; then {after:.2g} % of the torque of {inputs.names[most]} remain unexplained, instead of {before:.3g} %."
+    before, after = 100.0 * np.minimum(root.shares, 1.0), 100.0 * best.exact  # predicting nothing leaves all
+    most = int(np.argmax(before - after))  # where they explain most
+    then = f"; then {after[most]:.2g} % of the torque of {inputs.names[most]} remain, instead of {before[most]:.3g} %."
     for cause in best.causes:
         if cause.about != "delay":
             told = {"joints": inputs.named(cause.joints), "numbers": cause.numbers, "correction": cause.correction}

@@ -21,6 +21,7 @@ ROUNDING = 1e-12  # of the largest value of any joint
 HELD_STEPS = 0.5  # share of equal successive values from which on a signal moves in steps, such as a held command
 FROZEN_SECONDS = 0.1
 FROZEN_ROWS = 10
+AGREES = 0.6  # steps of the position from row to row, up to which a velocity agrees with it
 NEEDED = 0.1  # of the largest torque of the joints that have one: less is that of a wrong mass
 PASSIVE = 0.5  # of the inertial torque: a mechanism that swings by itself needs less
 MOVES = 0.2  # of its root mean square speed, above which a joint moves
@@ -191,9 +192,13 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
     moves = np.abs(speed) > MOVES * np.sqrt(np.square(speed).mean())
     if name != "u":
         others &= np.diff(log.u[:, joint]) != 0  # at rest q and v stand still together, while u is noisy or not
-    start = length = 0
+    start, length, agrees = 0, 0, np.zeros(len(held), dtype=bool)
+    if name == "v" and speed.any():  # where an encoder counts as many steps in each row, v is right to stand still
+        slope = float(values[1:] @ speed / (speed @ speed))  # whatever the unit of v is
+        agrees = np.abs(values[1:] - slope * speed) * step < AGREES * abs(slope) * resolution(log.q[:, joint])
     for begin, end in runs(held & follows).tolist():
-        if end - begin <= max(length, FROZEN_ROWS - 1) or (end - begin) * step < FROZEN_SECONDS:
+        rows = end - begin
+        if rows <= max(length, FROZEN_ROWS - 1) or rows * step < FROZEN_SECONDS or agrees[begin:end].all():
             continue
         gone = np.cumsum(speed[begin:end]) * step
         jump = abs(values[end + 1] - values[begin]) if end < len(held) else np.inf
@@ -260,11 +265,7 @@ def sampling_doubts(inputs: CheckInput) -> Iterator[Doubt]:
         what=f"{len(log)} rows in {each}, {seconds:.1f} s in all, {1.0 / median:.4g} Hz.",
         numbers={"sample_rate": 1.0 / median, "seconds": seconds, "episodes": count, "rows": len(log)},
     )
-    yield from _repeated(log, follows)
-
-
-def _repeated(log: Dataset, follows: np.ndarray) -> Iterator[Doubt]:
-    """Rows in which every position is that of the row before although velocities show that the robot moves."""
+    # rows in which every position is that of the row before although velocities show that the robot moves
     same = (np.diff(log.q, axis=0) == 0).all(axis=1) & follows
     speed = np.abs(log.v).max(axis=1)[1:]
     moves = speed > 0.1 * np.sqrt(np.square(speed).mean())
@@ -291,8 +292,10 @@ FACTORS: dict[float, tuple[str, str | None]] = {
     0.5 / np.pi: ("turns per second where q is in rad", "rev/s"),
 }
 """Ratios of v to dq/dt, what explains each, and the unit of v, where q is in rad but for that of degrees."""
+SLIDING = {0.001: FACTORS[0.001], 100.0: ("cm/s", "cm/s"), 1000.0: ("mm/s", "mm/s")}
 
 CLOSE = 0.05  # deviation from one of them, or from 1, that noise and filters explain
+SURE = 0.025  # the same for some joints alone: gears of 1:10 and 1:60 are that close to rpm and deg/s
 UNEXPLAINED = 0.3  # share of the power of v that dq/dt may leave unexplained, at the best factor and shift
 FEW = 0.05  # share below which a factor is meant seriously
 IDLE = 0.01  # of the largest of all joints, up to which what moves a joint may be noise
@@ -360,20 +363,29 @@ def _differences(
 ) -> Iterator[Doubt]:
     """One doubt for all joints in which v or a differs from the derivative in the same way."""
     step = float(np.median(np.diff(inputs.even.time)))
-    groups: dict[tuple[str, float], list[int]] = {}
+    groups: dict[tuple[str, float, str, str | None], list[int]] = {}
     for joint, (factor, shift, left) in fits.items():
         late = np.isfinite(shift) and abs(shift) > max(LEAST_SHIFT * step, 5e-4)
         sort = "sign" if factor < 0.0 else "factor" if abs(factor - 1.0) > CLOSE else "late" if late else ""
         kind = "other" if left > UNEXPLAINED else sort if left < FEW else ""
-        known = next((known for known in FACTORS if abs(factor / known - 1.0) < CLOSE), 0.0)
+        usual = FACTORS if inputs.rotates[joint] else SLIDING
+        known = next((x for x in usual if abs(factor / x - 1.0) < CLOSE and kind == "factor"), 0.0)
+        guess, unit = usual.get(known if name == "v" else 0.0, ("", None))
         if kind:
-            groups.setdefault((kind, known if kind == "factor" else 0.0), []).append(joint)
-    what = EVERY_QUANTITY[name]
-    for (kind, known), joints in groups.items():
+            groups.setdefault((kind, known, guess, unit), []).append(joint)
+    what, units = EVERY_QUANTITY[name], {x: inputs.stated_units(x) for x in "qv"}
+    for (_, known, _, unit), joints in groups.items():
+        if unit and (len(joints) == len(fits) or all(abs(fits[k][0] / known - 1.0) < SURE for k in joints)):
+            signal, word = ("q", "deg") if known == DEGREE else ("v", unit)
+            kin = {k for k in of if inputs.rotates[k] == inputs.rotates[joints[0]]}  # also those that stand still
+            alike, si = kin if kin & fits.keys() <= {*joints} else joints, inputs.unit_of_each(signal)
+            units[signal] = [word if k in alike and x == si[k] else x for k, x in enumerate(units[signal])]
+    other = {x: tuple(own) for x, own in units.items() if own != inputs.stated_units(x)}
+    for (kind, _, guess, unit), joints in groups.items():
         factor, shift, unexplained = fits[joints[0]]
         named, every = inputs.named(joints), len(joints) == len(of) > 2
         one = f"the {what} of {'all joints' if every else listed(named)} is"
-        guess, unit = FACTORS.get(known, ("", None)) if name == "v" else ("", None)
+        guess = unit if unit and inputs.stated_units("q")[joints[0]] != inputs.unit_of_each("q")[joints[0]] else guess
         level: Level = "wrong"
         if kind == "other":
             level = "look" if name == "a" else "wrong"
@@ -396,11 +408,8 @@ def _differences(
         correction: dict[str, Any] = {}
         if name == "v" and kind == "sign" and abs(factor + 1.0) < CLOSE:
             correction = {"sign": {"v": tuple(-1.0 if each in named else 1.0 for each in inputs.names)}}
-        elif level == "wrong" and unit is not None and len(joints) == len(fits):
-            signal, word = ("q", "deg") if known == DEGREE else ("v", unit)
-            alike = {k for k in of if inputs.rotates[k] == inputs.rotates[joints[0]]}  # also those that stand still
-            units = [word if k in alike else own for k, own in enumerate(inputs.unit_of_each(signal))]
-            correction = {"unit": {signal: tuple(units)}}
+        elif unit and other:
+            correction = {"unit": other}
         each = [
             {"quantity": name, "factor": f, "delay": s if np.isfinite(s) else None, "unexplained": left}
             for f, s, left in (fits[joint] for joint in joints)

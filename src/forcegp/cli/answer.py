@@ -53,8 +53,8 @@ def answer_lines(
     seen = seen_in(doubts)
     unsettled = FIRST & {*seen}
     held += "; settle what is said above first" if unsettled else ""
-    flags = ((each["command"].removeprefix("forcegp import "), each["about"]) for each in content["mistakes"])
-    mistakes = ", ".join(text.replace("--unit ", "").replace("--", "") or wrong for text, wrong in flags) or "nothing"
+    flags = dict.fromkeys(x["command"].removeprefix("forcegp import ") or x["about"] for x in content["mistakes"])
+    mistakes = ", ".join(x.replace("--unit ", "").replace("--", "") for x in flags) or "nothing"
     late, lag, rate = prepared["delay"], prepared["lag"], (len(dataset) - len(dataset.episodes)) / seconds
     early = "early: a controller that holds u is half a time step" if -late * rate < 1.0 else "early, or q and v late"
     why = prepared["why"].get("delay", "u is taken to be on time").partition(";")[0].rstrip(".")

@@ -25,7 +25,7 @@ from forcegp.atomic_files import atomic_file, atomic_folder, write_json
 from forcegp.cli.answer import FIRST, answer_lines, short_name, verdict
 from forcegp.cli.command import CONFIG, LOG, Command, options_of, unless_given
 from forcegp.cli.fit import write_estimates
-from forcegp.cli.logs import ColumnOptions, FilterOptions, prepared_rows, resolved
+from forcegp.cli.logs import ColumnOptions, FilterOptions, prepared_rows
 from forcegp.cli.payload import LAWS, payload_dict, payload_text, with_payload
 from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal, doubts_table, facts
@@ -193,7 +193,7 @@ class Auto(Command):
             if not found:
                 dataset, stops = forcegp.checks.without_stops(dataset)
                 return dataset, {**done, "stops": [each.to_dict() for each in stops]}, mapping, mistakes, robot
-            mistakes.append(found[0])
+            mistakes += [doubt for doubt in found if doubt.correction == found[0].correction]
             robot = replace(robot, gravity=found[0].correction.get("gravity", {}).get("base", robot.gravity))
             model = self.columns.model(robot)
             mapping = mapping.corrected_by(found[0].correction, dataset.joint_names, done["columns"])
@@ -217,7 +217,7 @@ class Auto(Command):
         if self.filter.cutoff == "auto" and elastic:
             slow = min(elastic[0].numbers["cutoff"], report.inputs.cutoff or math.inf)
             wanted = replace(wanted, cutoff=slow, why={"cutoff": "below the resonance of an elastic joint"})
-        numbers = resolved(terminal, replace(wanted, every=1, stance="log"), raw)
+        numbers = replace(wanted, every=1, stance="log").resolved(raw)
         period = 0.0 if numbers.cutoff is None else 1.0 / float(numbers.cutoff)  # in which a filter spoils the ends
         stance, every = "auto" if open_switches else "log", wanted.every
         numbers = replace(numbers, trim=max(self.filter.trim, period), stance=stance, every=every)

@@ -65,21 +65,12 @@ def prepared_rows(
     """Rows to learn from, with `thin` as many as the filter leaves, and the same at the full rate."""
     if preparation.changes_nothing and not preparation.why:  # what was looked for and not found is reported
         return raw, raw
-    preparation = resolved(terminal, preparation, raw)
+    preparation = preparation.resolved(raw)
+    for why in (each for each in preparation.why.values() if "taken to" in each):  # assumed without a look
+        terminal.note(why)
     every = preparation.thinning(raw) if thin else preparation.every
     rows = replace(preparation, every=every).apply(raw)
     return rows, rows if every == 1 else replace(preparation, every=1).apply(raw)
-
-
-def resolved(
-    terminal: Terminal, preparation: forcegp.data.Preparation, dataset: forcegp.Dataset
-) -> forcegp.data.Preparation:
-    """The same with numbers in place of "auto"; what is assumed without a look is reported on stderr."""
-    found = preparation.resolved(dataset)
-    for why in found.why.values():
-        if "taken to" in why:
-            terminal.note(why)
-    return found
 
 
 @dataclass(frozen=True, kw_only=True)

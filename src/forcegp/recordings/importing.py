@@ -191,6 +191,7 @@ def _what_was_done(
         "mapping": mapping.plain(),
         "guessed": list(plan.guessed),
         "columns": {name: [text for signal, text in columns if signal == name] for name in plan.logged},
+        "units": {name: [x.unit.name for x in plan.signals if x.signal == name] for name in plan.logged},
         "open_switches": list(plan.open_switches),
         "signals": {name: made[name] if lacking[name] == entries[name] else logged[name] for name in SIGNALS},
         "recordings": [recording.told for recording in recordings],

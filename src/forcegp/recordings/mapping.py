@@ -22,6 +22,7 @@ from forcegp.errors import InvalidInput, require_known, require_type, usable_arg
 from forcegp.recordings.source import Source
 
 UNIT_OF_A_NAME = re.compile(r"[\[(]([^\d\[(]+)[\])]$|_([A-Za-z]{2,})$")
+NUMBERED = re.compile(r"(?P<stem>(?P<word>.*?)[\[(_. ]*)(?P<number>\d{1,4})?[\])]?\s*$")
 COMMA = re.compile(r",(?![^{\[]*[}\]])(?=(?:[^`]*`[^`]*`)*[^`]*$)")
 EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body", "force": "foot=fx,fy,fz"}
 OF_IMU, OF_LINKS = "imu", "torque"  # before the frame of an IMU, and the joint of a torque, in `force`
@@ -93,6 +94,12 @@ def named_unit(quantity: str, column: str) -> str | None:
         return None if found is None else log_unit(quantity, found[1] or found[2]).name
     except InvalidInput:
         return None
+
+
+def in_short(quantity: str, units: Sequence[str]) -> tuple[str, ...]:
+    """Units of all columns, as a mapping states them: one of each kind where those of a kind share it."""
+    once = dict.fromkeys(name for name in units if name != "1")
+    return tuple(once) if len({log_unit(quantity, name).si for name in once}) == len(once) else tuple(units)
 
 
 SIGNALS = ("q", "v", "u", "a")
@@ -192,14 +199,15 @@ class ColumnMapping:
         places = [joints.index(name) for name in self.joints or joints]
 
         def in_order(values: Sequence[Any]) -> tuple[Any, ...]:
-            return (values[0],) if len(set(values)) == 1 else tuple(values[place] for place in places)
+            each = values if len(values) != len(places) else [values[place] for place in places]  # once for each kind
+            return tuple(each[:1] if len(set(each)) == 1 else each)
 
         sign = dict(self.sign)
         for signal, values in correction.get("sign", {}).items():
             now = sign.get(signal, (1.0,))
             now = now * len(places) if len(now) == 1 else now
             sign[signal] = tuple(old * float(values[place]) for old, place in zip(now, places, strict=True))
-        units = {name: in_order(values) for name, values in correction.get("unit", {}).items()}
+        units = {name: in_short(name, in_order(values)) for name, values in correction.get("unit", {}).items()}
         axes = {**self.axes, **correction.get("axes", {})}
         changes: dict[str, Any] = {"unit": {**self.unit, **units}, "sign": sign, "axes": axes}
         if "orientation" in correction:
@@ -318,6 +326,19 @@ def guessed_columns(signal: str, joints: Sequence[str], source: Source) -> tuple
     return fitting[0] if fitting else None if bare == tuple(joints) else guessed_columns(signal, bare, source)
 
 
+def counted_columns(signal: str, count: int, source: Source) -> tuple[str, ...] | None:
+    """`q1 ... q7`, `dq[0] ...` or `joint_torques[0] ...`, exactly `count`; None for none, and for several."""
+    found: dict[str, dict[int, str]] = {}
+    for column in source.columns():
+        name = NUMBERED.match(UNIT_OF_A_NAME.sub("", column) if named_unit(signal, column) else column)
+        word = name["word"].lower() if name else ""
+        if name and {word, word.removeprefix("joint_"), word.removeprefix("q")} & WORDS[signal]:
+            found.setdefault(name["stem"], {})[int(name["number"] or 0)] = column
+    wanted = [*range(count)], [*range(1, count + 1)]
+    fitting = [tuple(x[k] for k in sorted(x)) for x in found.values() if sorted(x) in wanted]
+    return fitting[0] if len(fitting) == 1 else None
+
+
 def guessed_time(source: Source, used: Sequence[str]) -> str | None:
     """The column that must be the time: by the format, or the only one of such a name. None if there is none."""
     by_format = source.time_beside(used)
@@ -339,12 +360,7 @@ def _says(signal: str, around: tuple[str, str]) -> bool:
 TOKEN = (
     r"`(?P<quoted>[^`]*)`|(?P<name>%s)|(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?(?!\w))|(?P<word>[^\s+*/`()-]+)"
 )
-OPERATIONS: dict[type[ast.operator], Any] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-}
+OPERATIONS: Any = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv}
 MOST_PARTS = 500
 
 

@@ -16,6 +16,7 @@ from forcegp.data.configurations import following
 from forcegp.data.dataset import BEYOND, LARGEST_MEASURED, SENSORS
 from forcegp.data.views import ends_of_range
 from forcegp.errors import DatasetError, FileFormatError, MistakenUnit
+from forcegp.recordings.mapping import in_short, log_unit
 from forcegp.recordings.ros_bag import Read, read_on_one_clock
 from forcegp.recordings.signal_plan import Layout, SignalPlan, spans
 from forcegp.recordings.source import MOST_LOST, Columns, Source
@@ -29,6 +30,8 @@ MARGIN = 0.1
 """Of its range: how far a position may be beyond the limits of the URDF. Stops give way, and zeros are set by hand."""
 
 TURNS = 4.0 * np.pi  # rad: positions of a joint beyond this whose unit is not stated as rad are taken for degrees
+MOVES = 0.1
+"""Of the range of joints in another unit: one within its limits that moves so far is right; one that rests fits any."""
 REPEATED = 0.05
 """Of the median step: a stamp that comes sooner after another is the same one again; nothing is sampled so unevenly."""
 
@@ -292,29 +295,34 @@ def _require_plausible_positions(
 ) -> None:
     """Refuse positions far beyond the limits of the URDF; without limits, those that look like degrees."""
     limits = {joint.name: (joint.lower, joint.upper) for joint in robot.joints}
-    for item, column in zip(plan.signals, values.T, strict=True):
-        if item.signal != "q":
-            continue
+    own = {x.joint: (x.unit.name, y) for x, y in zip(plan.signals, values.T, strict=True) if x.signal == "q"}
+    units, ranges, seen = dict[str, str](), {name: float(np.ptp(x)) for name, (_, x) in own.items()}, dict[str, str]()
+    for name, (unit, column) in own.items():
         low, high = float(column.min()), float(column.max())
-        lower, upper = limits.get(item.joint, (-np.inf, np.inf))
+        lower, upper = limits.get(name, (-np.inf, np.inf))
         margin = MARGIN * (upper - lower) if np.isfinite(upper - lower) else 0.0
         least, most = lower - margin, upper + margin
-        degrees = item.unit.name == "rad" and max(-low, high) > TURNS
-        other = (
-            "deg" if degrees else "mm" if item.unit.name == "m" and least <= 1e-3 * low and 1e-3 * high <= most else ""
-        )
-        used = {x.unit.si: x.unit.name for x in plan.signals if x.signal == "q" and x.unit.si != "1"}
-        units = ",".join((used | {item.unit.si: other}).values())
-        where = f"{label}: q of joint {item.joint!r} runs from {low:.4g} to {high:.4g} {item.unit.si}"
+        degrees = unit == "rad" and max(-low, high) > TURNS
+        where = f"{label}: q of joint {name!r} runs from {low:.4g} to {high:.4g} {log_unit('q', unit).si}"
+        units[name] = "deg" if degrees else "mm" if unit == "m" and least <= 1e-3 * low <= 1e-3 * high <= most else unit
         if low < least or high > most:
-            seen = f"{where}, beyond its limits {lower:.4g} to {upper:.4g} in the URDF."
-            if other:
-                hint = f"Is it in {other}? Then add `unit` q={units}. `beyond_limits` accepts it."
-                raise MistakenUnit(f"{seen} {hint}", "q", units)
-            raise DatasetError(f"{seen} Are unit, sign, zero and URDF right? `beyond_limits` accepts it.")
-        if degrees and item.joint not in believed and not np.isfinite(upper - lower):
-            hint = f"Give `unit` q={units} if it is in deg, `unit` q=rad if not."
-            raise MistakenUnit(f"{where}, more than two turns. {hint}", "q", units)
+            seen[name] = f"{where}, beyond its limits {lower:.4g} to {upper:.4g} in the URDF."
+        elif degrees and name not in believed and not np.isfinite(upper - lower):
+            seen[name] = f"{where}, more than two turns."
+        else:
+            units[name], ranges[name] = unit, ranges[name] if np.isfinite(upper - lower) else 0.0
+    for meant in {log_unit("q", units[name]) for name in seen if units[name] != own[name][0]}:
+        usual = np.median([ranges[name] for name in seen if units[name] == meant.name]) / meant.per_si
+        alike = [x for x in units if units[x] == meant.si and (x in seen or ranges[x] < MOVES * usual)]
+        units |= dict.fromkeys(alike, meant.name)
+    stated = ",".join(in_short("q", [units[name] for name in plan.positions]))
+    for name, what in seen.items():
+        if units[name] == own[name][0]:
+            raise DatasetError(f"{what} Are unit, sign, zero and URDF right? `beyond_limits` accepts it.")
+        hint = f"Is it in {units[name]}? Then add `unit` q={stated}. `beyond_limits` accepts it."
+        if what.endswith("two turns."):
+            hint = f"Give `unit` q={stated} if it is in deg, `unit` q=rad if not."
+        raise MistakenUnit(f"{what} {hint}", "q", stated)
 
 
 def _stretches(

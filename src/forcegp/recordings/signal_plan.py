@@ -23,9 +23,11 @@ from forcegp.recordings.mapping import (
     ColumnMapping,
     Expression,
     LogUnit,
+    counted_columns,
     expanded,
     guessed_columns,
     guessed_time,
+    in_short,
     log_unit,
     named_after,
     named_unit,
@@ -119,6 +121,7 @@ class SignalPlan:
     """Everything that is read from a table. `signals` stand signal by signal, each in the order of `joints`."""
 
     joints: tuple[str, ...]
+    positions: tuple[str, ...]  # in the order of the log
     signals: tuple[JointSignal, ...]
     layout: Layout
     orientation: str
@@ -158,7 +161,7 @@ def signal_plan(
     robot = model.robot
     joints = _joints(mapping, robot)
     log, order = columns_of(mapping, model, joints)
-    guessed: list[str] = []
+    guessed, by_number = list[str](), "q"
     found: dict[str, list[Expression]] = {}
     for signal in SIGNALS:
         patterns = getattr(mapping, signal)
@@ -173,8 +176,11 @@ def signal_plan(
                 patterns = tuple(found_by[name] for name in names) if len(found_by) == len(names) else None
             if patterns is None and signal == "u" and may_lack_switches and model.actuators:
                 patterns = guessed_columns(signal, names[: len(model.actuators)], source)
+            if patterns is None and signal in by_number and {*names} <= {*joints}:
+                patterns = counted_columns(signal, len(names), source)
+                by_number = "qvu" if patterns else by_number  # nothing beside columns with names of joints
             if patterns is not None:
-                guessed.append(f"{signal} = {', '.join(patterns)}")
+                guessed.append(f"{signal} = {' ... '.join(dict.fromkeys(patterns[:: max(len(patterns) - 1, 1)]))}")
                 found[signal] = [parse_expression(name, [name], str(source.path)) for name in patterns]
         elif patterns is not None:
             found[signal] = _expressions(patterns, joints, source, may_lack=signal in ("v", "a"))
@@ -215,7 +221,7 @@ def signal_plan(
     signals += tuple(item for frame in mapping.force for item in _sensor(mapping, frame, source, model))
     for name in found.keys() - mapping.unit.keys():
         if any(x.unit.per_si != 1.0 for x in signals if x.signal == name):
-            units = ",".join(x.unit.name for x in signals if x.signal == name)
+            units = ",".join(in_short(name, [x.unit.name for x in signals if x.signal == name]))
             guessed.append(f"unit {name}={units}, as the columns are called")
     lacking = {name: [x.expression is LACKING for x in signals if x.signal == name != "u"] for name in found}
     episode = mapping.episode or (EPISODE if EPISODE in source.columns() else None)
@@ -227,6 +233,7 @@ def signal_plan(
     [time_unit, *_] = mapping.unit.get("time", (usual,))
     return SignalPlan(
         joints=tuple(order["v"]),
+        positions=tuple(log["q"]),
         signals=signals,
         layout=layout_of(mapping, model, lacking, len(order["v"])),
         orientation=mapping.orientation or ORIENTATIONS[0],
