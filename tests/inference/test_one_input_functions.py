@@ -11,7 +11,7 @@ from tests.inference.problems import normal, rows_of_call
 from forcegp.codegen.library import NOT_FINITE
 from forcegp.forces.kernels import kernel_of
 from forcegp.inference import ExactPosterior, LatentKernels, Terms
-from forcegp.inference.one_input import OneInputCall, drawn_form, one_input_form, value_and_slope
+from forcegp.inference.one_input import OneInputCall, one_input_form, value_and_slope
 from forcegp.inference.pathwise import draw_functions
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import kernel_sums
@@ -102,9 +102,11 @@ def test_what_has_no_form():
     """Several inputs, and what is smooth."""
     several = Latents(LatentKernels([kernel_of("matern-3/2", 2, 1.0)]), (normal(5, 2),), (normal(5),))
     assert one_input_form(several, 0) is None
-    assert drawn_form(draw_functions(posterior("matern-3/2", 2), 2, seed=0), several, 0) is None
+    assert one_input_form(several, 0, functions=draw_functions(posterior("matern-3/2", 2), 2, seed=0)) is None
     assert one_input_form(latents("squared-exponential", normal(5)), 0) is None
-    assert drawn_form(draw_functions(posterior("matern-5/2"), 2, seed=0), posterior("matern-5/2"), 0) is None
+    assert (
+        one_input_form(posterior("matern-5/2"), 0, functions=draw_functions(posterior("matern-5/2"), 2, seed=0)) is None
+    )
 
 
 def posterior(expression: str, dimension: int = 1) -> ExactPosterior:
@@ -120,7 +122,7 @@ def test_drawn_functions_of_rough_kernels_are_exact(expression):
     """The cosines of a Matern 1/2 have any frequency, and no table could hold them."""
     latent = posterior(expression)
     drawn = draw_functions(latent, 3, seed=5, widening=1.5)
-    form = drawn_form(drawn, latent, 0)
+    form = one_input_form(latent, 0, functions=drawn)
     s = torch.cat([latent.features[0][:, 0], torch.linspace(-90, 90, 2001, dtype=torch.float64)])
     close(form.values(s), drawn([s[:, None].expand(3, -1, -1)])[..., 0].mT, 1e-11)
     nothing = torch.zeros(12, 3, dtype=torch.float64)

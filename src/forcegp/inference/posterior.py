@@ -172,7 +172,7 @@ def with_rows(latent: ExactPosterior, terms: Terms) -> ExactPosterior:
         for c, (kernel, z, at) in enumerate(zip(latent.kernels.dense, features, latent.features, strict=True)):
             cross += added.through(c, old.through(c, kernel.cross(z, at).mT).mT)
         factor = appended(factor, cross, deflated_covariance(added.C, latent.kernels(features)))
-        joined = Deflation(*(torch.cat([getattr(part, name) for part in (old, added)]) for name in _PARTS))
+        joined = Deflation(*map(torch.cat, zip(old, added, strict=True)))
         joint = tuple(torch.cat([z, new.detach()]) for z, new in zip(latent.features, features, strict=True))
         return ExactPosterior(latent.kernels, joint, _solved(joined, factor))
 
@@ -180,7 +180,7 @@ def with_rows(latent: ExactPosterior, terms: Terms) -> ExactPosterior:
 def with_only(latent: ExactPosterior, rows: Int[Tensor, " kept"]) -> ExactPosterior:
     """The posterior of some rows, in the order given, factorised anew. Raises NumericalError where it cannot be."""
     with torch.no_grad():
-        deflation = Deflation(*(getattr(latent.system.deflation, name)[rows] for name in _PARTS))
+        deflation = Deflation(*(part[rows] for part in latent.system.deflation))
         features = tuple(z[rows] for z in latent.features)
         factor = factorize(lambda: deflated_covariance(deflation.C, latent.kernels(features)))
         return ExactPosterior(latent.kernels, features, _solved(deflation, factor))
@@ -200,9 +200,6 @@ def appended(factor: CholeskyFactor, cross: Float[Tensor, "m n"], own: Float[Ten
     corner = factorize(own.clone)
     lower[size:, size:] = corner.lower
     return CholeskyFactor(lower, max(factor.jitter, corner.jitter))
-
-
-_PARTS = ("U", "C", "t", "remainder")
 
 
 def _solved(deflation: Deflation, factor: CholeskyFactor) -> DeflatedSystem:
