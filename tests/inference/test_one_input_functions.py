@@ -143,7 +143,7 @@ def test_the_c_code_computes_the_same(expression, lanes, tmp_path):
     function = rows_of_call(OneInputCall.in_pieces(kernel_sums(given)[0], form), lanes, tmp_path)
     s = torch.cat([torch.linspace(-1.2, 1.2, 170) * float(form.knots.abs().max()), form.knots[:16], torch.zeros(5)])
     outputs = [torch.empty(len(s), size, dtype=torch.float64) for size in function.outputs]
-    assert function.rows(len(s), [s.double()[:, None]], outputs) == 0
+    assert function.rows([s.double()[:, None]], outputs) == 0
     for found, expected in zip(outputs, value_and_slope(form.values, s.double()), strict=False):
         close(found, expected, 1e-13)
     assert function.single(torch.tensor([math.nan]).double())[0] & NOT_FINITE

@@ -89,9 +89,8 @@ def factorize(build: Callable[[], Float[Tensor, "n n"]]) -> CholeskyFactor:
         if ok:
             if jitter:
                 warnings.warn(
-                    f"added {jitter:.2e} ({relative:.0e} of the mean diagonal) to make a {matrix.shape[0]} x "
-                    f"{matrix.shape[0]} covariance "
-                    "positive definite; larger noise or fewer duplicate points avoid this",
+                    f"added {jitter:.2e} ({relative:.0e} of the mean diagonal) to make a {len(matrix)} x {len(matrix)} "
+                    "covariance positive definite; larger noise or fewer duplicate points avoid this",
                     NumericalWarning,
                     stacklevel=2,
                 )
