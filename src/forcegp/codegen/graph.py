@@ -20,11 +20,7 @@ ZERO, ONE = 0, 1
 """Numbers of the nodes that hold these constants."""
 
 NAMED = ("sin", "cos", "tan", "sqrt", "tanh", "asinh", "exp", "log", "log1p", "expm1")
-UNARY: dict[str, Callable[[float], float]] = {
-    "negate": operator.neg,
-    "absolute": abs,
-    **{name: getattr(math, name) for name in NAMED},
-}
+UNARY: dict[str, Any] = {"negate": operator.neg, "absolute": abs, **{name: getattr(math, name) for name in NAMED}}
 ARITHMETIC = {"add": operator.add, "subtract": operator.sub, "multiply": operator.mul, "divide": operator.truediv}
 COMPARED = {"less": operator.lt, "at_most": operator.le, "equal": operator.eq}
 BINARY: dict[str, Callable[[float, float], float]] = {**ARITHMETIC, "power": math.pow, "atan2": math.atan2, **COMPARED}

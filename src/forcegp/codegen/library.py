@@ -237,14 +237,9 @@ def are_plain(given: Sequence[object], size: int) -> bool:
     if len(shape) not in (1, 2) or shape[-1:] != (size,):
         return False
     for x in given:  # not a generator: every prediction of one state passes here
-        if (
-            type(x) is not Tensor
-            or x.shape != shape
-            or x.dtype is not torch.float64
-            or x.requires_grad
-            or not x.is_cpu
-            or not x.is_contiguous()
-        ):
+        if type(x) is not Tensor or x.shape != shape or x.dtype is not torch.float64:
+            return False
+        if x.requires_grad or not x.is_cpu or not x.is_contiguous():
             return False
     return True
 

@@ -383,9 +383,7 @@ def _added_product(graph: Graph, bias: Any, x: Any, y: Any, beta: Any = 1.0, alp
 
 HANDLERS: dict[str, Callable[..., Any]] = {
     "full_like": lambda graph, x, value: _Numbers(torch.full_like(x.nodes, graph.constant(value))),
-    "constant_pad_nd": lambda graph, x, pad, value=0.0: _Numbers(
-        torch.constant_pad_nd(x.nodes, pad, graph.constant(value))
-    ),
+    "constant_pad_nd": lambda graph, x, pad, y=0.0: _Numbers(torch.constant_pad_nd(x.nodes, pad, graph.constant(y))),
     # the decomposition that torch has of it takes a second to import what it needs
     "addcmul": lambda graph, x, y, z, value=1.0: _binary("add")(graph, x, _binary("multiply")(graph, y, z), value),
     **{name: _binary(NAMES[name]) for name in ("add", "sub", "mul", "div")},

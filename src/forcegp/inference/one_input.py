@@ -203,16 +203,11 @@ def one_input_form(
         polynomials += [np.concatenate([outside, left]), np.concatenate([right, outside])]
         starts += [torch.cat([y[:1], y]), torch.cat([y, y[-1:]])]
         sides, rates = [*sides, side, side], [*rates, rate, -rate]
-    return OneInputFunctions(
-        knots,
-        torch.stack(starts, dim=-1) if starts else knots.new_zeros(len(knots) + 1, 0),
-        torch.as_tensor(np.concatenate(polynomials, axis=-1), device=knots.device),
-        knots.new_tensor([rate for _, rate in curves] + rates),
-        torch.stack(list(constants.values()), dim=-1),
-        tuple(kind for kind, _ in curves),
-        tuple(constants),
-        tuple(sides),
-    )
+    start = torch.stack(starts, dim=-1) if starts else knots.new_zeros(len(knots) + 1, 0)
+    pieces = torch.as_tensor(np.concatenate(polynomials, axis=-1), device=knots.device)
+    levels, every = torch.stack(list(constants.values()), dim=-1), knots.new_tensor([x for _, x in curves] + rates)
+    kinds = tuple(kind for kind, _ in curves)
+    return OneInputFunctions(knots, start, pieces, every, levels, kinds, tuple(constants), tuple(sides))
 
 
 def _news(drawn: DrawnTerm) -> Float[Tensor, "S P"]:

@@ -27,7 +27,6 @@ PADDING = 8
 BLOCK = 64
 """Centres whose kernels are held at once."""
 
-
 Formulas = tuple[Callable[[Tensor, Tensor], Tensor], Callable[[Tensor], Tensor], tuple[float, ...]]
 """(z (1, d), z_j (1, d)) -> the kernels of all latents at that pair, less a level each; z -> k(z, z); the levels."""
 

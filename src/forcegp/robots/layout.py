@@ -20,6 +20,8 @@ from forcegp.robots.urdf import MOVABLE, Joint, RobotDescription, free_joint
 BaseChoice = Literal["fixed", "floating"]
 """How the root link is held: in the world, or not at all."""
 
+Loops = Sequence[tuple[str, str, str]]
+"""Names of equalities that hold two links together, and these."""
 WORLDS = ("world", "map", "odom", "ground", "universe")
 WORD = r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+"
 """Words of a name: FL foot, upper Leg, front left wheel."""
@@ -108,8 +110,7 @@ def followed(
     return held, drives
 
 
-@dataclass(frozen=True)
-class Placement:
+class Placement(NamedTuple):
     """Pose ``offset`` (4, 4) of a link in the frame of the ``body`` that carries it (``WORLD``: fixed in the world)."""
 
     body: int
@@ -243,7 +244,7 @@ def lay_out(
     )
 
 
-def check_tree(layout: Layout, loops: Sequence[tuple[str, str, str]], problems: Problems) -> None:
+def check_tree(layout: Layout, loops: Loops, problems: Problems) -> None:
     """Report links that an equality of the file holds together (its name, the links) although joints move them."""
 
     def moving(link: str) -> list[int]:
@@ -254,14 +255,13 @@ def check_tree(layout: Layout, loops: Sequence[tuple[str, str, str]], problems: 
 
     for name, *links in loops:
         if between := sorted(set(moving(links[0])) ^ set(moving(links[1]))):
-            problems.errors.append(
-                RobotModelError(
-                    f"{problems.source}: {name} closes a loop, from link {links[0]!r} to {links[1]!r}",
-                    "; a robot is a tree here, which would move in another way. Lock the joints between these links "
-                    f"({', '.join(layout.bodies[body].name for body in between)}) by `locked`, or take the "
-                    "equality out of the file where nothing holds them together.",
-                )
+            advice = (
+                "; a robot is a tree here, which would move in another way. Lock the joints between these links "
+                f"({', '.join(layout.bodies[body].name for body in between)}) by `locked`, or take the "
+                "equality out of the file where nothing holds them together."
             )
+            seen = f"{problems.source}: {name} closes a loop, from link {links[0]!r} to {links[1]!r}"
+            problems.errors.append(RobotModelError(seen, advice))
 
 
 def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]]:

@@ -185,7 +185,6 @@ class RobotStructure(Summary):
     tree: Tree
     urdf_text: str
     _locked: tuple[tuple[str, float], ...]
-    _frames: dict[str, tuple[int, Tensor]]
     base: BaseChoice = "fixed"
     """How the root link is held."""
 
@@ -307,9 +306,9 @@ class RobotStructure(Summary):
 
     def frame(self, name: str) -> tuple[int, Float[Tensor, "4 4"]]:
         """Body (``WORLD`` = -1) that carries a frame, and the frame's pose in that body's frame."""
-        require_known("frame", name, self.name, self._frames, UnknownName)
-        body, offset = self._frames[name]
-        return body, offset.clone()
+        require_known("frame", name, self.name, self.layout.links, UnknownName)
+        body, offset = self.layout.links[name]
+        return body, torch.tensor(offset, device=self.device)
 
     def checked_input(self, name: str, value: object) -> Tensor:
         """In float64; :class:`~forcegp.errors.InvalidInput` unless it is (..., nv), or a possible q, on its device."""

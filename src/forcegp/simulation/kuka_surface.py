@@ -189,7 +189,6 @@ def multiplier_with_friction(
 STEPS_PER_REPORT = 240
 DIVERGED = 100.0  # rad/s
 
-
 Motion = dict[str, np.ndarray]
 """The recorded rows of one episode: q, v, u, a and time, true forces (joint_torques, tool_torques, tool_force,
 multiplier), and in_contact."""

@@ -161,7 +161,6 @@ def joint_acceleration(config: KukaSurfaceConfig, state: ArmState, reference: Ai
 RATE = 240
 """Rows per second."""
 
-
 Columns = Mapping[str, np.ndarray]
 
 
