@@ -47,15 +47,9 @@ def read_apart(
     settings = dict.fromkeys(ones, "1") | {"PYTHONPATH": path, "PYTHONWARNINGS": "ignore", "MUJOCO_GL": "disable"}
     asked = {"reader": reader, "seconds": SECONDS, "memory": MEMORY, "largest": LARGEST} | request
     try:
-        process = subprocess.run(
-            [sys.executable, "-P", "-m", __name__],
-            input=json.dumps(asked).encode(),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=os.environ | settings,
-            timeout=2 * asked["seconds"],
-            check=False,
-        )
+        how: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "timeout": 2 * asked["seconds"]}
+        command, given = [sys.executable, "-P", "-m", __name__], json.dumps(asked).encode()
+        process = subprocess.run(command, input=given, env=os.environ | settings, check=False, **how)
         return json.loads(process.stdout)
     except (subprocess.TimeoutExpired, ValueError):
         limits = f"{asked['seconds']} s or {asked['memory'] >> 20} MiB"

@@ -46,7 +46,7 @@ def compiled(tmp_path, lanes):
 
 def rows_of(function: RowFunction, *inputs: torch.Tensor) -> list[torch.Tensor]:
     outputs = [torch.empty(len(inputs[0]), size, dtype=torch.float64) for size in function.outputs]
-    assert function.rows(len(inputs[0]), inputs, outputs) == 0
+    assert function.rows(inputs, outputs) == 0
     return outputs
 
 
@@ -109,7 +109,7 @@ def test_functions_far_from_where_they_are_easy(compiled):
     x = x.double()[:, None]
     function = compiled(Program(graph, {"x": 1}, {"y": outputs}))
     values = torch.empty(len(x), len(names), dtype=torch.float64)
-    function.rows(len(x), [x], [values])
+    function.rows([x], [values])
     theirs = torch.cat([getattr(torch, {"absolute": "abs"}.get(name, name))(x) for name in names], dim=1)
     torch.testing.assert_close(values, theirs, rtol=4e-15, atol=1e-307, equal_nan=True)
 
@@ -228,7 +228,7 @@ def test_outputs_of_a_call_stand_where_it_does():
     made = Graph(1)
     copied = Copier(made, graph, dict(zip(graph.inputs, made.inputs, strict=True)))([*outputs, first])
     for of, nodes in ((graph, [*outputs, first]), (made, copied)):
-        text = write_function("part", of, [of.sum(nodes)], 1, ["f"], statements=3)
+        text = write_function("part", of, [of.sum(nodes)], 1, ["f"], most=3)
         parts = [part for part in text.split("static APART void part_") if "c4[" in part]
         assert len(parts) == 1
         assert "real c4[12]" in parts[0]

@@ -16,7 +16,7 @@ from forcegp.inference import ExactPosterior, OptimizerOptions, best_of, engines
 from forcegp.inference.engines import ProblemSize, choose_engine
 from forcegp.inference.inducing import InducingPosterior
 from forcegp.inference.likelihood import factorize
-from forcegp.inference.one_input import drawn_form, one_input_form
+from forcegp.inference.one_input import one_input_form
 from forcegp.inference.pathwise import draw_functions
 from forcegp.inference.prepared_kernels import compress, kernel_sums
 
@@ -30,7 +30,9 @@ def test_drawn_functions_and_forms_of_one_input():
         drawn = draw_functions(latent, 3, seed=1, widening=1.3, frequencies=8)
         given = latents(expression, normal(9, seed=3))
         sums = kernel_sums(given)[0]
-        forms = [form for form in (drawn_form(drawn, latent, 0), one_input_form(given, 0)) if form is not None]
+        forms = [
+            form for form in (one_input_form(latent, 0, functions=drawn), one_input_form(given, 0)) if form is not None
+        ]
         values = drawn([s.expand(3, 25)[..., None], torch.stack([s, s.flip(0)], -1).expand(3, 25, 2)])
         parts = [[form.table(), form.rates, [*form.curves], [*form.sides], form.values(s)] for form in forms]
         written = [len(form.c_source("f")) for form in forms] + [len(sums.c_source(n, n == 8)) for n in (1, 8)]

@@ -11,7 +11,7 @@ from tests.inference.problems import normal, rows_of_call
 from forcegp.codegen.library import NOT_FINITE
 from forcegp.forces.kernels import kernel_of
 from forcegp.inference import ExactPosterior, LatentKernels, Terms
-from forcegp.inference.one_input import OneInputCall, drawn_form, one_input_form, value_and_slope
+from forcegp.inference.one_input import OneInputCall, one_input_form, value_and_slope
 from forcegp.inference.pathwise import draw_functions
 from forcegp.inference.posterior import LatentPosterior
 from forcegp.inference.prepared_kernels import kernel_sums
@@ -102,9 +102,11 @@ def test_what_has_no_form():
     """Several inputs, and what is smooth."""
     several = Latents(LatentKernels([kernel_of("matern-3/2", 2, 1.0)]), (normal(5, 2),), (normal(5),))
     assert one_input_form(several, 0) is None
-    assert drawn_form(draw_functions(posterior("matern-3/2", 2), 2, seed=0), several, 0) is None
+    assert one_input_form(several, 0, functions=draw_functions(posterior("matern-3/2", 2), 2, seed=0)) is None
     assert one_input_form(latents("squared-exponential", normal(5)), 0) is None
-    assert drawn_form(draw_functions(posterior("matern-5/2"), 2, seed=0), posterior("matern-5/2"), 0) is None
+    assert (
+        one_input_form(posterior("matern-5/2"), 0, functions=draw_functions(posterior("matern-5/2"), 2, seed=0)) is None
+    )
 
 
 def posterior(expression: str, dimension: int = 1) -> ExactPosterior:
@@ -120,7 +122,7 @@ def test_drawn_functions_of_rough_kernels_are_exact(expression):
     """The cosines of a Matern 1/2 have any frequency, and no table could hold them."""
     latent = posterior(expression)
     drawn = draw_functions(latent, 3, seed=5, widening=1.5)
-    form = drawn_form(drawn, latent, 0)
+    form = one_input_form(latent, 0, functions=drawn)
     s = torch.cat([latent.features[0][:, 0], torch.linspace(-90, 90, 2001, dtype=torch.float64)])
     close(form.values(s), drawn([s[:, None].expand(3, -1, -1)])[..., 0].mT, 1e-11)
     nothing = torch.zeros(12, 3, dtype=torch.float64)
@@ -141,7 +143,7 @@ def test_the_c_code_computes_the_same(expression, lanes, tmp_path):
     function = rows_of_call(OneInputCall.in_pieces(kernel_sums(given)[0], form), lanes, tmp_path)
     s = torch.cat([torch.linspace(-1.2, 1.2, 170) * float(form.knots.abs().max()), form.knots[:16], torch.zeros(5)])
     outputs = [torch.empty(len(s), size, dtype=torch.float64) for size in function.outputs]
-    assert function.rows(len(s), [s.double()[:, None]], outputs) == 0
+    assert function.rows([s.double()[:, None]], outputs) == 0
     for found, expected in zip(outputs, value_and_slope(form.values, s.double()), strict=False):
         close(found, expected, 1e-13)
     assert function.single(torch.tensor([math.nan]).double())[0] & NOT_FINITE

@@ -65,7 +65,7 @@ def test_other_widths_of_vector_registers_and_parts(robot, tmp_path, lanes, stat
     inputs, outputs = list(random(3, 13, 3)), [torch.full((13, 3), torch.nan, dtype=torch.float64)]
     source = write_program(trace_dynamics(robot, "forward_dynamics"), lanes, statements)
     library = compile_library(source, ("-std=gnu11", "-O1", "-fPIC", "-shared"), tmp_path / "one.so", "evaluate")
-    assert RowFunction(library, 3, [3]).rows(13, inputs, outputs) == 0
+    assert RowFunction(library, 3, [3]).rows(inputs, outputs) == 0
     torch.testing.assert_close(outputs[0], robot.forward_dynamics(*inputs))
 
 

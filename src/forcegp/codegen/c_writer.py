@@ -72,19 +72,18 @@ class Program:
 
 
 def write_function(
-    name: str,
-    graph: Graph,
-    outputs: Sequence[int],
-    lanes: int,
-    tables: Sequence[str] = (),
-    statements: int = STATEMENTS,
+    name: str, graph: Graph, outputs: Sequence[int], lanes: int, tables: Sequence[str] = (), most: int = STATEMENTS
 ) -> str:
     """`static void NAME(const double *const *t, long live, const real *x, real *y)`: y from x in `live` lanes.
 
-    `t` are the tables of the C functions that the graph calls, in the order of their names in `tables`.
+    `t` are the tables of the C functions that the graph calls, in the order of their names in `tables`. A function
+    that it is cut into has at `most` so many statements.
     """
-    order = _order(graph, outputs)
-    parts = [order[k : k + statements] for k in range(0, len(order), statements)] or [[]]
+    wanted, made = set(outputs), graph.nodes
+    needed = [node for node in graph.needed(outputs) if node in wanted or made[node][0] not in LEAVES]
+    # outputs of a call follow it at once, for its array is not kept
+    order = sorted(needed, key=lambda node: (made[node][1], node) if made[node][0] == "output" else (node, -1))
+    parts = [order[k : k + most] for k in range(0, len(order), most)] or [[]]
     places, waiting = _places(graph, parts)
     stores: dict[int, list[int]] = {}
     for position, node in enumerate(outputs):
@@ -225,13 +224,6 @@ def _number(value: float) -> str:
     if value == value and abs(value) != float("inf"):
         return value.hex()
     return "0.0 / 0.0" if value != value else f"{math.copysign(1.0, value)} / 0.0"
-
-
-def _order(graph: Graph, outputs: Sequence[int]) -> list[int]:
-    """Nodes in the order of their statements: outputs of a call follow it at once, for its array is not kept."""
-    wanted, nodes = set(outputs), graph.nodes
-    needed = [node for node in graph.needed(outputs) if node in wanted or nodes[node][0] not in LEAVES]
-    return sorted(needed, key=lambda node: (nodes[node][1], node) if nodes[node][0] == "output" else (node, -1))
 
 
 def _places(graph: Graph, parts: list[list[int]]) -> tuple[dict[int, tuple[int, int]], int]:

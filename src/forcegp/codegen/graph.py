@@ -20,11 +20,7 @@ ZERO, ONE = 0, 1
 """Numbers of the nodes that hold these constants."""
 
 NAMED = ("sin", "cos", "tan", "sqrt", "tanh", "asinh", "exp", "log", "log1p", "expm1")
-UNARY: dict[str, Callable[[float], float]] = {
-    "negate": operator.neg,
-    "absolute": abs,
-    **{name: getattr(math, name) for name in NAMED},
-}
+UNARY: dict[str, Any] = {"negate": operator.neg, "absolute": abs, **{name: getattr(math, name) for name in NAMED}}
 ARITHMETIC = {"add": operator.add, "subtract": operator.sub, "multiply": operator.mul, "divide": operator.truediv}
 COMPARED = {"less": operator.lt, "at_most": operator.le, "equal": operator.eq}
 BINARY: dict[str, Callable[[float, float], float]] = {**ARITHMETIC, "power": math.pow, "atan2": math.atan2, **COMPARED}
@@ -65,19 +61,16 @@ class Graph:
 
     def call(self, name: str, operands: Sequence[int], outputs: int, slopes: Slopes | None = None) -> list[int]:
         """The outputs of a C function; `slopes` names those beyond them that are derivatives."""
-        call = self._record(("call", name, *operands))
-        self.outputs_of[call] = max([outputs, *(1 + k for k in (slopes or {}).values())])
-        if slopes is not None:
-            self.slopes[call] = slopes
+        call = self.called(name, operands, max([outputs, *(1 + k for k in (slopes or {}).values())]), slopes)
         return [self.output(call, k) for k in range(outputs)]
 
-    def call_of(self, other: "Graph", call: int, operands: Sequence[int]) -> int:
-        """The same call as in another graph."""
-        made = self._record(("call", other.nodes[call][1], *operands))
-        self.outputs_of[made] = other.outputs_of[call]
-        if call in other.slopes:
-            self.slopes[made] = other.slopes[call]
-        return made
+    def called(self, name: str, operands: Sequence[int], outputs: int, slopes: Slopes | None) -> int:
+        """The node of a call, which gives so many numbers."""
+        call = self._record(("call", name, *operands))
+        self.outputs_of[call] = outputs
+        if slopes is not None:
+            self.slopes[call] = slopes
+        return call
 
     def output(self, call: int, position: int) -> int:
         """One output of a call."""
@@ -182,7 +175,8 @@ class Copier:
             elif operation == "look up":
                 known[node] = graph.look_up(rest[0], known[rest[1]])
             elif operation == "call":
-                known[node] = graph.call_of(self.other, node, [known[operand] for operand in rest[1:]])
+                operands, outputs = [known[operand] for operand in rest[1:]], self.other.outputs_of[node]
+                known[node] = graph.called(rest[0], operands, outputs, self.other.slopes.get(node))
             elif operation == "output":
                 known[node] = graph.output(known[rest[0]], rest[1])
             else:
@@ -254,7 +248,11 @@ def partials(graph: Graph, node: int) -> list[tuple[int, Callable[[], int]]]:
     if operation in FLAT:
         return []
     if operation == "output":
-        return _slopes_of_call(graph, node)
+        _, call, position = graph.nodes[node]
+        if (found := graph.slopes.get(call)) is None:
+            raise InvalidInput(f"{graph.nodes[call][1]} gives no derivatives; make the program with slopes.")
+        each = ((operand, found.get((position, k))) for k, operand in enumerate(graph.operands(call)))
+        return [(operand, partial(graph.output, call, slope)) for operand, slope in each if slope is not None]
     apply, constant, x = graph.apply, graph.constant, operands[0]
 
     def square(y: int) -> int:
@@ -297,11 +295,3 @@ def partials(graph: Graph, node: int) -> list[tuple[int, Callable[[], int]]]:
             _, y, z = operands
             return [(y, lambda: apply("choose", x, ONE, ZERO)), (z, lambda: apply("choose", x, ZERO, ONE))]
     raise AssertionError(operation)
-
-
-def _slopes_of_call(graph: Graph, node: int) -> list[tuple[int, Callable[[], int]]]:
-    _, call, position = graph.nodes[node]
-    if (found := graph.slopes.get(call)) is None:
-        raise InvalidInput(f"{graph.nodes[call][1]} gives no derivatives; make the program with slopes.")
-    operands = ((operand, found.get((position, k))) for k, operand in enumerate(graph.operands(call)))
-    return [(operand, partial(graph.output, call, slope)) for operand, slope in operands if slope is not None]

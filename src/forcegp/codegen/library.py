@@ -182,6 +182,9 @@ def own_file(path: Path, *, parent: bool = False) -> None:
         )
 
 
+Tensors = Sequence[Tensor]
+
+
 class RowFunction:
     """`evaluate` of a library, on flat `tables`: rows of numbers of length `outputs` from rows of so many `inputs`."""
 
@@ -201,17 +204,13 @@ class RowFunction:
         return self._evaluate(0, 1, self._tables, *given), made
 
     def rows(
-        self,
-        count: int,
-        inputs: Sequence[Tensor],
-        outputs: Sequence[Tensor],
-        threads: int | None = None,
-        least: int = STATES_PER_THREAD,
+        self, inputs: Tensors, outputs: Tensors, threads: int | None = None, least: int = STATES_PER_THREAD
     ) -> int:
         """Fill contiguous `outputs` (count, size); what is to be reported. An input (1, size) serves all states.
 
         Batches of `least` states for each take as many threads as torch has, or `threads`.
         """
+        count = len(outputs[0])
         parts = max(1, min(torch.get_num_threads() if threads is None else threads, count // least))
         steps = ((each, each.shape[1] if len(each) == count else 0) for each in (*inputs, *outputs))
         given = [x for each, step in steps for x in (each.data_ptr(), step)]
@@ -238,14 +237,9 @@ def are_plain(given: Sequence[object], size: int) -> bool:
     if len(shape) not in (1, 2) or shape[-1:] != (size,):
         return False
     for x in given:  # not a generator: every prediction of one state passes here
-        if (
-            type(x) is not Tensor
-            or x.shape != shape
-            or x.dtype is not torch.float64
-            or x.requires_grad
-            or not x.is_cpu
-            or not x.is_contiguous()
-        ):
+        if type(x) is not Tensor or x.shape != shape or x.dtype is not torch.float64:
+            return False
+        if x.requires_grad or not x.is_cpu or not x.is_contiguous():
             return False
     return True
 

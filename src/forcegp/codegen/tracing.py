@@ -39,14 +39,12 @@ INDEXED = ("index", "index_select", "gather")
 OUTWARDS = (Tensor.numpy, Tensor.tolist, Tensor.__array__)
 BRANCH = "a branch on the values of a tensor, or numbers taken out of it"
 
+Tensors = Sequence[Tensor]
 NAMES = {"neg": "negate", "abs": "absolute", "add": "add", "sub": "subtract", "mul": "multiply", "div": "divide"}
 
 
 def trace(
-    function: Callable[..., Sequence[Tensor]],
-    examples: Sequence[Tensor],
-    graph: Graph | None = None,
-    inputs: Sequence[int] = (),
+    function: Callable[..., Tensors], examples: Tensors, graph: Graph | None = None, inputs: Sequence[int] = ()
 ) -> tuple[Graph, list[Tensor]]:
     """The graph of function(*examples) -> tensors, and the nodes of its outputs in their shapes.
 
@@ -379,15 +377,13 @@ def _product(graph: Graph, x: Any, y: Any) -> _Numbers:
 
 def _added_product(graph: Graph, bias: Any, x: Any, y: Any, beta: Any = 1.0, alpha: Any = 1.0) -> _Numbers:
     """addmm and baddbmm."""
-    product = _binary("multiply")(graph, _product(graph, x, y), float(alpha))
-    return _binary("add")(graph, product, _binary("multiply")(graph, bias, float(beta)))
+    times = _binary("multiply")
+    return _binary("add")(graph, times(graph, _product(graph, x, y), float(alpha)), times(graph, bias, float(beta)))
 
 
 HANDLERS: dict[str, Callable[..., Any]] = {
     "full_like": lambda graph, x, value: _Numbers(torch.full_like(x.nodes, graph.constant(value))),
-    "constant_pad_nd": lambda graph, x, pad, value=0.0: _Numbers(
-        torch.constant_pad_nd(x.nodes, pad, graph.constant(value))
-    ),
+    "constant_pad_nd": lambda graph, x, pad, y=0.0: _Numbers(torch.constant_pad_nd(x.nodes, pad, graph.constant(y))),
     # the decomposition that torch has of it takes a second to import what it needs
     "addcmul": lambda graph, x, y, z, value=1.0: _binary("add")(graph, x, _binary("multiply")(graph, y, z), value),
     **{name: _binary(NAMES[name]) for name in ("add", "sub", "mul", "div")},

@@ -24,6 +24,9 @@ from forcegp.robots.arguments import finite_vector, real_array
 Motion = tuple[Any, Any, Any]
 """q, v and u (T, nv) of one recording; u[k] acts from row k to row k + 1."""
 
+Residuals = tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor]
+"""As of `_torques`, filtered (T - 1 - settle, nv); velocities in the middle of all steps; and M a, filtered."""
+
 BLOCK = 2.0
 """Seconds of free motion of which the largest distance counts once: what follows upon it resembles it."""
 LEAST_BLOCKS = 20
@@ -137,7 +140,7 @@ class ContactMonitor:
         self.noise = NoiseLevels(self.noise.acceleration, force)
         self.near_rest = at_rest, np.take(SLOW, which) * speed
         self.usual = torch.from_numpy(np.sqrt(np.mean(np.stack(slow)[which, :, range(self.robot.nv)] ** 2, axis=1)))
-        distances = [self._distances(*each) for each in found]
+        distances = [self._distances(each) for each in found]
         largest = torch.cat([d[: len(d) // block * block].view(-1, block).amax(1) for d in distances])
         self._maxima = gumbel_r.fit(largest.sqrt().numpy())
         self.threshold = float(gumbel_r.isf(rate * BLOCK / 3600.0, *self._maxima)) ** 2
@@ -160,7 +163,7 @@ class ContactMonitor:
     def run(self, q: Any, v: Any, u: Any) -> ContactState:
         """The same of a whole recording (T, nv); nothing is known at its first row."""
         found, pad = self._residuals(q, v, u), torch.nn.functional.pad
-        return self._state(pad(found[0], (0, 0, 1, 0)), pad(self._distances(*found), (1, 0)))
+        return self._state(pad(found[0], (0, 0, 1, 0)), pad(self._distances(found), (1, 0)))
 
     def place(self, q: Any, torque: Any) -> ContactPlace:
         """The contact at q (nv,) that explains an external torque (nv,) by a force without a moment.
@@ -234,17 +237,12 @@ class ContactMonitor:
         """exp(-|v| / fade) (T, nv), filtered as torques are."""
         return self._low_passed(np.exp(-np.abs(v.numpy()) / fade))
 
-    def _distances(
-        self, tau: Tensor, M: Tensor, extra: Tensor | None, v: Tensor, inertial: Tensor
-    ) -> Float[Tensor, " rows"]:
-        """Of what `_residuals` returns."""
+    def _distances(self, found: Residuals) -> Float[Tensor, " rows"]:
+        tau, M, extra, v, inertial = found
         slow = torch.from_numpy(self._near_rest(v, self.near_rest[1]))[len(v) - len(tau) :]
         return self._distance(tau, self._covariance(M, extra, slow, inertial))
 
-    def _residuals(
-        self, q: Any, v: Any, u: Any, settle: int = 0
-    ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor]:
-        """As `_torques`, filtered (T - 1 - settle, nv); velocities in the middle of all steps; and M a, filtered."""
+    def _residuals(self, q: Any, v: Any, u: Any, settle: int = 0) -> Residuals:
         q, v, u = self._motion(q, v, u)
         if q.dim() != 2 or len(q) < 2:
             raise InvalidInput(

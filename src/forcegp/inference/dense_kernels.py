@@ -12,16 +12,8 @@ from operator import add, mul
 from typing import Any, NamedTuple, cast
 
 import torch
-from gpytorch.kernels import (
-    AdditiveKernel,
-    ConstantKernel,
-    Kernel,
-    LinearKernel,
-    MaternKernel,
-    ProductKernel,
-    RBFKernel,
-    ScaleKernel,
-)
+from gpytorch import kernels as gp
+from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
 from torch.func import functional_call
@@ -34,24 +26,24 @@ PointMap = Callable[[Tensor], Tensor]
 
 def embedding(kernel: Kernel) -> tuple[PointMap, float] | None:
     """e(z) and nu of k(|e(z) - e(z')|), inf for the squared exponential; None where k is not known to be so."""
-    if type(kernel) in (RBFKernel, MaternKernel):
-        return partial(scaled, kernel), float(kernel.nu if isinstance(kernel, MaternKernel) else math.inf)
+    if type(kernel) in (gp.RBFKernel, gp.MaternKernel):
+        return partial(scaled, kernel), float(kernel.nu if isinstance(kernel, gp.MaternKernel) else math.inf)
     matern = getattr(kernel, "matern_embedding", None)
     return None if matern is None else (matern, float(cast(float, kernel.nu)))
 
 
 def weight_features(kernel: Kernel) -> PointMap | None:
     """phi(z) with k = phi(z) . phi(z'), one entry per weight; None for kernels that are not known to be so."""
-    if type(kernel) is LinearKernel:
+    if type(kernel) is gp.LinearKernel:
         return lambda z: z * kernel.variance.reshape(-1).sqrt()
-    if type(kernel) is ConstantKernel:
+    if type(kernel) is gp.ConstantKernel:
         return lambda z: kernel.constant.sqrt().reshape(1, 1).expand(len(z), 1)
     return getattr(kernel, "weight_features", None)
 
 
 def squared_exponential_parameters(kernel: Kernel) -> tuple[Tensor, Tensor] | None:
     """Length scales and output scale of a plain scaled squared exponential; None for every other kernel."""
-    if type(kernel) is not ScaleKernel or type(kernel.base_kernel) is not RBFKernel:
+    if type(kernel) is not gp.ScaleKernel or type(kernel.base_kernel) is not gp.RBFKernel:
         return None
     base = kernel.base_kernel
     if kernel.active_dims is not None or base.active_dims is not None or kernel.batch_shape or base.batch_shape:
@@ -108,14 +100,14 @@ def taken_apart(kernel: Kernel) -> DenseKernel:
     """The kernel as sums, products and leaves whose formulas are evaluated here; any other kernel is called."""
     kind, found, phi = type(kernel), None, None
     if not kernel.batch_shape and kernel.active_dims is None:
-        if kind in (AdditiveKernel, ProductKernel):  # subclasses may have other formulas
-            parts = [taken_apart(cast(Kernel, part)) for part in cast(AdditiveKernel, kernel).kernels]
-            combine: Callable[[Tensor, Tensor], Tensor] = add if kind is AdditiveKernel else mul
+        if kind in (gp.AdditiveKernel, gp.ProductKernel):  # subclasses may have other formulas
+            parts = [taken_apart(cast(Kernel, part)) for part in cast(gp.AdditiveKernel, kernel).kernels]
+            combine: Callable[[Tensor, Tensor], Tensor] = add if kind is gp.AdditiveKernel else mul
             return DenseKernel(
                 lambda z, other: reduce(combine, [part.cross(z, other) for part in parts]),
                 lambda z: reduce(combine, [part.diagonal(z) for part in parts]),
             )
-        if isinstance(kernel, ScaleKernel) and kind is ScaleKernel:
+        if isinstance(kernel, gp.ScaleKernel) and kind is gp.ScaleKernel:
             base = taken_apart(kernel.base_kernel)
 
             def scaled_by(value: Tensor) -> Tensor:

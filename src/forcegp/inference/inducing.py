@@ -5,7 +5,7 @@ Weights w with k_c ~ phi_c . phi_c', phi_c(z) = L_c^-1 k_c(p_c, z), of precision
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import accumulate, pairwise
 
@@ -51,60 +51,60 @@ def pivoted_cholesky(
         return torch.tensor(indices, dtype=torch.long, device=z.device)
 
 
-@dataclass(frozen=True, eq=False)
-class WeightSpace:
-    """The weights of all latents, conditioned on deflated data; the weights of the latents follow each other.
+CANDIDATES = 20_000
+"""Rows among which inducing points are sought, spread evenly over all."""
 
-    `points` p_c, `lowers` L_c, `precision` the factor of B, `mean` of the weights; `left_out`: the mean over rows of
-    the sum over latents of |C_ic|^2 (k_c(z_i, z_i) - |phi_c(z_i)|^2).
+
+@dataclass(frozen=True, eq=False)
+class InducingPosterior(LatentPosterior):
+    """The variational posterior of the weights of all latents, which follow each other.
+
+    `features` are the inducing points p_c, `lowers` L_c, `factor` that of the precision B, `mean_weights` (P,) of the
+    weights; `left_out`: the mean over rows of the sum over latents of |C_ic|^2 (k_c(z_i, z_i) - |phi_c(z_i)|^2), what
+    the points leave out of the prior variance of a row in units of its noise.
     """
 
     kernels: LatentKernels
-    points: tuple[Float[Tensor, "_ _"], ...]
+    features: tuple[Float[Tensor, "_ _"], ...]
     lowers: tuple[Float[Tensor, "_ _"], ...]
-    precision: CholeskyFactor
-    mean: Float[Tensor, " P"]
+    factor: CholeskyFactor
+    mean_weights: Float[Tensor, " P"]
     left_out: float
 
     @classmethod
-    def of(
-        cls,
-        kernels: LatentKernels,
-        features: Sequence[Float[Tensor, "N _"]],
-        points: Sequence[Float[Tensor, "_ _"]],
-        C: Float[Tensor, "N r C"],
-        t: Float[Tensor, "N r"],
-    ) -> "WeightSpace":
-        """Condition on all rows; time O(N P^2). Raises NumericalError where the points cannot be factorised."""
-        points = tuple(z.detach() for z in points)
-        own = zip(kernels.dense, points, strict=True)
-        lowers = tuple(factorize(partial(kernel.cross, z, z)).lower.tril() for kernel, z in own)
-        prior = cls(kernels, points, lowers, CholeskyFactor(C.new_zeros(0, 0)), C.new_zeros(0), 0.0)
-        slices = prior.slices
-        pairs = (C[..., :, None] * C[..., None, :]).sum(1)  # C_i^T C_i
-        target = (C * t[..., None]).sum(1)  # C_i^T t_i
-        relevance = C.square().sum(1)
-        B, right = torch.eye(prior.count, dtype=C.dtype, device=C.device), C.new_zeros(prior.count)
-        left_out = C.new_zeros(())
-        height = max(1, BLOCK_BYTES // (8 * max(1, prior.count)))
-        for start in range(0, len(C), height):
-            rows = slice(start, start + height)
-            block = [z[rows] for z in features]
-            phi = prior.columns(block)
-            for c, left in enumerate(phi):
-                remainder = kernels.dense[c].diagonal(block[c]) - left.square().sum(0)
-                left_out += relevance[rows, c] @ remainder.clamp_min(0.0)
-                right[slices[c]] += left @ target[rows, c]
-                for d, other in enumerate(phi[: c + 1]):
-                    B[slices[c], slices[d]] += (left * pairs[rows, c, d]) @ other.mT
-        precision = factorize(B.clone)
-        mean = precision.solve(right[:, None])[:, 0] if prior.count else right
-        return cls(kernels, points, lowers, precision, mean, float(left_out) / max(1, len(C)))
+    def condition(cls, kernels: LatentKernels, terms: Terms, *, points: int, tolerance: float) -> "InducingPosterior":
+        """On all rows, by at most `points` points per latent; fewer where its share of `tolerance` suffices.
 
-    @property
-    def count(self) -> int:
-        """The number of weights, P."""
-        return sum(len(lower) for lower in self.lowers)
+        Time O(N P^2). Raises NumericalError where the points cannot be factorised.
+        """
+        with torch.no_grad():
+            deflation, features = terms.deflated(), terms.features
+            C, count = deflation.C, len(deflation.C)
+            relevance, target = C.square().sum(1), (C * deflation.t[..., None]).sum(1)  # of C_i^T t_i
+            some = torch.linspace(0, count - 1, min(count, CANDIDATES), dtype=torch.float64).round().long().to(C.device)
+            share, centers, lowers = tolerance / max(1, C.shape[-1]) * len(some), [], []
+            for kernel, z, own in zip(kernels.dense, features, relevance[some].mT, strict=True):
+                centers.append(at := z[some[pivoted_cholesky(kernel, z[some], own, points, share)]].detach())
+                lowers.append(factorize(partial(kernel.cross, at, at)).lower.tril())
+            size = sum(map(len, lowers))
+            B, right = torch.eye(size, dtype=C.dtype, device=C.device), C.new_zeros(size)
+            bare = cls(kernels, tuple(centers), tuple(lowers), CholeskyFactor(B), right, 0.0)
+            pairs = (C[..., :, None] * C[..., None, :]).sum(1)  # C_i^T C_i
+            left_out, slices = C.new_zeros(()), bare.slices
+            height = max(1, BLOCK_BYTES // (8 * max(1, size)))
+            for start in range(0, count, height):
+                rows = slice(start, start + height)
+                block = [z[rows] for z in features]
+                phi = bare.columns(block)
+                for c, left in enumerate(phi):
+                    remainder = kernels.dense[c].diagonal(block[c]) - left.square().sum(0)
+                    left_out += relevance[rows, c] @ remainder.clamp_min(0.0)
+                    right[slices[c]] += left @ target[rows, c]
+                    for d, other in enumerate(phi[: c + 1]):
+                        B[slices[c], slices[d]] += (left * pairs[rows, c, d]) @ other.mT
+            factor = factorize(B.clone)
+            mean = factor.solve(right[:, None])[:, 0] if size else right
+            return replace(bare, factor=factor, mean_weights=mean, left_out=float(left_out) / max(1, count))
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
@@ -114,7 +114,7 @@ class WeightSpace:
 
     def columns(self, features: Sequence[Float[Tensor, "n _"]]) -> list[Float[Tensor, "_ n"]]:
         """phi_c at points, one column each."""
-        crosses = (k.cross(p, z) for k, p, z in zip(self.kernels.dense, self.points, features, strict=True))
+        crosses = (k.cross(p, z) for k, p, z in zip(self.kernels.dense, self.features, features, strict=True))
         return [torch.linalg.solve_triangular(L, K, upper=False) for L, K in zip(self.lowers, crosses, strict=True)]
 
     def center_weights(self, weights: Float[Tensor, "P S"]) -> list[Float[Tensor, "_ S"]]:
@@ -122,58 +122,21 @@ class WeightSpace:
         own = zip(self.lowers, self.slices, strict=True)
         return [torch.linalg.solve_triangular(lower.mT, weights[part], upper=True) for lower, part in own]
 
-
-CANDIDATES = 20_000
-"""Rows among which inducing points are sought."""
-
-
-@dataclass(frozen=True, eq=False)
-class InducingPosterior(LatentPosterior):
-    """The variational posterior; `features` are the inducing points."""
-
-    kernels: LatentKernels
-    space: WeightSpace
-
-    @classmethod
-    def condition(cls, kernels: LatentKernels, terms: Terms, *, points: int, tolerance: float) -> "InducingPosterior":
-        """On at most `points` points per latent; fewer where its share of `tolerance` suffices (`left_out`)."""
-        with torch.no_grad():
-            deflation, features = terms.deflated(), terms.features
-            pivots = inducing_pivots(kernels, features, deflation.C, points, tolerance)
-            places = [z[found] for z, found in zip(features, pivots, strict=True)]
-            return cls(kernels, WeightSpace.of(kernels, features, places, deflation.C, deflation.t))
-
-    @property
-    def left_out(self) -> float:
-        """What the points leave out of the prior variance of a row, in units of its noise, on average."""
-        return self.space.left_out
-
-    @property
-    @override
-    def features(self) -> tuple[Float[Tensor, "_ _"], ...]:  # type: ignore[override]  # a field there, read only
-        return self.space.points
-
     @cached_property
     @override
     def weights(self) -> tuple[Float[Tensor, " _"], ...]:  # type: ignore[override]  # a property there, read only
-        return tuple(w[:, 0] for w in self.space.center_weights(self.space.mean[:, None]))
+        return tuple(w[:, 0] for w in self.center_weights(self.mean_weights[:, None]))
 
     @override
-    def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
-        # what the weights leave out of k_c, and Phi_z B^-1 Phi_z^T
-        latents, count = len(self.features), len(features[0])
-        height = max(1, BLOCK_BYTES // max(1, 8 * self.space.count * latents))
-        blocks = [self._covariance_block([z[i : i + height] for z in features]) for i in range(0, count, height)]
-        return torch.cat(blocks) if blocks else features[0].new_zeros(0, latents, latents)
-
     def _covariance_block(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
-        space, count, latents = self.space, len(features[0]), len(self.features)
-        wide = features[0].new_zeros(space.count, latents, count)
+        # what the weights leave out of k_c, and Phi_z B^-1 Phi_z^T
+        count, latents = len(features[0]), len(self.features)
+        wide = features[0].new_zeros(len(self.mean_weights), latents, count)
         remainders = []
-        for c, (part, phi) in enumerate(zip(space.slices, space.columns(features), strict=True)):
+        for c, (part, phi) in enumerate(zip(self.slices, self.columns(features), strict=True)):
             wide[part, c] = phi
             remainders.append((self.kernels.dense[c].diagonal(features[c]) - phi.square().sum(0)).clamp_min(0.0))
-        V = space.precision.solve_lower(wide.flatten(1)).unflatten(1, (latents, count)).permute(2, 1, 0)
+        V = self.factor.solve_lower(wide.flatten(1)).unflatten(1, (latents, count)).permute(2, 1, 0)
         return torch.diag_embed(torch.stack(remainders, dim=-1)) + V @ V.mT
 
     @override
@@ -182,28 +145,9 @@ class InducingPosterior(LatentPosterior):
     ) -> tuple[Float[Tensor, "S _"], ...]:
         # the values at the points are drawn from their posterior, L_c w_c with w ~ N(mean, B^-1), and what the prior
         # functions have there is taken off
-        size = len(self.space.mean), len(prior[0])
-        draws = torch.randn(size, generator=generator, dtype=torch.float64, device=self.space.mean.device)
-        drawn = self.space.mean[:, None] + self.space.precision.solve_upper(draws)
-        own = zip(self.space.lowers, prior, strict=True)
+        size = len(self.mean_weights), len(prior[0])
+        draws = torch.randn(size, generator=generator, dtype=torch.float64, device=self.mean_weights.device)
+        drawn = self.mean_weights[:, None] + self.factor.solve_upper(draws)
+        own = zip(self.lowers, prior, strict=True)
         whitened = [torch.linalg.solve_triangular(lower, values.mT, upper=False) for lower, values in own]
-        return tuple(w.mT for w in self.space.center_weights(drawn - torch.cat(whitened)))
-
-
-def inducing_pivots(
-    kernels: LatentKernels,
-    features: Sequence[Float[Tensor, "N _"]],
-    C: Float[Tensor, "N r C"],
-    points: int,
-    tolerance: float = 0.0,
-) -> list[Int[Tensor, " m"]]:
-    """Numbers of the rows that are inducing points of each latent, among `CANDIDATES` rows spread evenly over all.
-
-    At most `points`; fewer where every latent leaves out less than its share of `tolerance`.
-    """
-    count = len(C)
-    candidates = torch.linspace(0, count - 1, min(count, CANDIDATES), dtype=torch.float64).round().long().to(C.device)
-    relevance = C.square().sum(1)[candidates]
-    share = tolerance / max(1, C.shape[-1]) * len(candidates)
-    each = zip(kernels.dense, features, relevance.mT, strict=True)
-    return [candidates[pivoted_cholesky(kernel, z[candidates], own, points, share)] for kernel, z, own in each]
+        return tuple(w.mT for w in self.center_weights(drawn - torch.cat(whitened)))

@@ -89,9 +89,8 @@ def factorize(build: Callable[[], Float[Tensor, "n n"]]) -> CholeskyFactor:
         if ok:
             if jitter:
                 warnings.warn(
-                    f"added {jitter:.2e} ({relative:.0e} of the mean diagonal) to make a {matrix.shape[0]} x "
-                    f"{matrix.shape[0]} covariance "
-                    "positive definite; larger noise or fewer duplicate points avoid this",
+                    f"added {jitter:.2e} ({relative:.0e} of the mean diagonal) to make a {len(matrix)} x {len(matrix)} "
+                    "covariance positive definite; larger noise or fewer duplicate points avoid this",
                     NumericalWarning,
                     stacklevel=2,
                 )
@@ -120,8 +119,7 @@ RANK_TOLERANCE = 1e-12
 """Singular values of W~_i below this fraction of the largest count as zero: rounding in H A^T = 0."""
 
 
-@dataclass(frozen=True, eq=False)
-class Deflation:
+class Deflation(NamedTuple):
     """W~_i = U_i C_i, t_i = U_i^T y~_i and the remainder y~_i - U_i t_i, for N points."""
 
     U: Float[Tensor, "N D r"]
@@ -310,16 +308,12 @@ class _DeflatedNLL(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, upstream: Tensor):  # type: ignore[override]  # the base takes *args
-        return scaled_gradients("the deflated likelihood", upstream, ctx.gradients)
-
-
-def scaled_gradients(what: str, upstream: Tensor, gradients: Sequence[Tensor | None]) -> tuple[Tensor | None, ...]:
-    """What `backward` returns of gradients that `forward` computed. Raises NotImplementedError for second ones."""
-    if torch.is_grad_enabled():  # create_graph=True: the gradients would pass for constants
-        raise NotImplementedError(
-            f"{what} has first derivatives only; for a Hessian take finite differences of its gradient"
-        )
-    return tuple(None if g is None else upstream * g for g in gradients)
+        if torch.is_grad_enabled():  # create_graph=True: the gradients would pass for constants
+            raise NotImplementedError(
+                "the deflated likelihood has first derivatives only; for a Hessian take finite differences of its "
+                "gradient"
+            )
+        return tuple(None if g is None else upstream * g for g in ctx.gradients)
 
 
 def _contractions(system: DeflatedSystem, K_needed: Sequence[bool]) -> tuple[Tensor, list[Tensor | None]]:

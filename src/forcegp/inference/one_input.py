@@ -11,7 +11,6 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
-from gpytorch.kernels import Kernel
 from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
@@ -143,42 +142,26 @@ FAR = 1e30  # there tanh(s / w) is 1, and s times the derivative of asinh(s / w)
 
 
 def one_input_form(
-    latent: LatentPosterior, index: int, coefficients: Float[Tensor, "N R"] | None = None
+    latent: LatentPosterior,
+    index: int,
+    coefficients: Float[Tensor, "N R"] | None = None,
+    functions: FunctionSamples | None = None,
 ) -> OneInputFunctions | None:
-    """sum_j k(z, z_j) c_jr of one latent; without coefficients, its posterior mean. None for kernels without a form."""
-    centers = latent.features[index].detach()
-    if centers.shape[-1] != 1:
-        return None
-    weights = latent.weights[index].detach()[:, None] if coefficients is None else coefficients.detach()
-    return markov_functions(latent.kernels[index], centers[:, 0], weights)
+    """sum_j k(s, s_j) c_jr of one latent, exactly; without coefficients its posterior mean, or S drawn `functions`.
 
-
-def drawn_form(drawn: FunctionSamples, latent: LatentPosterior, index: int) -> OneInputFunctions | None:
-    """S drawn functions of one latent; None as in `one_input_form`, and for functions that have cosines."""
-    centers = latent.features[index].detach()
-    if centers.shape[-1] != 1:
-        return None
-    terms = drawn.terms[index]
-    if any(term.frequencies for term in terms):
-        return None
-    return markov_functions(latent.kernels[index], centers[:, 0], drawn.beta[index].mT, terms, drawn.widening)
-
-
-def markov_functions(
-    kernel: Kernel,
-    centers: Float[Tensor, " N"],
-    coefficients: Float[Tensor, "N R"],
-    drawn: Sequence[DrawnTerm] = (),
-    widening: float = 1.0,
-) -> OneInputFunctions | None:
-    """sum_j k(s, s_j) c_jr exactly; None where the kernel is not made of `CURVES` and Materns of them.
-
-    Where `drawn` has functions of its terms, without cosines, `widening` times these are added.
+    None where the kernel is not made of `CURVES` and Materns of them, and for functions that have cosines.
     """
+    centers = latent.features[index].detach()
+    drawn, widening = (functions.terms[index], functions.widening) if functions else ((), 1.0)
+    if centers.shape[-1] != 1 or any(term.frequencies for term in drawn):
+        return None
+    if coefficients is None:
+        coefficients = functions.beta[index].mT if functions else latent.weights[index][:, None]
     try:
-        terms = kernel_terms(kernel)
+        terms = kernel_terms(latent.kernels[index])
     except InvalidInput:
         return None
+    coefficients, centers = coefficients.detach(), centers[:, 0]
     grids = [_places(each, centers) for each in drawn]
     coefficients = torch.cat([coefficients, coefficients.new_zeros(sum(map(len, grids)), coefficients.shape[1])])
     first, centers = len(centers), torch.cat([centers, *grids])
@@ -220,16 +203,11 @@ def markov_functions(
         polynomials += [np.concatenate([outside, left]), np.concatenate([right, outside])]
         starts += [torch.cat([y[:1], y]), torch.cat([y, y[-1:]])]
         sides, rates = [*sides, side, side], [*rates, rate, -rate]
-    return OneInputFunctions(
-        knots,
-        torch.stack(starts, dim=-1) if starts else knots.new_zeros(len(knots) + 1, 0),
-        torch.as_tensor(np.concatenate(polynomials, axis=-1), device=knots.device),
-        knots.new_tensor([rate for _, rate in curves] + rates),
-        torch.stack(list(constants.values()), dim=-1),
-        tuple(kind for kind, _ in curves),
-        tuple(constants),
-        tuple(sides),
-    )
+    start = torch.stack(starts, dim=-1) if starts else knots.new_zeros(len(knots) + 1, 0)
+    pieces = torch.as_tensor(np.concatenate(polynomials, axis=-1), device=knots.device)
+    levels, every = torch.stack(list(constants.values()), dim=-1), knots.new_tensor([x for _, x in curves] + rates)
+    kinds = tuple(kind for kind, _ in curves)
+    return OneInputFunctions(knots, start, pieces, every, levels, kinds, tuple(constants), tuple(sides))
 
 
 def _news(drawn: DrawnTerm) -> Float[Tensor, "S P"]:
@@ -359,7 +337,7 @@ def drawn_calls(
 ) -> list[tuple[KernelSum, ...]] | None:
     """The functions that `draw_functions` draws, in the forms that `calls` have; None where one has no such form."""
     drawn = draw_functions(latent, samples, seed, widening)
-    forms = [(part, drawn_form(drawn, latent, part.latents[0])) for part in calls]
+    forms = [(part, one_input_form(latent, part.latents[0], functions=drawn)) for part in calls]
     known = [(part, form) for part, form in forms if form is not None]
     if len(known) < len(forms):
         return None

@@ -181,15 +181,9 @@ def minimize_objective(
             break  # a line search that fails at once, with an empty memory, has nothing left to try
     if search.failures:
         status += f" ({search.failures} of {search.evaluations} evaluations failed, the last because {search.cause})"
-    return OptimizationResult(
-        parameters=search.unflatten(search.best_point),
-        value=float(search.best_value),
-        history=tuple(history),
-        status=status,
-        converged=converged,
-        evaluations=search.evaluations,
-        cpu_seconds=time.process_time() - start_time,
-    )
+    found, spent = search.unflatten(search.best_point), time.process_time() - start_time
+    value = float(search.best_value)
+    return OptimizationResult(found, value, tuple(history), status, converged, search.evaluations, spent)
 
 
 def _sentence(status: int, message: str, options: OptimizerOptions) -> str:

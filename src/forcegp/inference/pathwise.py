@@ -154,7 +154,6 @@ class DrawnTerm:
 FREQUENCIES = 256
 """Random frequencies of one drawn function, each with a cosine and a sine."""
 
-
 BLOCK_BYTES = 16 * 2**20
 """Working memory of the cosines of functions at the training points."""
 

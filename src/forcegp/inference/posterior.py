@@ -33,6 +33,8 @@ class LatentPosterior(ABC):
 
     kernels: LatentKernels
     features: tuple[Float[Tensor, "_ _"], ...]
+    factor: CholeskyFactor
+    """What covariances are solved with."""
     remedy: ClassVar[str] = "fit with engine='exact' (and fewer points, where memory does not suffice)"
     """What to do where the factorised covariance of all rows is needed."""
 
@@ -42,8 +44,8 @@ class LatentPosterior(ABC):
         """The weight w_cj of every centre of each latent."""
 
     @abstractmethod
-    def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
-        """Cov(f_c, f_d) at the same point, for n points."""
+    def _covariance_block(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
+        """`covariance` of points that fit into memory."""
 
     @abstractmethod
     def function_weights(
@@ -53,6 +55,13 @@ class LatentPosterior(ABC):
 
         f_s,c(z) = prior function + sum_j k_c(z, z_j) w_s,cj (Matheron's rule; Wilson et al. 2020, eq. 10).
         """
+
+    def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
+        """Cov(f_c, f_d) at the same point, for n points."""
+        latents, points = len(self.features), len(features[0])
+        height = max(1, BLOCK_BYTES // max(1, 8 * latents * len(self.factor.lower)))
+        blocks = [self._covariance_block([z[i : i + height] for z in features]) for i in range(0, points, height)]
+        return torch.cat(blocks) if blocks else features[0].new_zeros(0, latents, latents)
 
     def mean(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C"]:
         """E f_c = sum_j k_c(z, z_j) w_cj (Rasmussen & Williams 2006, eq. 2.25); differentiable in the features."""
@@ -98,6 +107,11 @@ class ExactPosterior(LatentPosterior):
 
     @property
     @override
+    def factor(self) -> CholeskyFactor:  # type: ignore[override]  # a field there, read only
+        return self.system.factor
+
+    @property
+    @override
     def weights(self) -> tuple[Float[Tensor, " N"], ...]:
         return self.system.beta.unbind(-1)
 
@@ -108,23 +122,17 @@ class ExactPosterior(LatentPosterior):
     def joint_covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "Cn Cn"]:
         """Cov(f_c(z_i), f_d(z_j)) at all of n points, by latent. Rasmussen & Williams 2006, eq. 2.26."""
         C = torch.cat([self.data_covariance(index, z) for index, z in enumerate(features)], dim=-1)
-        V = self.system.factor.solve_lower(C)
+        V = self.factor.solve_lower(C)
         prior = torch.block_diag(*[kernel.matrix(z) for kernel, z in zip(self.kernels.dense, features, strict=True)])
         return prior - V.mT @ V
 
     @override
-    def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
+    def _covariance_block(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
         # k_c(z, z) delta_cd - V_c^T V_d with V_c = L^-1 Cov(data, f_c(z)) (Rasmussen & Williams 2006, eq. 2.26)
-        latents, points = len(self.features), len(features[0])
-        height = max(1, BLOCK_BYTES // max(1, 8 * latents * len(self.system.factor.lower)))
-        blocks = []
-        for start in range(0, points, height):
-            block = [z[start : start + height] for z in features]
-            C = torch.cat([self.data_covariance(index, z) for index, z in enumerate(block)], dim=1)
-            V = self.system.factor.solve_lower(C).unflatten(1, (latents, -1)).permute(2, 1, 0)
-            prior = torch.stack([k.diagonal(z) for k, z in zip(self.kernels.dense, block, strict=True)], dim=-1)
-            blocks.append(torch.diag_embed(prior) - V @ V.mT)
-        return torch.cat(blocks) if blocks else features[0].new_zeros(0, latents, latents)
+        C = torch.cat([self.data_covariance(index, z) for index, z in enumerate(features)], dim=1)
+        V = self.factor.solve_lower(C).unflatten(1, (len(features), -1)).permute(2, 1, 0)
+        prior = torch.stack([k.diagonal(z) for k, z in zip(self.kernels.dense, features, strict=True)], dim=-1)
+        return torch.diag_embed(prior) - V @ V.mT
 
     @override
     def function_weights(
@@ -164,7 +172,7 @@ def with_rows(latent: ExactPosterior, terms: Terms) -> ExactPosterior:
         for c, (kernel, z, at) in enumerate(zip(latent.kernels.dense, features, latent.features, strict=True)):
             cross += added.through(c, old.through(c, kernel.cross(z, at).mT).mT)
         factor = appended(factor, cross, deflated_covariance(added.C, latent.kernels(features)))
-        joined = Deflation(*(torch.cat([getattr(part, name) for part in (old, added)]) for name in _PARTS))
+        joined = Deflation(*map(torch.cat, zip(old, added, strict=True)))
         joint = tuple(torch.cat([z, new.detach()]) for z, new in zip(latent.features, features, strict=True))
         return ExactPosterior(latent.kernels, joint, _solved(joined, factor))
 
@@ -172,7 +180,7 @@ def with_rows(latent: ExactPosterior, terms: Terms) -> ExactPosterior:
 def with_only(latent: ExactPosterior, rows: Int[Tensor, " kept"]) -> ExactPosterior:
     """The posterior of some rows, in the order given, factorised anew. Raises NumericalError where it cannot be."""
     with torch.no_grad():
-        deflation = Deflation(*(getattr(latent.system.deflation, name)[rows] for name in _PARTS))
+        deflation = Deflation(*(part[rows] for part in latent.system.deflation))
         features = tuple(z[rows] for z in latent.features)
         factor = factorize(lambda: deflated_covariance(deflation.C, latent.kernels(features)))
         return ExactPosterior(latent.kernels, features, _solved(deflation, factor))
@@ -192,9 +200,6 @@ def appended(factor: CholeskyFactor, cross: Float[Tensor, "m n"], own: Float[Ten
     corner = factorize(own.clone)
     lower[size:, size:] = corner.lower
     return CholeskyFactor(lower, max(factor.jitter, corner.jitter))
-
-
-_PARTS = ("U", "C", "t", "remainder")
 
 
 def _solved(deflation: Deflation, factor: CholeskyFactor) -> DeflatedSystem:

@@ -27,21 +27,20 @@ PADDING = 8
 BLOCK = 64
 """Centres whose kernels are held at once."""
 
-
-PairFunction = Callable[[Tensor, Tensor], Tensor]
-"""(z (1, d), z_j (1, d)) -> the kernels of all latents at that pair."""
+Formulas = tuple[Callable[[Tensor, Tensor], Tensor], Callable[[Tensor], Tensor], tuple[float, ...]]
+"""(z (1, d), z_j (1, d)) -> the kernels of all latents at that pair, less a level each; z -> k(z, z); the levels."""
 
 
 @dataclass(frozen=True, eq=False)
 class KernelSum:
     """The sums of G latents over the same N centres, with what their C function needs.
 
-    `weights` (G, N) are those of the posterior mean. `name` is that of the C function.
+    `weights` (G, N) are those of the posterior mean, `name` is that of the C function. `pair` and `prior` are traced
+    from kernels less a constant `level` each.
     """
 
     name: str
     latents: tuple[int, ...]
-    features: int
     centers: Float[Tensor, "N d"]
     weights: Float[Tensor, "G N"]
     pair: Graph
@@ -51,23 +50,10 @@ class KernelSum:
     level: tuple[float, ...]
     roots: Float[Tensor, "G N R"] | None = None
 
-    @classmethod
-    def of(
-        cls,
-        name: str,
-        latents: tuple[int, ...],
-        centers: Float[Tensor, "N d"],
-        weights: Float[Tensor, "G N"],
-        function: PairFunction,
-        diagonal: Callable[[Tensor], Tensor],
-        level: tuple[float, ...],
-    ) -> "KernelSum":
-        """Traced from kernels less a constant `level` each. Raises InvalidInput, naming what no graph holds."""
-        example = centers[:1]
-        pair, (kernels,) = trace(lambda z, c: [function(z, c)], [example, example.clone()])
-        prior, (variances,) = trace(lambda z: [diagonal(z)], [example])
-        nodes = (tuple(found.flatten().tolist()) for found in (kernels, variances))
-        return cls(name, latents, centers.shape[-1], centers, weights, pair, next(nodes), prior, next(nodes), level)
+    @property
+    def features(self) -> int:
+        """How many numbers z has."""
+        return self.centers.shape[-1]
 
     def call(self, graph: Graph, z: Sequence[int], slopes: bool) -> list[int]:
         """The nodes of E f_c at features z, as a call of the C function; with `slopes` it can be differentiated."""
@@ -323,14 +309,17 @@ def kernel_sums(latent: LatentPosterior) -> tuple[KernelSum, ...]:
         centers, kernel = latent.features[group[0]], latent.kernels.dense[group[0]]
         weights = torch.stack([latent.weights[c].detach() for c in group])
         scales = [each for c in group if (each := squared_exponential_parameters(latent.kernels[c])) is not None]
-        formulas = _squared_exponentials(centers, scales) if scales else (kernel.cross, kernel.diagonal, (0.0,))
-        found.append(KernelSum.of(f"latents{k}", group, centers, weights, *formulas))
+        alone: Formulas = kernel.cross, kernel.diagonal, (0.0,)
+        cross, diagonal, level = _squared_exponentials(centers, scales) if scales else alone
+        example = centers[:1]
+        pair, (kernels,) = trace(lambda z, c, cross=cross: [cross(z, c)], [example, example.clone()])
+        prior, (variances,) = trace(lambda z, diagonal=diagonal: [diagonal(z)], [example])
+        nodes = (tuple(found.flatten().tolist()) for found in (kernels, variances))
+        found.append(KernelSum(f"latents{k}", group, centers, weights, pair, next(nodes), prior, next(nodes), level))
     return tuple(found)
 
 
-def _squared_exponentials(
-    centers: Float[Tensor, "N d"], scales: Sequence[tuple[Tensor, Tensor]]
-) -> tuple[PairFunction, Callable[[Tensor], Tensor], tuple[float, ...]]:
+def _squared_exponentials(centers: Float[Tensor, "N d"], scales: Sequence[tuple[Tensor, Tensor]]) -> Formulas:
     """k_c(z, z_j) - s_c of latents with the same centres, k_c(z, z), and s_c: k is nearly s, and sums would cancel."""
     shift = centers.mean(0)
     precisions = torch.stack([length.detach().expand(centers.shape[-1]) ** -2 for length, _ in scales])

@@ -238,6 +238,14 @@ def integrate(
     in q0, v0, u and what `feedback` adds. InvalidInput for a dt that is no positive number or a start beyond the limit.
     """
     check_start(v0, dt)
+
+    def guarded(u: Tensor, q0: Tensor, v0: Tensor, q: Tensor, v: Tensor) -> Tensor:
+        """a(q, v) under u, NaN at states that are not finite: models are asked at (q0, v0) in their place."""
+        finite = torch.isfinite(q).all(-1, keepdim=True) & torch.isfinite(v).all(-1, keepdim=True)
+        if bool(finite.all()):
+            return acceleration(q, v, u)
+        return torch.where(finite, acceleration(torch.where(finite, q, q0), torch.where(finite, v, v0), u), math.nan)
+
     q, v = q0, v0
     steps, n = u.shape[:2]
     rows_q, rows_v, rows_a = [q], [v], []  # stacked in the end, which keeps the graph where there is one
@@ -246,7 +254,7 @@ def integrate(
     alive = torch.ones(n, dtype=torch.bool, device=q.device)
     for k in range(steps):
         forces = u[k] if feedback is None else u[k] + feedback(k, q, v)
-        step = integrator(_at_finite_states(acceleration, q, v, forces), q, v, dt)
+        step = integrator(partial(guarded, forces, q, v), q, v, dt)
         rows_a.append(torch.where(alive[:, None], step.a, math.nan))
         bounded = (step.v.abs() <= SPEED_LIMIT).all(-1) & torch.isfinite(step.q).all(-1)  # NaN compares as false
         good = alive & bounded & step.found
@@ -275,20 +283,6 @@ def check_start(v0: Tensor, dt: float) -> None:
             f"v0 has a joint velocity of {float(v0.abs().max()):.3g}; a motion faster than {SPEED_LIMIT:g} rad/s or "
             "m/s counts as diverged, check its units."
         )
-
-
-def _at_finite_states(
-    acceleration: Callable[[Tensor, Tensor, Tensor], Tensor], q0: Tensor, v0: Tensor, u: Tensor
-) -> Acceleration:
-    """a(q, v) under u, which is NaN at states that are not finite: models are asked at (q0, v0) in their place."""
-
-    def guarded(q: Tensor, v: Tensor) -> Tensor:
-        finite = torch.isfinite(q).all(-1, keepdim=True) & torch.isfinite(v).all(-1, keepdim=True)
-        if bool(finite.all()):
-            return acceleration(q, v, u)
-        return torch.where(finite, acceleration(torch.where(finite, q, q0), torch.where(finite, v, v0), u), math.nan)
-
-    return guarded
 
 
 def warn_of_divergence(diverged_at: Tensor, not_found: Tensor, dt: float, what: str) -> None:

@@ -105,19 +105,13 @@ def _step_by_step(
 
 
 def _pass(
-    accelerations: Accelerations,
-    q0: Tensor,
-    v0: Tensor,
-    u: Tensor,
-    middles: tuple[Tensor, Tensor],
-    h: float,
-    parameters: bool,
+    model: Accelerations, q0: Tensor, v0: Tensor, u: Tensor, middles: tuple[Tensor, Tensor], h: float, full: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """q, v (K, T+1, nv) of the linearised steps, their middles, and the derivatives of q (K, T+1, nv, 2 nv + P)."""
+    """q, v (K, T+1, nv) of linearised steps, their middles, and if `full` derivatives of q (K, T+1, nv, 2 nv + P)."""
     nv, half = v0.shape[-1], 0.5 * h
     identity = torch.eye(nv, dtype=q0.dtype, device=q0.device)
     middle_q, middle_v = middles
-    at = accelerations.linear(middle_q.flatten(0, 1), middle_v.flatten(0, 1), u.flatten(0, 1), parameters)
+    at = model.linear(middle_q.flatten(0, 1), middle_v.flatten(0, 1), u.flatten(0, 1), full)
     a, a_q, a_v = (x.unflatten(0, u.shape[:2]) for x in (at.a, at.a_q, at.a_v))
     constant = half * (a - (a_q @ middle_q[..., None] + a_v @ middle_v[..., None])[..., 0])
     inverse = torch.linalg.inv(identity - half * (a_v + half * a_q))

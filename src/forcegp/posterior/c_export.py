@@ -18,7 +18,6 @@ from forcegp.errors import CompilerError, InvalidInput, NumericalError, require_
 from forcegp.inference.posterior import ExactPosterior
 from forcegp.posterior.c_files import CFiles, Check, identifier, split
 from forcegp.posterior.posterior import Posterior
-from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.preparation import rows_for, sample_states
 from forcegp.posterior.programs import Physics, require_step
 
@@ -90,7 +89,15 @@ def export_c(
     code = posterior.programs(compressed=reference.compressed)
     called = identifier(name or posterior.model.robot.name)
     if monitor is not None:
-        _check_monitor(monitor, posterior, reference)
+        known: Any = getattr(monitor, "calibrated", None) and monitor.model
+        same = known is posterior.model or getattr(known, "posterior", None) is posterior
+        kind = known.kind if same and monitor.open and posterior.latent_names else "none"
+        if not same or kind != ("compressed" if reference.kind == "compressed" else "none"):
+            raise InvalidInput(
+                "the monitor is that of another model, or counts another covariance than the program has; make it of "
+                "posterior.predictor() and export with `covariance`, or of posterior.predictor(covariance='none') "
+                "without."
+            )
     export = CFiles(posterior, reference, code, called, jacobian, steps, integrator, monitor)
     checks = _checks(export)
     with atomic_folder(folder, overwrite=False) as temporary:
@@ -105,18 +112,6 @@ def export_c(
         files = {path.name: path.stat().st_size for path in sorted(temporary.iterdir())}
     inflation = None if reference.inflation is None else float(reference.inflation.max())
     return CExport(export.name, folder, files, differences, inflation)
-
-
-def _check_monitor(monitor: Any, posterior: Posterior, reference: Predictor) -> None:
-    """Raise InvalidInput for one that is not calibrated, of another model, or that needs another covariance."""
-    known: Any = getattr(monitor, "calibrated", None) and monitor.model
-    same = known is posterior.model or getattr(known, "posterior", None) is posterior
-    kind = known.kind if same and monitor.open and posterior.latent_names else "none"
-    if not same or kind != ("compressed" if reference.kind == "compressed" else "none"):
-        raise InvalidInput(
-            "the monitor is that of another model, or counts another covariance than the program has; make it of "
-            "posterior.predictor() and export with `covariance`, or of posterior.predictor(covariance='none') without."
-        )
 
 
 def rounding(posterior: Posterior, q: Tensor, v: Tensor, u: Tensor) -> float:

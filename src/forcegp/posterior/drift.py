@@ -239,20 +239,16 @@ def followed(posterior: Posterior, rows: Dataset) -> Posterior:
     until = float(rows.time[rows.episode == rows.episodes[-1]].max())
     drift = replace(drift, level=level.tolist(), std=std.tolist(), until=until, here=here)
     louder = scaled(posterior.model, torch.as_tensor(1.0 + moved))
-    return replace(posterior, target=louder, estimates=_moved(posterior, moved, std)).with_settings(drift=asdict(drift))
-
-
-def _moved(posterior: Posterior, d: np.ndarray, std: np.ndarray) -> Any:
-    """Estimates of dry friction at the new level, with what is unknown of that."""
     laws = [law for law in posterior.trained.laws if isinstance(law, DryFriction)]
     names = [f"{force_name(law)}.{x}" for law in laws for x, of in law.coefficients.items() if not of.logarithm]
     place = {f"{name}.{joint}": j for name in names for j, joint in enumerate(posterior.joint_names)}
-    entries = [
-        each if (j := place.get(each.name)) is None
-        else replace(each, value=float(each.value * (1.0 + d[j])), std=float(np.hypot(each.std, std[j] * each.value)))
-        for each in posterior.estimates.entries
-    ]  # fmt: skip
-    return replace(posterior.estimates, entries=tuple(entries))
+    entries = list(posterior.estimates.entries)
+    for k, each in enumerate(entries):  # at the new level, with what is unknown of that
+        if (j := place.get(each.name)) is not None:
+            value, spread = float(each.value * (1.0 + moved[j])), float(np.hypot(each.std, std[j] * each.value))
+            entries[k] = replace(each, value=value, std=spread)
+    estimates = replace(posterior.estimates, entries=tuple(entries))
+    return replace(posterior, target=louder, estimates=estimates).with_settings(drift=asdict(drift))
 
 
 def _missed(posterior: Posterior, rows: Dataset) -> tuple[np.ndarray, np.ndarray, float]:

@@ -1,7 +1,7 @@
 """`Posterior`: what a fit knows of a model, as a value that predicts."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -114,22 +114,15 @@ class Posterior(Fitted):
         def through(affine: AffineMap) -> Gaussian:
             return whole.through(affine.matrix, affine.offset)
 
-        predicted, noise = moving, Noise.covariance(given, dynamics.H)
+        noise = Noise.covariance(given, dynamics.H)
         noise = torch.diag_embed(noise).expand_as(dynamics.H) if noise.dim() == 2 else noise
         if self.is_black_box:  # its functions hold what contacts do, so forces are not those of anything
-            return Prediction(predicted.mean, predicted.covariance, None, None, None, noise)
+            return Prediction(moving.mean, moving.covariance, None, None, None, noise)
         multiplier = through(dynamics.multiplier_map())
-        return Prediction(
-            predicted.mean,
-            predicted.covariance,
-            multiplier=multiplier,
-            contact_force=through(dynamics.contact_force_map()),
-            unknown_force=learned,
-            noise_covariance=noise,
-            frames=tuple(contact.frame for contact in self.model.contacts),
-            off=dynamics.off(),
-            unseen=self._unseen(multiplier, dynamics) if covariance else None,
-        )
+        forces = multiplier, through(dynamics.contact_force_map()), learned
+        frames = tuple(contact.frame for contact in self.model.contacts)
+        unseen = self._unseen(multiplier, dynamics) if covariance else None
+        return Prediction(moving.mean, moving.covariance, *forces, noise, frames, dynamics.off(), unseen)
 
     def unlearned(self, dynamics: ConstrainedDynamics) -> Tensor | None:
         """The covariance of joint forces beside what was learned: noise, what pushed, and what contacts hid."""
@@ -180,15 +173,9 @@ class Posterior(Fitted):
         B = self.trained.unknown.direction(dynamics)
         for name, term, which in self.trained.unknown.named(robot):
             own, mixing, point = latents.entries(which), B[..., which], term.point_force(dynamics)
-            parts[name] = ForceComponent(
-                name,
-                term.latent_names(robot),
-                term.latent_units(robot),
-                own,
-                joint_force=own.through(mixing),
-                acceleration=own.through(dynamics.H @ mixing),
-                point_force=None if point is None else own.through(point),
-            )
+            latent = own, own.through(mixing), own.through(dynamics.H @ mixing)
+            at_point = None if point is None else own.through(point)
+            parts[name] = ForceComponent(name, term.latent_names(robot), term.latent_units(robot), *latent, at_point)
         return parts
 
     @usable_arguments("curve")
@@ -344,8 +331,9 @@ class Posterior(Fitted):
         """The same, conditioned on another device, such as "cuda". InvalidInput for one that is not there."""
         model = self.trained.to(device)
         at: torch.device = model.robot.device
-        result = replace(self.result, parameters=_all_on(self.result.parameters, at))
-        learned = self.training.to(at), _all_on(self.hyperparameters, at), result
+        result = replace(self.result, parameters={name: x.to(at) for name, x in self.result.parameters.items()})
+        given = {name: value.to(at) for name, value in self.hyperparameters.items()}
+        learned = self.training.to(at), given, result
         there = Posterior.conditioned(model, *learned, self.settings, self.engine, self.estimates)
         carried = there if self.target is None else there.with_model(self.target.to(device))
         return carried.with_settings(**self.settings)
@@ -353,7 +341,3 @@ class Posterior(Fitted):
     def with_settings(self, **settings: Any) -> "Posterior":
         """The same posterior with more entries in `settings`."""
         return replace(self, settings={**self.settings, **settings})
-
-
-def _all_on(tensors: Mapping[str, Tensor], device: torch.device) -> dict[str, Tensor]:
-    return {name: value.to(device) for name, value in tensors.items()}

@@ -238,7 +238,7 @@ class Predictor(Summary):
         if (compiled := self.compiled(kind)) is None:
             return self._by_torch(kind, states)
         outputs = [torch.empty(count, size, dtype=torch.float64) for size in compiled.outputs]
-        if compiled.rows(count, states, outputs):
+        if compiled.rows(states, outputs):
             self._repair(kind, states, outputs)
         return outputs
 

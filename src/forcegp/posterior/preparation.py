@@ -13,7 +13,7 @@ from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.evidence.likelihood import TrainingData
 from forcegp.forces import ObservedWrench
 from forcegp.inference.posterior import ExactPosterior
-from forcegp.inference.prepared_kernels import CompressedCovariance, Sample, compress
+from forcegp.inference.prepared_kernels import Sample, compress
 from forcegp.model import Model
 from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.programs import Physics
@@ -24,7 +24,6 @@ SAMPLES, CHECKS = 300, 150
 """States that choose the compressed covariance, and others that show how good it is."""
 STEP = 0.3
 """Length of a step away from a training state, in differences of two others."""
-
 
 TOLERANCE, LARGEST_RANK = 0.01, 1536
 """By how much standard deviations of a compressed covariance exceed the exact ones at most, where the rank suffices."""
@@ -46,7 +45,18 @@ def prepared_predictor(posterior: Any, covariance: str, compile: bool) -> Predic
                 f"{type(latent).__name__} does not have; give covariance='exact', which is the one that it has, "
                 f"'none', or {latent.remedy}."
             )
-        compressed = _compressed(latent, training, physics)
+        # functions of one input are rough: between two training values, what is uncertain hangs on these two alone
+        rough = any(z.shape[-1] == 1 for z in latent.features)
+
+        def sample(count: int, seed: int, rows: int) -> Sample:
+            with torch.no_grad():
+                W, features = physics.mixing(*sample_states(training, model.robot.space, count, seed, rows))
+            usable = torch.isfinite(W).flatten(1).all(1)  # no state of its own has a surface without a normal
+            return Sample([z[usable] for z in features], W[usable])
+
+        chosen = sample(SAMPLES, 0, len(training.q) if rough else SAMPLES // 3)
+        check = sample(CHECKS, 1, CHECKS // 3)
+        compressed = compress(latent, chosen, check, tolerance=TOLERANCE, largest=LARGEST_RANK)
         reached = float(compressed.inflation.max()) if len(compressed.inflation) else 0.0
         if reached > TOLERANCE:
             warnings.warn(
@@ -73,20 +83,6 @@ def rows_for(training: TrainingData, trained: Model, model: Model) -> TrainingDa
         )
     with_zero = torch.nn.functional.pad(training.u, (0, 1))
     return replace(training, u=with_zero[..., [had.index(name) if name in had else -1 for name in model.inputs]])
-
-
-def _compressed(latent: ExactPosterior, training: TrainingData, physics: Physics) -> CompressedCovariance:
-    # functions of one input are rough: between two training values, what is uncertain hangs on these two alone
-    rough = any(z.shape[-1] == 1 for z in latent.features)
-
-    def sample(count: int, seed: int, rows: int) -> Sample:
-        with torch.no_grad():
-            W, features = physics.mixing(*sample_states(training, physics.model.robot.space, count, seed, rows))
-        usable = torch.isfinite(W).flatten(1).all(1)  # no state of its own has a surface without a normal
-        return Sample([z[usable] for z in features], W[usable])
-
-    chosen = sample(SAMPLES, 0, len(training.q) if rough else SAMPLES // 3)
-    return compress(latent, chosen, sample(CHECKS, 1, CHECKS // 3), tolerance=TOLERANCE, largest=LARGEST_RANK)
 
 
 def sample_states(

@@ -342,14 +342,6 @@ class Programs:
         found = [part.table() for part in self.sums]
         return [aligned(x) for x in found + [part.root_table() for part in self.sums if kind == "covariance"]]
 
-    def drawn(self, samples: int, seed: int) -> "Sequence[Programs] | None":
-        """Those of each drawn function, whose texts are equal; None where one has no form in pieces."""
-        if not samples or not self.sums:
-            return [self] * max(1, samples)
-        if (drawn := drawn_calls(self.latent, self.sums, samples, seed, self.widening)) is None:
-            return None
-        return [replace(self, compressed=None, given=(self.traced, calls)) for calls in drawn]
-
     def function(self, kind: str) -> RowFunction:
         """A program, or the loop of an integrator: found or made. Raises CompilerError where that cannot be."""
         (_, nv, nu), m = self.sizes, len(self.physics.model.contacts)
@@ -367,9 +359,11 @@ class Programs:
         """Over the mean or each drawn function; None without such a step or form. Raises CompilerError."""
         if integrator not in steps_of(self.space):
             return None
-        if not samples:
-            return [self.function(integrator)]
-        if (codes := self.drawn(samples, seed)) is None:
-            return None
-        first = codes[0].function(integrator)
-        return [RowFunction(first.library, first.inputs, first.outputs, code.tables()) for code in codes]
+        codes = [self] * max(1, samples)
+        if samples and self.sums:
+            if (drawn := drawn_calls(self.latent, self.sums, samples, seed, self.widening)) is None:
+                return None
+            codes = [replace(self, compressed=None, given=(self.traced, calls)) for calls in drawn]
+        first, *others = codes  # whose texts are equal
+        loop = first.function(integrator)
+        return [loop, *(RowFunction(loop.library, loop.inputs, loop.outputs, code.tables()) for code in others)]

@@ -100,7 +100,7 @@ def moved(
     for k, loop in enumerate(loops):
         at = slice(own * k, own * (k + 1))
         made = [x[at].view(own, -1) for x in (Q, V, A, ended)]
-        loop.rows(own, [*(x[at] for x in given), seconds], made, threads, least=8)
+        loop.rows([*(x[at] for x in given), seconds], made, threads, least=8)
     ended, not_found = ended.long(), torch.zeros(count, dtype=torch.bool)
     left = torch.nonzero((ended < -1).view(-1, own).any(0))[:, 0]
     if len(left):

@@ -281,7 +281,13 @@ def read_on_one_clock(source: Source, plan: SignalPlan) -> Read:
     stamps = found[time]
     kept = np.ones(len(stamps), bool)
     for topic in [topic for topic in own if topic != clock]:
-        stamp = _stamp_beside(source, topic, time.removeprefix(f"{clock}:"))
+        wanted = time.removeprefix(f"{clock}:")  # its own clock is that of the time where it has it
+        stamp: str | None = wanted
+        if isinstance(source, RosBag):
+            kinds = [wanted, *((STAMP, LOG_TIME) if wanted in (STAMP, LOG_TIME) else ())]
+            stamp = next((f"{topic}:{kind}" for kind in kinds if f"{topic}:{kind}" in source.columns()), None)
+        if stamp is None:
+            raise InvalidInput(f"{source.path}: {topic} has no {wanted}; name as `time` a {LOG_TIME}.")
         track = read(topic, [stamp, *own[topic]])
         notes += source.notes()
         steps = np.diff(track[stamp]) * seconds
@@ -334,17 +340,6 @@ def _at(
     change = np.where(np.abs(later - values) < most, later - values, 0.0)
     share = np.divide(since, span, out=np.zeros(len(time)), where=span > 0)
     return values + share[:, None] * change, np.where(span > 0, span, since), there
-
-
-def _stamp_beside(source: Source, topic: str, wanted: str) -> str:
-    """The clock of a topic: that of the time where the topic has it. Raises InvalidInput for another kind."""
-    if not isinstance(source, RosBag):
-        return wanted
-    kinds = [wanted, *((STAMP, LOG_TIME) if wanted in (STAMP, LOG_TIME) else ())]
-    found = next((f"{topic}:{kind}" for kind in kinds if f"{topic}:{kind}" in source.columns()), None)
-    if found is None:
-        raise InvalidInput(f"{source.path}: {topic} has no {wanted}; name as `time` a {LOG_TIME}.")
-    return found
 
 
 def _topics(columns: Columns, plan: SignalPlan) -> tuple[dict[str, str], dict[str, Bool[np.ndarray, " rows"]]]:

@@ -230,18 +230,11 @@ def _drawn(server: Any, recorded: RecordedScene) -> Callable[[int], None]:
     center = recorded.poses[..., :3, 3].mean(axis=(0, 1)) if recorded.shapes else np.zeros(3)
     server.initial_camera.position = tuple(center + size * np.array([0.6, -0.55, 0.28]))
     server.initial_camera.look_at = tuple(center)
-    links = [
-        scene.add_mesh_simple(
-            f"/robot/{place}",
-            shape.vertices.astype(np.float32),
-            shape.faces.astype(np.uint32),
-            color=DARK_LINK if place % 2 else LINK,
-            opacity=OPACITY,
-            flat_shading=True,
-        )
-        for place, shape in enumerate(recorded.shapes)
-    ]
-    arrows = []
+    links, arrows = [], []
+    for place, shape in enumerate(recorded.shapes):
+        look = {"color": DARK_LINK if place % 2 else LINK, "opacity": OPACITY, "flat_shading": True}
+        triangles = shape.vertices.astype(np.float32), shape.faces.astype(np.uint32)
+        links.append(scene.add_mesh_simple(f"/robot/{place}", *triangles, **look))
     for place, group in enumerate(recorded.arrows):  # of the mean, and thinner pale ones to the end of the interval
         color = np.array(COLORS[place % len(COLORS)])
         looks = ("mean", color, 0.014), ("interval", color + PALE * (255 - color), 0.008)

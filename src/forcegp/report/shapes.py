@@ -117,11 +117,10 @@ def _loaded(element: Element, urdf: Path | None, doubts: list[str]) -> Any:
         return None
     try:
         mesh = trimesh_module().load(path, force="mesh", skip_materials=True)
+        if not len(mesh.faces):
+            raise ValueError("it holds no faces")
     except Exception as error:  # of which trimesh has many kinds
         doubts.append(f"{name} could not be read ({error}); its link is drawn as a capsule.")
-        return None
-    if not len(mesh.faces):
-        doubts.append(f"{name} could not be read (it holds no faces); its link is drawn as a capsule.")
         return None
     if scale := _numbers(element, "scale"):
         mesh.apply_scale(scale)

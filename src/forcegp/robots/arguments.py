@@ -96,6 +96,8 @@ def usable_device(device: torch.device | str) -> torch.device:
 
 
 Vector = Sequence[float | int] | np.ndarray | Tensor
+Armature = Vector | Mapping[str, float | int]
+"""Rotor inertias at the joints (kg m^2 or kg), one per joint or by joint name."""
 JointValues = Float[Tensor, "*#batch nv"]
 """One value per joint, float64 (..., nv); the batch dimensions of several arguments broadcast."""
 Positions = Float[Tensor, "*#batch nq"]

@@ -119,7 +119,7 @@ class CompiledRobot(RigidBodyDynamics):
                 batch = broadcast_batch({name: value.shape[:-1] for name, value in zip(names, given, strict=True)})
                 given = [x.expand(*batch, -1).reshape(batch.numel(), x.shape[-1]).contiguous() for x in given]
             results = [torch.empty(batch.numel(), size, dtype=torch.float64) for size in program.outputs]
-            bits = program.rows(batch.numel(), given, results)
+            bits = program.rows(given, results)
         if bits & NOT_POSITIVE:
             raise NumericalError(NOT_POSITIVE_DEFINITE)
         made = zip(results, shapes_of(function, nv), strict=True)

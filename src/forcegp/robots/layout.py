@@ -20,6 +20,8 @@ from forcegp.robots.urdf import MOVABLE, Joint, RobotDescription, free_joint
 BaseChoice = Literal["fixed", "floating"]
 """How the root link is held: in the world, or not at all."""
 
+Loops = Sequence[tuple[str, str, str]]
+"""Names of equalities that hold two links together, and these."""
 WORLDS = ("world", "map", "odom", "ground", "universe")
 WORD = r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+"
 """Words of a name: FL foot, upper Leg, front left wheel."""
@@ -108,22 +110,7 @@ def followed(
     return held, drives
 
 
-def with_followers(
-    joints: Mapping[str, Joint], bodies: Sequence[Joint], drives: Mapping[str, tuple[str, float, float]]
-) -> tuple[Joint, ...]:
-    """The joints with rotors and friction of those that follow: by multiplier^2, dry friction by |multiplier|."""
-    whole = dict(joints)
-    for body in bodies:
-        if body.name in drives:
-            name, multiplier, _ = drives[body.name]
-            factors = {"armature": multiplier**2, "damping": multiplier**2, "friction": abs(multiplier)}
-            sums = {key: getattr(whole[name], key) + by * getattr(body, key) for key, by in factors.items()}
-            whole[name] = replace(whole[name], **sums)
-    return tuple(whole.values())
-
-
-@dataclass(frozen=True)
-class Placement:
+class Placement(NamedTuple):
     """Pose ``offset`` (4, 4) of a link in the frame of the ``body`` that carries it (``WORLD``: fixed in the world)."""
 
     body: int
@@ -241,16 +228,23 @@ def lay_out(
         raise RobotModelError(
             f"{description.source}: {len(bodies)} joints move; forcegp takes up to {MOST_BODIES}, lock the others."
         )
-    places = {name: place for place, name in enumerate(joint.name for joint in bodies if joint.name not in drives)}
-    joints = with_followers({body.name: body for body in bodies if body.name not in drives}, bodies, drives)
+    joints = {body.name: body for body in bodies if body.name not in drives}
+    for body in (body for body in bodies if body.name in drives):  # rotors and friction of those that follow count, too
+        name, multiplier, _ = drives[body.name]
+        factors = {"armature": multiplier**2, "damping": multiplier**2, "friction": abs(multiplier)}
+        sums = {key: getattr(joints[name], key) + by * getattr(body, key) for key, by in factors.items()}
+        joints[name] = replace(joints[name], **sums)
+    places = {name: place for place, name in enumerate(joints)}
     moved = [drives.get(joint.name, (joint.name, 1.0, 0.0)) for joint in bodies]
     drive = tuple(Drive(places[name], multiplier, offset) for name, multiplier, offset in moved)
     links.pop(OUTSIDE, None)
     hold: BaseChoice = base or ("floating" if own else "fixed")
-    return Layout(tuple(bodies), drive, joints, tuple(parents), tuple(origins), links, tuple(groups), hold)
+    return Layout(
+        tuple(bodies), drive, tuple(joints.values()), tuple(parents), tuple(origins), links, tuple(groups), hold
+    )
 
 
-def check_tree(layout: Layout, loops: Sequence[tuple[str, str, str]], problems: Problems) -> None:
+def check_tree(layout: Layout, loops: Loops, problems: Problems) -> None:
     """Report links that an equality of the file holds together (its name, the links) although joints move them."""
 
     def moving(link: str) -> list[int]:
@@ -261,14 +255,13 @@ def check_tree(layout: Layout, loops: Sequence[tuple[str, str, str]], problems: 
 
     for name, *links in loops:
         if between := sorted(set(moving(links[0])) ^ set(moving(links[1]))):
-            problems.errors.append(
-                RobotModelError(
-                    f"{problems.source}: {name} closes a loop, from link {links[0]!r} to {links[1]!r}",
-                    "; a robot is a tree here, which would move in another way. Lock the joints between these links "
-                    f"({', '.join(layout.bodies[body].name for body in between)}) by `locked`, or take the "
-                    "equality out of the file where nothing holds them together.",
-                )
+            advice = (
+                "; a robot is a tree here, which would move in another way. Lock the joints between these links "
+                f"({', '.join(layout.bodies[body].name for body in between)}) by `locked`, or take the "
+                "equality out of the file where nothing holds them together."
             )
+            seen = f"{problems.source}: {name} closes a loop, from link {links[0]!r} to {links[1]!r}"
+            problems.errors.append(RobotModelError(seen, advice))
 
 
 def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]]:

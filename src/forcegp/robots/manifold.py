@@ -98,7 +98,10 @@ class ConfigurationSpace:
         unit = torch.eye(self.nv, dtype=q.dtype, device=q.device).expand(*q.shape[:-1], -1, -1)
 
         def moved(group: Group) -> Tensor:
-            return velocity_of(q[..., None, group.places], unit[..., group.rows])
+            own, (linear, angular) = q[..., None, group.places], unit[..., group.rows].split(3, -1)
+            rate = torch.cat([0.5 * angular, torch.zeros_like(angular[..., :1])], -1)
+            turned = quaternion_product(own[..., TURN].expand(rate.shape), rate)
+            return torch.cat([(pose(own)[0] @ linear[..., None])[..., 0], turned], -1)
 
         return self._joined(lambda rows, _: unit[..., rows], moved).mT
 
@@ -190,14 +193,6 @@ def integrated(q: Float[Tensor, "*batch 7"], step: Float[Tensor, "*batch 6"]) ->
     half = torch.cat([0.5 * _sine(quarter) * angular, 1.0 - quarter * _versine(quarter)], -1)
     turned = quaternion_product(_unit(q[..., TURN]), half)
     return torch.cat([origin + (rotation @ moved[..., None])[..., 0], turned], -1)
-
-
-def velocity_of(q: Float[Tensor, "*#batch 7"], v: Float[Tensor, "*#batch 6"]) -> Tensor:
-    """dq/dt under the body velocity v."""
-    linear, angular = v.split(3, -1)
-    rate = torch.cat([0.5 * angular, torch.zeros_like(angular[..., :1])], -1)
-    turned = quaternion_product(q[..., TURN].expand(*v.shape[:-1], -1), rate)
-    return torch.cat([(pose(q)[0] @ linear[..., None])[..., 0], turned], -1)
 
 
 def difference(start: Float[Tensor, "*batch 7"], end: Float[Tensor, "*batch 7"]) -> Tensor:

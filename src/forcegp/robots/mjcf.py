@@ -130,6 +130,12 @@ class MjcfWriter:
         else:
             self._body(root, np.eye(4), [], 2)
         motors = [f"    <motor name={quoteattr(name)} joint={quoteattr(name)}/>" for name in robot.single_joint_names]
+        couplings = [
+            f"    <joint joint1={quoteattr(joint.name)} joint2={quoteattr(joint.mimics.joint)} "
+            f'polycoef="{numbers((joint.mimics.offset, joint.mimics.multiplier, 0.0, 0.0, 0.0))}"/>'
+            for joint in robot.description.joints
+            if joint.mimics is not None and joint.name in self.moving
+        ]
         return "\n".join(
             [
                 f"<mujoco model={quoteattr(robot.name)}>",
@@ -138,7 +144,7 @@ class MjcfWriter:
                 "  <worldbody>",
                 *self.lines,
                 "  </worldbody>",
-                *_block("equality", self._couplings()),
+                *_block("equality", couplings),
                 *_block("actuator", motors),
                 "</mujoco>\n",
             ]
@@ -195,14 +201,6 @@ class MjcfWriter:
                     found[joint.child] = found[name] @ still
                     names.append(joint.child)
         return found
-
-    def _couplings(self) -> list[str]:
-        return [
-            f"    <joint joint1={quoteattr(joint.name)} joint2={quoteattr(joint.mimics.joint)} "
-            f'polycoef="{numbers((joint.mimics.offset, joint.mimics.multiplier, 0.0, 0.0, 0.0))}"/>'
-            for joint in self.robot.description.joints
-            if joint.mimics is not None and joint.name in self.moving
-        ]
 
 
 def _inertial(mass: float, center: np.ndarray, inertia: np.ndarray) -> str:

@@ -1,7 +1,7 @@
 """`Robot`: a URDF as an immutable value with batched, differentiable rigid-body functions."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -15,6 +15,7 @@ from typing_extensions import override
 from forcegp.atomic_files import write_text
 from forcegp.errors import InvalidInput, RobotFileWarning, require_plausible, usable_arguments
 from forcegp.robots.arguments import (
+    Armature,
     JointValues,
     Positions,
     Problems,
@@ -27,7 +28,7 @@ from forcegp.robots.arguments import (
 from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import SINGULAR
 from forcegp.robots.kinematics import Kinematics
-from forcegp.robots.layout import BaseChoice, check_base, check_tree, lay_out
+from forcegp.robots.layout import BaseChoice, Loops, check_base, check_tree, lay_out
 from forcegp.robots.mjcf import MjcfWriter, is_mjcf, translate
 from forcegp.robots.mjcf_model import Translation
 from forcegp.robots.structure import RigidBodyDynamics, RobotStructure, bodies_without_inertia, compile_tree
@@ -75,7 +76,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         *,
         source: str = "<text>",
         gravity: Vector = GRAVITY,
-        armature: Vector | Mapping[str, float | int] | None = None,
+        armature: Armature | None = None,
         locked: Mapping[str, float | int] | None = None,
         inertias: InertiaChoice = "strict",
         base: BaseChoice | None = None,
@@ -125,7 +126,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         path: Path | None,
         *,
         gravity: Vector | None = None,
-        armature: Vector | Mapping[str, float | int] | None = None,
+        armature: Armature | None = None,
         locked: Mapping[str, float | int] | None = None,
         inertias: InertiaChoice = "strict",
         base: BaseChoice | None = None,
@@ -144,9 +145,8 @@ class Robot(RobotStructure, RigidBodyDynamics):
         text: str,
         problems: Problems,
         gravity: Vector,
-        armature: Vector | Mapping[str, float | int] | None,
-        loops: Sequence[tuple[str, str, str]] = (),
-        *,
+        armature: Armature | None,
+        loops: Loops = (),
         quiet: bool = False,
     ) -> "Robot":
         """The robot of URDF text; `problems` has the arguments and what is wrong already, `loops` are refused."""
@@ -170,8 +170,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
                 layout = lay_out(description, locked, base, Problems(problems.source, problems.given))
             text, description = with_chosen_inertias(inertias, text, description, layout, problems)
             tree = compile_tree(description, layout, down)
-            frames = {name: (place.body, torch.as_tensor(place.offset)) for name, place in layout.links.items()}
-            robot = cls(description, layout, tree, text, tuple(locked.items()), frames, layout.base)
+            robot = cls(description, layout, tree, text, tuple(locked.items()), layout.base)
             without = bodies_without_inertia(description, layout, tree, problems.broken)
             limp = robot._limp() if without and not problems.broken else range(robot.nv)
             problems.errors += [error for coordinate, error in without if coordinate in limp]
@@ -208,7 +207,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         values, vectors = torch.linalg.eigh(scale[:, None] * M * scale)
         return set((vectors[:, values <= SINGULAR].abs() > 1e-6).any(1).nonzero()[:, 0].tolist())
 
-    def with_armature(self, armature: Vector | Mapping[str, float | int]) -> "Robot":
+    def with_armature(self, armature: Armature) -> "Robot":
         """A robot with other rotor inertias (kg m^2 or kg), one per joint or by joint name (the others keep theirs)."""
         if isinstance(armature, Mapping):
             armature = dict(zip(self.joint_names, self.armature.tolist(), strict=True)) | dict(armature)
@@ -216,15 +215,13 @@ class Robot(RobotStructure, RigidBodyDynamics):
 
     def to(self, device: torch.device | str) -> "Robot":
         """The same robot with its constants on ``device``, for instance "cuda"."""
-        tree = self.tree.to(device)
-        frames = {name: (body, offset.to(tree.rest.device)) for name, (body, offset) in self._frames.items()}
-        return replace(self, tree=tree, _frames=frames)
+        return replace(self, tree=self.tree.to(device))
 
     def compile(self, folder: str | Path | None = None) -> CompiledRobot:
         """Its dynamics as machine code, kept in ``folder``: see :class:`~forcegp.robots.compiled.CompiledRobot`."""
         return CompiledRobot(self, folder)
 
-    def with_text(self, text: str, armature: Vector | Mapping[str, float | int] | None = None) -> "Robot":
+    def with_text(self, text: str, armature: Armature | None = None) -> "Robot":
         """A robot of another URDF text, with its rotor inertias if none are given: same gravity, base and device."""
         robot = Robot._again(text, self.source, self.to_stored(), armature)
         return robot if self.device.type == "cpu" else robot.to(self.device)

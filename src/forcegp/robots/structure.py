@@ -71,7 +71,7 @@ class Tree:
 def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndarray) -> Tree:
     """Batched constants for :mod:`forcegp.robots.kinematics`, on the CPU."""
     n, revolute = len(layout.bodies), np.array([joint.type != "prismatic" for joint in layout.bodies])
-    rest, sine, cosine, slide = np.zeros((4, n, 4, 4))
+    rest, sine, cosine, slide = local = np.zeros((4, n, 4, 4))
     own, positions = np.eye(n), np.arange(len(layout.joints))
     for group in layout.groups:
         own[group.bodies, group.bodies] = 1.0
@@ -101,18 +101,15 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
     for name in layout.moving:
         placement, inertial = layout.links[name], description.links[name]
         if inertial is not None:
-            local = pseudo_inertia(inertial.mass, inertial.center_of_mass, inertial.inertia)
-            inertias[placement.body] += placement.offset @ local @ placement.offset.T
+            own_frame = pseudo_inertia(inertial.mass, inertial.center_of_mass, inertial.inertia)
+            inertias[placement.body] += placement.offset @ own_frame @ placement.offset.T
     fall = np.zeros((3, 4))
     fall[:, 3] = gravity
     coupling = np.zeros((n, len(layout.joints)))
     coupling[range(n), [drive.joint for drive in layout.drives]] = [drive.multiplier for drive in layout.drives]
     armature = np.array([joint.armature for joint in layout.joints])
     constants: dict[str, Any] = {
-        "rest": rest[..., None],
-        "sine": sine[..., None],
-        "cosine": cosine[..., None],
-        "slide": slide[..., None],
+        **dict(zip(("rest", "sine", "cosine", "slide"), local[..., None], strict=True)),
         "revolute": revolute[:, None, None],
         "descendants": descendants,
         "ancestors": moves.T,
@@ -188,7 +185,6 @@ class RobotStructure(Summary):
     tree: Tree
     urdf_text: str
     _locked: tuple[tuple[str, float], ...]
-    _frames: dict[str, tuple[int, Tensor]]
     base: BaseChoice = "fixed"
     """How the root link is held."""
 
@@ -310,9 +306,9 @@ class RobotStructure(Summary):
 
     def frame(self, name: str) -> tuple[int, Float[Tensor, "4 4"]]:
         """Body (``WORLD`` = -1) that carries a frame, and the frame's pose in that body's frame."""
-        require_known("frame", name, self.name, self._frames, UnknownName)
-        body, offset = self._frames[name]
-        return body, offset.clone()
+        require_known("frame", name, self.name, self.layout.links, UnknownName)
+        body, offset = self.layout.links[name]
+        return body, torch.tensor(offset, device=self.device)
 
     def checked_input(self, name: str, value: object) -> Tensor:
         """In float64; :class:`~forcegp.errors.InvalidInput` unless it is (..., nv), or a possible q, on its device."""

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from forcegp.atomic_files import unreadable
 from forcegp.errors import LARGEST, InvalidInput, NonPhysicalInertia, RobotModelError, UnknownName, required_extra
-from forcegp.robots.arguments import Problems, Vector, by_joint, finite_vector
+from forcegp.robots.arguments import Armature, Problems, by_joint, finite_vector
 from forcegp.robots.inertia import physical_objection
 from forcegp.robots.layout import Layout
 from forcegp.robots.urdf import RobotDescription, numbers, parse_urdf, with_prefixes
@@ -92,9 +92,7 @@ def with_joint_values(text: str, layout: Layout, values: Mapping[str, Sequence[f
     return replace_dynamics(text, given, source=source)
 
 
-def with_armature(
-    text: str, layout: Layout, given: Vector | Mapping[str, float | int], robot: str, *, source: str
-) -> str:
+def with_armature(text: str, layout: Layout, given: Armature, robot: str, *, source: str) -> str:
     """URDF text with these rotor inertias (kg m^2 or kg), in joint order or by joint name; 0 where none is given."""
     joints = tuple(joint.name for joint in layout.joints)
     values = finite_vector("armature", by_joint(given, joints, robot), len(joints))

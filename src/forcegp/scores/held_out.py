@@ -196,10 +196,7 @@ class HeldOutMotions:
 
 
 def held_out_motions(
-    recording: Dataset,
-    held_out: Bool[np.ndarray, " rows"],
-    horizons: Sequence[float] | None = None,
-    starts: int = STARTS,
+    log: Dataset, held_out: Bool[np.ndarray, " rows"], horizons: Sequence[float] | None = None, starts: int = STARTS
 ) -> HeldOutMotions:
     """`starts` motions in every held-out stretch without gaps that lasts as long as the longest horizon.
 
@@ -211,10 +208,10 @@ def held_out_motions(
     wanted, starts = tuple(sorted(set(wanted))), whole_number("starts", starts, 1)
     if not wanted:
         return HeldOutMotions()
-    if not recording.time_ordered:
+    if not log.time_ordered:
         return HeldOutMotions(notes=("no motion was predicted: the rows are not in the order of time.",))
-    stretches, step = stretches_without_gap(recording, held_out), median_step(recording)
-    longest = max((float(np.ptp(recording.time[rows])) for rows in stretches), default=0.0)
+    stretches, step = stretches_without_gap(log, held_out), median_step(log)
+    longest = max((float(np.ptp(log.time[rows])) for rows in stretches), default=0.0)
     possible, notes = tuple(h for h in wanted if step <= h <= longest * (1.0 + EVEN_STEPS)), list[str]()
     if len(possible) < len(wanted):
         left_out = ", ".join(f"{h:g} s" for h in wanted if h not in possible)
@@ -223,8 +220,8 @@ def held_out_motions(
             raise InvalidInput(f"horizons {notes[0]} Give shorter ones.")
     found = list[tuple[Dataset, tuple[int, ...]]]()
     for rows in stretches if possible else ():
-        if np.ptp(recording.time[rows]) >= possible[-1] * (1.0 - EVEN_STEPS):
-            own = recording.rows(rows)
+        if np.ptp(log.time[rows]) >= possible[-1] * (1.0 - EVEN_STEPS):
+            own = log.rows(rows)
             try:
                 found.append((own, recorded_motions(own, starts, possible[-1]).rows))
             except InvalidInput as error:

@@ -23,7 +23,7 @@ from forcegp.posterior.posterior import Posterior
 from forcegp.progress import part
 from forcegp.robots.arguments import whole_number
 from forcegp.scores.experiment import Experiment, fingerprint, kept, scored
-from forcegp.scores.held_out import STARTS, HeldOutMotions, Split, held_out_motions, split_named
+from forcegp.scores.held_out import STARTS, Split, held_out_motions, split_named
 from forcegp.scores.models import Candidate, Given, candidate, candidates, default_models, identified_model
 from forcegp.scores.page import page, preparation_lines
 from forcegp.scores.scores import Scores
@@ -100,7 +100,14 @@ def score(
             JobStore.open(Path(folder), KIND, how, overwrite=overwrite)
         log, recording = decided(log), decided(recording or log)
         motions = held_out_motions(recording, np.ones(len(recording), dtype=bool), horizons or (), starts)
-        runs = _runs_of(before, log, motions, integrator)
+        runs = {}
+        for place, (name, posterior) in enumerate(before.items()):  # one run of each, on all rows
+            require_rows("log", log, posterior.joint_names, "the model")
+            integrator_named(integrator, posterior.model)
+            run = {"split": "all rows", "seed": 0, "error": None, "cpu_seconds": None}
+            run |= {"training_rows": len(posterior.training)}
+            with part(place, len(before), name):
+                runs[name] = [run | scored(posterior, log, motions, integrator)]
         about |= {"splits": [], "seeds": [0], "notes": list(motions.notes)}
         scores = _scores(log, runs, known, about, lambda name, _: before[name])
         if folder is not None:
@@ -146,21 +153,6 @@ def write(scores: Scores, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / RESULTS, scores.to_dict())
     write_text(folder / PAGE, page(scores))
-
-
-def _runs_of(
-    given: Mapping[str, Posterior], log: Dataset, motions: HeldOutMotions, integrator: str
-) -> dict[str, list[dict[str, Any]]]:
-    """One run of each posterior, on all rows."""
-    runs = {}
-    for place, (name, posterior) in enumerate(given.items()):
-        require_rows("log", log, posterior.joint_names, "the model")
-        integrator_named(integrator, posterior.model)
-        run = {"split": "all rows", "seed": 0, "error": None, "cpu_seconds": None}
-        run |= {"training_rows": len(posterior.training)}
-        with part(place, len(given), name):
-            runs[name] = [run | scored(posterior, log, motions, integrator)]
-    return runs
 
 
 def _scores(

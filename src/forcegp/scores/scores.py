@@ -175,8 +175,6 @@ class Scores(Summary):
     about: Mapping[str, Any] = field(default_factory=dict)
     fit: Callable[[str, Mapping[str, Posterior]], Posterior] | None = field(default=None, compare=False)
 
-    # ------------------------------------------------------------------ numbers
-
     def value(self, score: str, quantity: str = ACCELERATION, model: str | None = None) -> float | None:
         """One number for all joints, the median over runs: `value("rmse", "position after 1 s")`."""
         found = self.spread(score, quantity, model)
@@ -224,8 +222,6 @@ class Scores(Summary):
             there = f", and of {quantity} {', '.join(held[quantity])}" if quantity in held else ""
             raise InvalidInput(f"{words}{there}. Errors of forces need their truth in the log, and motions `horizons`.")
         return [run["table"][quantity][score] for run in self.finished(name)]
-
-    # ------------------------------------------------------------------ which model
 
     def left(self, model: str, beside: Iterable[str] = ()) -> tuple[str, dict[str, float | None]]:
         """What a model leaves of torques where it and those beside it tell, else of accelerations; by joint."""
@@ -318,8 +314,6 @@ class Scores(Summary):
             raise FitError("these scores came without their models.")
         return self.fit(self.recommended, identified or {})
 
-    # ------------------------------------------------------------------ to show
-
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a reader has to know beside the numbers; of several models with their names, alike ones once."""
@@ -355,6 +349,7 @@ class Scores(Summary):
     def to_dict(self) -> dict[str, Any]:
         """Everything but the models as plain JSON values."""
         models, taken = dict[str, Any](), self.winner
+        difference = taken and taken.difference and asdict(taken.difference)
         for name, model in self.models.items():
             table = {
                 quantity: {
@@ -370,12 +365,7 @@ class Scores(Summary):
             "units": dict(self.units),
             "models": models,
             "recommended": self.recommended,
-            "winner": taken
-            and {
-                "model": taken.model,
-                "sentence": taken.sentence,
-                "difference": taken.difference and asdict(taken.difference),
-            },
+            "winner": taken and {"model": taken.model, "sentence": taken.sentence, "difference": difference},
             "warnings": list(self.warnings),
             "failures": self.failures,
             "runs": {name: [dict(run) for run in runs] for name, runs in self.runs.items()},

@@ -16,7 +16,6 @@ from forcegp.robots import Robot
 Numbers = Mapping[str, Any]
 """Coefficients by name, one number or one per joint; "velocity" stands for velocities that have no number here."""
 
-
 Friction = Callable[..., Float[np.ndarray, "*batch nv"]]
 """(v, u or None), (..., nv) each, u [Nm or N] of the actuators -> joint forces with the sign that accelerates."""
 

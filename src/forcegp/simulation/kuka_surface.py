@@ -162,12 +162,11 @@ class IdealContact:
         return ContactForces(multiplier, friction, torques, True, torques + multiplier * row)
 
 
+Joints = Float[np.ndarray, " nv"]
+
+
 def multiplier_with_friction(
-    mass: Float[np.ndarray, "nv nv"],
-    force: Float[np.ndarray, " nv"],
-    row: Float[np.ndarray, " nv"],
-    per_load: Float[np.ndarray, " nv"],
-    b: float,
+    mass: Float[np.ndarray, "nv nv"], force: Joints, row: Joints, per_load: Joints, b: float
 ) -> float:
     """The multiplier [N] of `row . a = b` where friction gives the joint torques `per_load |lambda|`.
 
@@ -190,7 +189,6 @@ def multiplier_with_friction(
 STEPS_PER_REPORT = 240
 DIVERGED = 100.0  # rad/s
 
-
 Motion = dict[str, np.ndarray]
 """The recorded rows of one episode: q, v, u, a and time, true forces (joint_torques, tool_torques, tool_force,
 multiplier), and in_contact."""
@@ -204,7 +202,7 @@ def simulate_episode(config: KukaSurfaceConfig, robot: Robot, plant: RigidBodyDy
     settle, steps = config.settle_steps, config.settle_steps + config.rows_per_episode
     limits, table = np.array(config.torque_limits), table_of(config)
     laws = joint_friction_of(config, robot)
-    columns: dict[str, np.ndarray] = {}
+    rows: list[dict[str, Any]] = []
     q, v = np.deg2rad(config.start_degrees), np.zeros(robot.nv)
     law = None if config.surface == "none" else tool_friction_of(config)
     contact = IdealContact(table, law, config.baumgarte_omega, config.baumgarte_zeta)
@@ -230,11 +228,7 @@ def simulate_episode(config: KukaSurfaceConfig, robot: Robot, plant: RigidBodyDy
         joint_torques = laws(v, u)
         forces = contact.forces(state, u + joint_torques)
         a = np.linalg.solve(state.mass, u + joint_torques + forces.push - state.bias)
-        row = {"q": q, "v": v, "u": u, "a": a, "joint_torques": joint_torques, **forces._asdict()}
-        if step == 0:
-            columns = {name: np.zeros((steps, *np.shape(x)), np.asarray(x).dtype) for name, x in row.items()}
-        for name, value in row.items():
-            columns[name][step] = value
+        rows.append({"q": q, "v": v, "u": u, "a": a, "joint_torques": joint_torques, **forces._asdict()})
         v = v + config.time_step * a
         q = q + config.time_step * v
         if not np.abs(v).max() < DIVERGED:  # also NaN
@@ -245,6 +239,7 @@ def simulate_episode(config: KukaSurfaceConfig, robot: Robot, plant: RigidBodyDy
         if (step + 1) % STEPS_PER_REPORT == 0 or step + 1 == steps:
             tell(step + 1, steps)
 
+    columns = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
     if config.surface != "none" and not columns["in_contact"][: settle + 1].any():
         raise SimulationError(
             f"episode {episode}: no contact within settle_seconds = {config.settle_seconds:.3g} s. "
@@ -290,16 +285,12 @@ def simulate_kuka_surface(config: KukaSurfaceConfig) -> Dataset:
     model = Model(robot, contacts, (Actuation(), RigidBodies()), baumgarte=baumgarte)
     signals = {name: columns[name] for name in ("q", "v", "u", "a", "time")}
     more = {"u": "commanded torque minus joint damping"}
-    return recorded("kuka-surface", config, model, signals, _truth(config, columns), more)
-
-
-def _truth(config: KukaSurfaceConfig, columns: Motion) -> dict[str, np.ndarray]:
-    """Every true force of the rows, as far as it exists."""
-    truth, parts = {"a": columns["a"]}, {}
+    truth, parts = dict[str, np.ndarray](), dict[str, np.ndarray]()  # every force, as far as it exists
     if config.surface != "none":
         truth["lambda"] = columns["multiplier"][:, None]
         parts["Q_U.tool-friction"] = columns["tool_torques"]
         truth["force.tool-friction"] = columns["tool_force"]
     if config.joint_friction != "none":
         parts["Q_U.joint-friction"] = columns["joint_torques"]
-    return {**truth, **parts, "Q_U": sum(parts.values(), np.zeros_like(truth["a"]))}
+    truth |= {**parts, "Q_U": sum(parts.values(), np.zeros_like(columns["a"]))}
+    return recorded("kuka-surface", config, model, signals, truth, more)

@@ -161,14 +161,11 @@ def joint_acceleration(config: KukaSurfaceConfig, state: ArmState, reference: Ai
 RATE = 240
 """Rows per second."""
 
+Columns = Mapping[str, np.ndarray]
+
 
 def recorded(
-    scenario: str,
-    config: Any,
-    model: Model,
-    motion: Mapping[str, np.ndarray],
-    truth: Mapping[str, np.ndarray],
-    metadata: Mapping[str, Any] | None = None,
+    scenario: str, config: Any, model: Model, motion: Columns, truth: Columns, metadata: Mapping[str, Any]
 ) -> Dataset:
     """Rows of `config.episodes` episodes of equal length: q, v, u and the true a of `motion`, which gets its noise.
 
@@ -181,5 +178,5 @@ def recorded(
     about = {"scenario": scenario, "config": dataclasses.asdict(config), "versions": {"forcegp": __version__}}
     rows: dict[str, Any] = {"time": np.tile(np.arange(steps) / RATE, config.episodes), **motion}
     rows |= {"a": motion["a"] + config.noise * noise, "episode": np.repeat(np.arange(config.episodes), steps)}
-    rows |= {"truth": {"a": motion["a"], **truth}, "metadata": about | dict(metadata or {})}
+    rows |= {"truth": {"a": motion["a"], **truth}, "metadata": about | dict(metadata)}
     return Dataset(**rows, model=model, noise_std=np.full(nv, config.noise) if config.noise > 0 else None)
