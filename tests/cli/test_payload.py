@@ -3,13 +3,36 @@
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from tests.fit.test_payload import CENTER, MASS, TEXT, loaded, log
 from tests.goldens.compare import assert_unchanged
 
-from forcegp import Dataset, Robot
-from forcegp.cli.payload import other_causes
+from forcegp import Dataset, Payload, Robot
+from forcegp.cli.payload import other_causes, payload_text
+
+
+@pytest.mark.parametrize(
+    ("half", "far", "told"),
+    [
+        (0.01, 0.008, "0.5 ± 0.01 kg at (20, 0, 50) mm of hand, if the URDF's links are right"),
+        (0.01, 0.015, "0.5 ± 0.01 kg at (20, 0, 50 ± 15) mm of hand, if the URDF's links are right"),
+        (1.1, 0.015, "none (0.5 ± 1 kg)"),
+        (1.7, 0.015, "not known from this log (0.5 ± 2 kg)"),
+    ],
+)
+def test_what_is_hardly_known_of_a_payload_is_said(half, far, told):
+    numbers = {"mass": (0.5, half), **dict(zip("xyz", ((0.02, 0.001), (0.0, 0.001), (0.05, far)), strict=True))}
+    each = {
+        f"payload.{name if name == 'mass' else f'center_of_mass.{name}'}": SimpleNamespace(
+            value=value, std=error / 2.0, interval=(value - error, value + error)
+        )
+        for name, (value, error) in numbers.items()
+    }
+    robot = SimpleNamespace(mass=5.0, base="fixed", layout=SimpleNamespace(groups=()))
+    model = SimpleNamespace(laws=[Payload("hand", 0.5)], robot=robot)
+    assert payload_text(SimpleNamespace(estimates=each, model=model)) == told
 
 
 @pytest.fixture(scope="module")

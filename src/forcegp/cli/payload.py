@@ -28,6 +28,7 @@ WIDER = 2.3
 """Where a base moves, times the windows of a fit: a mass needs less of what is fast than rotors do."""
 LAWS = "viscous", "gear", "offset", "rotor"
 SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
+MOST_OPEN = 0.3  # of the robot's mass in half an interval, from which on a payload is not known
 FAR = 0.01  # m of half an interval, from which on a coordinate of a centre is shown with it
 MOST_FACTORS = 3  # of one cause that a person can look for
 
@@ -165,6 +166,8 @@ def payload_text(found: Any) -> str:
     parts = {name: found.estimates[f"payload.{name}"] for name in ("mass", *(f"center_of_mass.{x}" for x in "xyz"))}
     mass, *center = parts.values()
     error, *widths = (0.5 * (each.interval[1] - each.interval[0]) for each in parts.values())
+    if error > MOST_OPEN * found.model.robot.mass:
+        return f"not known from this log ({mass.value:.2g} ± {error:.1g} kg)"
     if mass.value < max(SURE * mass.std, LEAST_PAYLOAD):
         size = f"{mass.value:.2g} ± {error:.1g} kg"
         return f"none, or {size}" if mass.value > mass.std else f"none ({size})"
