@@ -196,6 +196,9 @@ def test_the_seconds_of_a_push_are_named_and_left_out():
     assert push.numbers["seconds"] == pytest.approx([4.0, 6.0], abs=0.4)
     kept = without_pushes(touched, doubts)
     assert (len(kept.episodes), round(len(kept), -2)) == (2, 2000)
+    for end, episodes in ((9.0, 2), (10.5, 1)):  # with 3 s and 1.5 s of the log behind it
+        found = [look(about="push", what="", numbers={"seconds": [4.0, end]})]
+        assert len(without_pushes(touched, found).episodes) == episodes
 
 
 def test_currents_are_in_a_wrong_unit_although_rotors_and_friction_explain_them():

@@ -94,6 +94,9 @@ def test_overlap_is_refused():
     with pytest.raises(InvalidInput, match="leave one to learn from, or hold out blocks"):
         split_named(recording(60, 1), "leave-one-out")
     assert len(split_named(recording(64, 8), "auto")[0].held_out) == 2, "a quarter"
+    for share, whole in ((0.7, False), (0.5, True)):
+        unequal = recording(60, 2, episode=(np.arange(60) >= 60 * share).astype(int), time=0.01 * np.arange(60))
+        assert split_named(unequal, "auto", 0.01)[0].name.startswith("episode") == whole
 
 
 def rows_of(data) -> set[float]:

@@ -303,12 +303,19 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
     return _cut(log, out), [doubt]
 
 
+SHORT = 2.0  # s, of what stays between pushes: up to which filters and splits have no use for it
+
+
 def without_pushes(log: Dataset, doubts: Sequence[Doubt]) -> Dataset:
     """The log without the seconds in which something is touched; of several episodes, whose times repeat, as it is."""
     seen = [doubt for doubt in doubts if doubt.about in ("push", UNKNOWN) and "seconds" in doubt.numbers]
     spans = [doubt.numbers["seconds"] for doubt in seen if len(log.episodes) == 1]
     touched = [np.flatnonzero((log.time >= begin) & (log.time <= end)) for begin, end in spans]
-    return _cut(log, np.concatenate(touched)) if touched else log
+    if not touched:
+        return log
+    left = _cut(log, np.concatenate(touched))
+    long = [each for each in left.episodes if np.ptp(left.time[left.episode == each]) > SHORT]
+    return left.rows(np.isin(left.episode, long)) if long else left
 
 
 def _cut(log: Dataset, rows: np.ndarray) -> Dataset:

@@ -91,11 +91,14 @@ class Split:
         return {"name": self.name, "words": self.words, "held_out": held_out, "guard": self.guard}
 
 
+MOST = 0.6  # of the rows, from which on an episode is too much to be held out, or to be learned from alone
+
+
 @usable_arguments("split_named")
 def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split, ...]:
     """The splits of a text, as `forcegp score --split` takes it: several for leave-one-out, else one.
 
-    auto: a quarter of the episodes, drawn at random, or with one episode blocks 3 and 5 of five.
+    auto: a quarter of the episodes, drawn at random; where one is `MOST` of the log, blocks 3 and 5 of five.
     folds: the episodes in up to four groups, drawn at random, each held out in turn; with one episode as auto.
     episodes:N,N...: whole episodes.
     leave-one-out: every episode once.
@@ -104,7 +107,8 @@ def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split
     Raises InvalidInput for anything else, and where nothing would be held out or nothing left to learn from.
     """
     require_type("dataset", dataset, Dataset)
-    known, alone = [int(each) for each in dataset.episodes], len(dataset.episodes) == 1
+    known = [int(each) for each in dataset.episodes]
+    alone = np.unique(dataset.episode, return_counts=True)[1].max() > MOST * len(dataset)
     kind, *parts = (DEFAULT_BLOCKS if text in ("auto", "folds") and alone else text).split(":")
     try:
         match kind, [[int(word) for word in part.split(",")] for part in parts]:
