@@ -16,6 +16,7 @@ from forcegp.checks.residuals import pushed_where_they_are
 from forcegp.checks.search import UNKNOWN, moving
 from forcegp.checks.torques import with_gravity
 from forcegp.data import Dataset, Preparation
+from forcegp.doubts import look
 from forcegp.errors import InvalidInput
 from forcegp.forces import Coulomb, Viscous
 from forcegp.mechanics import fixed_point
