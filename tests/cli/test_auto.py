@@ -15,7 +15,7 @@ from tests.goldens.compare import assert_unchanged
 from tests.simulation.pendulum import double_pendulum
 
 from forcegp import Dataset, Robot, load_posterior
-from forcegp.cli.answer import FIRST, is_explained, seen_in, verdict
+from forcegp.cli.answer import FIRST, heavy_links, is_explained, seen_in, verdict
 from forcegp.cli.auto import default_models, more_laws
 from forcegp.cli.logs import prepared_rows
 from forcegp.cli.main import parse_arguments
@@ -228,6 +228,24 @@ def test_the_answer_repeats_what_concerns_sensors_and_velocities():
     told = {"sensor": "one agrees.", "force sensor": off, "push": "a push.", "saturation": "one is clipped."}
     assert seen == {"velocity": "v is late. Shift it.", **told}
     assert FIRST & {*seen} == {"force sensor"}
+
+
+@pytest.mark.parametrize(
+    ("value", "least", "by", "payload", "told"),
+    [
+        (26.0, 16.0, "log", None, "arm 26 kg, 2.6 times the URDF's: wrong there, or a balancer, a gas"),
+        (24.0, 16.0, "log", None, ""),
+        (45.0, 16.0, "log", None, "arm 45 kg"),
+        (45.0, 14.0, "log", None, ""),
+        (45.0, 25.0, "prior", None, ""),
+        (45.0, 25.0, "log", {"link": "arm"}, ""),
+    ],
+)  # fmt: skip
+def test_links_that_are_far_heavier_are_told(value, least, by, payload, told):
+    each = SimpleNamespace(value=value, start=10.0, interval=(least, 60.0), decided_by=by)
+    found = heavy_links({"arm.mass": each, "viscous.arm": each}, payload)
+    assert found.startswith(told)
+    assert bool(found) == bool(told)
 
 
 def test_what_the_check_saw_is_estimated():

@@ -112,6 +112,7 @@ def answer_lines(
         *of_joints,
         *([("whole mass", weight)] if moving else []),
         ("payload", held),
+        *([("heavy links", each)] if (each := heavy_links(values, content["payload"])) else []),
         *causes.items(),
         ("models", f"error of q{ahead} / nRMSE of the acceleration (1: that of its mean), on unseen time: {errors}"),
         *left_of_torques(scores, best),
@@ -119,6 +120,20 @@ def answer_lines(
         ("record next", command + (f" (least is known of {weak})" if weak else "")),
         ("wrote", f"{out}/report.html, {out}/model, {out}/identified.urdf, {out}/validation/report.md"),
     ]  # fmt: skip
+
+
+HEAVY, SURELY = 2.5, 1.5  # times a link's mass in the URDF, and of its interval, from which more than the link is in it
+
+
+def heavy_links(values: Mapping[str, Any], payload: Mapping[str, Any] | None) -> str:
+    """Links that the log makes far heavier than the URDF has them, but for one that holds a payload."""
+    holds, found = (payload or {}).get("link"), list[str]()
+    for name, each in values.items():
+        link, dot, what = name.rpartition(".")
+        if dot and what == "mass" and link != holds and each.decided_by == "log" and (each.start or 0.0) > 0.0:
+            times, least = each.value / each.start, each.interval[0] / each.start
+            found += [f"{link} {each.value:.3g} kg, {times:.2g} times the URDF's"] * (times > HEAVY and least > SURELY)
+    return f"{'; '.join(found)}: wrong there, or a balancer, a gas spring or a cable pulls" if found else ""
 
 
 def seen_in(doubts: Sequence[Mapping[str, Any]]) -> dict[str, str]:
