@@ -143,6 +143,25 @@ def pipe(folder: Path) -> Path:
     return folder / "log.csv"
 
 
+def bag_elsewhere(kind: str) -> Callable[[Path], Path]:
+    """A bag whose only file is a link, a pipe, or named so that SQLite finds the file above it."""
+
+    def make(folder: Path) -> Path:
+        bag = write_bag2(folder / "log", motion(), "sqlite3")
+        (file := next(bag.glob("*.db3"))).rename(folder / "secret.db3")
+        if kind == "link":
+            file.symlink_to(folder / "secret.db3")
+        elif kind == "pipe":
+            os.mkfifo(file)
+        else:
+            (bag / "%2e%2e%2fsecret.db3").touch()
+            stated = (bag / "metadata.yaml").read_text().replace(file.name, "%2e%2e%2fsecret.db3")
+            (bag / "metadata.yaml").write_text(stated)
+        return bag
+
+    return make
+
+
 def linked(folder: Path) -> Path:
     write_hdf5(folder / "other.h5", motion())
     with h5py.File(folder / "log.h5", "w") as file:
@@ -212,6 +231,9 @@ BROKEN = {
     "bomb of zeros": Broken(bomb_of_parquet, "no log of sensors shrinks so far", ARRAYS),
     "pipe": Broken(pipe, "log.csv is not a regular file"),
     "crash of scipy": Broken(crashing_matlab, "log.mat: matlab crashed at it", ARRAYS),
+    "bag of links": Broken(bag_elsewhere("link"), "'log.db3' is a pipe, a device or a link to elsewhere"),
+    "bag of pipes": Broken(bag_elsewhere("pipe"), "'log.db3' is a pipe, a device or a link to elsewhere"),
+    "bag of addresses": Broken(bag_elsewhere("name"), "has %, ? or # in its name"),
     "long integer": Broken(written("log.json", b"[1%b]" % (b"0" * 400)), "no array of numbers", ARRAYS),
     "huge number": Broken(setting("u_elbow", 7, 1e100), "'u_elbow' (u of joint 'elbow') is 1e+100 at row 7"),
     "huge time": Broken(scaled(1e300, "time"), "the median step is"),

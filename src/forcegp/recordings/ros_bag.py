@@ -1,15 +1,10 @@
 """Bags of ROS 1 and 2, .mcap and .db3, read with `rosbags` (extra "logs"); several topics on one clock."""
 
 import re
-import shutil
 import tempfile
 import warnings
-import weakref
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,22 +13,15 @@ from jaxtyping import Bool, Float, Shaped
 from typing_extensions import override
 
 from forcegp.errors import DatasetError, DataWarning, FileFormatError, InvalidInput, required_extra
-from forcegp.recordings.cut_mcap import is_cut, whole_copy
+from forcegp.recordings import bag_messages
+from forcegp.recordings.bag_messages import LOG_TIME
 from forcegp.recordings.signal_plan import SignalPlan
-from forcegp.recordings.source import LONGEST_VECTOR, Columns, Source, element_names, reading, require_plausible_size
+from forcegp.recordings.source import Columns, Source
 from forcegp.robots.manifold import QUATERNION
+from forcegp.sandbox import MEMORY, SECONDS, read_apart
 
-LOG_TIME = "log_time"
-ROWS_AT_A_TIME = 2**16  # numbers of Python take ten times the memory of those in an array
 STAMP = "header.stamp"
-LOOKED_AT = 100  # messages of each topic that decide which columns there are: publishers may share a topic
-JOINT_STATE = "sensor_msgs/msg/JointState"
-NAMES = re.compile(r"name|\w*names")
-"""Fields whose texts name the elements of vectors beside them, and of those in messages beside them."""
 TWICE = re.compile(r"(pose|twist|accel)\.\1$")
-TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
-NANOSECONDS = 10**9
-NUMBER, ARRAY = (int, float), (np.ndarray, list)  # a union written at the call would be made for every field
 MOST_WHOLE = 0.5
 """Of the rows of a table: where more have all columns, the others were lost, and no topics stand side by side."""
 
@@ -53,52 +41,41 @@ class RosBag(Source):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self._left_out = 0
-        self.ros1 = path.suffix.lower() == ".bag"
-        own = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
-        cut = [file for file in own if is_cut(file)]
-        self._read = own if cut or not (path / "metadata.yaml").is_file() else [path]
-        if cut:
-            copies = Path(tempfile.mkdtemp())
-            weakref.finalize(self, shutil.rmtree, copies)
-            self._read = [whole_copy(file, copies) if file in cut else file for file in own]
+        self._left_out, real = 0, path.resolve()
+        for file in path.iterdir() if path.is_dir() else (path,):
+            inside = file.resolve()
+            if not {*"%?#"}.isdisjoint(file.name):  # SQLite takes names for URIs and decodes them
+                raise FileFormatError(
+                    f"{path}: {file.name!r} has %, ? or # in its name; rename it, and in metadata.yaml."
+                )
+            if not inside.is_relative_to(real) or not (inside.is_file() or inside.is_dir()):
+                raise FileFormatError(f"{path}: {file.name!r} is a pipe, a device or a link to elsewhere; take it out.")
+        self._topics: Mapping[str, tuple[str, ...]]  # topic -> its columns
+        listed = self._answer({})[0]
+        self._topics, self._named = ({name: tuple(own) for name, own in each.items()} for each in listed["listed"])
         if not self.columns():
             raise FileFormatError(f"{path} holds no messages with numbers.")
-        if cut:
-            with self._open() as reader:
-                whole = f"the {reader.message_count} whole messages before are read"
+        if listed["cut"]:
+            whole = f"the {listed['count']} whole messages before are read"
             warnings.warn(f"{path} ends in the middle of a record: {whole}.", DataWarning, stacklevel=2)
 
-    @contextmanager
-    def _open(self) -> Iterator[Any]:
-        reader_of = required_extra("rosbags.highlevel", "logs", "reading bags").AnyReader
-        types = required_extra("rosbags.typesys", "logs", "reading bags")
-        known = types.get_typestore(types.Stores.ROS1_NOETIC if self.ros1 else types.Stores.LATEST)
-        with reading(self.path, "a bag"), reader_of(self._read, default_typestore=known) as reader:
-            # rosbags 0.11 does not publish its list of MCAP chunks; a version without it reads them unchecked
-            for storage in (getattr(bag, "storage", None) for bag in reader.readers):
-                for store in getattr(storage, "storages", [storage]):  # a directory has several, a file is one
-                    for chunk in getattr(store, "chunks", ()):
-                        require_plausible_size(self.path, "a chunk", chunk.uncompressed_size, chunk.compressed_size)
-            yield reader
-
-    @cached_property
-    def _topics(self) -> Mapping[str, tuple[str, ...]]:
-        """Topic -> its columns."""
-        found: dict[str, dict[str, None]] = {}
-        self._named = dict[str, tuple[str, ...]]()
-        with self._open() as reader:
-            for connection in reader.connections:
-                names = found.setdefault(connection.topic, {})
-                for _, _, raw in islice(reader.messages([connection]), LOOKED_AT):
-                    vectors: dict[str, list[str]] = {}
-                    names |= dict.fromkeys(numbers(reader.deserialize(raw, connection.msgtype), None, vectors))
-                    for vector, elements in vectors.items():
-                        of = f"{connection.topic}:"
-                        own = dict.fromkeys((*self._named.get(of + vector, ()), *(of + name for name in elements)))
-                        self._named[of + vector] = tuple(own)
-                    names[LOG_TIME] = None
-        return {topic: tuple(f"{topic}:{name}" for name in names) for topic, names in found.items()}
+    def _answer(self, asked: Mapping[str, Any]) -> tuple[Mapping[str, Any], list[np.ndarray]]:
+        """What `bag_messages.answer` says in a process of its own, and the columns. Raises FileFormatError."""
+        required_extra("rosbags", "logs", "reading bags")
+        size = sum(file.stat().st_size for file in self.files())
+        with tempfile.TemporaryDirectory() as scratch:
+            limits = {"seconds": SECONDS + (size >> 18), "memory": MEMORY + 20 * size}
+            places = {"module": bag_messages.__name__, "path": str(self.path), "scratch": scratch}
+            asked = {**asked, **limits, **places}
+            answer = read_apart(
+                "rosbags", str(self.path), asked, FileFormatError, "record it again, or give a whole one"
+            )
+            if "refused" in answer:
+                raise FileFormatError(answer["refused"])
+            if "topic" not in asked:
+                return answer, []
+            with np.load(Path(scratch, bag_messages.KEPT), allow_pickle=False) as kept:
+                return answer, [kept[name] for name in kept.files]
 
     @override
     def columns(self) -> tuple[str, ...]:
@@ -156,66 +133,9 @@ class RosBag(Source):
                 f"{self.path}: the columns come from the topics {', '.join(topics)}, whose messages have times of "
                 "their own; read them one by one."
             )
-        wanted = [name[len(topics[0]) + 1 :] for name in names]
-        self._left_out = 0
-        with self._open() as reader:
-            connections = [item for item in reader.connections if item.topic == topics[0]]
-            kinds = sorted({item.msgtype for item in connections})
-            if len(kinds) > 1:
-                raise FileFormatError(f"{self.path}: topic {topics[0]} has messages of several types: {kinds}.")
-            messages = reader.messages(connections)
-            fields = {own.partition(".")[0].partition("[")[0] for own in wanted}
-            pieces: dict[str, list[np.ndarray]] = {name: [np.zeros(0, int)] for name in names}
-            while batch := list(islice(messages, ROWS_AT_A_TIME)):
-                found = ({**numbers(reader.deserialize(raw, kinds[0]), fields), LOG_TIME: at} for _, at, raw in batch)
-                table = [[values[own] for own in wanted] for values in found if values.keys() >= set(wanted)]
-                self._left_out += len(batch) - len(table)
-                for name, column in zip(names, zip(*table, strict=True), strict=False):
-                    pieces[name].append(np.array(column))
-        return {name: np.concatenate(own[1:] or own) for name, own in pieces.items()}
-
-
-def numbers(
-    message: Any, fields: Collection[str] | None = None, vectors: dict[str, list[str]] | None = None
-) -> dict[str, int | float]:
-    """The numbers of a message by path, `wrench.force.x` or `data[3]`; stamps in ns, elements that have names by these.
-
-    Texts and vectors of more than `LONGEST_VECTOR` numbers are left out; with `fields`, all but these fields of the
-    message. `vectors` receives the paths in every vector whose elements have names. Raises FileFormatError for a
-    JointState whose names and values differ in number.
-    """
-    found: dict[str, int | float] = {}
-
-    def collect(message: Any, before: str, names: Sequence[str]) -> None:
-        own = (texts for name, texts in vars(message).items() if NAMES.fullmatch(name) and isinstance(texts, list))
-        names = next((texts for texts in own if len(set(map(str, texts))) == len(texts)), names)
-        for name, value in vars(message).items():
-            path = before + name
-            if (fields is not None and not before and name not in fields) or isinstance(value, str):
-                continue
-            if isinstance(value, NUMBER):
-                found[path] = value
-            elif isinstance(value, ARRAY):
-                if message.__msgtype__ == JOINT_STATE and len(value) not in (0, len(names)):
-                    raise FileFormatError(f"a JointState has {len(names)} names but {len(value)} values of {name!r}.")
-                elements = value if isinstance(value, list) else value.tolist() if len(value) <= LONGEST_VECTOR else []
-                paths = element_names(path, len(elements))
-                if len(names) == len(elements):
-                    paths = [f"{path}.{each}" for each in names]
-                if elements and isinstance(elements[0], NUMBER):
-                    found.update(zip(paths, elements, strict=True))
-                    if vectors is not None and len(names) == len(elements):
-                        vectors[path] = paths
-                elif elements and not isinstance(elements[0], str):
-                    for inside, element in zip(paths, elements, strict=True):
-                        collect(element, f"{inside}.", names)
-            elif value.__msgtype__ in TIMES:
-                found[path] = value.sec * NANOSECONDS + value.nanosec
-            else:
-                collect(value, f"{path}.", names)
-
-    collect(message, "", ())
-    return found
+        answer, columns = self._answer({"topic": topics[0], "wanted": [name[len(topics[0]) + 1 :] for name in names]})
+        self._left_out = answer["left_out"]
+        return dict(zip(names, columns, strict=True))
 
 
 @dataclass(frozen=True)
