@@ -111,9 +111,9 @@ def require_replaceable(
         )
 
 
-def write_text(path: str | Path, text: str) -> None:
+def write_text(path: str | Path, text: str, *, overwrite: bool = True) -> None:
     """Write UTF-8 text with the line ends that it has. Raises as `atomic_file`."""
-    with atomic_file(path) as temporary:
+    with atomic_file(path, overwrite=overwrite) as temporary:
         temporary.write_bytes(text.encode("utf-8"))
 
 

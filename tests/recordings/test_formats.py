@@ -1,10 +1,12 @@
 """Every format passes the same tests."""
 
+import gzip
 import json
 from pathlib import Path
 
 import h5py
 import numpy as np
+import pyarrow as pa
 import pytest
 import scipy.io
 from numpy.testing import assert_array_equal
@@ -25,7 +27,7 @@ from tests.recordings.log_files import (
 from tests.recordings.source_conformance import SourceConformance
 
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput
-from forcegp.recordings import ColumnMapping, import_recordings, open_source
+from forcegp.recordings import ColumnMapping, import_recordings, open_source, tables
 from forcegp.recordings.source import require_distinct
 
 
@@ -325,6 +327,18 @@ def test_sensors_of_other_topics_are_vectors_of_their_messages(tmp_path):
     log = import_recordings([write_bag2(tmp_path / "log", motion())], mapping, model=model("continuous"))
     np.testing.assert_allclose(log.measured["force.one"][7], [7.0, 0.5, -1.0])
     np.testing.assert_allclose(log.measured["imu.two@0,0,0.1"][7], 9.80665 * np.array([7.0, 0.5, -1.0]))
+
+
+@pytest.mark.parametrize(("name", "encoding"), [("log.csv", "utf-8"), ("log.csv.gz", "utf-8"), ("log.csv", "utf-16")])
+def test_no_thread_of_pyarrow_waits_for_python(tmp_path, monkeypatch, name, encoding):
+    """It would crash at the end of Python: a stream of Python's, or a handler of rows."""
+    write_text(tmp_path / "log.csv", table(motion()))
+    content = (tmp_path / "log.csv").read_text().encode(encoding)
+    (tmp_path / name).write_bytes(gzip.compress(content) if name.endswith("gz") else content)
+    own, given = tables.arrow_csv.read_csv, []
+    monkeypatch.setattr(tables.arrow_csv, "read_csv", lambda *all, **more: (given.append(all), own(*all, **more))[1])
+    assert len(open_source(tmp_path / name).read(["time"])["time"]) == len(motion()["time"])
+    assert [(isinstance(source, pa.NativeFile), reads.use_threads) for source, reads, *_ in given] == [(True, False)]
 
 
 def test_columns_of_several_topics_are_refused(tmp_path):

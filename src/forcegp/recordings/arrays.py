@@ -275,7 +275,7 @@ def parquet_arrays(path: Path) -> Arrays:
 
     def content(name: str, width: int | None) -> np.ndarray:
         with reading(path, PARQUET), parquet.ParquetFile(path, pre_buffer=False) as file:
-            column = file.read(columns=[name]).column(name).combine_chunks()
+            column = file.read(columns=[name], use_threads=False).column(name).combine_chunks()
             if width is None:
                 return arrow_numbers(column)
             lengths = pc.call_function("list_value_length", [column]).fill_null(0).to_numpy(zero_copy_only=False)

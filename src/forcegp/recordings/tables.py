@@ -198,36 +198,40 @@ class DelimitedText(Source):
             )
         return {name: values[self._columns.index(name) :: width] for name in names}
 
-    def _parsed(self, stored: list[str], wanted: list[str], kinds: dict[str, Any], threads: bool = True) -> Any:
+    def _parsed(self, stored: list[str], wanted: list[str], kinds: dict[str, Any], again: bool = False) -> Any:
+        """The table; `again` after an error, with the row that it names, and without a line that was cut."""
         blanks = self._delimiter == BLANKS
         with reading(self.path, "text"), self._opened() as stream:
             for _ in range(self._lines_before):
                 stream.readline()
-            source, cut = stream, False
-            if blanks or self._comments or not threads:
+            # pyarrow reads ahead on threads, in which a stream of Python's would crash where Python ends meanwhile
+            begin, source, cut = stream.tell(), pa.OSFile(str(self.path)), False
+            source = pa.CompressedInputStream(source, "gzip") if self._compressed else source
+            source.read(begin)
+            if self.encoding != "utf-8" or blanks or self._comments or again:
                 text = _COMMENT_LINE.sub(b"", stream.read()) if self._comments else stream.read()
-                cut = not threads and not text.endswith(b"\n")  # is it the line at which the log was cut?
+                cut = again and not text.endswith(b"\n")  # is it the line at which the log was cut?
                 if cut:
                     text = text[: text.rfind(b"\n") + 1]
                 if blanks:
                     text = re.sub(rb"[ \t]+", b"\t", _OUTER_BLANKS.sub(b"", text.replace(b"\r\n", b"\n")))
-                source = io.BytesIO(text)
+                source = pa.BufferReader(text)
             ragged: list[Any] = []
             words = {*arrow_csv.ConvertOptions().null_values, *self._no_numbers}
             skip = (lambda row: ragged.append(row) or "skip") if self.lenient else None
-            reads = arrow_csv.ReadOptions(use_threads=threads, block_size=BLOCK, column_names=stored)
+            reads = arrow_csv.ReadOptions(use_threads=False, block_size=BLOCK, column_names=stored)
             parses = arrow_csv.ParseOptions(delimiter="\t" if blanks else self._delimiter, invalid_row_handler=skip)
             converts = {"include_columns": wanted, "column_types": kinds, "decimal_point": self._decimal}
             converts["null_values"] = [*words]
             try:
                 table = arrow_csv.read_csv(source, reads, parses, arrow_csv.ConvertOptions(**converts))
             except pa.ArrowInvalid as error:
-                if threads:  # pyarrow counts rows on one thread only
-                    return self._parsed(stored, wanted, kinds, threads=False)
+                if not again:
+                    return self._parsed(stored, wanted, kinds, again=True)
                 found = _CONVERSION.search(str(error))
                 if self.lenient and found and len(self._no_numbers) < LAST_LINES:
                     self._no_numbers.append(found[3])
-                    return self._parsed(stored, wanted, kinds, threads=False)
+                    return self._parsed(stored, wanted, kinds, again=True)
                 raise self._told_by_pyarrow(error) from error
             if len(ragged) > MOST_LOST * (len(table) + len(ragged)):
                 raise FileFormatError(
