@@ -162,6 +162,18 @@ def bag_elsewhere(kind: str) -> Callable[[Path], Path]:
     return make
 
 
+def integers(folder: Path) -> Path:
+    with h5py.File(folder / "log.h5", "w") as file:
+        file.create_dataset("q", data=np.zeros((100 * 2**17, 2), np.int8), compression="gzip")
+    return folder / "log.h5"
+
+
+def twins(path: Path) -> Path:
+    with zipfile.ZipFile(path, "a") as file:
+        file.writestr("q", b"")
+    return path
+
+
 def linked(folder: Path) -> Path:
     write_hdf5(folder / "other.h5", motion())
     with h5py.File(folder / "log.h5", "w") as file:
@@ -205,6 +217,8 @@ def folder_of_logs(folder: Path) -> Path:
     return folder / "logs"
 
 
+ONE = "--time time --q q_a,q_a --u u_a,u_a --robot arm.urdf"
+LATE = b"".join(b"%.2f,0,0\n" % (1e6 * (k // 150) + k % 150 / 100) for k in range(300))
 GOOD = csv(lambda columns: None)
 
 BROKEN = {
@@ -234,6 +248,21 @@ BROKEN = {
     "bag of links": Broken(bag_elsewhere("link"), "'log.db3' is a pipe, a device or a link to elsewhere"),
     "bag of pipes": Broken(bag_elsewhere("pipe"), "'log.db3' is a pipe, a device or a link to elsewhere"),
     "bag of addresses": Broken(bag_elsewhere("name"), "has %, ? or # in its name"),
+    "small integers": Broken(integers, "the file claims 200 MiB", ARRAYS),
+    "short rows": Broken(
+        lambda folder: written("log.csv.gz", gzip.compress(b"a,b\n" + b"0,0\n" * 2**23))(folder), "shrinks so far"
+    ),
+    "two of one name": Broken(lambda folder: twins(archive(folder)), "holds two arrays of one name", ARRAYS),
+    "rows of any length": Broken(
+        written("log.json", b"[" + b"[1],[1,2]," * 9999 + b"[1]]"), "lists of different", ARRAYS
+    ),
+    "month 13": Broken(
+        written("log.csv", b"time,q_a,u_a\n" + b"2024-13-45 1:00:00,0,0\n" * 9), "'time', the time, is missing", ONE
+    ),
+    "a long gap": Broken(
+        written("log.csv", b"time,q_a,u_a\n" + LATE), "300 rows would become 1e+08", f"{ONE} --gap 1e7"
+    ),
+    "a high rate": Broken(GOOD, "--rate", f"{FLAGS} --rate 1e8"),
     "long integer": Broken(written("log.json", b"[1%b]" % (b"0" * 400)), "no array of numbers", ARRAYS),
     "huge number": Broken(setting("u_elbow", 7, 1e100), "'u_elbow' (u of joint 'elbow') is 1e+100 at row 7"),
     "huge time": Broken(scaled(1e300, "time"), "the median step is"),

@@ -113,7 +113,8 @@ class Terminal:
         """Print the result of the command as one JSON object, if that was asked for."""
         if self._stdout is not None:
             sys.stdout.flush()
-            text = json.dumps(value, indent=1, allow_nan=False) + "\n"
+            finite = json.loads(json.dumps(value), parse_constant=lambda _: None)  # JSON has no NaN and infinity
+            text = json.dumps(finite, indent=1, allow_nan=False) + "\n"
             with os.fdopen(os.dup(self._stdout), "w", encoding="utf-8") as stdout:
                 stdout.write(text)
 

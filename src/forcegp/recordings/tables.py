@@ -8,6 +8,7 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import date
 from itertools import compress, takewhile
 from pathlib import Path
@@ -67,7 +68,8 @@ class DelimitedText(Source):
         if self._compressed:
             with reading(path, "text"), gzip.open(path) as stream:  # the size that it states is that of its last part
                 while stream.read(BLOCK):
-                    require_plausible_size(path, "what is compressed", stream.tell(), path.stat().st_size)
+                    # a number of two letters takes eight bytes
+                    require_plausible_size(path, "what is compressed", 4 * stream.tell(), path.stat().st_size)
         with reading(path, "text"), self._opened() as stream:
             self._notes = ["its letters are taken for cp1252"] if self.encoding == "cp1252" else []
             self._no_numbers: list[str] = []
@@ -280,7 +282,8 @@ def seconds_of(texts: Sequence[str | None]) -> np.ndarray:
     for row, found in enumerate(_TIME.fullmatch((text or "").strip()) for text in texts):
         if found is not None:
             day = [int(part) for part in re.split(r"\D", found[1] or "1970-1-1")]
-            days = date(*(day if day[0] > 31 else reversed(day))).toordinal() - date(1970, 1, 1).toordinal()
-            hour, minute, second = f"{found[3] or '0:0'}:0".replace(",", ".").split(":")[:3]
-            seconds[row] = 86400.0 * days + 3600 * int(hour) + 60 * int(minute) + float(second)
+            with suppress(ValueError):  # a month 13
+                days = date(*(day if day[0] > 31 else reversed(day))).toordinal() - date(1970, 1, 1).toordinal()
+                hour, minute, second = f"{found[3] or '0:0'}:0".replace(",", ".").split(":")[:3]
+                seconds[row] = 86400.0 * days + 3600 * int(hour) + 60 * int(minute) + float(second)
     return seconds + 86400.0 * np.cumsum((seconds < 86400.0) & (np.diff(seconds, prepend=seconds[:1]) < -43200.0))
