@@ -25,8 +25,7 @@ TRIAL = 2**16
 """Bytes that `require_writable` writes."""
 MARK = "Written by forcegp"
 """Stands near the end of pages and robot files, which may be replaced."""
-HOLE = 100 << 20
-"""Bytes that a file may lack of its size."""
+HOLE = 100 << 20  # bytes that a file may lack of its size
 LARGEST_TEXT = 32 << 20
 """Bytes of JSON or of a list that forcegp wrote: digests, settings, results; most have some thousand."""
 
@@ -286,9 +285,7 @@ def _lines(folder: Path, names: Iterable[str]) -> list[bytes]:
 
 def file_digest(path: Path) -> str:
     """The SHA-256 of a file. Raises FileFormatError for one that is almost all hole, which would be read for hours."""
-    if path.stat().st_size > max(HOLE, 200 * 512 * getattr(path.stat(), "st_blocks", math.inf)):
-        raise FileFormatError(
-            f"{path} claims {path.stat().st_size >> 20} MiB that are not there; copy or write it again."
-        )
+    if (size := path.stat().st_size) > max(HOLE, 200 * 512 * getattr(path.stat(), "st_blocks", math.inf)):
+        raise FileFormatError(f"{path} claims {size >> 20} MiB that are not there; copy or write it again.")
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -10,7 +10,7 @@ from tests.recordings.log_files import EPOCH, joint_states, motion, write_bag2
 
 from forcegp.errors import DataWarning, FileFormatError
 from forcegp.recordings import ColumnMapping, import_recordings, open_source, ros_bag
-from forcegp.recordings.bag_messages import numbers
+from forcegp.recordings.ros_bag import numbers
 
 COSTLY = {
     "or needed more than 3 s": "DROP TABLE schema; CREATE VIEW schema AS WITH RECURSIVE c(schema_version) AS "
@@ -66,7 +66,7 @@ def test_names_of_joints_hold_for_the_messages_inside():
     inside = {f"{at}.positions.{name}" for at in ("points[0]", "feedback") for name in ("elbow", "base")}
     assert inside < found.keys()
     assert found["feedback.positions.base"] == 2.0
-    assert vectors["feedback.positions"] == ["feedback.positions.elbow", "feedback.positions.base"]
+    assert [*vectors["feedback.positions"]] == ["feedback.positions.elbow", "feedback.positions.base"]
 
 
 def test_a_vector_whose_messages_name_the_joints_is_put_into_their_order(tmp_path):

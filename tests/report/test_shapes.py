@@ -70,7 +70,7 @@ def test_a_fine_mesh_loses_faces_and_keeps_its_size(tmp_path):
         ("file:///SECRET", None, "file:///SECRET is not below the folder of the URDF"),
         ("package://a/../secret.stl", None, "package://a/../secret.stl is not below the folder of the URDF"),
         ("link.stl", None, "link.stl is not below the folder of the URDF"),
-        ("scene.gltf", "{}", "scene.gltf is not one of .stl, .obj, .ply, .off up to 50 MiB"),
+        ("scene.gltf", "{}", "scene.gltf is no .stl/.obj/.ply/.off up to 50 MiB"),
         ("broken.obj", "f 1 2 nonsense", "broken.obj could not be read"),
     ],
 )

@@ -165,17 +165,15 @@ def hdf5_arrays(path: Path) -> Arrays:
             return stored[()]
 
     with reading(path, HDF5), h5py.File(path, "r") as file:
-        found = list(_stored(path, file, "", {}))
-        claimed = sum(COLUMN * math.prod(shape) for _, shape, _ in found if len(shape) < 3)  # others are no columns
-        require_plausible_size(path, "the file", claimed, sum(size for _, shape, size in found if len(shape) < 3))
+        found = list(_stored(path, file, "", set()))
+        flat = [(COLUMN * math.prod(shape), size) for _, shape, size in found if len(shape) < 3]  # others are pictures
+        require_plausible_size(path, "the file", *(sum(sizes) for sizes in zip((0, 0), *flat, strict=True)))
         return {name: (shape, lambda name=name: content(name)) for name, shape, _ in found}
 
 
-def _stored(
-    path: Path, group: h5py.Group, prefix: str, seen: dict[int, None]
-) -> Iterator[tuple[str, tuple[int, ...], int]]:
+def _stored(path: Path, group: h5py.Group, prefix: str, seen: set[Any]) -> Iterator[tuple[str, tuple[int, ...], int]]:
     """Name, shape and stored bytes of arrays; a group of several names counts by the first, else it may be endless."""
-    seen[h5py.h5o.get_info(group.id).addr] = None
+    seen.add(group)
     for name in map(str, group):
         full, link = prefix + name, group.get(name, getlink=True)
         item = group[name] if isinstance(link, h5py.HardLink) else None  # a soft link is another name
@@ -185,11 +183,10 @@ def _stored(
                 f"{path}: {full!r} is in another file, and links to other files are not followed; give that file, or "
                 "copy the data into one."
             )
-        if isinstance(item, h5py.Group):
+        if isinstance(item, h5py.Group) and item not in seen:
             if prefix.count("/") > 32:
                 raise FileFormatError(f"{path}: its groups are nested more than 32 deep.")
-            if h5py.h5o.get_info(item.id).addr not in seen:
-                yield from _stored(path, item, f"{full}/", seen)
+            yield from _stored(path, item, f"{full}/", seen)
         elif isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and item.shape is not None:
             stored = item.id.get_storage_size()
             require_plausible_size(path, repr(full), item.size * item.dtype.itemsize, stored)

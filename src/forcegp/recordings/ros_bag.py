@@ -1,10 +1,12 @@
 """Bags of ROS 1 and 2, .mcap and .db3, read with `rosbags` (extra "logs"); several topics on one clock."""
 
+import os
 import re
 import tempfile
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +15,20 @@ from jaxtyping import Bool, Float, Shaped
 from typing_extensions import override
 
 from forcegp.errors import DatasetError, DataWarning, FileFormatError, InvalidInput, required_extra
-from forcegp.recordings import bag_messages
-from forcegp.recordings.bag_messages import LOG_TIME
-from forcegp.recordings.signal_plan import SignalPlan
-from forcegp.recordings.source import Columns, Source
-from forcegp.robots.manifold import QUATERNION
+from forcegp.recordings.cut_mcap import is_cut, whole_copy
+from forcegp.recordings.source import LONGEST_VECTOR, Columns, Source, element_names, reading
 from forcegp.sandbox import MEMORY, SECONDS, read_apart
 
+LOG_TIME = "log_time"
+ROWS_AT_A_TIME = 2**16  # numbers of Python take ten times the memory of those in an array
+LOOKED_AT = 100  # messages of each topic that decide which columns there are: publishers may share a topic
 STAMP = "header.stamp"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+NAMES = re.compile(r"name|\w*names")
+"""Fields whose texts name the elements of vectors beside them, and of those in messages beside them."""
+TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+NANOSECONDS = 10**9
+NUMBER, ARRAY = (int, float), (np.ndarray, list)  # a union written at the call would be made for every field
 TWICE = re.compile(r"(pose|twist|accel)\.\1$")
 MOST_WHOLE = 0.5
 """Of the rows of a table: where more have all columns, the others were lost, and no topics stand side by side."""
@@ -44,15 +52,15 @@ class RosBag(Source):
         self._left_out, real = 0, path.resolve()
         for file in path.iterdir() if path.is_dir() else (path,):
             inside = file.resolve()
-            if not {*"%?#"}.isdisjoint(file.name):  # SQLite takes names for URIs and decodes them
-                raise FileFormatError(
-                    f"{path}: {file.name!r} has %, ? or # in its name; rename it, and in metadata.yaml."
-                )
-            if not inside.is_relative_to(real) or not (inside.is_file() or inside.is_dir()):
-                raise FileFormatError(f"{path}: {file.name!r} is a pipe, a device or a link to elsewhere; take it out.")
-        self._topics: Mapping[str, tuple[str, ...]]  # topic -> its columns
-        listed = self._answer({})[0]
-        self._topics, self._named = ({name: tuple(own) for name, own in each.items()} for each in listed["listed"])
+            here = inside.is_relative_to(real) and (inside.is_file() or inside.is_dir())
+            if not here or not {*"%?#"}.isdisjoint(file.name):  # SQLite takes names for URIs and decodes them
+                why = "a pipe, a device, a link to elsewhere or named with %, ? or #; take it out, or rename it."
+                raise FileFormatError(f"{path}: {file.name!r} is {why}")
+        listed, _ = self._answer({})
+        found = listed["found"]
+        self._topics = {topic: tuple(f"{topic}:{x}" for x in names) for topic, (names, _) in found.items()}
+        named = ((topic, *each) for topic, (_, vectors) in found.items() for each in vectors.items())
+        self._named = {f"{topic}:{vector}": tuple(f"{topic}:{x}" for x in own) for topic, vector, own in named}
         if not self.columns():
             raise FileFormatError(f"{path} holds no messages with numbers.")
         if listed["cut"]:
@@ -60,22 +68,19 @@ class RosBag(Source):
             warnings.warn(f"{path} ends in the middle of a record: {whole}.", DataWarning, stacklevel=2)
 
     def _answer(self, asked: Mapping[str, Any]) -> tuple[Mapping[str, Any], list[np.ndarray]]:
-        """What `bag_messages.answer` says in a process of its own, and the columns. Raises FileFormatError."""
+        """What `answer` says, and the columns asked for. Raises FileFormatError."""
         required_extra("rosbags", "logs", "reading bags")
-        size = sum(file.stat().st_size for file in self.files())
+        size, remedy = sum(file.stat().st_size for file in self.files()), "record it again, or give a whole one"
         with tempfile.TemporaryDirectory() as scratch:
-            limits = {"seconds": SECONDS + (size >> 18), "memory": MEMORY + 20 * size}
-            places = {"module": bag_messages.__name__, "path": str(self.path), "scratch": scratch}
-            asked = {**asked, **limits, **places}
-            answer = read_apart(
-                "rosbags", str(self.path), asked, FileFormatError, "record it again, or give a whole one"
-            )
-            if "refused" in answer:
-                raise FileFormatError(answer["refused"])
+            asked = {**asked, "module": __name__, "path": str(self.path), "kept": f"{scratch}/columns.npz"}
+            asked |= {"seconds": SECONDS + (size >> 18), "memory": MEMORY + 20 * size}
+            told = read_apart("rosbags", str(self.path), asked, FileFormatError, remedy)
+            if "refused" in told:
+                raise FileFormatError(told["refused"])
             if "topic" not in asked:
-                return answer, []
-            with np.load(Path(scratch, bag_messages.KEPT), allow_pickle=False) as kept:
-                return answer, [kept[name] for name in kept.files]
+                return told, []
+            with np.load(asked["kept"], allow_pickle=False) as kept:
+                return told, [kept[name] for name in kept.files]
 
     @override
     def columns(self) -> tuple[str, ...]:
@@ -138,6 +143,95 @@ class RosBag(Source):
         return dict(zip(names, columns, strict=True))
 
 
+def answer(request: dict[str, Any]) -> dict[str, Any]:
+    """Columns and named vectors by topic; with `topic`, its `wanted` fields in the file `kept`; `refused`: why not."""
+    path, tempfile.tempdir = Path(request["path"]), str(Path(request["kept"]).parent)
+    bag = path.absolute()
+    os.chdir(bag if bag.is_dir() else bag.parent)  # rosbags makes URIs of paths: SQLite would decode their folders
+    reader_of, types = (required_extra(f"rosbags.{name}", "logs", "reading bags") for name in ("highlevel", "typesys"))
+    known = types.get_typestore(types.Stores.ROS1_NOETIC if path.suffix.lower() == ".bag" else types.Stores.LATEST)
+    try:
+        with reading(path, "a bag"):
+            own = sorted(Path().glob("*.mcap")) if bag.is_dir() else [Path(bag.name)]
+            cut = [file for file in own if is_cut(file)]
+            read = own if cut or not bag.is_dir() or not Path("metadata.yaml").is_file() else [Path()]
+            read = [whole_copy(file, Path(tempfile.tempdir)) if file in cut else file for file in read]
+            with reader_of.AnyReader(read, default_typestore=known) as reader:
+                if "topic" in request:
+                    return {"left_out": _keep(reader, **request)}
+                found: dict[str, tuple[dict[str, None], dict[str, dict[str, None]]]] = {}
+                for connection in reader.connections:
+                    names, vectors = found.setdefault(connection.topic, ({}, {}))
+                    for _, _, raw in islice(reader.messages([connection]), LOOKED_AT):
+                        message = reader.deserialize(raw, connection.msgtype)
+                        names |= dict.fromkeys((*numbers(message, None, vectors), LOG_TIME))
+                return {"found": found, "cut": bool(cut), "count": reader.message_count if cut else 0}
+    except FileFormatError as error:
+        return {"refused": str(error)}
+
+
+def _keep(reader: Any, /, path: str, topic: str, wanted: Sequence[str], kept: str, **_: Any) -> int:
+    """Write the columns that are wanted of a topic; how many messages lack some of them."""
+    connections = [item for item in reader.connections if item.topic == topic]
+    kinds = sorted({item.msgtype for item in connections})
+    if len(kinds) > 1:
+        raise FileFormatError(f"{path}: topic {topic} has messages of several types: {kinds}.")
+    messages, left_out = reader.messages(connections), 0
+    fields = {own.partition(".")[0].partition("[")[0] for own in wanted}
+    pieces: list[list[np.ndarray]] = [[np.zeros(0, int)] for _ in wanted]
+    while batch := list(islice(messages, ROWS_AT_A_TIME)):
+        found = ({**numbers(reader.deserialize(raw, kinds[0]), fields), LOG_TIME: at} for _, at, raw in batch)
+        table = [[values[own] for own in wanted] for values in found if values.keys() >= set(wanted)]
+        left_out += len(batch) - len(table)
+        for piece, column in zip(pieces, zip(*table, strict=True), strict=False):
+            piece.append(np.array(column))
+    np.savez(kept, *(np.concatenate(own[1:] or own) for own in pieces))
+    return left_out
+
+
+def numbers(
+    message: Any, fields: Collection[str] | None = None, vectors: dict[str, dict[str, None]] | None = None
+) -> dict[str, int | float]:
+    """The numbers of a message by path, `wrench.force.x` or `data[3]`; stamps in ns, elements that have names by these.
+
+    Texts and vectors of more than `LONGEST_VECTOR` numbers are left out; with `fields`, all but these fields of the
+    message. `vectors` receives the paths in every vector whose elements have names. Raises FileFormatError for a
+    JointState whose names and values differ in number.
+    """
+    found: dict[str, int | float] = {}
+
+    def collect(message: Any, before: str, names: Sequence[str]) -> None:
+        own = (texts for name, texts in vars(message).items() if NAMES.fullmatch(name) and isinstance(texts, list))
+        names = next((texts for texts in own if len(set(map(str, texts))) == len(texts)), names)
+        for name, value in vars(message).items():
+            path = before + name
+            if (fields is not None and not before and name not in fields) or isinstance(value, str):
+                continue
+            if isinstance(value, NUMBER):
+                found[path] = value
+            elif isinstance(value, ARRAY):
+                if message.__msgtype__ == JOINT_STATE and len(value) not in (0, len(names)):
+                    raise FileFormatError(f"a JointState has {len(names)} names but {len(value)} values of {name!r}.")
+                elements = value if isinstance(value, list) else value.tolist() if len(value) <= LONGEST_VECTOR else []
+                paths = element_names(path, len(elements))
+                if len(names) == len(elements):
+                    paths = [f"{path}.{each}" for each in names]
+                if elements and isinstance(elements[0], NUMBER):
+                    found.update(zip(paths, elements, strict=True))
+                    if vectors is not None and len(names) == len(elements):
+                        vectors.setdefault(path, {}).update(dict.fromkeys(paths))
+                elif elements and not isinstance(elements[0], str):
+                    for inside, element in zip(paths, elements, strict=True):
+                        collect(element, f"{inside}.", names)
+            elif value.__msgtype__ in TIMES:
+                found[path] = value.sec * NANOSECONDS + value.nanosec
+            else:
+                collect(value, f"{path}.", names)
+
+    collect(message, "", ())
+    return found
+
+
 @dataclass(frozen=True)
 class Read:
     """Columns of one length, remarks, columns of u that hold, of other topics the median step and the age per row.
@@ -158,12 +252,14 @@ class Read:
                       axis=0)  # fmt: skip
 
 
-def read_on_one_clock(source: Source, plan: SignalPlan) -> Read:
-    """The columns of a plan, all at the messages of the topic of its time; of a sparse table, of its positions.
+def read_on_one_clock(source: Source, plan: Any) -> Read:
+    """The columns of a `SignalPlan`, all at the messages of the topic of its time; of a sparse table, of its positions.
 
     Angles that move by half a turn or more between two messages are held, as they wrap, and of quaternions the sign
     means nothing. Raises InvalidInput where joining has no meaning, DatasetError for stamps backwards or apart.
     """
+    from forcegp.robots.manifold import QUATERNION  # with torch, which the process that reads bags lacks
+
     topics = {name: source.topic_of(name) for name in plan.columns} if isinstance(source, RosBag) else {}
     whole, filled = Columns(), dict[str, np.ndarray]()
     if len({*topics.values()}) < 2:
@@ -267,7 +363,7 @@ def _stamp_beside(source: Source, topic: str, wanted: str) -> str:
     return found
 
 
-def _topics(columns: Columns, plan: SignalPlan) -> tuple[dict[str, str], dict[str, Bool[np.ndarray, " rows"]]]:
+def _topics(columns: Columns, plan: Any) -> tuple[dict[str, str], dict[str, Bool[np.ndarray, " rows"]]]:
     """Columns of a table by topic, called by its first column, and where it has values: exports join several topics.
 
     The time is that of the positions. One topic for a table of whole rows, or without a column of the time.

@@ -68,8 +68,8 @@ class DelimitedText(Source):
         if self._compressed:
             with reading(path, "text"), gzip.open(path) as stream:  # the size that it states is that of its last part
                 while stream.read(BLOCK):
-                    # a number of two letters takes eight bytes
-                    require_plausible_size(path, "what is compressed", 4 * stream.tell(), path.stat().st_size)
+                    expanded = 4 * stream.tell()  # a number of two letters takes eight bytes
+                    require_plausible_size(path, "what is compressed", expanded, path.stat().st_size)
         with reading(path, "text"), self._opened() as stream:
             self._notes = ["its letters are taken for cp1252"] if self.encoding == "cp1252" else []
             self._no_numbers: list[str] = []

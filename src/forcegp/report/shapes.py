@@ -43,10 +43,9 @@ def trimesh_module() -> Any:
 def link_shapes(robot: Robot, urdf: str | Path | None = None) -> tuple[list[LinkShape], list[str]]:
     """The shape of every link, and sentences about those that could not be drawn as their file says.
 
-    `urdf` is a file whose visual elements are taken by the names of the links; its meshes are searched below
-    its folder, or that of the ROS package around it. Without it those of the robot's own URDF count, of which only
-    boxes, cylinders and spheres can be drawn: a Robot has no folder. Links with mass and without shape become capsules
-    to the joints that they carry.
+    `urdf` is a file whose visual elements are taken by the names of the links; its meshes are those below
+    its folder, or that of its ROS package. Without it those of the robot's own URDF count, of which only boxes,
+    cylinders and spheres are drawn: a Robot has no folder. Links with mass but no shape become capsules to the joints.
 
     Raises MissingExtra without trimesh, and InvalidInput for a file that is no URDF.
     """
@@ -117,11 +116,7 @@ def _loaded(element: Element, urdf: Path | None, doubts: list[str]) -> Any:
     name = element.get("filename", "")
     path = None if urdf is None else _found(name, urdf)
     if path is None or path.suffix.lower() not in FORMATS or path.stat().st_size > LARGEST_FILE:
-        why = (
-            "is not below the folder of the URDF"
-            if path is None
-            else f"is not one of {', '.join(FORMATS)} up to 50 MiB"
-        )
+        why = "is not below the folder of the URDF" if path is None else f"is no {'/'.join(FORMATS)} up to 50 MiB"
         doubts.append(f"{name} {why}; its link is drawn as a capsule.")
         return None
     try:
