@@ -134,8 +134,7 @@ def test_whole_messages_before_a_cut_are_read_with_a_warning(tmp_path, packed, s
 def test_a_bag_costs_no_more_than_its_limits(tmp_path, monkeypatch, told):
     monkeypatch.setattr(ros_bag, "SECONDS", 3 if " s" in told else 30)
     bag = write_bag2(tmp_path / "log", motion(), "sqlite3")
-    with closing(sqlite3.connect(next(bag.glob("*.db3")))) as file:
+    with closing(sqlite3.connect(bag / "log.db3")) as file:
         file.executescript(COSTLY[told])
-    with pytest.raises(FileFormatError, match=told) as caught:
+    with pytest.raises(FileFormatError, match=f"^[^\n]*{told}[^\n]*$"):
         open_source(bag)
-    assert "\n" not in str(caught.value)

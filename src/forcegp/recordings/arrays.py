@@ -42,7 +42,6 @@ MOST_NAMES = 12  # of arrays in a message
 NUMPY, HDF5, MATLAB, PARQUET = "a NumPy archive", "an HDF5 file", "a MATLAB file", "a Parquet file"
 INTERNAL = "#"  # begins names under which MATLAB keeps the contents of cells
 REFERENCE = np.dtype(object)
-COLUMN = 8  # bytes of a number in a column, whatever it takes in the file
 MOST_RAGGED = 10_000  # lists of different lengths in one, such as episodes
 
 Arrays = Mapping[str, tuple[tuple[int, ...], Callable[[], np.ndarray]]]
@@ -150,7 +149,7 @@ def numpy_arrays(path: Path) -> Arrays:
                 )
             if dtype.kind in "fiu":
                 if len(shape) < 3:
-                    require_plausible_size(path, repr(name), COLUMN * math.prod(shape), member.compress_size)
+                    require_plausible_size(path, repr(name), 8 * math.prod(shape), member.compress_size)
                 found[name] = shape, lambda name=name: content(name)
     return found
 
@@ -166,7 +165,9 @@ def hdf5_arrays(path: Path) -> Arrays:
 
     with reading(path, HDF5), h5py.File(path, "r") as file:
         found = list(_stored(path, file, "", set()))
-        flat = [(COLUMN * math.prod(shape), size) for _, shape, size in found if len(shape) < 3]  # others are pictures
+        flat = [
+            (8 * math.prod(shape), size) for _, shape, size in found if len(shape) < 3
+        ]  # as columns, without pictures
         require_plausible_size(path, "the file", *(sum(sizes) for sizes in zip((0, 0), *flat, strict=True)))
         return {name: (shape, lambda name=name: content(name)) for name, shape, _ in found}
 

@@ -69,8 +69,8 @@ class Recording:
             stamps, held = time, list(self.layout.held)
             count = int(np.floor((stamps[-1] - stamps[0]) / step * (1 + 1e-12))) + 1
             if count > max(MOST_ROWS, LARGEST_STRETCH * len(stamps)):
-                given, made = self.source.path, f"{len(stamps)} rows would become {count:.3g}, {step:.3g} s apart"
-                raise DatasetError(f"{given}: {made}; give a lower `rate`, or a shorter `gap` that ends an episode.")
+                seen = f"{self.source.path}: {len(stamps)} rows would become {count:.3g}"
+                raise DatasetError(f"{seen}; give a lower `rate`, or a shorter `gap` that ends an episode.")
             time = np.minimum(stamps[0] + step * np.arange(count), stamps[-1])
             before = np.searchsorted(stamps, time * (1 + 1e-12), side="right") - 1
             u = signals.get("u", np.zeros((len(stamps), 0)))[before]

@@ -207,9 +207,8 @@ class DelimitedText(Source):
             for _ in range(self._lines_before):
                 stream.readline()
             # pyarrow reads ahead on threads, in which a stream of Python's would crash where Python ends meanwhile
-            begin, source, cut = stream.tell(), pa.OSFile(str(self.path)), False
-            source = pa.CompressedInputStream(source, "gzip") if self._compressed else source
-            source.read(begin)
+            cut, source = False, pa.input_stream(str(self.path), "gzip" if self._compressed else None)
+            source.read(stream.tell())
             if self.encoding != "utf-8" or blanks or self._comments or again:
                 text = _COMMENT_LINE.sub(b"", stream.read()) if self._comments else stream.read()
                 cut = again and not text.endswith(b"\n")  # is it the line at which the log was cut?
