@@ -165,9 +165,7 @@ def hdf5_arrays(path: Path) -> Arrays:
 
     with reading(path, HDF5), h5py.File(path, "r") as file:
         found = list(_stored(path, file, "", set()))
-        flat = [
-            (8 * math.prod(shape), size) for _, shape, size in found if len(shape) < 3
-        ]  # as columns, without pictures
+        flat = [(8 * math.prod(shape), size) for _, shape, size in found if len(shape) < 3]  # no pictures
         require_plausible_size(path, "the file", *(sum(sizes) for sizes in zip((0, 0), *flat, strict=True)))
         return {name: (shape, lambda name=name: content(name)) for name, shape, _ in found}
 
