@@ -299,6 +299,9 @@ def test_folders_that_others_made_or_wrote_into_are_not_replaced(tmp_path):
     (folder / "elsewhere").symlink_to("/nowhere")
     with pytest.raises(FileFormatError, match=r"did not write \(elsewhere, notes/monday\.txt\)"):
         asked()
+    os.truncate(folder / "model.txt", 1 << 30)
+    with pytest.raises(FileFormatError, match="claims 1024 MiB"):
+        require_unchanged(folder, "fit again")
     (folder / "model.txt").write_text("other")
     with pytest.raises(FileFormatError, match=r"damaged: model\.txt is not as it was written; fit again"):
         require_unchanged(folder, "fit again")

@@ -7,6 +7,7 @@ import contextlib
 import ctypes
 import hashlib
 import json
+import math
 import os
 import re
 import secrets
@@ -24,6 +25,7 @@ TRIAL = 2**16
 """Bytes that `require_writable` writes."""
 MARK = "Written by forcegp"
 """Stands near the end of pages and robot files, which may be replaced."""
+HOLE = 100 << 20  # bytes that a file may lack of its size
 LARGEST_TEXT = 32 << 20
 """Bytes of JSON or of a list that forcegp wrote: digests, settings, results; most have some thousand."""
 
@@ -111,9 +113,9 @@ def require_replaceable(
         )
 
 
-def write_text(path: str | Path, text: str) -> None:
+def write_text(path: str | Path, text: str, *, overwrite: bool = True) -> None:
     """Write UTF-8 text with the line ends that it has. Raises as `atomic_file`."""
-    with atomic_file(path) as temporary:
+    with atomic_file(path, overwrite=overwrite) as temporary:
         temporary.write_bytes(text.encode("utf-8"))
 
 
@@ -282,6 +284,8 @@ def _lines(folder: Path, names: Iterable[str]) -> list[bytes]:
 
 
 def file_digest(path: Path) -> str:
-    """The SHA-256 of a file."""
+    """The SHA-256 of a file. Raises FileFormatError for one that is almost all hole, which would be read for hours."""
+    if (size := path.stat().st_size) > max(HOLE, 200 * 512 * getattr(path.stat(), "st_blocks", math.inf)):
+        raise FileFormatError(f"{path} claims {size >> 20} MiB that are not there; copy or write it again.")
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,7 +1,7 @@
-"""Readers of files that others wrote, those of MuJoCo, xacro and MATLAB, in a process of their own with limits.
+"""Readers of files that others wrote, those of MuJoCo, xacro, MATLAB and ROS, in a process of their own with limits.
 
 What crashes, hangs or takes all memory there is an error here. `python -m forcegp.sandbox` is that process: it
-takes one request as JSON and gives one answer as JSON; it imports neither torch nor the rest of forcegp.
+takes one request as JSON and gives one answer as JSON; it imports no torch, and of forcegp the `module` asked for.
 """
 
 import base64
@@ -37,10 +37,10 @@ def read_apart(
     error: type[ForceGPError] = RobotModelError,
     remedy: str = "give the file of one robot, without copies in great number",
 ) -> dict[str, Any]:
-    """The answer of a reader ("mujoco", "xacro" or "matlab"); `refused` in it is the reason of one that failed.
+    """The answer of a reader ("mujoco", "xacro", "matlab", or that of a module).
 
-    Raises the `error` where there is no answer: the reader crashed, or needed more than `SECONDS` or `MEMORY`, or
-    those of the request.
+    `refused` in it is the reason of one that failed. Raises the `error` where there is none: the reader crashed, or
+    needed more than `SECONDS` or `MEMORY`, or those of the request.
     """
     path = os.pathsep.join(folder for folder in sys.path if folder)
     ones = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MALLOC_ARENA_MAX", "PYTHONDONTWRITEBYTECODE")
@@ -60,8 +60,10 @@ def _answer(request: dict[str, Any]) -> dict[str, Any]:
     if os.name == "posix":  # elsewhere only the wall time is limited
         import resource
 
-        for limit, value in ((resource.RLIMIT_CPU, request["seconds"]), (resource.RLIMIT_AS, request["memory"])):
-            resource.setrlimit(limit, (value, value))
+        for limit, value in (("CPU", "seconds"), ("AS", "memory"), ("FSIZE", "memory")):
+            resource.setrlimit(getattr(resource, f"RLIMIT_{limit}"), (request[value], request[value]))
+    if "module" in request:
+        return importlib.import_module(request["module"]).answer(request)
     return {"mujoco": _compiled, "xacro": _expanded, "matlab": _variables}[request["reader"]](request)
 
 

@@ -82,6 +82,7 @@ REFUSALS = {
     ("import", "noisy.h5", "--delay", "0.1,x", "--out", "x.h5"): "--delay is '0.1,x'; give seconds",
     ("import", "lost.h5", "--cutoff", "9", "--out", "x.h5"): "not sampled uniformly: the step after row 599",
     ("import", "noisy.h5", "--cutoff", "-3", "--out", "x.h5"): "cutoff is -3.0",
+    ("import", "noisy.h5", "--cutoff", "1e-300", "--out", "x.h5"): "more than 1e+15 are needed",
     ("check", "arm.urdf"): "is not an HDF5 file",
 }
 

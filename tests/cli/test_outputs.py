@@ -141,15 +141,20 @@ def test_files_that_a_user_put_there_are_never_deleted(folder, no_work, monkeypa
     assert Path("out/notes.txt").read_text() == "mine"
 
 
-@pytest.mark.parametrize("written", ["a file", "a folder"])
+@pytest.mark.parametrize("written", ["a file", "a robot", "a motion", "a folder"])
 def test_what_another_process_wrote_meanwhile_stays(folder, capfd, monkeypatch, written):
     def meanwhile(own, make):
         return lambda *given, **more: (make(), own(*given, **more))[1]
 
-    if written == "a file":
-        change = meanwhile(forcegp.import_recordings, lambda: Path("out").write_text("theirs"))
-        monkeypatch.setattr(forcegp, "import_recordings", change)
-        told = refused([*IMPORT.split(), "--out", "out"], capfd)
+    works = {"a file": (forcegp, "import_recordings"), "a motion": (forcegp, "excitation")}
+    works["a robot"] = (forcegp.Model, "from_file")
+    words = {"a robot": "robot arm.urdf --out out.xml", "a motion": "excite --robot arm.urdf --tries 3 --out out"}
+    if written != "a folder":
+        out = words.get(written, "out").split()[-1]
+        change = meanwhile(getattr(*works[written]), lambda: Path(out).write_text("theirs"))
+        monkeypatch.setattr(*works[written], change)
+        told = refused(words.get(written, f"{IMPORT} --out out").split(), capfd).replace(".xml", "")
+        Path(out).rename("out")
         assert Path("out").read_text() == "theirs"
     else:
         change = meanwhile(

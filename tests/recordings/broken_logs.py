@@ -88,14 +88,6 @@ def scaled(factor: float, *names: str) -> Callable[[Path], Path]:
     return csv(change)
 
 
-def swapped(columns: dict[str, np.ndarray]) -> None:
-    columns["time"][[50, 51]] = columns["time"][[51, 50]]
-
-
-def constant_time(columns: dict[str, np.ndarray]) -> None:
-    columns["time"][:] = 3.0
-
-
 def wrapping(columns: dict[str, np.ndarray]) -> None:
     columns["q_elbow"] = (np.linspace(0, 9, len(columns["time"])) + np.pi) % (2 * np.pi) - np.pi
 
@@ -143,6 +135,29 @@ def pipe(folder: Path) -> Path:
     return folder / "log.csv"
 
 
+def elsewhere(spoil: Callable[[Path, Path], object]) -> Callable[[Path], Path]:
+    """A bag whose only file lies above it, and what stands in its place."""
+
+    def make(folder: Path) -> Path:
+        bag = write_bag2(folder / "log", motion(), "sqlite3")
+        spoil(bag / "log.db3", (bag / "log.db3").rename(folder / "secret.db3"))
+        return bag
+
+    return make
+
+
+def integers(folder: Path) -> Path:
+    with h5py.File(folder / "log.h5", "w") as file:
+        file.create_dataset("q", data=np.zeros((100 * 2**17, 2), np.int8), compression="gzip")
+    return folder / "log.h5"
+
+
+def twins(path: Path) -> Path:
+    with zipfile.ZipFile(path, "a") as file:
+        file.writestr("q", b"")
+    return path
+
+
 def linked(folder: Path) -> Path:
     write_hdf5(folder / "other.h5", motion())
     with h5py.File(folder / "log.h5", "w") as file:
@@ -161,10 +176,6 @@ def mcap(folder: Path) -> Path:
     return next(write_bag2(folder / "log", motion()).glob("*.mcap"))
 
 
-def episode_again(columns: dict) -> None:
-    columns["episode"] = np.repeat([0.0, 1.0, 0.0, 0.0], len(columns["time"]) // 4)
-
-
 def with_urdf(make: Callable[[Path], Path], *joints: str) -> Callable[[Path], Path]:
     def both(folder: Path) -> Path:
         (folder / "arm.urdf").write_text(urdf(*joints))
@@ -181,56 +192,62 @@ def written(name: str, content: bytes) -> Callable[[Path], Path]:
     return make
 
 
-def folder_of_logs(folder: Path) -> Path:
-    (folder / "logs").mkdir()
-    return folder / "logs"
-
-
+ONE = "--time time --q q_a,q_a --u u_a,u_a --robot arm.urdf"
+LATE = b"".join(b"%.2f,0,0\n" % (1e6 * (k // 150) + k % 150 / 100) for k in range(300))
 GOOD = csv(lambda columns: None)
 
 BROKEN = {
     "no such file": Broken(lambda folder: folder / "log.csv", "log.csv does not exist"),
     "missing column": Broken(GOOD, "no column 'p_shoulder'", FLAGS.replace("q_{", "p_{")),
     "nothing mapped": Broken(
-        with_urdf(GOOD, "hip", "knee"), "no columns for q (positions)", "--time time --robot arm.urdf"
-    ),
+        with_urdf(GOOD, "hip", "knee"), "no columns for q (positions)", "--time time --robot arm.urdf"),
     "no robot": Broken(GOOD, "give --robot ARM.urdf", "--time time --q q_shoulder,q_elbow --u 0"),
     "NaN": Broken(setting("v_elbow", 7, np.nan), "'v_elbow' (v of joint 'elbow') is missing (empty or NaN) at row 7"),
     "text": Broken(
-        text(lambda t: t.replace(t.splitlines()[5].split(",")[2], "stop", 1)), "'q_elbow' holds 'stop' at row 4"
-    ),
+        text(lambda t: t.replace(t.splitlines()[5].split(",")[2], "stop", 1)), "'q_elbow' holds 'stop' at row 4"),
     "ragged": Broken(text(lambda t: t + "1.0,2.0\n"), "row 200 (line 202) has 2 fields instead of 7"),
     "duplicate names": Broken(text(lambda t: t.replace("v_elbow", "q_elbow")), "'q_elbow' stands over columns 3, 5"),
     "no header": Broken(
-        text(lambda t: t[t.index("\n") + 1 :]), "no column 'q_shoulder' in log.csv. Valid columns: c1, c2"
-    ),
+        text(lambda t: t[t.index("\n") + 1 :]), "no column 'q_shoulder' in log.csv. Valid columns: c1, c2"),
     "binary": Broken(written("log.csv", bytes(range(256)) * 9), "holds binary data"),
     "pickle": Broken(written("log.pkl", pickle.dumps([1])), "reading those runs code"),
-    "folder": Broken(folder_of_logs, "no ROS 2 bag (metadata.yaml)"),
+    "folder": Broken(lambda folder: (folder / "logs").mkdir() or folder / "logs", "no ROS 2 bag (metadata.yaml)"),
     "folder without a name": Broken(lambda folder: folder, ". is a folder, but no ROS 2 bag (metadata.yaml)"),
     "gzip bomb": Broken(bomb_of_gzip, "no log of sensors shrinks so far"),
     "bomb of zeros": Broken(bomb_of_parquet, "no log of sensors shrinks so far", ARRAYS),
     "pipe": Broken(pipe, "log.csv is not a regular file"),
     "crash of scipy": Broken(crashing_matlab, "log.mat: matlab crashed at it", ARRAYS),
+    "bag of links": Broken(elsewhere(Path.symlink_to), "'log.db3' is a pipe, a device, a link to elsewhere"),
+    "bag of pipes": Broken(elsewhere(lambda bag, _: os.mkfifo(bag)), "'log.db3' is a pipe, a device, a link"),
+    "bag of addresses": Broken(elsewhere(lambda bag, _: bag.with_name("%2e%2e%2fsecret.db3").touch()), "%, ? or #"),
+    "small integers": Broken(integers, "the file claims 200 MiB", ARRAYS),
+    "short rows": Broken(
+        lambda folder: written("log.csv.gz", gzip.compress(b"a,b\n" + b"0,0\n" * 2**23))(folder), "shrinks so far"),
+    "two of one name": Broken(lambda folder: twins(archive(folder)), "holds two arrays of one name", ARRAYS),
+    "rows of any length": Broken(
+        written("log.json", b"[" + b"[1],[1,2]," * 9999 + b"[1]]"), "lists of different", ARRAYS),
+    "month 13": Broken(
+        written("log.csv", b"time,q_a,u_a\n" + b"2024-13-45 1:00:00,0,0\n" * 9), "'time', the time, is missing", ONE),
+    "a long gap": Broken(
+        written("log.csv", b"time,q_a,u_a\n" + LATE), "300 rows would become 1e+08", f"{ONE} --gap 1e7"),
+    "a high rate": Broken(GOOD, "--rate", f"{FLAGS} --rate 1e8"),
     "long integer": Broken(written("log.json", b"[1%b]" % (b"0" * 400)), "no array of numbers", ARRAYS),
     "huge number": Broken(setting("u_elbow", 7, 1e100), "'u_elbow' (u of joint 'elbow') is 1e+100 at row 7"),
     "huge time": Broken(scaled(1e300, "time"), "the median step is"),
-    "time backwards": Broken(csv(swapped), "time runs backwards by 0.00195312 s at row 51 (line 53)"),
-    "time stands still": Broken(csv(constant_time), "all rows have the same time stamp"),
+    "time backwards": Broken(
+        csv(lambda x: x["time"].put([50, 51], x["time"][[51, 50]])), "runs backwards by 0.00195312 s at row 51 (line 53)"),
+    "time stands still": Broken(csv(lambda columns: columns["time"].fill(3.0)), "all rows have the same time stamp"),
     "ms given as s": Broken(scaled(1e3, "time"), "add --unit time=ms"),
     "unknown unit": Broken(GOOD, "no unit 'degrees' in the units of q; did you mean", f"{FLAGS} --unit q=degrees"),
     "angle wraps": Broken(csv(wrapping), "jumps by more than half a turn", FLAGS),
     "degrees": Broken(scaled(57.3, "q_shoulder", "q_elbow"), "Give --unit q=deg if it is in deg"),
     "beyond limits": Broken(
-        with_urdf(scaled(3.0, "q_elbow"), "shoulder", "elbow"), "beyond its limits -1.5 to 1.5 in the URDF"
-    ),
+        with_urdf(scaled(3.0, "q_elbow"), "shoulder", "elbow"), "beyond its limits -1.5 to 1.5 in the URDF"),
     "another robot": Broken(
-        with_urdf(GOOD, "shoulder", "wrist"), "'pendulum' has shoulder, wrist", f"{FLAGS} --joints shoulder,elbow"
-    ),
+        with_urdf(GOOD, "shoulder", "wrist"), "'pendulum' has shoulder, wrist", f"{FLAGS} --joints shoulder,elbow"),
     "too few columns": Broken(GOOD, "u has 1 columns for 2 joints", FLAGS.replace("u_{joints}", "u_elbow")),
     "no combination": Broken(
-        GOOD, "is no combination", FLAGS.replace("--q q_{joints}", "--q q_shoulder**q_elbow,q_elbow")
-    ),
+        GOOD, "is no combination", FLAGS.replace("--q q_{joints}", "--q q_shoulder**q_elbow,q_elbow")),
     "cut member": Broken(lambda f: member(f, claiming((200, 2))), "claims the shape (200, 2)", ARRAYS),
     "bad header": Broken(lambda f: member(f, npy.magic(1, 0) + b"\xff\x10" + b"{" * 5000), "a NumPy archive", ARRAYS),
     "npz bomb": Broken(lambda f: member(f, claiming((10**8, 2)) + bytes(2 * 10**8)), "shrinks so far", ARRAYS),
@@ -239,10 +256,9 @@ BROKEN = {
     "no such group": Broken(archive, "no array or group", f"{ARRAYS} --episodes run*"),
     "external link": Broken(linked, "links to other files are not followed", ARRAYS),
     "hollow HDF5": Broken(hollow, "shrinks so far", ARRAYS),
-    "two topics": Broken(
-        mcap,
-        "several topics are joined by their stamps",
-        "--step 0.002 --q /joint_states:position --u /wrench:wrench.force.x,0 --robot arm.urdf",
-    ),
-    "episode again": Broken(csv(episode_again), "episode 0 begins again at row 100", f"{FLAGS} --episode episode"),
-}
+    "two topics": Broken(mcap, "several topics are joined by their stamps",
+        "--step 0.002 --q /joint_states:position --u /wrench:wrench.force.x,0 --robot arm.urdf"),
+    "episode again": Broken(
+        csv(lambda columns: columns.update(episode=np.repeat([0.0, 1.0, 0.0, 0.0], 50))),
+        "episode 0 begins again at row 100", f"{FLAGS} --episode episode"),
+}  # fmt: skip

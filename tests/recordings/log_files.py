@@ -65,6 +65,7 @@ def write_hdf5(path: Path, data: dict[str, np.ndarray]) -> Path:
     with h5py.File(path, "w") as file:
         for name, values in data.items():
             file.create_dataset(f"log/{name}", data=values, compression="gzip")
+        file["log/again"] = file["log"]  # a second name, and by it names without end
     return path
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pyarrow as pa
 import pytest
 import scipy.io
 from numpy.testing import assert_array_equal
@@ -25,7 +26,7 @@ from tests.recordings.log_files import (
 from tests.recordings.source_conformance import SourceConformance
 
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput
-from forcegp.recordings import ColumnMapping, import_recordings, open_source
+from forcegp.recordings import ColumnMapping, import_recordings, open_source, tables
 from forcegp.recordings.source import require_distinct
 
 
@@ -325,6 +326,14 @@ def test_sensors_of_other_topics_are_vectors_of_their_messages(tmp_path):
     log = import_recordings([write_bag2(tmp_path / "log", motion())], mapping, model=model("continuous"))
     np.testing.assert_allclose(log.measured["force.one"][7], [7.0, 0.5, -1.0])
     np.testing.assert_allclose(log.measured["imu.two@0,0,0.1"][7], 9.80665 * np.array([7.0, 0.5, -1.0]))
+
+
+def test_no_thread_of_pyarrow_waits_for_python(tmp_path, monkeypatch):
+    """It would crash at the end of Python: in a stream of Python's, or in a handler of rows."""
+    own, given = tables.arrow_csv.read_csv, []
+    monkeypatch.setattr(tables.arrow_csv, "read_csv", lambda *all: (given.append(all), own(*all))[1])
+    open_source(write_text(tmp_path / "log.csv", table(motion()))).read(["time"])
+    assert [(isinstance(source, pa.NativeFile), reads.use_threads) for source, reads, *_ in given] == [(True, False)]
 
 
 def test_columns_of_several_topics_are_refused(tmp_path):

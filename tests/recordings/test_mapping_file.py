@@ -45,7 +45,7 @@ def test_a_file_says_what_options_say_and_flags_come_first(tmp_path):
         ("- q", "must be a mapping"), ("q: []", "q is"), ("q: [[a]]", "q is"), ("unit: {q: [true]}", "unit is"),
         ("q: !!python/object/apply:os.system [id]", "YAML"), ("step: soon", "step is 'soon'; give seconds"),
         ("ned: 'no'", "ned is 'no'; give true or false"), ("q: [a", "YAML"),
-        ("q: " + "a" * 2**20, "larger than 1 MiB"),
+        ("q: " + "a" * 2**16, "larger than 64 KiB"),
     ],
 )  # fmt: skip
 def test_what_is_no_mapping_is_one_line_with_the_file(text, told, tmp_path):

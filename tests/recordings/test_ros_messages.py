@@ -1,13 +1,23 @@
 """Numbers taken out of ROS messages, against those that were put in, and messages in the order of time."""
 
+import sqlite3
+from contextlib import closing
+
 import numpy as np
 import pytest
 from tests.data.samples import model
-from tests.recordings.log_files import EPOCH, joint_states, motion
+from tests.recordings.log_files import EPOCH, joint_states, motion, write_bag2
 
 from forcegp.errors import DataWarning, FileFormatError
-from forcegp.recordings import ColumnMapping, import_recordings, open_source
+from forcegp.recordings import ColumnMapping, import_recordings, open_source, ros_bag
 from forcegp.recordings.ros_bag import numbers
+
+COSTLY = {
+    "or needed more than 3 s": "DROP TABLE schema; CREATE VIEW schema AS WITH RECURSIVE c(schema_version) AS "
+    "(SELECT 1 UNION ALL SELECT 2 FROM c) SELECT count(*) AS schema_version FROM c",
+    "memory": "ALTER TABLE messages RENAME TO old; CREATE TABLE messages (id, topic_id, timestamp, data AS "
+    "(zeroblob(900000000))); INSERT INTO messages SELECT id, topic_id, timestamp FROM old",
+}
 
 typesys = pytest.importorskip("rosbags.typesys")
 ROS2 = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
@@ -56,7 +66,7 @@ def test_names_of_joints_hold_for_the_messages_inside():
     inside = {f"{at}.positions.{name}" for at in ("points[0]", "feedback") for name in ("elbow", "base")}
     assert inside < found.keys()
     assert found["feedback.positions.base"] == 2.0
-    assert vectors["feedback.positions"] == ["feedback.positions.elbow", "feedback.positions.base"]
+    assert [*vectors["feedback.positions"]] == ["feedback.positions.elbow", "feedback.positions.base"]
 
 
 def test_a_vector_whose_messages_name_the_joints_is_put_into_their_order(tmp_path):
@@ -118,3 +128,13 @@ def test_whole_messages_before_a_cut_are_read_with_a_warning(tmp_path, packed, s
         assert len(read) in expected
         np.testing.assert_array_equal(read, motion()["q"][: len(read), 1])
         (tmp_path / "log" / "metadata.yaml").unlink(missing_ok=True)  # as a recorder leaves it that was killed
+
+
+@pytest.mark.parametrize("told", COSTLY)
+def test_a_bag_costs_no_more_than_its_limits(tmp_path, monkeypatch, told):
+    monkeypatch.setattr(ros_bag, "SECONDS", 3 if " s" in told else 30)
+    bag = write_bag2(tmp_path / "log", motion(), "sqlite3")
+    with closing(sqlite3.connect(bag / "log.db3")) as file:
+        file.executescript(COSTLY[told])
+    with pytest.raises(FileFormatError, match=f"^[^\n]*{told}[^\n]*$"):
+        open_source(bag)

@@ -46,6 +46,7 @@ def test_solids_have_their_size_and_place(tmp_path, geometry, low, high):
 def test_meshes_are_found_scaled_and_placed(tmp_path, name):
     folder = tmp_path / "shop" / "meshes"
     folder.mkdir(parents=True)
+    (tmp_path / "package.xml").touch()
     trimesh.creation.box(extents=(1.0, 2.0, 3.0)).export(folder / "block.stl")
     found, doubts = drawn(tmp_path, hand=(f'<mesh filename="{name}" scale="0.1 0.1 0.1"/>', "0 0 1", "0 0 0"))
     np.testing.assert_allclose(np.ptp(found["hand"].vertices, axis=0), [0.1, 0.2, 0.3], atol=1e-6)
@@ -64,18 +65,29 @@ def test_a_fine_mesh_loses_faces_and_keeps_its_size(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "doubt"),
     [
-        ("away.stl", None, "away.stl is not beside the URDF"),
-        ("scene.gltf", "{}", "scene.gltf is not one of .stl, .obj, .ply, .off up to 50 MiB"),
+        ("away.stl", None, "away.stl is not below the folder of the URDF"),
+        *((x, None, f"{x} is not below") for x in ("../secret.stl", "file:///SECRET", "package://a/../secret.stl")),
+        ("link.stl", None, "link.stl is not below"),
+        ("scene.gltf", "{}", "scene.gltf is no .stl/.obj/.ply/.off up to 50 MiB"),
         ("broken.obj", "f 1 2 nonsense", "broken.obj could not be read"),
     ],
 )
 def test_what_cannot_be_read_becomes_a_capsule_and_is_named(tmp_path, name, content, doubt):
-    (tmp_path / "robots").mkdir()
+    (tmp_path / "robots" / "a").mkdir(parents=True)
+    trimesh.creation.box().export(tmp_path / "secret.stl")
+    (tmp_path / "robots" / "link.stl").symlink_to(tmp_path / "secret.stl")
+    name, doubt = (text.replace("/SECRET", str(tmp_path / "secret.stl")) for text in (name, doubt))
     if content is not None:
         (tmp_path / "robots" / name).write_text(content)
     found, (said,) = drawn(tmp_path, hand=(f'<mesh filename="{name}"/>', "0 0 0", "0 0 0"))
     assert said.startswith(doubt)
     assert len(found["hand"].faces) > 0
+
+
+@pytest.mark.parametrize("solid", ["cylinder", "sphere", "box", 'box size="1"', 'cylinder radius="nan" length="1"'])
+def test_solids_without_their_numbers_are_left_out(tmp_path, solid):
+    _, (said,) = drawn(tmp_path, hand=(f"<{solid}/>", "0 0 0", "0 0 0"))
+    assert said == "a shape of link 'hand' lacks numbers that it needs; it is left out."
 
 
 def test_a_capsule_reaches_from_joint_to_joint():

@@ -261,7 +261,7 @@ class Excite(Command):
         given["surfaces"] = parse_contacts(self.avoid) if self.avoid else None
         with terminal.progress(f"choosing a motion of {self.seconds:g} s"):
             chosen = forcegp.excitation(model or forcegp.load_posterior(str(self.model)), **given)
-        chosen.save_csv(self.out)
+        chosen.save_csv(self.out, overwrite=self.overwrite)
         usage = {name: values.tolist() for name, values in chosen.usage.items()}
         table = {f"{name}\nover limit": values for name, values in usage.items()}
         spread = None if chosen.spread is None else chosen.spread.tolist()

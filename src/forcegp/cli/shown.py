@@ -58,10 +58,11 @@ class Robot(Command):
             terminal.warn(text)
         content = _content(robot) | {"file": str(self.robot), "repaired": repaired}
         content["inputs"] = list(model.inputs)
-        terminal.show(*_shown(robot, content))
         if self.out is not None:
             text, mark = robot.to_urdf() if self.out.suffix == ".urdf" else model.to_mjcf(), f"<!-- {MARK} -->\n"
-            write_text(self.out, text.removesuffix(mark) + mark)
+            write_text(self.out, text.removesuffix(mark) + mark, overwrite=self.overwrite)
+        terminal.show(*_shown(robot, content))
+        if self.out is not None:
             content["written"] = str(self.out)
             terminal.note(f"wrote {self.out}")
         return content

@@ -113,9 +113,9 @@ class Terminal:
         """Print the result of the command as one JSON object, if that was asked for."""
         if self._stdout is not None:
             sys.stdout.flush()
-            text = json.dumps(value, indent=1, allow_nan=False) + "\n"
+            value = json.loads(json.dumps(value), parse_constant=lambda _: None)  # JSON has no NaN and infinity
             with os.fdopen(os.dup(self._stdout), "w", encoding="utf-8") as stdout:
-                stdout.write(text)
+                stdout.write(json.dumps(value, indent=1) + "\n")
 
     def show(self, *renderables: RenderableType) -> None:
         """Print the result, texts as they are; nothing with --json. A table gets the columns that it needs."""

@@ -168,14 +168,14 @@ class Excitation(Summary):
         q, v, a = (spline(np.clip(t, 0.0, self.seconds)) @ self.motion.points for spline in self.basis)
         return self.start + q, v, a
 
-    def save_csv(self, path: str | Path, rate: float = 100.0) -> None:
+    def save_csv(self, path: str | Path, rate: float = 100.0, *, overwrite: bool = True) -> None:
         """Write t in s and q, v, a and u of every joint, `rate` rows per second, as `forcegp import` reads them."""
         check_time_step(rate)
         time = np.arange(round(self.seconds * rate) + 1) / rate
         states = self.trajectory(time)
         names = ["t", *(f"{what}_{joint}" for what in "qvau" for joint in self.robot.joint_names)]
         quoted = (f'"{name.replace(chr(34), 2 * chr(34))}"' if set(name) & {",", '"'} else name for name in names)
-        with atomic_file(path) as temporary:
+        with atomic_file(path, overwrite=overwrite) as temporary:
             table = np.hstack([time[:, None], *states, self.torques(*states)])
             np.savetxt(temporary, table, "%.9g", ",", header=",".join(quoted), comments="", encoding="utf-8")
 

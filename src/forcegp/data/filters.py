@@ -47,11 +47,13 @@ class LowPass:
         from scipy.signal import butter, sosfiltfilt  # half a second, which only filtering should cost
 
         slowest = np.abs(butter(self.order, self.cutoff, fs=rate, output="zpk")[1]).max()
-        padding = max(int(np.ceil(np.log(TRANSIENT) / np.log(slowest))), self.order + 1)
+        with np.errstate(all="ignore"):  # it never dies out at a cut-off of almost 0
+            dies = np.ceil(np.log(TRANSIENT) / np.log(slowest)) if slowest < 1.0 else np.inf
+        padding = int(max(min(dies, 1e15), self.order + 1))
         if len(values) <= padding:
             raise DatasetError(
                 f"{len(values)} rows are too few for a filter of order {self.order} with a cut-off at {self.cutoff} Hz;"
-                f" more than {padding} are needed. Use a higher cut-off, or leave the episode out."
+                f" more than {padding:g} are needed. Use a higher cut-off, or leave the episode out."
             )
         return sosfiltfilt(butter(self.order, self.cutoff, fs=rate, output="sos"), values, axis=0, padlen=padding)
 

@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save
 from forcegp import __version__
 from forcegp.atomic_files import atomic_folder, read_json, require_replaceable, require_unchanged, write_digests
 from forcegp.data import units_for
-from forcegp.data.dataset import FORCE, IMU
+from forcegp.data.dataset import BEYOND, FORCE, IMU, LARGEST_MEASURED
 from forcegp.errors import FileFormatError, ForceGPError, require_type, usable_arguments
 from forcegp.evidence.likelihood import TrainingData
 from forcegp.inference import OptimizationResult, engine_from_dict
@@ -100,6 +100,8 @@ def load_posterior(path: str | Path) -> Posterior:
         for name, value in tensors.items():
             if value.dtype != torch.float64 or not bool(value.isfinite().all()):
                 raise ValueError(f"{name} is {value.dtype} or has values that are not finite")
+            if name.startswith((TRAINING, REFERENCE)) and bool((value.abs() > LARGEST_MEASURED).any()):
+                raise ValueError(f"{name} has values {BEYOND.rstrip('.')}")
         model = _model(path / ROBOT, document["model"])
         training = _rows(TRAINING, tensors, model)
         if any(name.startswith(REFERENCE) for name in tensors):

@@ -42,6 +42,7 @@ MOST_NAMES = 12  # of arrays in a message
 NUMPY, HDF5, MATLAB, PARQUET = "a NumPy archive", "an HDF5 file", "a MATLAB file", "a Parquet file"
 INTERNAL = "#"  # begins names under which MATLAB keeps the contents of cells
 REFERENCE = np.dtype(object)
+MOST_RAGGED = 10_000  # lists of different lengths in one, such as episodes
 
 Arrays = Mapping[str, tuple[tuple[int, ...], Callable[[], np.ndarray]]]
 """By full name, shape and content of every array of numbers in a file."""
@@ -126,6 +127,8 @@ def numpy_arrays(path: Path) -> Arrays:
     found = {}
     with reading(path, NUMPY), zipfile.ZipFile(path) as archive:
         members = archive.infolist()
+        if len({member.filename.removesuffix(".npy") for member in members}) < len(members):
+            raise FileFormatError(f"{path} holds two arrays of one name; save it again, each under its own.")
         require_plausible_size(path, "the archive", sum(x.file_size for x in members), path.stat().st_size)
         for member in members:
             require_plausible_size(path, repr(member.filename), member.file_size, member.compress_size)
@@ -145,6 +148,8 @@ def numpy_arrays(path: Path) -> Arrays:
                     f"{path}: {name!r} claims the shape {shape}, but the file does not hold that much."
                 )
             if dtype.kind in "fiu":
+                if len(shape) < 3:
+                    require_plausible_size(path, repr(name), 8 * math.prod(shape), member.compress_size)
                 found[name] = shape, lambda name=name: content(name)
     return found
 
@@ -159,10 +164,15 @@ def hdf5_arrays(path: Path) -> Arrays:
             return stored[()]
 
     with reading(path, HDF5), h5py.File(path, "r") as file:
-        return {name: (shape, lambda name=name: content(name)) for name, shape in _stored(path, file, "")}
+        found = list(_stored(path, file, "", set()))
+        flat = [(8 * math.prod(shape), size) for _, shape, size in found if len(shape) < 3]  # no pictures
+        require_plausible_size(path, "the file", *(sum(sizes) for sizes in zip((0, 0), *flat, strict=True)))
+        return {name: (shape, lambda name=name: content(name)) for name, shape, _ in found}
 
 
-def _stored(path: Path, group: h5py.Group, prefix: str) -> Iterator[tuple[str, tuple[int, ...]]]:
+def _stored(path: Path, group: h5py.Group, prefix: str, seen: set[Any]) -> Iterator[tuple[str, tuple[int, ...], int]]:
+    """Name, shape and stored bytes of arrays; a group of several names counts by the first, else it may be endless."""
+    seen.add(group)
     for name in map(str, group):
         full, link = prefix + name, group.get(name, getlink=True)
         item = group[name] if isinstance(link, h5py.HardLink) else None  # a soft link is another name
@@ -172,13 +182,14 @@ def _stored(path: Path, group: h5py.Group, prefix: str) -> Iterator[tuple[str, t
                 f"{path}: {full!r} is in another file, and links to other files are not followed; give that file, or "
                 "copy the data into one."
             )
-        if isinstance(item, h5py.Group):
+        if isinstance(item, h5py.Group) and item not in seen:
             if prefix.count("/") > 32:
                 raise FileFormatError(f"{path}: its groups are nested more than 32 deep.")
-            yield from _stored(path, item, f"{full}/")
+            yield from _stored(path, item, f"{full}/", seen)
         elif isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and item.shape is not None:
-            require_plausible_size(path, repr(full), item.size * item.dtype.itemsize, item.id.get_storage_size())
-            yield full, tuple(item.shape)
+            stored = item.id.get_storage_size()
+            require_plausible_size(path, repr(full), item.size * item.dtype.itemsize, stored)
+            yield full, tuple(item.shape), stored
 
 
 def matlab_arrays(path: Path) -> Arrays:
@@ -190,7 +201,8 @@ def matlab_arrays(path: Path) -> Arrays:
         arrays = hdf5_arrays(path)
         with reading(path, MATLAB), h5py.File(path, "r") as file:
             if file.visititems(lambda _, item: True if getattr(item, "dtype", None) == REFERENCE else None):
-                return _lists({name: _referred(file, file[name]) for name in map(str, file) if name[0] != INTERNAL})
+                left = iter(range(path.stat().st_size // 8))  # a reference takes so many bytes
+                return _lists({x: _referred(file, file[x], left) for x in map(str, file) if x[0] != INTERNAL})
         turned = {name: shape[::-1] for name, (shape, _) in arrays.items() if name[0] != INTERNAL}
         upright = {name: shape[::-1] if len(shape) == 2 and shape[0] == 1 else shape for name, shape in turned.items()}
         return {
@@ -209,12 +221,14 @@ def matlab_arrays(path: Path) -> Arrays:
         return _lists(json.loads(answer["content"], object_hook=lambda own: restored[own["#"]] if "#" in own else own))
 
 
-def _referred(file: h5py.File, item: Any) -> Any:
+def _referred(file: h5py.File, item: Any, left: Iterator[int]) -> Any:
     """The content of a part of a MATLAB file as mappings, lists (cells, fields of arrays of structs) and arrays."""
+    if next(left, None) is None:
+        raise ValueError("its cells hold each other")
     if isinstance(item, h5py.Group):
-        return {name: _referred(file, item[name]) for name in item}
+        return {name: _referred(file, item[name], left) for name in item}
     if item.dtype == REFERENCE:
-        return [_referred(file, file[reference]) for reference in item[()].T.ravel()]
+        return [_referred(file, file[reference], left) for reference in item[()].T.ravel()]
     return np.squeeze(item[()].T)
 
 
@@ -260,6 +274,8 @@ def _numbers(value: Any, name: str) -> Iterator[tuple[str, np.ndarray]]:
             yield name, array
             return
     if isinstance(value, list | np.ndarray):
+        if len({len(own) for own in value if type(own) is list}) > 1 and len(value) > MOST_RAGGED:
+            raise ValueError(f"a list of {len(value)} lists of different lengths")
         parts = [dict(_numbers(inside, "")) for inside in value]
         shapes = {key: own.shape for part in parts for key, own in part.items()}
         if all(own.shape == shapes[key] and own.size < len(parts) for part in parts for key, own in part.items()):
@@ -275,7 +291,7 @@ def parquet_arrays(path: Path) -> Arrays:
 
     def content(name: str, width: int | None) -> np.ndarray:
         with reading(path, PARQUET), parquet.ParquetFile(path, pre_buffer=False) as file:
-            column = file.read(columns=[name]).column(name).combine_chunks()
+            column = file.read(columns=[name], use_threads=False).column(name).combine_chunks()
             if width is None:
                 return arrow_numbers(column)
             lengths = pc.call_function("list_value_length", [column]).fill_null(0).to_numpy(zero_copy_only=False)

@@ -1,5 +1,6 @@
 """Options of columns in a YAML file, which belongs to many logs of one robot: their words, as on the command line."""
 
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -10,7 +11,7 @@ import yaml
 from forcegp.errors import FileFormatError, require_known
 from forcegp.recordings.source import reading
 
-LARGEST = 2**20  # bytes
+LARGEST = 2**16  # bytes: some thousand names
 OF_FOLDER = "forcegp.yaml"
 KINDS = {"step": (float, "seconds"), "ned": (bool, "true or false"), "side_by_side": (bool, "true or false")}
 """What is no text, and its name."""
@@ -27,8 +28,8 @@ class _OnceLoader(yaml.SafeLoader):
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
         keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        if repeated := [key for key in keys if keys.count(key) > 1]:
-            raise yaml.constructor.ConstructorError(None, None, f"{repeated[0]!r} stands twice", node.start_mark)
+        if repeated := [key for key, count in Counter(map(repr, keys)).items() if count > 1]:
+            raise yaml.constructor.ConstructorError(None, None, f"{repeated[0]} stands twice", node.start_mark)
         return super().construct_mapping(node, deep)
 
 
@@ -41,7 +42,7 @@ def read_mapping(path: Path, known: Sequence[str]) -> dict[str, Any]:
         raise FileFormatError(f"{path} is not a file; give `mapping` a YAML file.")
     with reading(path, "YAML"):
         if path.stat().st_size > LARGEST:
-            raise FileFormatError(f"{path} is larger than 1 MiB; that is no mapping of columns.")
+            raise FileFormatError(f"{path} is larger than 64 KiB; that is no mapping of columns.")
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_OnceLoader)  # a SafeLoader
     if not isinstance(content, dict):
         raise FileFormatError(f"{path} must be a mapping such as 'q: pos{{1..7}}'.")

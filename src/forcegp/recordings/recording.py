@@ -25,6 +25,7 @@ from forcegp.robots.manifold import POSITIONS, TURN, ConfigurationSpace
 Jumps = tuple[Int[np.ndarray, " jumps"], str, str]
 """Rows before which something moves too far, what was seen, and what to do."""
 LARGEST_ERROR = 0.01  # of the length of a quaternion: more is no rounding
+MOST_ROWS, LARGEST_STRETCH = 1_000_000, 20  # that even times make of a few rows, and of each
 ROUNDED = 1e-9  # differences from length 1 beyond this are reported
 MARGIN = 0.1
 """Of its range: how far a position may be beyond the limits of the URDF. Stops give way, and zeros are set by hand."""
@@ -70,6 +71,9 @@ class Recording:
         if step is not None:
             stamps, held = time, list(self.layout.held)
             count = int(np.floor((stamps[-1] - stamps[0]) / step * (1 + 1e-12))) + 1
+            if count > max(MOST_ROWS, LARGEST_STRETCH * len(stamps)):
+                seen = f"{self.source.path}: {len(stamps)} rows would become {count:.3g}"
+                raise DatasetError(f"{seen}; give a lower `rate`, or a shorter `gap` that ends an episode.")
             time = np.minimum(stamps[0] + step * np.arange(count), stamps[-1])
             before = np.searchsorted(stamps, time * (1 + 1e-12), side="right") - 1
             u = signals.get("u", np.zeros((len(stamps), 0)))[before]

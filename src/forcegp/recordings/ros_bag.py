@@ -1,14 +1,11 @@
 """Bags of ROS 1 and 2, .mcap and .db3, read with `rosbags` (extra "logs"); several topics on one clock."""
 
+import os
 import re
-import shutil
 import tempfile
 import warnings
-import weakref
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -19,21 +16,20 @@ from typing_extensions import override
 
 from forcegp.errors import DatasetError, DataWarning, FileFormatError, InvalidInput, required_extra
 from forcegp.recordings.cut_mcap import is_cut, whole_copy
-from forcegp.recordings.signal_plan import SignalPlan
-from forcegp.recordings.source import LONGEST_VECTOR, Columns, Source, element_names, reading, require_plausible_size
-from forcegp.robots.manifold import QUATERNION
+from forcegp.recordings.source import LONGEST_VECTOR, Columns, Source, element_names, reading
+from forcegp.sandbox import MEMORY, SECONDS, read_apart
 
 LOG_TIME = "log_time"
 ROWS_AT_A_TIME = 2**16  # numbers of Python take ten times the memory of those in an array
-STAMP = "header.stamp"
 LOOKED_AT = 100  # messages of each topic that decide which columns there are: publishers may share a topic
+STAMP = "header.stamp"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 NAMES = re.compile(r"name|\w*names")
 """Fields whose texts name the elements of vectors beside them, and of those in messages beside them."""
-TWICE = re.compile(r"(pose|twist|accel)\.\1$")
 TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 NANOSECONDS = 10**9
 NUMBER, ARRAY = (int, float), (np.ndarray, list)  # a union written at the call would be made for every field
+TWICE = re.compile(r"(pose|twist|accel)\.\1$")
 MOST_WHOLE = 0.5
 """Of the rows of a table: where more have all columns, the others were lost, and no topics stand side by side."""
 
@@ -53,52 +49,38 @@ class RosBag(Source):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self._left_out = 0
-        self.ros1 = path.suffix.lower() == ".bag"
-        own = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
-        cut = [file for file in own if is_cut(file)]
-        self._read = own if cut or not (path / "metadata.yaml").is_file() else [path]
-        if cut:
-            copies = Path(tempfile.mkdtemp())
-            weakref.finalize(self, shutil.rmtree, copies)
-            self._read = [whole_copy(file, copies) if file in cut else file for file in own]
+        self._left_out, real = 0, path.resolve()
+        for file in path.iterdir() if path.is_dir() else (path,):
+            inside = file.resolve()
+            here = inside.is_relative_to(real) and (inside.is_file() or inside.is_dir())
+            if not here or not {*"%?#"}.isdisjoint(file.name):  # SQLite takes names for URIs and decodes them
+                why = "a pipe, a device, a link to elsewhere or named with %, ? or #; take it out, or rename it."
+                raise FileFormatError(f"{path}: {file.name!r} is {why}")
+        listed, _ = self._answer({})
+        found = listed["found"]
+        self._topics = {topic: tuple(f"{topic}:{x}" for x in names) for topic, (names, _) in found.items()}
+        named = ((topic, *each) for topic, (_, vectors) in found.items() for each in vectors.items())
+        self._named = {f"{topic}:{vector}": tuple(f"{topic}:{x}" for x in own) for topic, vector, own in named}
         if not self.columns():
             raise FileFormatError(f"{path} holds no messages with numbers.")
-        if cut:
-            with self._open() as reader:
-                whole = f"the {reader.message_count} whole messages before are read"
+        if listed["cut"]:
+            whole = f"the {listed['count']} whole messages before are read"
             warnings.warn(f"{path} ends in the middle of a record: {whole}.", DataWarning, stacklevel=2)
 
-    @contextmanager
-    def _open(self) -> Iterator[Any]:
-        reader_of = required_extra("rosbags.highlevel", "logs", "reading bags").AnyReader
-        types = required_extra("rosbags.typesys", "logs", "reading bags")
-        known = types.get_typestore(types.Stores.ROS1_NOETIC if self.ros1 else types.Stores.LATEST)
-        with reading(self.path, "a bag"), reader_of(self._read, default_typestore=known) as reader:
-            # rosbags 0.11 does not publish its list of MCAP chunks; a version without it reads them unchecked
-            for storage in (getattr(bag, "storage", None) for bag in reader.readers):
-                for store in getattr(storage, "storages", [storage]):  # a directory has several, a file is one
-                    for chunk in getattr(store, "chunks", ()):
-                        require_plausible_size(self.path, "a chunk", chunk.uncompressed_size, chunk.compressed_size)
-            yield reader
-
-    @cached_property
-    def _topics(self) -> Mapping[str, tuple[str, ...]]:
-        """Topic -> its columns."""
-        found: dict[str, dict[str, None]] = {}
-        self._named = dict[str, tuple[str, ...]]()
-        with self._open() as reader:
-            for connection in reader.connections:
-                names = found.setdefault(connection.topic, {})
-                for _, _, raw in islice(reader.messages([connection]), LOOKED_AT):
-                    vectors: dict[str, list[str]] = {}
-                    names |= dict.fromkeys(numbers(reader.deserialize(raw, connection.msgtype), None, vectors))
-                    for vector, elements in vectors.items():
-                        of = f"{connection.topic}:"
-                        own = dict.fromkeys((*self._named.get(of + vector, ()), *(of + name for name in elements)))
-                        self._named[of + vector] = tuple(own)
-                    names[LOG_TIME] = None
-        return {topic: tuple(f"{topic}:{name}" for name in names) for topic, names in found.items()}
+    def _answer(self, asked: Mapping[str, Any]) -> tuple[Mapping[str, Any], list[np.ndarray]]:
+        """What `answer` says, and the columns asked for. Raises FileFormatError."""
+        required_extra("rosbags", "logs", "reading bags")
+        size, remedy = sum(file.stat().st_size for file in self.files()), "record it again, or give a whole one"
+        with tempfile.TemporaryDirectory() as scratch:
+            asked = {**asked, "module": __name__, "path": str(self.path), "kept": f"{scratch}/columns.npz"}
+            asked |= {"seconds": SECONDS + (size >> 18), "memory": MEMORY + 20 * size}
+            told = read_apart("rosbags", str(self.path), asked, FileFormatError, remedy)
+            if "refused" in told:
+                raise FileFormatError(told["refused"])
+            if "topic" not in asked:
+                return told, []
+            with np.load(asked["kept"], allow_pickle=False) as kept:
+                return told, [kept[name] for name in kept.files]
 
     @override
     def columns(self) -> tuple[str, ...]:
@@ -156,27 +138,59 @@ class RosBag(Source):
                 f"{self.path}: the columns come from the topics {', '.join(topics)}, whose messages have times of "
                 "their own; read them one by one."
             )
-        wanted = [name[len(topics[0]) + 1 :] for name in names]
-        self._left_out = 0
-        with self._open() as reader:
-            connections = [item for item in reader.connections if item.topic == topics[0]]
-            kinds = sorted({item.msgtype for item in connections})
-            if len(kinds) > 1:
-                raise FileFormatError(f"{self.path}: topic {topics[0]} has messages of several types: {kinds}.")
-            messages = reader.messages(connections)
-            fields = {own.partition(".")[0].partition("[")[0] for own in wanted}
-            pieces: dict[str, list[np.ndarray]] = {name: [np.zeros(0, int)] for name in names}
-            while batch := list(islice(messages, ROWS_AT_A_TIME)):
-                found = ({**numbers(reader.deserialize(raw, kinds[0]), fields), LOG_TIME: at} for _, at, raw in batch)
-                table = [[values[own] for own in wanted] for values in found if values.keys() >= set(wanted)]
-                self._left_out += len(batch) - len(table)
-                for name, column in zip(names, zip(*table, strict=True), strict=False):
-                    pieces[name].append(np.array(column))
-        return {name: np.concatenate(own[1:] or own) for name, own in pieces.items()}
+        answer, columns = self._answer({"topic": topics[0], "wanted": [name[len(topics[0]) + 1 :] for name in names]})
+        self._left_out = answer["left_out"]
+        return dict(zip(names, columns, strict=True))
+
+
+def answer(request: dict[str, Any]) -> dict[str, Any]:
+    """Columns and named vectors by topic; with `topic`, its `wanted` fields in the file `kept`; `refused`: why not."""
+    path, tempfile.tempdir = Path(request["path"]), str(Path(request["kept"]).parent)
+    bag = path.absolute()
+    os.chdir(bag if bag.is_dir() else bag.parent)  # rosbags makes URIs of paths: SQLite would decode their folders
+    reader_of, types = (required_extra(f"rosbags.{name}", "logs", "reading bags") for name in ("highlevel", "typesys"))
+    known = types.get_typestore(types.Stores.ROS1_NOETIC if path.suffix.lower() == ".bag" else types.Stores.LATEST)
+    try:
+        with reading(path, "a bag"):
+            own = sorted(Path().glob("*.mcap")) if bag.is_dir() else [Path(bag.name)]
+            cut = [file for file in own if is_cut(file)]
+            read = own if cut or not bag.is_dir() or not Path("metadata.yaml").is_file() else [Path()]
+            read = [whole_copy(file, Path(tempfile.tempdir)) if file in cut else file for file in read]
+            with reader_of.AnyReader(read, default_typestore=known) as reader:
+                if "topic" in request:
+                    return {"left_out": _keep(reader, **request)}
+                found: dict[str, tuple[dict[str, None], dict[str, dict[str, None]]]] = {}
+                for connection in reader.connections:
+                    names, vectors = found.setdefault(connection.topic, ({}, {}))
+                    for _, _, raw in islice(reader.messages([connection]), LOOKED_AT):
+                        message = reader.deserialize(raw, connection.msgtype)
+                        names |= dict.fromkeys((*numbers(message, None, vectors), LOG_TIME))
+                return {"found": found, "cut": bool(cut), "count": reader.message_count if cut else 0}
+    except FileFormatError as error:
+        return {"refused": str(error)}
+
+
+def _keep(reader: Any, /, path: str, topic: str, wanted: Sequence[str], kept: str, **_: Any) -> int:
+    """Write the columns that are wanted of a topic; how many messages lack some of them."""
+    connections = [item for item in reader.connections if item.topic == topic]
+    kinds = sorted({item.msgtype for item in connections})
+    if len(kinds) > 1:
+        raise FileFormatError(f"{path}: topic {topic} has messages of several types: {kinds}.")
+    messages, left_out = reader.messages(connections), 0
+    fields = {own.partition(".")[0].partition("[")[0] for own in wanted}
+    pieces: list[list[np.ndarray]] = [[np.zeros(0, int)] for _ in wanted]
+    while batch := list(islice(messages, ROWS_AT_A_TIME)):
+        found = ({**numbers(reader.deserialize(raw, kinds[0]), fields), LOG_TIME: at} for _, at, raw in batch)
+        table = [[values[own] for own in wanted] for values in found if values.keys() >= set(wanted)]
+        left_out += len(batch) - len(table)
+        for piece, column in zip(pieces, zip(*table, strict=True), strict=False):
+            piece.append(np.array(column))
+    np.savez(kept, *(np.concatenate(own[1:] or own) for own in pieces))
+    return left_out
 
 
 def numbers(
-    message: Any, fields: Collection[str] | None = None, vectors: dict[str, list[str]] | None = None
+    message: Any, fields: Collection[str] | None = None, vectors: dict[str, dict[str, None]] | None = None
 ) -> dict[str, int | float]:
     """The numbers of a message by path, `wrench.force.x` or `data[3]`; stamps in ns, elements that have names by these.
 
@@ -205,7 +219,7 @@ def numbers(
                 if elements and isinstance(elements[0], NUMBER):
                     found.update(zip(paths, elements, strict=True))
                     if vectors is not None and len(names) == len(elements):
-                        vectors[path] = paths
+                        vectors.setdefault(path, {}).update(dict.fromkeys(paths))
                 elif elements and not isinstance(elements[0], str):
                     for inside, element in zip(paths, elements, strict=True):
                         collect(element, f"{inside}.", names)
@@ -238,12 +252,14 @@ class Read:
                       axis=0)  # fmt: skip
 
 
-def read_on_one_clock(source: Source, plan: SignalPlan) -> Read:
-    """The columns of a plan, all at the messages of the topic of its time; of a sparse table, of its positions.
+def read_on_one_clock(source: Source, plan: Any) -> Read:
+    """The columns of a `SignalPlan`, all at the messages of the topic of its time; of a sparse table, of its positions.
 
     Angles that move by half a turn or more between two messages are held, as they wrap, and of quaternions the sign
     means nothing. Raises InvalidInput where joining has no meaning, DatasetError for stamps backwards or apart.
     """
+    from forcegp.robots.manifold import QUATERNION  # with torch, which the process that reads bags lacks
+
     topics = {name: source.topic_of(name) for name in plan.columns} if isinstance(source, RosBag) else {}
     whole, filled = Columns(), dict[str, np.ndarray]()
     if len({*topics.values()}) < 2:
@@ -342,7 +358,7 @@ def _at(
     return values + share[:, None] * change, np.where(span > 0, span, since), there
 
 
-def _topics(columns: Columns, plan: SignalPlan) -> tuple[dict[str, str], dict[str, Bool[np.ndarray, " rows"]]]:
+def _topics(columns: Columns, plan: Any) -> tuple[dict[str, str], dict[str, Bool[np.ndarray, " rows"]]]:
     """Columns of a table by topic, called by its first column, and where it has values: exports join several topics.
 
     The time is that of the positions. One topic for a table of whole rows, or without a column of the time.

@@ -57,6 +57,8 @@ class Source(ABC):
         found = self.table(names)
         if not len(found[names[0]]):
             raise FileFormatError(f"{self.path} has no rows; give a log with rows.")
+        if len({len(values) for values in found.values()}) > 1:
+            raise FileFormatError(f"{self.path} has columns of different lengths; copy or write it again.")
         integers = [name for name in names if found[name].dtype.kind in "iu" and found[name].dtype != np.uint64]
         return {name: np.ascontiguousarray(found[name], np.int64 if name in integers else float) for name in names}
 

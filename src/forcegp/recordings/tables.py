@@ -8,6 +8,7 @@ import re
 import warnings
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import date
 from itertools import compress, takewhile
 from pathlib import Path
@@ -67,7 +68,8 @@ class DelimitedText(Source):
         if self._compressed:
             with reading(path, "text"), gzip.open(path) as stream:  # the size that it states is that of its last part
                 while stream.read(BLOCK):
-                    require_plausible_size(path, "what is compressed", stream.tell(), path.stat().st_size)
+                    expanded = 4 * stream.tell()  # a number of two letters takes eight bytes
+                    require_plausible_size(path, "what is compressed", expanded, path.stat().st_size)
         with reading(path, "text"), self._opened() as stream:
             self._notes = ["its letters are taken for cp1252"] if self.encoding == "cp1252" else []
             self._no_numbers: list[str] = []
@@ -198,36 +200,39 @@ class DelimitedText(Source):
             )
         return {name: values[self._columns.index(name) :: width] for name in names}
 
-    def _parsed(self, stored: list[str], wanted: list[str], kinds: dict[str, Any], threads: bool = True) -> Any:
+    def _parsed(self, stored: list[str], wanted: list[str], kinds: dict[str, Any], again: bool = False) -> Any:
+        """The table; `again` after an error, with the row that it names, and without a line that was cut."""
         blanks = self._delimiter == BLANKS
         with reading(self.path, "text"), self._opened() as stream:
             for _ in range(self._lines_before):
                 stream.readline()
-            source, cut = stream, False
-            if blanks or self._comments or not threads:
+            # pyarrow reads ahead on threads, in which a stream of Python's would crash where Python ends meanwhile
+            cut, source = False, pa.input_stream(str(self.path), "gzip" if self._compressed else None)
+            source.read(stream.tell())
+            if self.encoding != "utf-8" or blanks or self._comments or again:
                 text = _COMMENT_LINE.sub(b"", stream.read()) if self._comments else stream.read()
-                cut = not threads and not text.endswith(b"\n")  # is it the line at which the log was cut?
+                cut = again and not text.endswith(b"\n")  # is it the line at which the log was cut?
                 if cut:
                     text = text[: text.rfind(b"\n") + 1]
                 if blanks:
                     text = re.sub(rb"[ \t]+", b"\t", _OUTER_BLANKS.sub(b"", text.replace(b"\r\n", b"\n")))
-                source = io.BytesIO(text)
+                source = pa.BufferReader(text)
             ragged: list[Any] = []
             words = {*arrow_csv.ConvertOptions().null_values, *self._no_numbers}
             skip = (lambda row: ragged.append(row) or "skip") if self.lenient else None
-            reads = arrow_csv.ReadOptions(use_threads=threads, block_size=BLOCK, column_names=stored)
+            reads = arrow_csv.ReadOptions(use_threads=False, block_size=BLOCK, column_names=stored)
             parses = arrow_csv.ParseOptions(delimiter="\t" if blanks else self._delimiter, invalid_row_handler=skip)
             converts = {"include_columns": wanted, "column_types": kinds, "decimal_point": self._decimal}
             converts["null_values"] = [*words]
             try:
                 table = arrow_csv.read_csv(source, reads, parses, arrow_csv.ConvertOptions(**converts))
             except pa.ArrowInvalid as error:
-                if threads:  # pyarrow counts rows on one thread only
-                    return self._parsed(stored, wanted, kinds, threads=False)
+                if not again:
+                    return self._parsed(stored, wanted, kinds, again=True)
                 found = _CONVERSION.search(str(error))
                 if self.lenient and found and len(self._no_numbers) < LAST_LINES:
                     self._no_numbers.append(found[3])
-                    return self._parsed(stored, wanted, kinds, threads=False)
+                    return self._parsed(stored, wanted, kinds, again=True)
                 raise self._told_by_pyarrow(error) from error
             if len(ragged) > MOST_LOST * (len(table) + len(ragged)):
                 raise FileFormatError(
@@ -276,7 +281,8 @@ def seconds_of(texts: Sequence[str | None]) -> np.ndarray:
     for row, found in enumerate(_TIME.fullmatch((text or "").strip()) for text in texts):
         if found is not None:
             day = [int(part) for part in re.split(r"\D", found[1] or "1970-1-1")]
-            days = date(*(day if day[0] > 31 else reversed(day))).toordinal() - date(1970, 1, 1).toordinal()
-            hour, minute, second = f"{found[3] or '0:0'}:0".replace(",", ".").split(":")[:3]
-            seconds[row] = 86400.0 * days + 3600 * int(hour) + 60 * int(minute) + float(second)
+            with suppress(ValueError):  # a month 13
+                days = date(*(day if day[0] > 31 else reversed(day))).toordinal() - date(1970, 1, 1).toordinal()
+                hour, minute, second = f"{found[3] or '0:0'}:0".replace(",", ".").split(":")[:3]
+                seconds[row] = 86400.0 * days + 3600 * int(hour) + 60 * int(minute) + float(second)
     return seconds + 86400.0 * np.cumsum((seconds < 86400.0) & (np.diff(seconds, prepend=seconds[:1]) < -43200.0))

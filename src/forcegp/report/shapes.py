@@ -43,9 +43,9 @@ def trimesh_module() -> Any:
 def link_shapes(robot: Robot, urdf: str | Path | None = None) -> tuple[list[LinkShape], list[str]]:
     """The shape of every link, and sentences about those that could not be drawn as their file says.
 
-    `urdf` is a file whose visual elements are taken by the names of the links; its meshes are searched beside it and
-    in the folders above. Without it those of the robot's own URDF count, of which only boxes, cylinders and spheres can
-    be drawn: a Robot has no folder. Links with mass and without shape become capsules to the joints that they carry.
+    `urdf` is a file whose visual elements are taken by the names of the links; its meshes are those below
+    its folder, or that of its ROS package. Without it those of the robot's own URDF count, of which only boxes,
+    cylinders and spheres are drawn: a Robot has no folder. Links with mass but no shape become capsules to the joints.
 
     Raises MissingExtra without trimesh, and InvalidInput for a file that is no URDF.
     """
@@ -59,8 +59,13 @@ def link_shapes(robot: Robot, urdf: str | Path | None = None) -> tuple[list[Link
     for link in root.findall("link"):
         name = link.get("name", "")
         if name in robot.link_names:
-            meshes = [_visual(element, None if urdf is None else Path(urdf), doubts) for element in link.iter("visual")]
-            if present := [mesh for mesh in meshes if mesh is not None]:
+            present = list[Any]()
+            for element in link.iter("visual"):
+                try:
+                    present += [_visual(element, None if urdf is None else Path(urdf), doubts)]
+                except (ValueError, TypeError, IndexError):  # attributes that are missing, too few or no numbers
+                    doubts.append(f"a shape of link {name!r} lacks numbers that it needs; it is left out.")
+            if present := [mesh for mesh in present if mesh is not None]:
                 drawn[name] = _few_faces(trimesh_module().util.concatenate(present))
     shaped = bool(drawn)
     for name, mesh in _capsules(robot).items():
@@ -100,11 +105,10 @@ def _visual(element: Element, urdf: Path | None, doubts: list[str]) -> Any:
 
 
 def _numbers(element: Element | None, name: str) -> list[float]:
-    words = "" if element is None else element.get(name, "")
-    try:
-        return [float(word) for word in words.split()]
-    except ValueError:
-        raise InvalidInput(f"a visual element has {name}={words!r}; give numbers, or leave the element out.") from None
+    values = [] if element is None else [float(word) for word in element.get(name, "").split()]
+    if not np.isfinite(values).all():
+        raise ValueError(name)
+    return values
 
 
 def _loaded(element: Element, urdf: Path | None, doubts: list[str]) -> Any:
@@ -112,7 +116,7 @@ def _loaded(element: Element, urdf: Path | None, doubts: list[str]) -> Any:
     name = element.get("filename", "")
     path = None if urdf is None else _found(name, urdf)
     if path is None or path.suffix.lower() not in FORMATS or path.stat().st_size > LARGEST_FILE:
-        why = "is not beside the URDF" if path is None else f"is not one of {', '.join(FORMATS)} up to 50 MiB"
+        why = "is not below the folder of the URDF" if path is None else f"is no {'/'.join(FORMATS)} up to 50 MiB"
         doubts.append(f"{name} {why}; its link is drawn as a capsule.")
         return None
     try:
@@ -128,12 +132,14 @@ def _loaded(element: Element, urdf: Path | None, doubts: list[str]) -> Any:
 
 
 def _found(name: str, urdf: Path) -> Path | None:
-    """The file that a URDF names: relative, absolute, or in a package whose folder is one of those above the URDF."""
+    """The file that a URDF names, or one of a package, below the folder of the URDF or that of its `package.xml`."""
     plain = name.removeprefix("file://")
     package = plain.removeprefix("package://").removeprefix("model://")
     within = package.partition("/")[2] if package != plain else package
-    candidates = (folder / end for folder in urdf.resolve().parents for end in (package, within))
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    above = urdf.resolve().parents
+    root = next((folder for folder in above if (folder / "package.xml").is_file()), above[0])
+    candidates = ((folder / end).resolve() for folder in above for end in (package, within))
+    return next((each for each in candidates if each.is_relative_to(root) and each.is_file()), None)
 
 
 def _few_faces(mesh: Any) -> Any:
