@@ -28,13 +28,11 @@ BUSY = 6
 """Processes that compute beside the tests in the variant `loaded`."""
 
 VARIANTS: dict[str, dict[str, str]] = {
-    "as-it-is": {},
-    **{f"openblas-{core}": {"OPENBLAS_CORETYPE": core} for core in ("Haswell", "SkylakeX", "Zen")},
+    "as-it-is": {}, **{f"openblas-{core}": {"OPENBLAS_CORETYPE": core} for core in ("Haswell", "SkylakeX", "Zen")},
     **{f"torch-{kind}": {"ATEN_CPU_CAPABILITY": kind} for kind in ("default", "avx2", "avx512")},
     **{f"mkl-{branch}": {"MKL_CBWR": branch} for branch in ("COMPATIBLE", "AVX2", "AVX512")},
-    "two-threads": {"FORCEGP_TEST_THREADS": "2"},
-    "loaded": {},
-}
+    "two-threads": {"FORCEGP_TEST_THREADS": "2"}, "loaded": {},
+}  # fmt: skip
 
 
 def main() -> int:
@@ -88,11 +86,9 @@ def run(name: str, arguments: list[str], log: Path) -> dict[str, object]:
         code = subprocess.run(command, cwd=REPOSITORY, env=environment, stdout=output, stderr=output).returncode
     text = log.read_text()
     return {
-        "code": code,
-        "seconds": round(time.monotonic() - begin),
-        "last": (text.strip().splitlines() or [""])[-1],
+        "code": code, "seconds": round(time.monotonic() - begin), "last": (text.strip().splitlines() or [""])[-1],
         "failed": re.findall(r"^(?:FAILED|ERROR) (\S+)", text, re.MULTILINE),
-    }
+    }  # fmt: skip
 
 
 @contextlib.contextmanager

@@ -25,11 +25,8 @@ def test_the_python_example_runs(repository: Path, tmp_path: Path):
     assert forces == "torch.Size([1200, 1]) torch.Size([1200, 7])"
     assert float(error.split()[3]) < 0.2
     assert {path.name for path in (tmp_path / "model").iterdir()} == {
-        "model.json",
-        "tensors.safetensors",
-        "robot.urdf",
-        "SHA256SUMS",
-    }
+        "model.json", "tensors.safetensors", "robot.urdf", "SHA256SUMS",
+    }  # fmt: skip
 
 
 def test_the_pictures_and_pages_that_it_names_exist(repository: Path):
@@ -50,11 +47,9 @@ def test_it_is_short_and_the_answer_is_the_one_that_was_measured(repository: Pat
 ROBOTS = {"EMPS": 0, "passive pendulum": 1, "driven double pendulum": 2}
 """How a row of the README begins -> the column of the page with its motions."""
 COLUMNS = (
-    "as given",
-    "independent GP, without physics",
-    "identified by accelerations",
+    "as given", "independent GP, without physics", "identified by accelerations",
     "`joint-friction` beside the identified model",
-)
+)  # fmt: skip
 
 
 def test_the_results_of_real_robots_are_those_of_their_page(repository: Path):

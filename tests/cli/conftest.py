@@ -32,14 +32,9 @@ def installed(executable) -> Forcegp:
 
     def run(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [executable, *(str(argument) for argument in arguments)],
-            cwd=folder,
-            env={**os.environ, "COLUMNS": "100"},
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=LONGEST,
-        )
+            [executable, *(str(argument) for argument in arguments)], cwd=folder, env={**os.environ, "COLUMNS": "100"},
+            capture_output=True, text=True, check=False, timeout=LONGEST,
+        )  # fmt: skip
 
     return run
 

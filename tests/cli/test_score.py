@@ -124,21 +124,19 @@ def test_runs_alone_are_scored_on_the_whole_log(forcegp, folder):
 OUT = "--out never"
 WRONG = [
     ("score missing.h5", "missing.h5 does not exist"),
-    ("score friction", "friction is a folder; give a dataset (.h5) last"),
-    ("score log.h5", "give --out FOLDER"),
+    ("score friction", "friction is a folder; give a dataset (.h5) last"), ("score log.h5", "give --out FOLDER"),
     ("score friction other.h5", "joints shoulder, elbow; the model was trained on pan, lift, bend"),
     ("score friction test.h5 --horizon 7", "not predicted: 7 s; held-out stretches last"),
     ("score friction test.h5 --observe 99", "--observe is 99 s; give seconds that one record is longer than"),
     ("score friction test.h5 --every 0", "--every 0 must be an integer of at least 1"),
     ("score friction test.h5 --integrator euler", "did you mean 'symplectic-euler'"),
-    (f"score log.h5 {OUT} --split thirds", "the split is 'thirds'"),
-    (f"score log.h5 {OUT} --points 500", "two thirds"),
+    (f"score log.h5 {OUT} --split thirds", "the split is 'thirds'"), (f"score log.h5 {OUT} --points 500", "two thirds"),
     (f"score log.h5 {OUT} --horizon soon", "'soon' is no list of numbers"),
     (f"score log.h5 {OUT} --forces given --forces given", "named twice"),
     (f"score log.h5 {OUT} --forces identifed", "give given, identified or FORCES"),
     (f"score log.h5 {OUT} --identification magic", "no force 'magic'"),
     ("score log.h5 --out log.h5", "log.h5 would be written over log.h5"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("words", "message"), WRONG, ids=[words for words, _ in WRONG])

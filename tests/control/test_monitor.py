@@ -179,14 +179,9 @@ def posterior():
     middle = [0.5 * (x[1:] + x[:-1]) for x in (q, v)]
     a = np.diff(v, axis=0) / DT + 0.02 * np.random.default_rng(9).standard_normal((len(q) - 1, 2))
     rows = Dataset(
-        q=middle[0],
-        v=middle[1],
-        u=u[:-1],
-        a=a,
-        time=DT * np.arange(len(a)),
-        model=URDF_ALONE,
+        q=middle[0], v=middle[1], u=u[:-1], a=a, time=DT * np.arange(len(a)), model=URDF_ALONE,
         noise_std=np.full(2, 0.02),
-    )
+    )  # fmt: skip
     return fit(URDF_ALONE.with_forces(JointFriction()), rows, points=40, restarts=1)
 
 

@@ -94,12 +94,9 @@ def test_what_predicts_is_what_is_written_down():
 def test_intervals_hold_the_truth():
     """Of 12 recordings, about 95 % of the intervals hold the truth."""
     truth = {
-        "viscous.pan": 0.3,
-        "viscous.lift": 0.2,
-        "coulomb.level.pan": 0.8,
-        "coulomb.level.bend": 0.3,
+        "viscous.pan": 0.3, "viscous.lift": 0.2, "coulomb.level.pan": 0.8, "coulomb.level.bend": 0.3,
         "offset.lift": -0.1,
-    }
+    }  # fmt: skip
     held = []
     for seed in range(12):
         train = recorded(150, 10 + seed, torque_noise=0.2)

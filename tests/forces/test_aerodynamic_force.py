@@ -19,14 +19,10 @@ def test_features_are_those_of_the_formulas():
     sides = np.stack([rows.u @ [-0.1, 0.1, 0.1, -0.1], -rows.u @ [0.1, -0.1, 0.1, -0.1]], axis=1)
     yaw = 0.02 * rows.u @ [1.0, 1.0, -1.0, -1.0]
     expected = {
-        "velocity": air,
-        "drag": np.linalg.norm(air, axis=1, keepdims=True) * air,
-        "rotor-drag": np.sqrt(thrust) * air,
-        "angular-velocity": rows.v[:, 3:],
-        "thrust": np.concatenate([thrust, sides, yaw[:, None]], axis=1),
-        "height": rows.q[:, 2:3],
-        "attitude": rotation.reshape(-1, 9),
-    }
+        "velocity": air, "drag": np.linalg.norm(air, axis=1, keepdims=True) * air, "rotor-drag": np.sqrt(thrust) * air,
+        "angular-velocity": rows.v[:, 3:], "thrust": np.concatenate([thrust, sides, yaw[:, None]], axis=1),
+        "height": rows.q[:, 2:3], "attitude": rotation.reshape(-1, 9),
+    }  # fmt: skip
     prior = AerodynamicForce()
     assert prior.inputs == tuple(expected)
     features = prior.features(dynamics)

@@ -40,11 +40,9 @@ def precise_value_and_gradients(W, residual, noise, kernel_matrices):
         value += mpmath.mpf(y.size) / 2 * mpmath.log(2 * mpmath.pi)
         G = np.array(((inverse - alpha * alpha.T) / 2).tolist()).reshape(count, outputs, count, outputs)
         gradients = [
-            2 * np.einsum("idje,cij,jec->idc", G, K, w),
-            np.array(list(alpha)).reshape(count, outputs),
-            np.einsum("idid->d", G)[None],
-            *np.einsum("idc,idje,jec->cij", w, G, w),
-        ]
+            2 * np.einsum("idje,cij,jec->idc", G, K, w), np.array(list(alpha)).reshape(count, outputs),
+            np.einsum("idid->d", G)[None], *np.einsum("idc,idje,jec->cij", w, G, w),
+        ]  # fmt: skip
         return float(value), [torch.as_tensor(gradient.astype(np.float64)) for gradient in gradients]
 
 

@@ -32,16 +32,14 @@ def contacts(kind: str, frame: str) -> tuple[Contact, ...]:
     """By name: none, one, three independent, the same twice, four corners of a plate on a plane (rank 3)."""
     plane, sphere, ball, _ = surfaces().values()
     return {
-        "none": (),
-        "one": (Contact(frame, POINT, plane),),
+        "none": (), "one": (Contact(frame, POINT, plane),),
         "three": (
-            Contact(frame, POINT, plane),
-            Contact(frame, (0.0, 0.1, 0.0), sphere),
+            Contact(frame, POINT, plane), Contact(frame, (0.0, 0.1, 0.0), sphere),
             Contact(frame, (-0.1, 0.0, 0.05), ball),
         ),
         "same twice": (Contact(frame, POINT, sphere), Contact(frame, POINT, sphere)),
         "four corners": tuple(Contact(frame, corner, plane) for corner in CORNERS),
-    }[kind]
+    }[kind]  # fmt: skip
 
 
 INDEPENDENT = ["none", "one", "three"]

@@ -100,15 +100,9 @@ def arm_data(rows: int, seed: int, model: Model | None = None) -> Dataset:
     dynamics, Q_U = model.dynamics(*states), unknown_force(states[1])
     a = dynamics.acceleration(Q_U).numpy()
     return Dataset(
-        q=q,
-        v=v,
-        u=u,
-        a=a + generator.normal(0.0, NOISE, a.shape),
-        time=np.arange(rows) * 0.01,
-        model=model,
-        noise_std=np.full(3, NOISE),
-        truth={"a": a, "lambda": dynamics.multiplier(Q_U).numpy(), "Q_U": Q_U.numpy()},
-    )
+        q=q, v=v, u=u, a=a + generator.normal(0.0, NOISE, a.shape), time=np.arange(rows) * 0.01, model=model,
+        noise_std=np.full(3, NOISE), truth={"a": a, "lambda": dynamics.multiplier(Q_U).numpy(), "Q_U": Q_U.numpy()},
+    )  # fmt: skip
 
 
 def quick_fit(model: Model, data: Dataset | None = None, iterations: int = 3, **options: Any) -> Posterior:

@@ -91,18 +91,15 @@ LOSSES = {
     "springs (Model.from_mjcf has them) (1)": ('stiffness="2"', BALL, ""),
     "tendons (1)": ("", BALL, '<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>'),
     "laws of actuators (u holds joint forces) (1)": (
-        "",
-        BALL,
-        '<actuator><position name="servo" joint="j" kp="3"/></actuator>',
+        "", BALL, '<actuator><position name="servo" joint="j" kp="3"/></actuator>',
     ),
     "forces of a medium (1)": ("", BALL, '<option viscosity="1"/>'),
     "compensation of gravity (1)": ("", BALL + '<body name="b" gravcomp="1"><geom size=".1"/></body>', ""),
     "couplings of joints that are not linear (equality 0)": (
-        "",
-        BALL + '<body name="b"><joint name="k"/><geom size=".1"/></body>',
+        "", BALL + '<body name="b"><joint name="k"/><geom size=".1"/></body>',
         '<equality><joint joint1="j" joint2="k" polycoef="0 1 1 0 0"/></equality>',
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("what", LOSSES)

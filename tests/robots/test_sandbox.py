@@ -23,9 +23,7 @@ ATTACKS = {
     "names itself": (SCENE.format('<include file="robot.xml"/>', BODY), {}, "names this file again"),
     "is its own model": (SCENE.format(SUB.format("robot.xml"), ATTACH), {}, "names this file again"),
     "a circle": (
-        SCENE.format(SUB.format("s.xml"), ATTACH),
-        {"s.xml": SCENE.format(SUB.format("s.xml"), BODY)},
-        "again",
+        SCENE.format(SUB.format("s.xml"), ATTACH), {"s.xml": SCENE.format(SUB.format("s.xml"), BODY)}, "again",
     ),
     "copies": (SCENE.format("", copies(9999, 9999, 9999)), {}, "or needed more than 1 s or 300 MiB"),
     "copies of a model": (
@@ -36,18 +34,15 @@ ATTACKS = {
     "many copies": (SCENE.format("", copies(400, 499)), {}, "or needed more than 1 s or 300 MiB"),
     "copies of a file": (
         SCENE.format("", copies(300, 300, inside='<include file="part.xml"/>')),
-        {"part.xml": f"<mujoco>{BODY}</mujoco>"},
-        "or needed more than 1 s or 300 MiB",
+        {"part.xml": f"<mujoco>{BODY}</mujoco>"}, "or needed more than 1 s or 300 MiB",
     ),
     "many files": (
-        SCENE.format("", INCLUDES),
-        {f"part_{k}.xml": f"<mujoco>{BODIES}</mujoco>" for k in range(80)},
+        SCENE.format("", INCLUDES), {f"part_{k}.xml": f"<mujoco>{BODIES}</mujoco>" for k in range(80)},
         "nbody is 2401, more than the 2000",
     ),
     "keys": (SCENE.format('<size nkey="2000000000"/>', BODY), {}, ""),
     "points": (
-        SCENE.format('<asset><mesh name="m" builtin="supersphere" params="20000 1 1"/></asset>', BODY),
-        {},
+        SCENE.format('<asset><mesh name="m" builtin="supersphere" params="20000 1 1"/></asset>', BODY), {},
         "or needed more than 1 s or 300 MiB",
     ),
     "depth": (SCENE.format("", "<body>" * 9000 + "</body>" * 9000), {}, "too deep"),
@@ -59,16 +54,13 @@ ATTACKS = {
             '<compiler meshdir=".."/><asset><mesh name="m" file="m.stl"/></asset>',
             BODY.replace('size=".1"', 'type="mesh" mesh="m"'),
         ),
-        {},
-        "not below the folder",
+        {}, "not below the folder",
     ),
     "a pipe": (SCENE.format("", '<flexcomp name="f" type="mesh" file="pipe.stl"/>' + BODY), {}, "a pipe or device"),
     "a grid above": (
-        SCENE.format("", '<flexcomp name="f" type="mesh" file="../secret.obj"/>' + BODY),
-        {},
-        "not below the folder",
+        SCENE.format("", '<flexcomp name="f" type="mesh" file="../secret.obj"/>' + BODY), {}, "not below the folder",
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("attack", ATTACKS)

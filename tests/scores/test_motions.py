@@ -35,11 +35,9 @@ def recording(rows: int = 101, episodes: int = 2, force: float = FORCE) -> Datas
     q = 0.1 * time[:, None] + 0.5 * a * time[:, None] ** 2
     arrays = {"q": q, "v": v, "u": np.full((rows, 1), force), "a": a}
     return Dataset(
-        **{name: np.tile(values, (episodes, 1)) for name, values in arrays.items()},
-        time=np.tile(time, episodes),
-        episode=np.repeat(np.arange(episodes), rows),
-        model=sledge(TRUE_MASS),
-    )
+        **{name: np.tile(values, (episodes, 1)) for name, values in arrays.items()}, time=np.tile(time, episodes),
+        episode=np.repeat(np.arange(episodes), rows), model=sledge(TRUE_MASS),
+    )  # fmt: skip
 
 
 def posterior(mass: float, data: Dataset):
