@@ -10,8 +10,7 @@ import torch
 
 def run_example(code: str, folder: Path) -> str:
     """What the code prints in that folder; warnings are no errors, as in a process of its own."""
-    printed = io.StringIO()
-    threads = torch.get_num_threads()
+    printed, threads = io.StringIO(), torch.get_num_threads()
     with contextlib.chdir(folder), contextlib.redirect_stdout(printed), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:

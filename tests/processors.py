@@ -43,8 +43,7 @@ def main() -> int:
     parser.add_argument("--workers", default="2", help="of pytest-xdist (default: 2)")
     given, arguments = parser.parse_known_args()
     FOLDER.mkdir(exist_ok=True)
-    code = contents()
-    rows = []
+    code, rows = contents(), []
     for name in given.only or possible():
         key = hashlib.sha256(json.dumps([code, name, arguments]).encode()).hexdigest()[:16]
         file = FOLDER / f"{name}-{key}.json"

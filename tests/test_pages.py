@@ -156,8 +156,7 @@ def test_the_examples_of_the_page_on_deploying_run(repository: Path, tmp_path: P
     pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
     monkeypatch.syspath_prepend(repository / "examples")
     source = (repository / "examples" / f"{program}.py").read_text(encoding="utf-8")
-    printed = run_example(source, tmp_path)
-    first, second = (float(number) for number in re.match(lines, printed).groups())
+    first, second = (float(number) for number in re.match(lines, run_example(source, tmp_path)).groups())
     if program == "swing_up":
         assert first > 2.0
         assert second < 0.2

@@ -31,8 +31,7 @@ def test_the_python_example_runs(repository: Path, tmp_path: Path):
 
 def test_the_pictures_and_pages_that_it_names_exist(repository: Path):
     links = re.findall(r"\]\(([^)#]+)\)", (repository / "README.md").read_text(encoding="utf-8"))
-    missing = [link for link in links if not link.startswith("http") and not (repository / link).exists()]
-    assert not missing
+    assert not [link for link in links if not link.startswith("http") and not (repository / link).exists()]
 
 
 def test_it_is_short_and_the_answer_is_the_one_that_was_measured(repository: Path):
@@ -125,8 +124,7 @@ def test_the_commands_and_forces_of_the_page_on_forces_exist(repository: Path):
     cells = re.findall(r"^\| (`[^|]+) \|", rows, re.MULTILINE)
     told = {name for cell in cells for name in re.findall(r"`(.+?)`", cell)}
     assert told == set(KERNELS)
-    model = simulate_kuka_surface(KukaSurfaceConfig(seconds=0.1)).model
-    count = 0
+    model, count = simulate_kuka_surface(KukaSurfaceConfig(seconds=0.1)).model, 0
     for commands in re.findall(r"```sh\n(.*?)```", page, re.DOTALL):
         for line in re.findall(r"^forcegp (.*)$", commands.replace("\\\n", " "), re.MULTILINE):
             command = parse_arguments(shlex.split(line))

@@ -24,8 +24,7 @@ def motion(seconds, seed, push=None, noise=0.003, dt=DT):
     """q, v, u (T, 2) of sines, exact but for noise; `push` (T, 2) are joint torques that u lacks."""
     time, rng = np.arange(round(seconds / dt)) * dt, np.random.default_rng(seed)
     rate, size, phase = rng.uniform(0.7, 3.0, (3, 2)), rng.uniform(0.2, 0.5, (3, 2)), rng.uniform(0, 6, (3, 2))
-    angle = rate[:, None] * time[None, :, None] + phase[:, None]
-    size = size[:, None]
+    angle, size = rate[:, None] * time[None, :, None] + phase[:, None], size[:, None]
     q, v = (size * np.sin(angle)).sum(0), (size * rate[:, None] * np.cos(angle)).sum(0)
     a = -(size * rate[:, None] ** 2 * np.sin(angle)).sum(0)
     at = [torch.from_numpy(0.5 * (x + np.roll(x, -1, 0))) for x in (q, v)]  # in the middle of the steps

@@ -78,8 +78,7 @@ def test_jacobians(names, likelihood):
     x[: space.bodies.size] = 0.2 * np.random.default_rng(1).normal(size=space.bodies.size)
 
     def residual(x):
-        found = rows.in_torque(x, rows.moving(a)) if likelihood == "torque" else rows.in_acceleration(x, a)
-        return found[:3]
+        return (rows.in_torque(x, rows.moving(a)) if likelihood == "torque" else rows.in_acceleration(x, a))[:3]
 
     _, in_parameters, in_laws = residual(x)
     found = np.concatenate([space.bodies.chained(x[: space.bodies.size], in_parameters), in_laws], axis=-1)

@@ -79,8 +79,7 @@ def test_along_the_surface_nothing_is_hidden(on_a_table):
 
 def test_all_hidden_is_refused(data):
     """A point that is held along all three axes holds the whole arm."""
-    robot = data.model.robot
-    q = torch.tensor(data.q[:1]).expand(12, 3).clone()
+    robot, q = data.model.robot, torch.tensor(data.q[:1]).expand(12, 3).clone()
     tip = Contact("hand", TIP, TABLE[0].surface).position(robot.kinematics(q))[0]
     normals = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
     walls = [Plane(normal, float(tip[axis])) for axis, normal in enumerate(normals)]

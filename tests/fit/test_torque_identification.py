@@ -169,8 +169,7 @@ def test_friction_under_load_does_not_explain_the_torque_by_itself():
     robot, generator = arm_model(0).robot, np.random.default_rng(0)
     q, v, a = generator.normal(size=(3, 400, 3))
     torque = robot.inverse_dynamics(*(torch.tensor(x) for x in (q, v, a))).numpy()
-    sign = np.tanh(v / 0.05)
-    u = torque + 0.02 * generator.normal(size=a.shape)
+    sign, u = np.tanh(v / 0.05), torque + 0.02 * generator.normal(size=a.shape)
     u[:, 0] = torque[:, 0] / (1.0 - 0.15 * sign[:, 0] * np.sign(torque[:, 0]))  # u = torque + 0.15 |u| sign
     u[:, 2] += 20.0 * sign[:, 2] * generator.uniform(0.5, 1.5, 400)
     log = Dataset(q=q, v=v, u=u, a=a, time=0.01 * np.arange(400.0), model=arm_model(0))

@@ -25,8 +25,7 @@ from forcegp.model import Model
 from forcegp.posterior import load_posterior, save_posterior
 from forcegp.robots import Robot
 
-BATCHES = [(), (4,), (2, 4)]
-STEP = 1e-5
+BATCHES, STEP = [(), (4,), (2, 4)], 1e-5
 
 
 @cache

@@ -9,8 +9,7 @@ from forcegp.data import with_wind
 
 
 def test_features_are_those_of_the_formulas():
-    rows = flight([(3.0, -2.0, 0.0)], rows=40)
-    wind = np.array([3.0, -2.0, 0.0])
+    rows, wind = flight([(3.0, -2.0, 0.0)], rows=40), np.array([3.0, -2.0, 0.0])
     seen = with_wind(rows, np.broadcast_to(wind, (40, 3)))
     dynamics = seen.model.dynamics(*map(torch.tensor, (seen.q, seen.v, seen.u)))
     rotation = dynamics.state.kinematics.frame_pose("body")[:, :3, :3].numpy()
@@ -40,5 +39,4 @@ def test_rotors_of_a_body_that_does_not_fly():
     q, v = robot.neutral()[None], torch.full((1, robot.nv), 0.3, dtype=torch.float64)
     dynamics = model.dynamics(q, v, torch.full((1, len(model.inputs)), 2.0, dtype=torch.float64))
     velocity, drag = AerodynamicForce("blade", ("velocity", "rotor-drag")).features(dynamics)[0].split(3, dim=-1)
-    root = (dynamics.state.delivered.norm() ** 2 + 1e-4) ** 0.25
-    torch.testing.assert_close(drag, root * velocity)
+    torch.testing.assert_close(drag, (dynamics.state.delivered.norm() ** 2 + 1e-4) ** 0.25 * velocity)

@@ -86,8 +86,7 @@ MISTAKES = {
 
 def test_every_name_that_needs_no_columns_of_u_is_here():
     told = {name.removeprefix("gp:").partition(":")[0] for name in NAMES}
-    observed = {"actuation", "thrusters", "observed-wrench", "observed-wind"}
-    assert told == {*SHORT, *BUILT_IN} - observed
+    assert told == {*SHORT, *BUILT_IN} - {"actuation", "thrusters", "observed-wrench", "observed-wind"}
     assert all(is_unknown(name.removeprefix("gp:").partition(":")[0]) == name.startswith("gp:") for name in NAMES)
 
 
@@ -108,8 +107,7 @@ def test_several_are_written_with_commas():
 def test_mistakes_are_explained(expression):
     with pytest.raises(InvalidInput) as caught:
         parse_forces(expression)
-    pieces = MISTAKES[expression].split("|")
-    assert any(piece in str(caught.value) for piece in pieces), str(caught.value)
+    assert any(piece in str(caught.value) for piece in MISTAKES[expression].split("|")), str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,7 @@ def dense_covariance(W, noise, kernel_matrices):
 
 
 def dense_negative_log_likelihood(W, residual, noise, kernel_matrices):
-    S = dense_covariance(W, noise, kernel_matrices)
-    y, lower = residual.reshape(-1), torch.linalg.cholesky(S)
+    y, lower = residual.reshape(-1), torch.linalg.cholesky(dense_covariance(W, noise, kernel_matrices))
     quadratic = y @ torch.cholesky_solve(y[:, None], lower)[:, 0]
     return 0.5 * quadratic + lower.diagonal().log().sum() + 0.5 * y.numel() * math.log(2.0 * math.pi)
 

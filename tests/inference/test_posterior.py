@@ -118,8 +118,7 @@ def test_covariance_is_positive_semi_definite_and_below_the_prior(count, outputs
 
 
 CPU = torch.device("cpu")
-SIZE = ProblemSize(rows=1000, outputs=2, rank=2, latents=3, features=9)
-GIB = 2**30
+SIZE, GIB = ProblemSize(rows=1000, outputs=2, rank=2, latents=3, features=9), 2**30
 
 
 @pytest.fixture

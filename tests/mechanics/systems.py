@@ -42,8 +42,7 @@ def contacts(kind: str, frame: str) -> tuple[Contact, ...]:
     }[kind]  # fmt: skip
 
 
-INDEPENDENT = ["none", "one", "three"]
-REDUNDANT = ["same twice", "four corners"]
+INDEPENDENT, REDUNDANT = ["none", "one", "three"], ["same twice", "four corners"]
 
 
 def model_with(model: str = "iiwa", kind: str = "one", **options: object) -> Model:
@@ -70,8 +69,7 @@ def regular_states(built: Model, count: int) -> tuple[torch.Tensor, torch.Tensor
         return tuple(x[:count] for x in candidates)
     singular = torch.linalg.svdvals(A)
     smallest = torch.where(singular > 1e-9 * singular[:, :1], singular, torch.inf).amin(-1)
-    best = (smallest / singular[:, 0]).topk(count).indices
-    return tuple(x[best] for x in candidates)
+    return tuple(x[(smallest / singular[:, 0]).topk(count).indices] for x in candidates)
 
 
 def solve_kkt(M, Q, A, b):

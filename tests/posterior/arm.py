@@ -92,8 +92,7 @@ def on_the_plane(model: Model, q: np.ndarray) -> np.ndarray:
 
 def arm_data(rows: int, seed: int, model: Model | None = None) -> Dataset:
     """Random states, the exact constrained acceleration and noise of standard deviation NOISE on it."""
-    model = model or arm_model()
-    generator = np.random.default_rng(seed)
+    model, generator = model or arm_model(), np.random.default_rng(seed)
     q = on_the_plane(model, generator.uniform([-1.0, 0.3, 0.3], [1.0, 1.2, 1.2], (rows, 3)))
     v, u = generator.normal(0.0, 0.7, (rows, 3)), generator.normal(0.0, 3.0, (rows, 3))
     states = [torch.tensor(x) for x in (q, v, u)]

@@ -19,8 +19,7 @@ from forcegp.integration import integrator_named
 from forcegp.model import Model
 from forcegp.robots import Robot
 
-NOISE = 0.2
-STEP = 0.01
+NOISE, STEP = 0.2, 0.01
 
 
 def given_system() -> Model:

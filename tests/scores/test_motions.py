@@ -31,8 +31,7 @@ def sledge(mass: float) -> Model:
 
 def recording(rows: int = 101, episodes: int = 2, force: float = FORCE) -> Dataset:
     time, a = STEP * np.arange(rows), np.full((rows, 1), force / TRUE_MASS)
-    v = 0.1 + a * time[:, None]
-    q = 0.1 * time[:, None] + 0.5 * a * time[:, None] ** 2
+    v, q = 0.1 + a * time[:, None], 0.1 * time[:, None] + 0.5 * a * time[:, None] ** 2
     arrays = {"q": q, "v": v, "u": np.full((rows, 1), force), "a": a}
     return Dataset(
         **{name: np.tile(values, (episodes, 1)) for name, values in arrays.items()}, time=np.tile(time, episodes),
