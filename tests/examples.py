@@ -11,8 +11,7 @@ import torch
 def run_example(code: str, folder: Path) -> str:
     """What the code prints in that folder; warnings are no errors, as in a process of its own."""
     printed, threads = io.StringIO(), torch.get_num_threads()
-    with contextlib.chdir(folder), contextlib.redirect_stdout(printed), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with contextlib.chdir(folder), contextlib.redirect_stdout(printed), warnings.catch_warnings(action="ignore"):
         try:
             exec(compile(code, "<example>", "exec"), {"__name__": "__main__"})
         finally:

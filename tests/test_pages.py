@@ -33,8 +33,7 @@ def test_the_page_on_moving_bases_runs(repository: Path, tmp_path: Path):
     run_example(poses, tmp_path)
     _, own, *_ = (block.splitlines() for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL))
     for command in own:
-        done = run_here(*shlex.split(command)[1:], folder=tmp_path)
-        assert done.returncode == 0, done.stderr
+        done = run_here(*shlex.split(command)[1:], folder=tmp_path).ok()
     for name in ("poses.h5", "flight.h5"):
         log = Dataset.load(tmp_path / name)
         t, turned = log.time, 0.4 * log.time
@@ -103,8 +102,7 @@ def test_the_commands_of_the_page_on_identification_run(repository: Path, tmp_pa
     for command in commands.splitlines():
         program, *words = command.split()
         assert program == "forcegp"
-        done = run_here(*words, folder=tmp_path)
-        assert done.returncode == 0, done.stderr
+        run_here(*words, folder=tmp_path).ok()
     assert (tmp_path / "identified" / "identified.urdf").exists()
 
 
@@ -183,8 +181,7 @@ def test_the_page_on_deploying_runs(repository: Path, tmp_path: Path):
     assert agree == "True"
     commands, build, planner = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
     for command in (commands + planner).splitlines():
-        done = run_here(*shlex.split(command)[1:], folder=tmp_path)
-        assert done.returncode == 0, done.stderr
+        run_here(*shlex.split(command)[1:], folder=tmp_path).ok()
     for command in build.splitlines():
         subprocess.run(command, shell=True, cwd=tmp_path / "controller", check=True)
     assert {"lbr_iiwa.casadi", "lbr_iiwa_step.casadi"} <= {file.name for file in (tmp_path / "planner").iterdir()}

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tests.cli.in_process import run_here
+from tests.cli.in_process import Done, run_here
 
 Forcegp = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -40,7 +40,7 @@ def installed(executable) -> Forcegp:
 
 
 @pytest.fixture(scope="session")
-def forcegp() -> Forcegp:
+def forcegp() -> Callable[..., Done]:
     """Run `forcegp` with these arguments in that folder, in this process; returns exit code, stdout and stderr."""
     return run_here
 
@@ -52,14 +52,12 @@ def workshop(forcegp, tmp_path_factory) -> Path:
     for name, seed in (("train", 1), ("test", 2)):
         made = forcegp(
             "simulate", "kuka-surface", "--seconds", 2, "--seed", seed, "--out", f"{name}.h5", "--json", folder=folder
-        )
-        assert made.returncode == 0, made.stderr
+        ).ok()
         (folder / f"{name}.json").write_text(made.stdout)
     fitted = forcegp(
         *("fit", "train.h5", "--forces", "gp:joint", "--points", 15, "--iterations", 8, "--restarts", 2),
         *("--out", "run"),
         folder=folder,
-    )
-    assert fitted.returncode == 0, fitted.stderr
+    ).ok()
     (folder / "fit.txt").write_text(fitted.stdout)
     return folder

@@ -249,8 +249,7 @@ def test_a_real_leg_tells_its_contact_force_without_the_sensor_after_a_calibrati
     laws = (Actuation(gain=LogNormal(1.0, 0.3)), GearFriction(), Offset())
 
     def left(forces, evidence):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)
+        with warnings.catch_warnings(action="ignore", category=DataWarning):
             points = 150 if evidence == Accelerations() else None
             posterior = fit(model.with_forces(*forces), train, evidence, points=points, restarts=1)
         rows = with_memory(test, posterior.model)

@@ -59,8 +59,7 @@ def log_of_cart():
 
 @pytest.mark.parametrize("case", FITS)
 def test_what_is_found_is_what_it_was(case):
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as said:
         posterior = FITS[case]().with_settings(widening=1.0)  # processors round it apart
     entries, rows = posterior.parameters.entries, posterior.training
     predicted = posterior.predict(rows.q[:5], rows.v[:5], rows.u[:5])

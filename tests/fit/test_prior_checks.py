@@ -72,8 +72,7 @@ def test_a_force_along_the_normal_is_hidden(on_a_table, prefix):
 
 
 def test_along_the_surface_nothing_is_hidden(on_a_table):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         fit(on_a_table, ToolForces(), JointFriction())
 
 
@@ -160,8 +159,7 @@ def test_equal_terms_are_refused(data):
     ids=["inputs", "all", "axes", "joints", "nothing", "none"],
 )  # fmt: skip
 def test_terms_that_differ_are_fitted_without_a_word(data, prior):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         fit(data, *prior)
 
 

@@ -77,8 +77,7 @@ class UnknownConformance:
     @classmethod
     def fitted(cls, data):
         model = data.model.with_forces(cls.prior)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NumericalWarning)  # so few iterations settle nothing
+        with warnings.catch_warnings(action="ignore", category=NumericalWarning):  # so few iterations settle nothing
             return fit(model, data, restarts=1, options=OptimizerOptions(iterations=3))
 
     def values(self, model, *states) -> torch.Tensor:

@@ -107,8 +107,7 @@ def arm_data(rows: int, seed: int, model: Model | None = None) -> Dataset:
 def quick_fit(model: Model, data: Dataset | None = None, iterations: int = 3, **options: Any) -> Posterior:
     """What a short search finds, of which nothing is asked; by default of 30 rows with the tool on the plane."""
     search = OptimizerOptions(iterations=iterations)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         return fit(model, arm_data(30, 0) if data is None else data, restarts=1, options=search, **options)
 
 

@@ -144,8 +144,7 @@ def pushed(forces, rows, seed=4, noise=0.0):
 @pytest.fixture(scope="module")
 def airborne():
     train = pushed([(0.0, 0.0, 0.0)], rows=200, noise=0.02)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         return fit(train.model.with_forces(AerodynamicForce(kernel="linear"), noise=0.02), train, points=60, restarts=1)
 
 
