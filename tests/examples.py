@@ -2,10 +2,18 @@
 
 import contextlib
 import io
+import re
 import warnings
 from pathlib import Path
 
 import torch
+
+HOW_TO = Path(__file__).resolve().parents[1] / "docs" / "how-to"
+
+
+def blocks(page: str, language: str = "python") -> list[str]:
+    """The code of this language on a page of docs/how-to/."""
+    return re.findall(rf"```{language}\n(.*?)```", (HOW_TO / f"{page}.md").read_text(encoding="utf-8"), re.DOTALL)
 
 
 def run_example(code: str, folder: Path) -> str:

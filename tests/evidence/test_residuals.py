@@ -5,22 +5,12 @@ import pytest
 import torch
 from tests.posterior.arm import arm_model
 
+from forcegp import Coulomb, LoadFriction
 from forcegp.errors import InvalidInput
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
 from forcegp.fit.physical import typical_sizes
-from forcegp.forces import (
-    Coulomb,
-    DirectionalFriction,
-    LoadFriction,
-    Offset,
-    Payload,
-    RigidBodies,
-    Rotor,
-    Spring,
-    Stribeck,
-    Viscous,
-)
+from forcegp.forces import DirectionalFriction, Offset, Payload, RigidBodies, Rotor, Spring, Stribeck, Viscous
 from forcegp.model import Model
 
 COUPLED = [[3.0, 0.0, 0.0], [-1.0, 4.0, 0.0], [0.0, 1.0, 2.0]]

@@ -13,17 +13,10 @@ from tests.forces.test_thrusters import DRONE
 from tests.robots.random_positions import random_positions
 from tests.robots.test_moving_bases import LIMBS, ROOTS, Pair
 
+from forcegp import Accelerations
 from forcegp.data import Dataset, Preparation
 from forcegp.errors import DataWarning, InvalidInput
-from forcegp.evidence import (
-    Accelerations,
-    NoiseLevels,
-    Torques,
-    base_parameters,
-    body_names,
-    standard_parameters,
-    torque_regressor,
-)
+from forcegp.evidence import NoiseLevels, Torques, base_parameters, body_names, standard_parameters, torque_regressor
 from forcegp.evidence.bodies import body_pseudo_inertias, carrying, with_bodies
 from forcegp.evidence.least_squares import weighted_least_squares, without
 from forcegp.evidence.parameter_space import ParameterSpace

@@ -11,21 +11,13 @@ from tests.forces.world_forces import WorldForces
 from tests.posterior.arm import arm_data, arm_model
 from torch.testing import assert_close
 
-from forcegp import ContactForces, Torques, Viscous
+from forcegp import AerodynamicForce, ContactForces, Torques, Viscous
 from forcegp.errors import DataWarning, InvalidInput, UnknownName
 from forcegp.fit import fit as fit_model
 from forcegp.fit.physical import typical_sizes
 from forcegp.fit.sensors import with_sensors
 from forcegp.fit.unseen import PUSHED, Unseen
-from forcegp.forces import (
-    Actuation,
-    AerodynamicForce,
-    ContactFriction,
-    JointForces,
-    JointFriction,
-    JointPositionForces,
-    ToolForces,
-)
+from forcegp.forces import Actuation, ContactFriction, JointForces, JointFriction, JointPositionForces, ToolForces
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Contact, Plane
 from forcegp.noise import Noise

@@ -11,18 +11,8 @@ from tests.mechanics.systems import model_with as model_of
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import FRAMES, MODELS
 
-from forcegp.forces import (
-    Actuation,
-    ContactFriction,
-    Coulomb,
-    JointFriction,
-    LoadFriction,
-    Payload,
-    RigidBodies,
-    Stribeck,
-    ToolForces,
-    Viscous,
-)
+from forcegp import ContactFriction, Coulomb
+from forcegp.forces import Actuation, JointFriction, LoadFriction, Payload, RigidBodies, Stribeck, ToolForces, Viscous
 from forcegp.mechanics import Contact, ImplicitSurface, Plane
 from forcegp.model import Model
 from forcegp.robots import Robot

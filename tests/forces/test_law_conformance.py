@@ -6,20 +6,8 @@ import torch
 from tests.forces.law_conformance import LawConformance
 from tests.forces.third_party_law import HardeningSpring
 
-from forcegp.forces import (
-    FORCES,
-    Coefficient,
-    Coulomb,
-    DirectionalFriction,
-    GearFriction,
-    JointLaw,
-    LoadFriction,
-    Offset,
-    Pull,
-    Spring,
-    Stribeck,
-    Viscous,
-)
+from forcegp import Coulomb, LoadFriction, Offset, Spring
+from forcegp.forces import FORCES, Coefficient, DirectionalFriction, GearFriction, JointLaw, Pull, Stribeck, Viscous
 
 THREE = [0.5, 0.4, 0.3]
 PLAIN = {
