@@ -43,14 +43,9 @@ class PretendTensor(torch.Tensor):
     @staticmethod
     def __new__(cls, inner: torch.Tensor, requires_grad: bool = False) -> PretendTensor:
         made = torch.Tensor._make_wrapper_subclass(
-            cls,
-            inner.size(),
-            strides=inner.stride(),
-            storage_offset=inner.storage_offset(),
-            dtype=inner.dtype,
-            device=PRETEND,
-            requires_grad=requires_grad,
-        )
+            cls, inner.size(), strides=inner.stride(), storage_offset=inner.storage_offset(), dtype=inner.dtype,
+            device=PRETEND, requires_grad=requires_grad,
+        )  # fmt: skip
         made.inner = inner
         return made
 

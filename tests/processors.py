@@ -28,13 +28,11 @@ BUSY = 6
 """Processes that compute beside the tests in the variant `loaded`."""
 
 VARIANTS: dict[str, dict[str, str]] = {
-    "as-it-is": {},
-    **{f"openblas-{core}": {"OPENBLAS_CORETYPE": core} for core in ("Haswell", "SkylakeX", "Zen")},
+    "as-it-is": {}, **{f"openblas-{core}": {"OPENBLAS_CORETYPE": core} for core in ("Haswell", "SkylakeX", "Zen")},
     **{f"torch-{kind}": {"ATEN_CPU_CAPABILITY": kind} for kind in ("default", "avx2", "avx512")},
     **{f"mkl-{branch}": {"MKL_CBWR": branch} for branch in ("COMPATIBLE", "AVX2", "AVX512")},
-    "two-threads": {"FORCEGP_TEST_THREADS": "2"},
-    "loaded": {},
-}
+    "two-threads": {"FORCEGP_TEST_THREADS": "2"}, "loaded": {},
+}  # fmt: skip
 
 
 def main() -> int:
@@ -45,8 +43,7 @@ def main() -> int:
     parser.add_argument("--workers", default="2", help="of pytest-xdist (default: 2)")
     given, arguments = parser.parse_known_args()
     FOLDER.mkdir(exist_ok=True)
-    code = contents()
-    rows = []
+    code, rows = contents(), []
     for name in given.only or possible():
         key = hashlib.sha256(json.dumps([code, name, arguments]).encode()).hexdigest()[:16]
         file = FOLDER / f"{name}-{key}.json"
@@ -88,11 +85,9 @@ def run(name: str, arguments: list[str], log: Path) -> dict[str, object]:
         code = subprocess.run(command, cwd=REPOSITORY, env=environment, stdout=output, stderr=output).returncode
     text = log.read_text()
     return {
-        "code": code,
-        "seconds": round(time.monotonic() - begin),
-        "last": (text.strip().splitlines() or [""])[-1],
+        "code": code, "seconds": round(time.monotonic() - begin), "last": (text.strip().splitlines() or [""])[-1],
         "failed": re.findall(r"^(?:FAILED|ERROR) (\S+)", text, re.MULTILINE),
-    }
+    }  # fmt: skip
 
 
 @contextlib.contextmanager

@@ -17,33 +17,23 @@ PACKAGE = REPOSITORY / "src" / "forcegp"
 
 # The packages in the order in which data flows, and which packages each may import: the table of docs/architecture.md.
 PACKAGES = {
-    "errors": set(),
-    "summary": set(),
-    "doubts": {"errors"},
-    "atomic_files": {"errors"},
-    "sandbox": {"errors"},
-    "codegen": {"errors", "atomic_files"},
-    "parallel": {"errors"},
-    "jobs": {"errors", "atomic_files", "parallel"},
-    "robots": {"errors", "summary", "atomic_files", "sandbox", "codegen"},
-    "mechanics": {"errors", "robots"},
-    "forces": {"errors", "robots", "mechanics"},
-    "noise": {"errors"},
+    "errors": set(), "summary": set(), "doubts": {"errors"}, "atomic_files": {"errors"}, "sandbox": {"errors"},
+    "codegen": {"errors", "atomic_files"}, "parallel": {"errors"}, "jobs": {"errors", "atomic_files", "parallel"},
+    "robots": {"errors", "summary", "atomic_files", "sandbox", "codegen"}, "mechanics": {"errors", "robots"},
+    "forces": {"errors", "robots", "mechanics"}, "noise": {"errors"},
     "model": {"errors", "summary", "robots", "mechanics", "forces", "noise"},
-}
+}  # fmt: skip
 MODEL = {"errors", "summary", "doubts", "robots", "mechanics", "forces", "noise", "model"}
 PACKAGES |= {
-    "data": MODEL | {"atomic_files"},
-    "recordings": MODEL | {"atomic_files", "sandbox", "data"},
-    "inference": {"errors", "codegen"},
-    "integration": {"errors", "robots", "mechanics", "model"},
+    "data": MODEL | {"atomic_files"}, "recordings": MODEL | {"atomic_files", "sandbox", "data"},
+    "inference": {"errors", "codegen"}, "integration": {"errors", "robots", "mechanics", "model"},
     "evidence": MODEL | {"data", "inference"},
     "posterior": MODEL | {"atomic_files", "codegen", "data", "inference", "integration", "evidence"},
     "fit": MODEL | {"parallel", "data", "inference", "integration", "evidence", "posterior"},
     "checks": MODEL | {"data", "evidence", "fit"},
     "control": MODEL | {"atomic_files", "codegen", "data", "inference", "integration", "evidence", "posterior"},
     "simulation": {"errors", "robots", "mechanics", "forces", "model", "data"},
-}
+}  # fmt: skip
 PACKAGES["scores"] = set(PACKAGES) - {"simulation"}
 PACKAGES["report"] = set(PACKAGES) - {"simulation"}
 PACKAGES["cli"] = set(PACKAGES)
@@ -55,19 +45,11 @@ PACKAGES["progress"] = set()
 # Optional or slow to import: imported inside the function that uses them. Modules named here may import them
 # at once, since `from forcegp import *` does not load those.
 IMPORTED_WHERE_USED = {
-    "casadi": (),
-    "viser": (),
-    "trimesh": (),
-    "jinja2": ("forcegp.report.page",),
-    "gymnasium": ("forcegp.control.environments",),
-    "mujoco": ("forcegp.control.mujoco_forces",),
-    "pybullet_data": (),
-    "matplotlib": ("forcegp.scores.figures", "forcegp.report"),
-    "joblib": (),
-    "rosbags": (),
-    "tyro": ("forcegp.cli",),
+    "casadi": (), "viser": (), "trimesh": (), "jinja2": ("forcegp.report.page",),
+    "gymnasium": ("forcegp.control.environments",), "mujoco": ("forcegp.control.mujoco_forces",), "pybullet_data": (),
+    "matplotlib": ("forcegp.scores.figures", "forcegp.report"), "joblib": (), "rosbags": (), "tyro": ("forcegp.cli",),
     "rich": ("forcegp.cli",),
-}
+}  # fmt: skip
 
 LONGEST_MODULE = 450  # lines; 100 to 300 are the rule, and what is one idea stays together
 NAMES_THAT_SAY_NOTHING = {"utils", "util", "helpers", "helper", "misc", "common", "tools", "stuff"}

@@ -32,8 +32,7 @@ def test_every_page_is_in_a_table_of_contents():
         for block in re.findall(r"^```\{toctree\}\n(.*?)^```", text(name), re.DOTALL | re.MULTILINE):
             entries = [line for line in block.splitlines() if line and not line.startswith(":")]
             for entry in entries:
-                pattern = re.sub(r".*<(.*)>", r"\1", entry) + ".md"
-                listed = sorted(PAGES[name].parent.glob(pattern))
+                listed = sorted(PAGES[name].parent.glob(re.sub(r".*<(.*)>", r"\1", entry) + ".md"))
                 assert listed, f"{name} lists {entry}, which does not exist"
                 found |= {str(page.resolve().relative_to(DOCS)) for page in listed}
     assert found == set(PAGES)

@@ -80,8 +80,7 @@ def test_the_published_page_has_no_link_that_only_the_repository_can_follow(repo
         text = re.sub(rule["pattern"], rule["replacement"], text)
     targets = re.findall(r"(!?)\[[^\]]*\]\(([^)]+)\)", text)
     assert len(relative) > 10
-    absolute = {target.partition("/v$HFPR_VERSION/")[2] for _, target in targets}
-    assert set(relative) <= absolute
+    assert set(relative) <= {target.partition("/v$HFPR_VERSION/")[2] for _, target in targets}
     for picture, target in targets:
         if not picture or "/forcegp/forcegp/" not in target:
             assert target.startswith("https://"), target

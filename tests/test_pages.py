@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.cli.in_process import run_here
-from tests.examples import run_example
+from tests.examples import blocks, run_example
 from tests.scores.moving_arm import moving_arm
 
 from forcegp import Dataset
@@ -18,23 +18,20 @@ from forcegp.cli.main import parse_arguments
 from forcegp.scores.models import candidates, usual_identification
 
 
-def test_the_page_on_ones_own_robot_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "how-to" / "your-robot.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+def test_the_page_on_ones_own_robot_runs(tmp_path: Path):
+    (example,) = blocks("your-robot")
     noise, error, *_, any_force, friction = run_example(example, tmp_path).splitlines()
     assert f"{float(any_force):.2f} and {float(friction):.2f}" == "0.80 and 0.10"  # the comment on the page
     assert all(0.05 < float(std) < 0.2 for std in re.findall(r"\d\.\d+", noise))
     assert float(error) < 0.3
 
 
-def test_the_page_on_moving_bases_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "how-to" / "moving-bases.md").read_text(encoding="utf-8")
-    example, poses = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+def test_the_page_on_moving_bases_runs(tmp_path: Path):
+    example, poses = blocks("moving-bases")
     run_example(poses, tmp_path)
-    _, own, *_ = (block.splitlines() for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL))
+    _, own, *_ = (block.splitlines() for block in blocks("moving-bases", "sh"))
     for command in own:
-        done = run_here(*shlex.split(command)[1:], folder=tmp_path)
-        assert done.returncode == 0, done.stderr
+        done = run_here(*shlex.split(command)[1:], folder=tmp_path).ok()
     for name in ("poses.h5", "flight.h5"):
         log = Dataset.load(tmp_path / name)
         t, turned = log.time, 0.4 * log.time
@@ -55,7 +52,7 @@ def test_the_page_on_moving_bases_runs(repository: Path, tmp_path: Path):
 @pytest.mark.nightly
 def test_the_page_on_scoring_runs(repository: Path, tmp_path: Path):
     page = (repository / "docs" / "how-to" / "scoring.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (example,) = blocks("scoring")
     moving_arm(1.5, 2).save(tmp_path / "log.h5")
     alone, taken, found = run_example(example, tmp_path).splitlines()
     assert len(re.findall(r"\d\.\d+", alone)) == 5
@@ -70,24 +67,21 @@ def test_the_page_on_scoring_runs(repository: Path, tmp_path: Path):
     assert len(candidates(command.models.names(), model, usual_identification(model))) == len(named) >= 8
 
 
-def test_the_page_on_reports_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "how-to" / "reports.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+def test_the_page_on_reports_runs(tmp_path: Path):
+    (example,) = blocks("reports")
     assert run_example(example, tmp_path).splitlines() == re.findall(r"print\(.*\)  # (.*)", example)
 
 
-def test_the_page_on_motions_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "how-to" / "motions.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+def test_the_page_on_motions_runs(tmp_path: Path):
+    (example,) = blocks("motions")
     windows, rms = run_example(example, tmp_path).split()[:2]
     assert windows == "7"
     assert float(rms.strip("[]")) < 1e-3
 
 
 @pytest.mark.nightly
-def test_the_page_on_identification_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "how-to" / "identification.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+def test_the_page_on_identification_runs(tmp_path: Path):
+    (example,) = blocks("identification")
     mass, decided = run_example(example, tmp_path).splitlines()[-2:]
     found, error = (float(number) for number in re.fullmatch(r"(\S+) \+- (\S+) kg", mass).groups())
     assert abs(found - 2.0) < 0.1
@@ -97,20 +91,17 @@ def test_the_page_on_identification_runs(repository: Path, tmp_path: Path):
 
 
 @pytest.mark.nightly
-def test_the_commands_of_the_page_on_identification_run(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "how-to" / "identification.md").read_text(encoding="utf-8")
-    commands, *_ = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)  # the others need logs of the reader's own
+def test_the_commands_of_the_page_on_identification_run(tmp_path: Path):
+    commands, *_ = blocks("identification", "sh")  # the others need logs of the reader's own
     for command in commands.splitlines():
         program, *words = command.split()
         assert program == "forcegp"
-        done = run_here(*words, folder=tmp_path)
-        assert done.returncode == 0, done.stderr
+        run_here(*words, folder=tmp_path).ok()
     assert (tmp_path / "identified" / "identified.urdf").exists()
 
 
-def test_the_page_on_rollouts_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "how-to" / "rollouts.md").read_text(encoding="utf-8")
-    printed = run_example("\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL)), tmp_path)
+def test_the_page_on_rollouts_runs(tmp_path: Path):
+    printed = run_example("\n".join(blocks("rollouts")), tmp_path)
     states, more, diverged, free, held = printed.splitlines()[-5:]
     assert states == "torch.Size([2, 241, 7]) torch.Size([2, 241, 7]) torch.Size([2, 240, 7])"
     assert more == "torch.Size([2, 241, 1]) torch.Size([10, 2, 241, 7])"
@@ -119,23 +110,20 @@ def test_the_page_on_rollouts_runs(repository: Path, tmp_path: Path):
 
 
 @pytest.mark.nightly
-def test_the_page_on_learning_while_working_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "how-to" / "incremental.md").read_text(encoding="utf-8")
-    printed = [run_example(code, tmp_path) for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL)]
+def test_the_page_on_learning_while_working_runs(tmp_path: Path):
+    printed = [run_example(code, tmp_path) for code in blocks("incremental")]
     assert [text.splitlines()[-1] for text in printed] == ["100 40", "True True"]
 
 
-def test_the_page_on_large_data_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "how-to" / "large-data.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+def test_the_page_on_large_data_runs(tmp_path: Path):
+    (example,) = blocks("large-data")
     engine, left_out = run_example(example, tmp_path).splitlines()
     assert engine == "inducing: as asked for"
     assert float(left_out.split()[2]) <= 1.0
 
 
-def test_the_page_on_gpus_runs_on_the_cpu(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "how-to" / "gpu.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+def test_the_page_on_gpus_runs_on_the_cpu(tmp_path: Path):
+    (example,) = blocks("gpu")
     assert run_example(example, tmp_path).splitlines()[-1] == "cpu"
 
 
@@ -156,8 +144,7 @@ def test_the_examples_of_the_page_on_deploying_run(repository: Path, tmp_path: P
     pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
     monkeypatch.syspath_prepend(repository / "examples")
     source = (repository / "examples" / f"{program}.py").read_text(encoding="utf-8")
-    printed = run_example(source, tmp_path)
-    first, second = (float(number) for number in re.match(lines, printed).groups())
+    first, second = (float(number) for number in re.match(lines, run_example(source, tmp_path)).groups())
     if program == "swing_up":
         assert first > 2.0
         assert second < 0.2
@@ -176,28 +163,25 @@ def test_the_examples_of_the_page_on_deploying_run(repository: Path, tmp_path: P
 @pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
 @pytest.mark.nightly
 @pytest.mark.usefixtures("unchecked")  # explicit steps add and scale CasADi's expressions as they do tensors
-def test_the_page_on_deploying_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "how-to" / "deploy.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+def test_the_page_on_deploying_runs(tmp_path: Path):
+    (example,) = blocks("deploy")
     files, agree = run_example(example, tmp_path).splitlines()
     assert "lbr_iiwa.c" in files
     assert agree == "True"
-    commands, build, planner = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)
+    commands, build, planner = blocks("deploy", "sh")
     for command in (commands + planner).splitlines():
-        done = run_here(*shlex.split(command)[1:], folder=tmp_path)
-        assert done.returncode == 0, done.stderr
+        run_here(*shlex.split(command)[1:], folder=tmp_path).ok()
     for command in build.splitlines():
         subprocess.run(command, shell=True, cwd=tmp_path / "controller", check=True)
     assert {"lbr_iiwa.casadi", "lbr_iiwa_step.casadi"} <= {file.name for file in (tmp_path / "planner").iterdir()}
 
 
 @pytest.mark.nightly
-def test_the_page_on_robots_runs_from_files_to_learned_forces(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "how-to" / "robots.md").read_text(encoding="utf-8")
-    record, drone = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+def test_the_page_on_robots_runs_from_files_to_learned_forces(tmp_path: Path):
+    record, drone = blocks("robots")
     run_example(record, tmp_path)
     assert run_example(drone, tmp_path).strip() == "('rotor_1', 'rotor_2', 'rotor_3', 'rotor_4')"
-    commands = "\n".join(re.findall(r"```sh\n(.*?)```", page, re.DOTALL))
+    commands = "\n".join(blocks("robots", "sh"))
     for command in re.findall(r"^forcegp .*$", commands, re.MULTILINE):
         done = run_here(*command.split()[1:], folder=tmp_path)
         assert done.returncode == 0, f"{command}: {done.stderr}"
@@ -209,9 +193,8 @@ def test_the_page_on_robots_runs_from_files_to_learned_forces(repository: Path, 
 
 
 @pytest.mark.nightly  # tests of predictors ask each function
-def test_the_page_on_control_rates_runs(repository: Path, tmp_path: Path):
-    page = (repository / "docs" / "how-to" / "control-rate.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+def test_the_page_on_control_rates_runs(tmp_path: Path):
+    (example,) = blocks("control-rate")
     rank, one, linear, many, step, inverse, gradient = run_example(example, tmp_path).splitlines()
     found, excess = re.fullmatch(r"rank (\d+), standard deviations at most (\S+)% too large", rank).groups()
     assert 1 < int(found) <= 300

@@ -25,17 +25,13 @@ def test_the_python_example_runs(repository: Path, tmp_path: Path):
     assert forces == "torch.Size([1200, 1]) torch.Size([1200, 7])"
     assert float(error.split()[3]) < 0.2
     assert {path.name for path in (tmp_path / "model").iterdir()} == {
-        "model.json",
-        "tensors.safetensors",
-        "robot.urdf",
-        "SHA256SUMS",
-    }
+        "model.json", "tensors.safetensors", "robot.urdf", "SHA256SUMS",
+    }  # fmt: skip
 
 
 def test_the_pictures_and_pages_that_it_names_exist(repository: Path):
     links = re.findall(r"\]\(([^)#]+)\)", (repository / "README.md").read_text(encoding="utf-8"))
-    missing = [link for link in links if not link.startswith("http") and not (repository / link).exists()]
-    assert not missing
+    assert not [link for link in links if not link.startswith("http") and not (repository / link).exists()]
 
 
 def test_it_is_short_and_the_answer_is_the_one_that_was_measured(repository: Path):
@@ -50,11 +46,9 @@ def test_it_is_short_and_the_answer_is_the_one_that_was_measured(repository: Pat
 ROBOTS = {"EMPS": 0, "passive pendulum": 1, "driven double pendulum": 2}
 """How a row of the README begins -> the column of the page with its motions."""
 COLUMNS = (
-    "as given",
-    "independent GP, without physics",
-    "identified by accelerations",
+    "as given", "independent GP, without physics", "identified by accelerations",
     "`joint-friction` beside the identified model",
-)
+)  # fmt: skip
 
 
 def test_the_results_of_real_robots_are_those_of_their_page(repository: Path):
@@ -130,8 +124,7 @@ def test_the_commands_and_forces_of_the_page_on_forces_exist(repository: Path):
     cells = re.findall(r"^\| (`[^|]+) \|", rows, re.MULTILINE)
     told = {name for cell in cells for name in re.findall(r"`(.+?)`", cell)}
     assert told == set(KERNELS)
-    model = simulate_kuka_surface(KukaSurfaceConfig(seconds=0.1)).model
-    count = 0
+    model, count = simulate_kuka_surface(KukaSurfaceConfig(seconds=0.1)).model, 0
     for commands in re.findall(r"```sh\n(.*?)```", page, re.DOTALL):
         for line in re.findall(r"^forcegp (.*)$", commands.replace("\\\n", " "), re.MULTILINE):
             command = parse_arguments(shlex.split(line))

@@ -13,11 +13,9 @@ from forcegp import ComputedTorque, export_c
 HERE = Path(__file__).parent
 EXAMPLE = HERE.parent / "examples" / "ros2_control"
 HEADERS = (
-    "controller_interface/controller_interface",
-    "pluginlib/class_list_macros",
-    "realtime_tools/realtime_buffer",
+    "controller_interface/controller_interface", "pluginlib/class_list_macros", "realtime_tools/realtime_buffer",
     "trajectory_msgs/msg/joint_trajectory_point",
-)
+)  # fmt: skip
 
 pytestmark = pytest.mark.skipif(not (shutil.which("cc") and shutil.which("c++")), reason="needs a C++ compiler")
 

@@ -66,5 +66,4 @@ def test_notebooks_show_the_same_facts_as_a_table(shown, name):
 
 
 def test_html_of_a_name_is_escaped():
-    odd = type("Odd", (Summary,), {"facts": lambda self: {"x": "<b>"}})
-    assert "<td>&lt;b&gt;</td>" in odd()._repr_html_()
+    assert "<td>&lt;b&gt;</td>" in type("Odd", (Summary,), {"facts": lambda self: {"x": "<b>"}})()._repr_html_()

@@ -39,8 +39,7 @@ def test_the_true_dynamics_reproduce_the_recording(run, tmp_path):
 
 def test_displaced_starts_are_exactly_off_the_surface_and_as_near_as_can_be(motion, recorded):
     q = recorded.q[:, 0]
-    displaced = fig4_jobs._displaced(motion.model, q)
-    tool = Tool(motion.model)
+    displaced, tool = fig4_jobs._displaced(motion.model, q), Tool(motion.model)
     height = motion.model.contacts[0].surface.offset
     for before, after in zip(q.numpy(), displaced.numpy(), strict=True):
         assert tool.position(after)[2] - height == pytest.approx(OFFSET, abs=1e-12)
@@ -59,6 +58,5 @@ def test_the_feedback_is_that_of_its_formula_and_nothing_on_the_recording(record
         q, v = recorded.q[:, k], recorded.v[:, k]
         assert torch.equal(feedback(k, q, v), torch.zeros_like(q))
         M = torch.tensor(np.array([oracle.mass_matrix(row) for row in q.numpy()]))
-        wanted = -(FREQUENCY**2) * dq - 2.0 * FREQUENCY * dv
-        expected = torch.einsum("nij,nj->ni", M, wanted)
+        expected = torch.einsum("nij,nj->ni", M, -(FREQUENCY**2) * dq - 2.0 * FREQUENCY * dv)
         torch.testing.assert_close(feedback(k, q + dq, v + dv), expected, rtol=1e-9, atol=1e-9)

@@ -20,8 +20,7 @@ def test_the_page_equals_its_numbers(results):
 
 
 def test_every_number_has_a_meaning_and_every_question_a_module(results):
-    known = {key for asked in QUESTIONS.values() for key in asked if key != "title"}
-    assert set(results) - known == ABOUT_ALL
+    assert set(results) - {key for asked in QUESTIONS.values() for key in asked if key != "title"} == ABOUT_ALL
     assert all(find_spec(f"benchmarks.{question}") for question in QUESTIONS)
 
 

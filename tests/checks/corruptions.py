@@ -136,8 +136,7 @@ def other_robot(data: Dataset, **changes: object) -> Dataset:
     """The model states another robot than the one that was recorded: attributes of the URDF times factors."""
     assert data.model is not None
     robot = data.model.robot
-    text = robot.urdf_text
-    gravity = changes.pop("gravity", robot.gravity.tolist())
+    text, gravity = robot.urdf_text, changes.pop("gravity", robot.gravity.tolist())
     for find, by in changes.pop("text", ()):  # type: ignore[attr-defined]
         assert find in text, find
         text = text.replace(find, by)

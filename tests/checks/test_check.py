@@ -144,8 +144,7 @@ def test_what_cannot_be_checked_is_refused():
 def test_a_model_whose_friction_remembers_is_compared_as_if_its_joints_had_slid_on():
     log = clean(4)
     steady, remembering = (Coulomb(0.4, 0.05, sigma=1e3, memory=memory) for memory in (False, True))
-    forces = log.model.forces
-    reports = [quick_check(log, log.model.with_forces(*forces, law)) for law in (steady, remembering)]
+    reports = [quick_check(log, log.model.with_forces(*log.model.forces, law)) for law in (steady, remembering)]
     assert reports[0] == reports[1]
 
 

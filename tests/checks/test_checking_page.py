@@ -3,16 +3,11 @@
 import re
 
 import pytest
-from tests.examples import run_example
+from tests.examples import blocks, run_example
 
 
-@pytest.fixture(scope="module")
-def page(repository):
-    return (repository / "docs" / "how-to" / "checking.md").read_text(encoding="utf-8")
-
-
-def test_the_example_finds_what_was_planted(page, tmp_path):
-    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+def test_the_example_finds_what_was_planted(tmp_path):
+    (example,) = blocks("checking")
     printed = run_example(example, tmp_path)
     assert re.search(r"\[wrong\] torque sign: the torque of elbow has the opposite sign", printed)
     delay = re.search(r"\[wrong\] delay: the torque of all joints is logged (\S+) ms .* later", printed)

@@ -252,8 +252,7 @@ def test_what_is_said_of_growing_mistakes(log):
         found[f"u {size}"] = numbers(carried_doubts(replace(drone, u=size * drone.u), drone.model))
     few = log.rows(slice(240, 480))
     for share in (0.004, 0.03, 0.07):
-        flips = few.u.copy()
-        some = np.random.default_rng(0).random(len(few)) < share
+        flips, some = few.u.copy(), np.random.default_rng(0).random(len(few)) < share
         flips[some, 12:] = 1.0 - flips[some, 12:]
         found[f"flags {share}"] = numbers(list(stance_doubts(replace(few, u=flips, truth={}), few.model))[2:])
     lifted = np.where(np.arange(few.u.shape[1]) < 12, few.u, 0.0)

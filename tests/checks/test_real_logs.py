@@ -17,13 +17,9 @@ def panda(shared) -> Dataset:
     folder: Path = shared("realdata/panda_gaz2019")
     names = ("time", "positions", "velocity", "torques")
     mapping = ColumnMapping(
-        time="exciting_traj_time:c1",
-        q=("exciting_traj_positions",),
-        v=("exciting_traj_velocity",),
-        u=("exciting_traj_torques",),
-        headerless=(1, 7, 7, 7),
-        side_by_side=True,
-    )
+        time="exciting_traj_time:c1", q=("exciting_traj_positions",), v=("exciting_traj_velocity",),
+        u=("exciting_traj_torques",), headerless=(1, 7, 7, 7), side_by_side=True,
+    )  # fmt: skip
     model = Model(Robot.from_urdf(folder / "model" / "panda_gaz2019_nomesh.urdf"))
     return import_recordings([folder / "raw" / f"exciting_traj_{name}.txt.gz" for name in names], mapping, model=model)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tests.cli.in_process import run_here
+from tests.cli.in_process import Done, run_here
 
 Forcegp = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -32,20 +32,15 @@ def installed(executable) -> Forcegp:
 
     def run(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [executable, *(str(argument) for argument in arguments)],
-            cwd=folder,
-            env={**os.environ, "COLUMNS": "100"},
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=LONGEST,
-        )
+            [executable, *(str(argument) for argument in arguments)], cwd=folder, env={**os.environ, "COLUMNS": "100"},
+            capture_output=True, text=True, check=False, timeout=LONGEST,
+        )  # fmt: skip
 
     return run
 
 
 @pytest.fixture(scope="session")
-def forcegp() -> Forcegp:
+def forcegp() -> Callable[..., Done]:
     """Run `forcegp` with these arguments in that folder, in this process; returns exit code, stdout and stderr."""
     return run_here
 
@@ -57,14 +52,12 @@ def workshop(forcegp, tmp_path_factory) -> Path:
     for name, seed in (("train", 1), ("test", 2)):
         made = forcegp(
             "simulate", "kuka-surface", "--seconds", 2, "--seed", seed, "--out", f"{name}.h5", "--json", folder=folder
-        )
-        assert made.returncode == 0, made.stderr
+        ).ok()
         (folder / f"{name}.json").write_text(made.stdout)
     fitted = forcegp(
         *("fit", "train.h5", "--forces", "gp:joint", "--points", 15, "--iterations", 8, "--restarts", 2),
         *("--out", "run"),
         folder=folder,
-    )
-    assert fitted.returncode == 0, fitted.stderr
+    ).ok()
     (folder / "fit.txt").write_text(fitted.stdout)
     return folder

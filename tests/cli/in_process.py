@@ -9,7 +9,7 @@ import tempfile
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO
+from typing import IO, Self
 
 import pytest
 import torch
@@ -20,7 +20,21 @@ PYTHON_FILTERS = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, 
 """Which warnings Python does not show where nobody asks for them: https://docs.python.org/3/library/warnings.html."""
 
 
-def run_here(*arguments: object, folder: Path | None = None, columns: int = 100) -> subprocess.CompletedProcess[str]:
+class Done(subprocess.CompletedProcess[str]):
+    def ok(self) -> Self:
+        assert self.returncode == 0, self.stderr
+        return self
+
+    def refused(self, message: str = "") -> str:
+        """The one line that says so, with this message."""
+        assert self.returncode == 2, self.stderr
+        (line,) = self.stderr.splitlines()
+        assert self.stderr.count("\n") == 1
+        assert message in line
+        return line
+
+
+def run_here(*arguments: object, folder: Path | None = None, columns: int = 100) -> Done:
     """Run `forcegp` with these arguments in that folder, in this process; returns exit code, stdout and stderr.
 
     Files, pipes and warnings are those of a new process, and what the command could change here is put back.
@@ -30,8 +44,7 @@ def run_here(*arguments: object, folder: Path | None = None, columns: int = 100)
         undo.callback(torch.set_num_threads, torch.get_num_threads())
         undo.enter_context(contextlib.chdir(folder or Path.cwd()))
         undo.enter_context(pytest.MonkeyPatch.context()).setenv("COLUMNS", str(columns))
-        undo.enter_context(warnings.catch_warnings())
-        warnings.simplefilter("default")
+        undo.enter_context(warnings.catch_warnings(action="default"))
         for category in PYTHON_FILTERS:
             warnings.simplefilter("ignore", category)
         stdout, stderr = (undo.enter_context(_into_a_file(name)) for name in ("stdout", "stderr"))
@@ -40,7 +53,7 @@ def run_here(*arguments: object, folder: Path | None = None, columns: int = 100)
         except SystemExit as end:  # --help
             code = end.code if isinstance(end.code, int) else int(end.code is not None)
         texts = [_text(stream) for stream in (stdout, stderr)]
-    return subprocess.CompletedProcess(["forcegp", *words], code, *texts)
+    return Done(["forcegp", *words], code, *texts)
 
 
 @contextlib.contextmanager
@@ -65,13 +78,8 @@ def _into_a_file(name: str) -> Iterator[IO[bytes]]:
 
 def _like(name: str, descriptor: int) -> IO[str]:
     """A stream to that descriptor, with what Python does there to letters that cannot be encoded."""
-    return open(
-        descriptor,
-        "w",
-        closefd=False,
-        encoding="utf-8",  # a descriptor
-        errors={"stderr": "backslashreplace"}.get(name, "strict"),
-    )
+    errors = {"stderr": "backslashreplace"}.get(name, "strict")
+    return open(descriptor, "w", closefd=False, encoding="utf-8", errors=errors)
 
 
 def _text(file: IO[bytes]) -> str:

@@ -51,8 +51,7 @@ def test_fit_writes_a_model_and_everything_needed_to_repeat_it(workshop):
 
 
 def test_score_prints_exactly_one_json_object(workshop, forcegp):
-    done = forcegp("score", "run", "train.h5", "--every", 4, "--json", folder=workshop)
-    assert done.returncode == 0, done.stderr
+    done = forcegp("score", "run", "train.h5", "--every", 4, "--json", folder=workshop).ok()
     content = json.loads(done.stdout)
     scores = content["models"]["run"]["scores"]
     assert scores["constraint"]["mae"]["all"]["median"] < 1e-10
@@ -68,8 +67,7 @@ def test_score_prints_exactly_one_json_object(workshop, forcegp):
 
 def test_score_shows_a_line_per_joint_and_draws(workshop, forcegp, tmp_path):
     words = ("score", "run", "test.h5", "--every", 8, "--out", tmp_path / "out")
-    done = forcegp(*words, folder=workshop)
-    assert done.returncode == 0, done.stderr
+    done = forcegp(*words, folder=workshop).ok()
     lines = re.findall(r"^\s*lbr_iiwa_joint_\d\s.*$", done.stdout, re.M)
     assert len(lines) == 7
     assert len({len(line.split()) for line in lines}) == 1
@@ -82,8 +80,7 @@ def test_score_shows_a_line_per_joint_and_draws(workshop, forcegp, tmp_path):
 def test_the_demo_tells_the_whole_story(forcegp, tmp_path, monkeypatch):
     small = ("demo", "--seconds", "1", "--points", "12", "--iterations", "3", "--overwrite")
     monkeypatch.setattr("forcegp.report.page.model_pictures", lambda *_: ([], []))  # as drawn for a score
-    done = forcegp(*small, folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = forcegp(*small, folder=tmp_path).ok()
     for row in ("S-GP ", "S-GP + analytical mean"):
         assert re.search(rf"^\s*{re.escape(row)}.*\d\.\d{{4}}", done.stdout, re.M), done.stdout
     results = json.loads((tmp_path / "demo" / "results.json").read_text())

@@ -19,15 +19,13 @@ def folder(forcegp, tmp_path_factory):
     place = tmp_path_factory.mktemp("excite")
     (place / "arm.urdf").write_text(URDF)
     arm_data(40, 0, arm_model(0)).save(place / "arm.h5")
-    done = forcegp("fit", "arm.h5", "--forces", "gp:joint-friction", *QUICK, "--out", "run", folder=place)
-    assert done.returncode == 0, done.stderr
+    forcegp("fit", "arm.h5", "--forces", "gp:joint-friction", *QUICK, "--out", "run", folder=place).ok()
     return place
 
 
 def test_the_next_motion_of_a_model_can_be_imported(forcegp, folder):
     words = ("excite", "run", *FEW, "--out", "next.csv")
-    done = forcegp(*words, "--json", folder=folder)
-    assert done.returncode == 0, done.stderr
+    done = forcegp(*words, "--json", folder=folder).ok()
     found = json.loads(done.stdout)
     assert max(max(each) for each in found["usage"].values()) <= 1.0
     assert (np.array(found["spread"][1]) < found["spread"][0]).all()
@@ -35,24 +33,19 @@ def test_the_next_motion_of_a_model_can_be_imported(forcegp, folder):
     assert_unchanged("cli/excite", {**found, "table": table}, rtol=1e-2)
     names = ("--time", "t", *(x for what in "qvu" for x in (f"--{what}", f"{what}_{{joints}}")))
     words_of_import = ("import", "next.csv", *names, "--joints", "pan,lift,bend", "--robot", "arm.urdf")
-    done = forcegp(*words_of_import, "--out", "next.h5", folder=folder)
-    assert done.returncode == 0, done.stderr
+    forcegp(*words_of_import, "--out", "next.h5", folder=folder).ok()
     data = Dataset.load(folder / "next.h5")
     assert len(data) >= 199
     assert np.abs(data.v).max() <= 1.5
 
-    again = forcegp(*words, folder=folder)
-    assert (again.returncode, again.stderr.count("\n")) == (2, 1)
-    assert "add --overwrite" in again.stderr
-    shown = forcegp(*words, "--overwrite", folder=folder)
-    assert shown.returncode == 0, shown.stderr
+    forcegp(*words, folder=folder).refused("add --overwrite")
+    shown = forcegp(*words, "--overwrite", folder=folder).ok()
     assert "spread of a" in shown.stdout
 
 
 def test_a_robot_without_a_model(forcegp, folder):
     words = ("excite", "--robot", "arm.urdf", *FEW, "--posture", "0,0.5,0.5", "--avoid", "hand:plane:0,0,1,-9")
-    done = forcegp(*words, "--out", "bare.csv", "--json", folder=folder)
-    assert done.returncode == 0, done.stderr
+    done = forcegp(*words, "--out", "bare.csv", "--json", folder=folder).ok()
     found = json.loads(done.stdout)
     assert found["spread"] is None
     assert found["condition"] > 1.0
@@ -72,7 +65,5 @@ def test_a_robot_without_a_model(forcegp, folder):
 )
 def test_what_is_refused(forcegp, folder, words, message):
     done = forcegp("excite", *words, "--seconds", 1, "--tries", 1, "--out", "never.csv", folder=folder)
-    assert done.returncode == 2
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
+    done.refused(message)
     assert not list(folder.glob("never*"))

@@ -35,8 +35,7 @@ def test_a_recording_becomes_a_page_in_the_browser(forcegp, folder, monkeypatch)
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
     for words in (("--out", "seen.html"), ()):
-        done = forcegp("view", "arm.h5", "--seconds", 0.2, *words, "--json", folder=folder)
-        assert done.returncode == 0, done.stderr
+        done = forcegp("view", "arm.h5", "--seconds", 0.2, *words, "--json", folder=folder).ok()
         assert "<iframe" in (folder / json.loads(done.stdout)["html"]).read_text()
     assert len(opened) == 1
     assert opened[0].startswith("file:///")

@@ -36,8 +36,7 @@ def folder(tmp_path_factory):
 def identified(forcegp, folder):
     """What fit prints of laws and bodies, which it wrote into `found`."""
     words = ("fit", "pendulum.h5", "--forces", "bodies,viscous,coulomb,offset", "--evidence", "torques")
-    done = forcegp(*words, "--out", "found", folder=folder)
-    assert done.returncode == 0, done.stderr
+    done = forcegp(*words, "--out", "found", folder=folder).ok()
     return done
 
 
@@ -80,8 +79,7 @@ def test_the_table_of_estimates_is_for_people(identified):
 
 def test_functions_beside_what_was_identified(forcegp, folder, identified):
     words = ("fit", "pendulum.h5", "--identified", "found", "--forces", "gp:joint-friction", "--noise", "learned")
-    done = forcegp(*words, *QUICK, "--out", "beside", "--json", folder=folder)
-    assert done.returncode == 0, done.stderr
+    done = forcegp(*words, *QUICK, "--out", "beside", "--json", folder=folder).ok()
     assert json.loads(done.stdout)["points"] == 12
     assert "forces: actuation, rigid-bodies, viscous, coulomb, offset" in done.stderr
     posterior = load_posterior(folder / "beside")
@@ -99,11 +97,9 @@ def test_functions_beside_what_was_identified(forcegp, folder, identified):
 )  # fmt: skip
 def test_models_by_name(forcegp, folder, forces, description):
     out = re.sub(r"\W", "-", forces)
-    done = forcegp("fit", "arm.h5", "--forces", forces, *QUICK, "--out", out, "--json", folder=folder)
-    assert done.returncode == 0, done.stderr
+    done = forcegp("fit", "arm.h5", "--forces", forces, *QUICK, "--out", out, "--json", folder=folder).ok()
     assert description in json.loads(done.stdout)["model"].lower()
-    scored = forcegp("score", out, "arm.h5", "--every", 4, "--json", folder=folder)
-    assert scored.returncode == 0, scored.stderr
+    scored = forcegp("score", out, "arm.h5", "--every", 4, "--json", folder=folder).ok()
     black_box = forces == "gp:independent"
     (model,) = json.loads(scored.stdout)["models"].values()
     assert (model["scores"]["constraint"]["mae"]["all"]["median"] > 1e-6) == black_box
@@ -113,8 +109,7 @@ def test_motions_refine_what_was_found(forcegp, folder):
     """A cart with friction of 3 Ns/m and 4 N, whose model has 1 and 1."""
     recording(line, 1, seconds=4.0).save(folder / "cart.h5")
     words = ("fit", "cart.h5", "--forces", "viscous,coulomb", "--evidence", "torques,motions:.5:bodies=false")
-    done = forcegp(*words, "--out", "moved", folder=folder)
-    assert done.returncode == 0, done.stderr
+    done = forcegp(*words, "--out", "moved", folder=folder).ok()
     assert "7 windows of 0.5 s, whose initial states" in " ".join(done.stdout.split())
     posterior = load_posterior(folder / "moved")
     assert posterior.settings["motions"]["seconds"] == 0.5
@@ -122,8 +117,7 @@ def test_motions_refine_what_was_found(forcegp, folder):
 
 
 def test_the_engine_is_said_and_stored(forcegp, folder):
-    done = forcegp("fit", "arm.h5", *QUICK, "--engine", "inducing", "--out", "inducing", folder=folder)
-    assert done.returncode == 0, done.stderr
+    done = forcegp("fit", "arm.h5", *QUICK, "--engine", "inducing", "--out", "inducing", folder=folder).ok()
     assert "inducing: as asked for" in done.stdout
     assert load_posterior(folder / "inducing").engine.name == "inducing"
 

@@ -17,23 +17,21 @@ FIT = "fit x.h5 --out run"
     ("words", "field", "entries"),
     [
         (
-            "score x.h5 --out r --forces a,gp:joint:inputs=q/v,kernel=k --forces identified@motions:1",
-            "forces",
+            "score x.h5 --out r --forces a,gp:joint:inputs=q/v,kernel=k --forces identified@motions:1", "forces",
             ("a,gp:joint:inputs=q/v,kernel=k", "identified@motions:1"),
         ),
         (f"{FIT} --forces gp:tool:frame=tool,x=1,viscous", "forces", ("gp:tool:frame=tool,x=1", "viscous")),
         (f"{FIT} --forces 'gp:a:kernel=(k + deep(x, y)),b'", "forces", ("gp:a:kernel=(k + deep(x, y))", "b")),
         (f"{FIT} --evidence torques:mean=.4,motions:1", "evidence", ("torques:mean=.4", "motions:1")),
         (
-            f"{FIT} --contact tool@0,-1e-3,0.1:plane:0,0,1,.055,link_2:sphere:0,0,0,1",
-            "contact",
+            f"{FIT} --contact tool@0,-1e-3,0.1:plane:0,0,1,.055,link_2:sphere:0,0,0,1", "contact",
             ("tool@0,-1e-3,0.1:plane:0,0,1,.055", "link_2:sphere:0,0,0,1"),
         ),
         (f"{FIT} --lock a=1,b=-0.5", "lock", ("a=1", "b=-0.5")),
         ("score x.h5 --out r --horizon 0.1,1", "horizon", (0.1, 1.0)),
         ("import x.csv --out f.h5 --q 'Winkel_A{1..6}' --u 'a,b'", "u", "a,b"),
     ],
-)
+)  # fmt: skip
 def test_lists_are_written_with_commas(words, field, entries):
     assert values_of(parse_arguments(shlex.split(words)))[field] == entries
 

@@ -26,14 +26,12 @@ def folder(tmp_path_factory):
 
 def test_a_clean_log_is_fitted_without_a_word(forcegp, folder):
     for name in ("clean.h5", "line.h5"):
-        done = forcegp("fit", name, *FIT, folder=folder)
-        assert done.returncode == 0, done.stderr
+        done = forcegp("fit", name, *FIT, folder=folder).ok()
         assert not looked(done.stderr)
 
 
 def test_one_line_names_what_is_wrong_and_the_next_step(forcegp, folder):
-    done = forcegp("fit", "sign.h5", *FIT, folder=folder)
-    assert done.returncode == 0, done.stderr
+    done = forcegp("fit", "sign.h5", *FIT, folder=folder).ok()
     (line,) = looked(done.stderr)
     assert line.startswith("warning: torque sign: the torque of joint2 has the opposite sign")
     assert "forcegp check sign.h5" in line

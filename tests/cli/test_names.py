@@ -27,8 +27,7 @@ def urdf():
 
 def test_in_a_terminal(forcegp, urdf, tmp_path):
     (tmp_path / "arm.urdf").write_text(urdf, encoding="utf-8")
-    done = forcegp("robot", "arm.urdf", folder=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = forcegp("robot", "arm.urdf", folder=tmp_path).ok()
     for name in NAMES:
         assert printable(name) in done.stdout
     assert "\x9b" not in done.stdout

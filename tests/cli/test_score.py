@@ -31,16 +31,14 @@ def folder(forcegp, tmp_path_factory):
     dataclasses.replace(log, noise_std=None, metadata={"rig": "small"}).save(path / "raw.h5")
     for name in ("friction", "joint"):
         words = ("--forces", f"gp:{name.replace('friction', 'joint-friction')}", "--points", 30, "--iterations", 5)
-        done = forcegp("fit", "train.h5", *words, "--restarts", 1, "--out", name, folder=path)
-        assert done.returncode == 0, done.stderr
+        forcegp("fit", "train.h5", *words, "--restarts", 1, "--out", name, folder=path).ok()
     return path
 
 
 @pytest.fixture(scope="module")
 def found(forcegp, folder):
     words = ("score", "joint", "log.h5", "--split", "episodes:1", "--every", 2, "--seeds", 2, *QUICK, *FORCES)
-    done = forcegp(*words, "--out", "results", "--json", folder=folder)
-    assert done.returncode == 0, done.stderr
+    done = forcegp(*words, "--out", "results", "--json", folder=folder).ok()
     return json.loads(done.stdout)
 
 
@@ -76,23 +74,20 @@ def test_the_same_command_resumes_and_another_is_refused(forcegp, found, folder)
     words = ("score", "joint", "log.h5", "--split", "episodes:1", "--every", 2, "--seeds", 2, *FORCES)
     (lost,) = (folder / "results" / "jobs").glob("*seed1-given")
     shutil.rmtree(lost)
-    done = forcegp(*words, *QUICK, "--out", "results", "--json", folder=folder)
-    assert done.returncode == 0, done.stderr
+    done = forcegp(*words, *QUICK, "--out", "results", "--json", folder=folder).ok()
     told = json.loads(done.stdout)
     for name in found["models"]:
         assert told["models"][name]["scores"] == found["models"][name]["scores"]
     done = forcegp(*words, *[39 if word == 40 else word for word in QUICK], "--out", "results", folder=folder)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "holds results with another points" in done.stderr
-    assert done.stderr.count("\n") == 1
+    done.refused("holds results with another points")
+    assert done.stdout == ""
 
 
 def test_a_raw_log_is_filtered_and_cut_into_blocks_with_a_guard(forcegp, folder):
     words = ["score", "raw.h5", "--robot", "arm.urdf", "--out", "raw", "--seeds", 1, *QUICK, "--forces", "given"]
     words += ["--identification", "viscous@accelerations"]
     words += ["--cutoff", 15, "--trim", 0.1, "--every", 2, "--split", "blocks:4:2", "--guard", 0.01]
-    done = forcegp(*words, folder=folder)
-    assert done.returncode == 0, done.stderr
+    done = forcegp(*words, folder=folder).ok()
     assert re.search(r"given\s+\d+\.\d+", done.stdout)
     page = (folder / "raw" / "report.md").read_text()
     assert "Preparation: cutoff 15.0, " in page
@@ -103,8 +98,7 @@ def test_a_raw_log_is_filtered_and_cut_into_blocks_with_a_guard(forcegp, folder)
 
 
 def test_runs_alone_are_scored_on_the_whole_log(forcegp, folder):
-    done = forcegp("score", "friction", "joint", "test.h5", "--horizon", ".1,.3", folder=folder)
-    assert done.returncode == 0, done.stderr
+    done = forcegp("score", "friction", "joint", "test.h5", "--horizon", ".1,.3", folder=folder).ok()
     assert re.search(r"^ *friction +\d+\.\d+ .*\n *joint +\d+\.\d+", done.stdout, re.M), done.stdout
     assert re.search(r"^take friction: .*error of predicted motions, friction / joint = ", done.stdout, re.M)
     one = forcegp("score", "friction", "test.h5", "--horizon", ".1", "--integrator", "symplectic-euler", folder=folder)
@@ -124,21 +118,19 @@ def test_runs_alone_are_scored_on_the_whole_log(forcegp, folder):
 OUT = "--out never"
 WRONG = [
     ("score missing.h5", "missing.h5 does not exist"),
-    ("score friction", "friction is a folder; give a dataset (.h5) last"),
-    ("score log.h5", "give --out FOLDER"),
+    ("score friction", "friction is a folder; give a dataset (.h5) last"), ("score log.h5", "give --out FOLDER"),
     ("score friction other.h5", "joints shoulder, elbow; the model was trained on pan, lift, bend"),
     ("score friction test.h5 --horizon 7", "not predicted: 7 s; held-out stretches last"),
     ("score friction test.h5 --observe 99", "--observe is 99 s; give seconds that one record is longer than"),
     ("score friction test.h5 --every 0", "--every 0 must be an integer of at least 1"),
     ("score friction test.h5 --integrator euler", "did you mean 'symplectic-euler'"),
-    (f"score log.h5 {OUT} --split thirds", "the split is 'thirds'"),
-    (f"score log.h5 {OUT} --points 500", "two thirds"),
+    (f"score log.h5 {OUT} --split thirds", "the split is 'thirds'"), (f"score log.h5 {OUT} --points 500", "two thirds"),
     (f"score log.h5 {OUT} --horizon soon", "'soon' is no list of numbers"),
     (f"score log.h5 {OUT} --forces given --forces given", "named twice"),
     (f"score log.h5 {OUT} --forces identifed", "give given, identified or FORCES"),
     (f"score log.h5 {OUT} --identification magic", "no force 'magic'"),
     ("score log.h5 --out log.h5", "log.h5 would be written over log.h5"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("words", "message"), WRONG, ids=[words for words, _ in WRONG])

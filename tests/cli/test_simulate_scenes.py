@@ -6,6 +6,4 @@ def test_options_of_other_scenarios_are_refused(forcegp, tmp_path):
         (("quadruped", "--surface", "tilted"), "--surface means nothing to quadruped"),
         (("quadruped", "--joint-friction", "lugre"), "lugre"),
     ):
-        refused = forcegp("simulate", *words, "--out", "no.h5", folder=tmp_path)
-        assert refused.returncode == 2
-        assert message in refused.stderr
+        forcegp("simulate", *words, "--out", "no.h5", folder=tmp_path).refused(message)

@@ -224,8 +224,7 @@ def test_outputs_of_a_call_stand_where_it_does():
     """Though there are more of them than statements in a part; and the same after a copy to another graph."""
     graph = Graph(1)
     first = graph.apply("sin", graph.inputs[0])
-    outputs = graph.call("f", [first], 11, slopes={(0, 0): 11})
-    made = Graph(1)
+    outputs, made = graph.call("f", [first], 11, slopes={(0, 0): 11}), Graph(1)
     copied = Copier(made, graph, dict(zip(graph.inputs, made.inputs, strict=True)))([*outputs, first])
     for of, nodes in ((graph, [*outputs, first]), (made, copied)):
         text = write_function("part", of, [of.sum(nodes)], 1, ["f"], most=3)

@@ -1,16 +1,12 @@
 """The examples of docs/how-to/control.md: they run, and with the tools of others where these are installed."""
 
-import re
-from pathlib import Path
-
 import pytest
-from tests.examples import run_example
+from tests.examples import blocks, run_example
 
 
 @pytest.fixture(scope="module")
 def examples() -> list[str]:
-    page = Path(__file__).resolve().parents[2] / "docs" / "how-to" / "control.md"
-    return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    return blocks("control")
 
 
 @pytest.mark.nightly

@@ -12,8 +12,7 @@ from forcegp.control.informative_motions import far_apart
 from forcegp.errors import InvalidInput
 from forcegp.forces import JointFriction
 
-FREE = arm_model(0)
-START = [0.3, 0.8, -0.6]
+FREE, START = arm_model(0), [0.3, 0.8, -0.6]
 FEW = {"motions": 9, "start": START, "seconds": 4.0}
 LIMITS = {"position": [0.5, 1.0, 0.7], "velocity": [1.0, 2.0, 1.5], "acceleration": 8.0, "torque": [50.0, 11.0, 3.0]}
 

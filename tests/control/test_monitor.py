@@ -24,8 +24,7 @@ def motion(seconds, seed, push=None, noise=0.003, dt=DT):
     """q, v, u (T, 2) of sines, exact but for noise; `push` (T, 2) are joint torques that u lacks."""
     time, rng = np.arange(round(seconds / dt)) * dt, np.random.default_rng(seed)
     rate, size, phase = rng.uniform(0.7, 3.0, (3, 2)), rng.uniform(0.2, 0.5, (3, 2)), rng.uniform(0, 6, (3, 2))
-    angle = rate[:, None] * time[None, :, None] + phase[:, None]
-    size = size[:, None]
+    angle, size = rate[:, None] * time[None, :, None] + phase[:, None], size[:, None]
     q, v = (size * np.sin(angle)).sum(0), (size * rate[:, None] * np.cos(angle)).sum(0)
     a = -(size * rate[:, None] ** 2 * np.sin(angle)).sum(0)
     at = [torch.from_numpy(0.5 * (x + np.roll(x, -1, 0))) for x in (q, v)]  # in the middle of the steps
@@ -179,14 +178,9 @@ def posterior():
     middle = [0.5 * (x[1:] + x[:-1]) for x in (q, v)]
     a = np.diff(v, axis=0) / DT + 0.02 * np.random.default_rng(9).standard_normal((len(q) - 1, 2))
     rows = Dataset(
-        q=middle[0],
-        v=middle[1],
-        u=u[:-1],
-        a=a,
-        time=DT * np.arange(len(a)),
-        model=URDF_ALONE,
+        q=middle[0], v=middle[1], u=u[:-1], a=a, time=DT * np.arange(len(a)), model=URDF_ALONE,
         noise_std=np.full(2, 0.02),
-    )
+    )  # fmt: skip
     return fit(URDF_ALONE.with_forces(JointFriction()), rows, points=40, restarts=1)
 
 

@@ -31,12 +31,9 @@ def columns(rows: int = 40, nv: int = 2, seed: int = 0) -> dict[str, np.ndarray]
 def dataset(rows: int = 40, seed: int = 0, **changes: object) -> Dataset:
     """`rows` random rows, the first half episode 0 and the rest episode 1, 10 ms apart."""
     fields = {
-        **columns(rows, seed=seed),
-        "time": 0.01 * np.arange(rows),
-        "episode": (np.arange(rows) >= rows // 2).astype(int),
-        "model": model(),
-        **changes,
-    }
+        **columns(rows, seed=seed), "time": 0.01 * np.arange(rows),
+        "episode": (np.arange(rows) >= rows // 2).astype(int), "model": model(), **changes,
+    }  # fmt: skip
     return Dataset(**fields)
 
 

@@ -67,11 +67,9 @@ def test_wrong_fields_are_named(changes, message):
 
 
 @given(
-    st.sampled_from(["q", "v", "u", "a"]),
-    st.integers(0, 39),
-    st.integers(0, 1),
+    st.sampled_from(["q", "v", "u", "a"]), st.integers(0, 39), st.integers(0, 1),
     st.sampled_from([np.nan, np.inf, -np.inf, 1e16, -1e308]),
-)
+)  # fmt: skip
 def test_the_row_and_column_of_a_bad_number_are_named(name, row, column, value):
     given = columns()
     given[name][row, column] = value

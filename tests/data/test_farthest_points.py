@@ -20,8 +20,7 @@ def by_definition(points: np.ndarray, count: int, start: int) -> list[int]:
     """All distances at once; quadratic in memory."""
     spread = points.std(axis=0)
     scaled = (points - points.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
-    distance = np.linalg.norm(scaled[:, None] - scaled[None], axis=2)
-    chosen = [start]
+    distance, chosen = np.linalg.norm(scaled[:, None] - scaled[None], axis=2), [start]
     while len(chosen) < count:
         nearest = distance[:, chosen].min(axis=1)
         nearest[chosen] = -1
@@ -38,8 +37,7 @@ def test_it_is_the_definition(seed):
 @given(TABLES, st.data())
 def test_it_is_nested_without_repetition_and_deterministic(points, data):
     rows = len(points)
-    count = data.draw(st.integers(1, rows))
-    start = data.draw(st.integers(0, rows - 1))
+    count, start = data.draw(st.integers(1, rows)), data.draw(st.integers(0, rows - 1))
     every = farthest_point_sampling(points, rows, start=start)
     assert sorted(every) == list(range(rows))
     assert every[0] == start

@@ -17,14 +17,10 @@ INNER = slice(500, 1500)  # away from the transients of the ends
 def motion(time: np.ndarray = TIME, **changes: object) -> Dataset:
     """q = (sin 10 t, t^2), with exact derivatives."""
     fields = {
-        "q": np.stack([np.sin(10 * time), time**2], 1),
-        "v": np.stack([10 * np.cos(10 * time), 2 * time], 1),
+        "q": np.stack([np.sin(10 * time), time**2], 1), "v": np.stack([10 * np.cos(10 * time), 2 * time], 1),
         "a": np.stack([-100 * np.sin(10 * time), np.full_like(time, 2)], 1),
-        "u": np.stack([np.cos(time), np.sin(time)], 1),
-        "time": time,
-        "model": model("continuous"),
-        **changes,
-    }
+        "u": np.stack([np.cos(time), np.sin(time)], 1), "time": time, "model": model("continuous"), **changes,
+    }  # fmt: skip
     return Dataset(**fields)
 
 

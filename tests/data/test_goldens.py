@@ -66,15 +66,12 @@ def test_filters(arm):
     walking = walk(2, 0.02, seconds=1.0)[0]
     walking = replace(walking, measured={"imu.trunk": walking.a[:, :3]})
     made = {
-        "filtered": columns(low_pass(walking, 12.0)),
-        "shifted": columns(shifted(walking, 0.013, 0.03, [1, 4])),
-        "differentiated": columns(differentiated(walking, "q")),
-        "resampled": columns(resample(walking, 0.0031)),
+        "filtered": columns(low_pass(walking, 12.0)), "shifted": columns(shifted(walking, 0.013, 0.03, [1, 4])),
+        "differentiated": columns(differentiated(walking, "q")), "resampled": columns(resample(walking, 0.0031)),
         "vectors": as_vectors(walking),
         "uneven": columns(differentiated(arm.rows(np.delete(np.arange(400), [0, 7, 300])), "q")),
-        "sums": sums_before(arm.u[:300], arm.time[:300], 0.4),
-        "farthest": farthest_rows(arm, 40).time,
-    }
+        "sums": sums_before(arm.u[:300], arm.time[:300], 0.4), "farthest": farthest_rows(arm, 40).time,
+    }  # fmt: skip
     turned = [torch.tensor(x[::15]) for x in (walking.q, walking.v, walking.a)]
     gravity = walking.model.robot.gravity
     q, v, a = turned[0], turned[1][:, :6], turned[2][:, :6]

@@ -13,8 +13,7 @@ from forcegp.data import Dataset, Delay, Preparation, differentiated, estimate_d
 from forcegp.data.spectrum import _knee_and_floor
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 
-RATE = 500.0
-SIGMA = 1e-4
+RATE, SIGMA = 500.0, 1e-4
 
 
 def swings(time: np.ndarray, seed: int, nv: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -37,8 +36,7 @@ def noisy(seconds: float = 12.0, seed: int = 0, sigma: float = SIGMA, rate: floa
 
 def arm_log(delay: float = 0.0, seconds: float = 8.0, seed: int = 1, noise: float = 0.02) -> Dataset:
     """The three-joint arm in free motion with the torques of inverse dynamics and friction, logged `delay` s late."""
-    model = arm_model(contacts=0)
-    time = np.arange(round(seconds * 200)) / 200
+    model, time = arm_model(contacts=0), np.arange(round(seconds * 200)) / 200
     q, v, a = swings(time, seed, 3)
     late = swings(time - delay, seed, 3)
     u = model.robot.inverse_dynamics(*(torch.tensor(x) for x in late)).numpy()
@@ -142,9 +140,6 @@ def test_what_a_delay_needs_is_said():
         estimate_delay(replace(arm_log(), model=arm_model()))
     with pytest.raises(DatasetError, match=r"rows lie more than 0.05 s from the ends.*at least 80"):
         estimate_delay(arm_log().rows(slice(0, 60)))
-
-
-# ---------------------------------------------------------------- lag
 
 
 # ---------------------------------------------------------------- preparation

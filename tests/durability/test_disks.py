@@ -59,8 +59,7 @@ def test_a_full_disk_leaves_the_old_output(inputs, disk, name):
             for text in (file for file in out.glob("*") if file.is_file() and file.name not in ("jobs.json", ".lock")):
                 text.unlink()
             old = snapshot(out)
-        free = int(part * size) // PAGE * PAGE
-        disk(f"size={used(place) + free}")
+        disk(f"size={used(place) + int(part * size) // PAGE * PAGE}")
         code, errors = run(command.line(out, again=True), inputs)
         assert_one_line(code, errors)
         refused += code == 2

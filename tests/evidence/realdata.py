@@ -73,8 +73,7 @@ def dfki(folder: Path, model: Model, *runs: int) -> Dataset:
 
 def panda_system(folder: Path) -> Model:
     """The manufacturer's Panda, one link of which breaks the triangle inequality."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
+    with warnings.catch_warnings(action="ignore", category=DataWarning):
         robot = Robot.from_urdf(folder / "panda_gaz2019/model/fer_franka_description.urdf", inertias="nearest")
     return Model(robot)
 

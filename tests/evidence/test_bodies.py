@@ -89,8 +89,7 @@ def test_equal_eigenvalues_have_a_derivative():
 def test_a_robot_with_other_bodies(text):
     robot, _ = thickened(Robot.from_urdf_text(text))
     ours = bodies(robot)
-    x = 0.3 * np.random.default_rng(2).normal(size=ours.size)
-    numbers = carrying(robot)
+    x, numbers = 0.3 * np.random.default_rng(2).normal(size=ours.size), carrying(robot)
     changed = with_bodies(robot, dict(zip(numbers, ours.pseudo_inertias(x), strict=True)))
     np.testing.assert_allclose(standard_parameters(changed), ours.parameters(x).ravel(), atol=1e-12, rtol=1e-12)
     same = with_bodies(robot, dict(zip(numbers, ours.pseudo_inertias(np.zeros(ours.size)), strict=True)))

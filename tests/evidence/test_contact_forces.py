@@ -157,8 +157,7 @@ def test_a_sensor_shows_forces_along_the_normal(tmp_path, monkeypatch):
     monkeypatch.setitem(FORCES, "world-forces", WorldForces)  # so that files carry it
     at = measured(on_plane(), on_plane(), rows=160)
     J = on_plane().robot.kinematics(*tensors(at, "q", "v")).frame_jacobian("hand", (0.0, 0.0, 0.2))[:, :3].numpy()
-    pull = -4.0 * np.tanh(2.0 * (J @ at.v[..., None])[:, 1, 0])
-    push = (J.transpose(0, 2, 1) @ NORMAL) * pull[:, None]
+    push = (J.transpose(0, 2, 1) @ NORMAL) * (-4.0 * np.tanh(2.0 * (J @ at.v[..., None])[:, 1, 0]))[:, None]
     log = measured(on_plane(), on_plane(), rows=160, noise=0.02, push=push)
     train, test = log.rows(slice(0, 120)), log.rows(slice(120, 160))
     states, truth = tensors(test, "q", "v", "u"), test.measured[SENSOR] @ NORMAL
@@ -250,8 +249,7 @@ def test_a_real_leg_tells_its_contact_force_without_the_sensor_after_a_calibrati
     laws = (Actuation(gain=LogNormal(1.0, 0.3)), GearFriction(), Offset())
 
     def left(forces, evidence):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)
+        with warnings.catch_warnings(action="ignore", category=DataWarning):
             points = 150 if evidence == Accelerations() else None
             posterior = fit(model.with_forces(*forces), train, evidence, points=points, restarts=1)
         rows = with_memory(test, posterior.model)

@@ -134,8 +134,7 @@ def test_derivatives_are_those_of_finite_differences():
 
 
 def test_from_columns_that_are_clipped_to_a_fit(tmp_path):
-    log = recorded()
-    at_links = [1e3 * at(name)[:, 0] for name in JOINTS]
+    log, at_links = recorded(), [1e3 * at(name)[:, 0] for name in JOINTS]
     at_links[1] = np.maximum(at_links[1], -2900.0)
     names = "t,q1,q2,q3,i1,i2,i3,s1,s2,s3"
     np.savetxt(tmp_path / "log.csv", np.c_[log.time, log.q, log.u, *at_links], delimiter=",", header=names, comments="")

@@ -40,8 +40,7 @@ def test_equals_the_dense_formula_with_all_gradients(mean, force, contacts):
     force_known = dynamics.Q_K if mean == "analytical" else torch.zeros_like(data.u)
     m = dynamics.constrained_offset + (dynamics.H @ force_known[..., None])[..., 0]
     z = torch.cat([data.q, data.v, data.u], -1)
-    z = (z - z.mean(0)) / z.std(0, correction=0)
-    matrices = []
+    z, matrices = (z - z.mean(0)) / z.std(0, correction=0), []
     for joint in range(3):
         lengthscale = parameters[f"kernels.{joint}.base_kernel.raw_lengthscale"].exp()
         outputscale = parameters[f"kernels.{joint}.raw_outputscale"].exp()
@@ -56,8 +55,7 @@ def test_equals_the_dense_formula_with_all_gradients(mean, force, contacts):
 
     assert float((value - expected).detach().abs()) < 1e-6
     for name, given, wanted in zip(parameters, gradients, expected_gradients, strict=True):
-        error = (given - wanted).abs().max() / wanted.abs().max().clamp_min(1e-6)
-        assert float(error) < 1e-7, name
+        assert float((given - wanted).abs().max() / wanted.abs().max().clamp_min(1e-6)) < 1e-7, name
 
 
 def test_start_values_are_the_moments_of_the_pseudo_inverse_force_residual():

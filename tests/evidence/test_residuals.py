@@ -5,22 +5,12 @@ import pytest
 import torch
 from tests.posterior.arm import arm_model
 
+from forcegp import Coulomb, LoadFriction
 from forcegp.errors import InvalidInput
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
 from forcegp.fit.physical import typical_sizes
-from forcegp.forces import (
-    Coulomb,
-    DirectionalFriction,
-    LoadFriction,
-    Offset,
-    Payload,
-    RigidBodies,
-    Rotor,
-    Spring,
-    Stribeck,
-    Viscous,
-)
+from forcegp.forces import DirectionalFriction, Offset, Payload, RigidBodies, Rotor, Spring, Stribeck, Viscous
 from forcegp.model import Model
 
 COUPLED = [[3.0, 0.0, 0.0], [-1.0, 4.0, 0.0], [0.0, 1.0, 2.0]]
@@ -78,8 +68,7 @@ def test_jacobians(names, likelihood):
     x[: space.bodies.size] = 0.2 * np.random.default_rng(1).normal(size=space.bodies.size)
 
     def residual(x):
-        found = rows.in_torque(x, rows.moving(a)) if likelihood == "torque" else rows.in_acceleration(x, a)
-        return found[:3]
+        return (rows.in_torque(x, rows.moving(a)) if likelihood == "torque" else rows.in_acceleration(x, a))[:3]
 
     _, in_parameters, in_laws = residual(x)
     found = np.concatenate([space.bodies.chained(x[: space.bodies.size], in_parameters), in_laws], axis=-1)

@@ -66,8 +66,7 @@ def test_rows_that_are_left_out_are_warned_of():
     quick = {"restarts": 1, "options": QUICK}
     with pytest.warns(DataWarning, match=r"0\.081 s away: .* of 200 rows are .*noise is learned from these"):
         fit(model, filtered(), points=200, **quick)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         assert len(independent_rows(filtered(1000))) > 100
     with pytest.warns(DataWarning, match="too few, so all are taken, and learned noise may be none"):
         few = fit(model, filtered(60), points=50, **quick)

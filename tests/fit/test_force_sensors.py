@@ -80,15 +80,13 @@ MISTAKES = {
     "a gain of 12": (lambda F, R: F / 12.0, "ok", "leaves"),
     "not tared": (lambda F, R: F + in_hand(R, [1.2, 0.0, -0.6]), "look", r"off by \(1.18, -0.08\d*, -0.57\d*\) N"),
     "drift": (
-        lambda F, R: F + in_hand(R, TIME * [4.0, 0.0, 3.0]),
-        "look",
-        r"drifts by \((4.0|3.9)\d, .*, (2.9|3.0)\d*\) N",
+        lambda F, R: F + in_hand(R, TIME * [4.0, 0.0, 3.0]), "look", r"drifts by \((4.0|3.9)\d, .*, (2.9|3.0)\d*\) N",
     ),
     "a step": (lambda F, R: F + in_hand(R, (TIME > 0.34) * [3.0, 0.0, -2.0]), "ok", "leaves 3"),
     "a faint signal": (lambda F, R: 2.0 * np.random.default_rng(0).normal(size=F.shape), "look", "does not follow"),
     "a fainter one": (lambda F, R: 0.8 * np.random.default_rng(0).normal(size=F.shape), "ok", "hardly notice"),
     "another signal": (lambda F, R: 5.0 * np.random.default_rng(0).normal(size=F.shape), "look", "does not follow"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)

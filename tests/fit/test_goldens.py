@@ -37,9 +37,7 @@ FITS = {
     "payload": lambda: Found(log(loaded(), 1, seconds=6.0, noise=0.05), laws=(Viscous(),)).posterior,
     "gears": lambda: fit(
         FREE.with_forces(Viscous(), GearFriction()),
-        log_with(lambda v, rigid: (LEVEL + 0.1 * abs(rigid)) * sign(v), rows=900),
-        Torques(),
-        rows=600,
+        log_with(lambda v, rigid: (LEVEL + 0.1 * abs(rigid)) * sign(v), rows=900), Torques(), rows=600,
     ),
     "motions": lambda: fit(log_of_cart().model.with_forces(Viscous()), log_of_cart(), [Accelerations(), Motions()]),
     "hidden": lambda: fit(held(Viscous()), replace(pushed(), measured={}), Torques()),
@@ -48,7 +46,7 @@ FITS = {
     "friction": lambda: in_air(JointFriction(), evidence=Accelerations(), points=40, **FEW),
     "beside": lambda: in_air(Viscous(), JointForces(("q",)), evidence=Accelerations(), points=30, **FEW),
     "plane": lambda: fit(arm_model().with_forces(JointForces()), arm_data(40, 1), points=25, **FEW),
-}
+}  # fmt: skip
 
 
 def pushed():
@@ -61,8 +59,7 @@ def log_of_cart():
 
 @pytest.mark.parametrize("case", FITS)
 def test_what_is_found_is_what_it_was(case):
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as said:
         posterior = FITS[case]().with_settings(widening=1.0)  # processors round it apart
     entries, rows = posterior.parameters.entries, posterior.training
     predicted = posterior.predict(rows.q[:5], rows.v[:5], rows.u[:5])

@@ -13,17 +13,10 @@ from tests.forces.test_thrusters import DRONE
 from tests.robots.random_positions import random_positions
 from tests.robots.test_moving_bases import LIMBS, ROOTS, Pair
 
+from forcegp import Accelerations
 from forcegp.data import Dataset, Preparation
 from forcegp.errors import DataWarning, InvalidInput
-from forcegp.evidence import (
-    Accelerations,
-    NoiseLevels,
-    Torques,
-    base_parameters,
-    body_names,
-    standard_parameters,
-    torque_regressor,
-)
+from forcegp.evidence import NoiseLevels, Torques, base_parameters, body_names, standard_parameters, torque_regressor
 from forcegp.evidence.bodies import body_pseudo_inertias, carrying, with_bodies
 from forcegp.evidence.least_squares import weighted_least_squares, without
 from forcegp.evidence.parameter_space import ParameterSpace
@@ -121,8 +114,7 @@ def test_residuals_and_their_jacobians(walker, likelihood):
         free = rows.open.swapaxes(1, 2) if likelihood == "torque" else None
         return without(r, free), without(jacobian, free)
 
-    start = space.start
-    dynamics = model.dynamics(*(torch.tensor(s) for s in (q, v, u)))
+    start, dynamics = space.start, model.dynamics(*(torch.tensor(s) for s in (q, v, u)))
     if likelihood == "torque":  # H takes out the same directions, along A^T
         wrong = (dynamics.M @ torch.tensor(a)[..., None])[..., 0] - dynamics.Q_K
         seen, ours = (dynamics.H.numpy() @ each[..., None] for each in (wrong.numpy(), residual(start)[0]))
@@ -196,8 +188,7 @@ def test_likely_accelerations_cost_least(walker):
     space = ParameterSpace(opened, dict.fromkeys(("force", "position", "velocity", "inertia"), np.ones(v.shape[1])))
     rows = RecordedRows(space, q, v, u)
     x = space.start + np.random.default_rng(2).uniform(0.05, 0.2, space.size)
-    levels = NoiseLevels(np.full(9, 0.3), np.full(9, 0.2))
-    measured = rows.moving(a)
+    levels, measured = NoiseLevels(np.full(9, 0.3), np.full(9, 0.2)), rows.moving(a)
     likely = rows.likely(x, measured, levels)
     of_base, of_joints = np.split(levels.force**2, [6])
     _, _, H = rows.acceleration(x)
@@ -307,8 +298,7 @@ def test_noise_under_constraints_is_that_of_the_rows(walker):
 def test_a_robot_that_cannot_move_teaches_nothing(walker):
     robot = walker.robot
     points = [(x, y, 0.1 * x * y) for x in (0.1, -0.1) for y in (0.1, -0.1)]
-    link = robot.layout.moving[0]
-    held = tuple(c for point in points for c in fixed_point(link, point))
+    held = tuple(c for point in points for c in fixed_point(robot.layout.moving[0], point))
     held += tuple(c for foot in ("a_foot", "b_foot") for point in points for c in fixed_point(foot, point))
     model = replace(walker, contacts=held)
     q, v, u = rows_of(walker, 20)

@@ -20,8 +20,7 @@ URDF = """<robot name="slide"><link name="base"/><link name="cart"><inertial><ma
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="x" type="prismatic">
 <parent link="base"/><child link="cart"/><axis xyz="1 0 0"/><limit lower="-5" upper="5" effort="99" velocity="9"/>
 </joint></robot>"""
-DT = 0.01
-QUIET = Noise(0.5)
+DT, QUIET = 0.01, Noise(0.5)
 
 
 def slide(viscous: float, coulomb: float) -> Model:

@@ -11,21 +11,13 @@ from tests.forces.world_forces import WorldForces
 from tests.posterior.arm import arm_data, arm_model
 from torch.testing import assert_close
 
-from forcegp import ContactForces, Torques, Viscous
+from forcegp import AerodynamicForce, ContactForces, Torques, Viscous
 from forcegp.errors import DataWarning, InvalidInput, UnknownName
 from forcegp.fit import fit as fit_model
 from forcegp.fit.physical import typical_sizes
 from forcegp.fit.sensors import with_sensors
 from forcegp.fit.unseen import PUSHED, Unseen
-from forcegp.forces import (
-    Actuation,
-    AerodynamicForce,
-    ContactFriction,
-    JointForces,
-    JointFriction,
-    JointPositionForces,
-    ToolForces,
-)
+from forcegp.forces import Actuation, ContactFriction, JointForces, JointFriction, JointPositionForces, ToolForces
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Contact, Plane
 from forcegp.noise import Noise
@@ -72,15 +64,13 @@ def test_a_force_along_the_normal_is_hidden(on_a_table, prefix):
 
 
 def test_along_the_surface_nothing_is_hidden(on_a_table):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         fit(on_a_table, ToolForces(), JointFriction())
 
 
 def test_all_hidden_is_refused(data):
     """A point that is held along all three axes holds the whole arm."""
-    robot = data.model.robot
-    q = torch.tensor(data.q[:1]).expand(12, 3).clone()
+    robot, q = data.model.robot, torch.tensor(data.q[:1]).expand(12, 3).clone()
     tip = Contact("hand", TIP, TABLE[0].surface).position(robot.kinematics(q))[0]
     normals = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
     walls = [Plane(normal, float(tip[axis])) for axis, normal in enumerate(normals)]
@@ -161,8 +151,7 @@ def test_equal_terms_are_refused(data):
     ids=["inputs", "all", "axes", "joints", "nothing", "none"],
 )  # fmt: skip
 def test_terms_that_differ_are_fitted_without_a_word(data, prior):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         fit(data, *prior)
 
 

@@ -94,12 +94,9 @@ def test_what_predicts_is_what_is_written_down():
 def test_intervals_hold_the_truth():
     """Of 12 recordings, about 95 % of the intervals hold the truth."""
     truth = {
-        "viscous.pan": 0.3,
-        "viscous.lift": 0.2,
-        "coulomb.level.pan": 0.8,
-        "coulomb.level.bend": 0.3,
+        "viscous.pan": 0.3, "viscous.lift": 0.2, "coulomb.level.pan": 0.8, "coulomb.level.bend": 0.3,
         "offset.lift": -0.1,
-    }
+    }  # fmt: skip
     held = []
     for seed in range(12):
         train = recorded(150, 10 + seed, torque_noise=0.2)
@@ -172,8 +169,7 @@ def test_friction_under_load_does_not_explain_the_torque_by_itself():
     robot, generator = arm_model(0).robot, np.random.default_rng(0)
     q, v, a = generator.normal(size=(3, 400, 3))
     torque = robot.inverse_dynamics(*(torch.tensor(x) for x in (q, v, a))).numpy()
-    sign = np.tanh(v / 0.05)
-    u = torque + 0.02 * generator.normal(size=a.shape)
+    sign, u = np.tanh(v / 0.05), torque + 0.02 * generator.normal(size=a.shape)
     u[:, 0] = torque[:, 0] / (1.0 - 0.15 * sign[:, 0] * np.sign(torque[:, 0]))  # u = torque + 0.15 |u| sign
     u[:, 2] += 20.0 * sign[:, 2] * generator.uniform(0.5, 1.5, 400)
     log = Dataset(q=q, v=v, u=u, a=a, time=0.01 * np.arange(400.0), model=arm_model(0))

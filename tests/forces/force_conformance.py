@@ -25,8 +25,7 @@ from forcegp.model import Model
 from forcegp.posterior import load_posterior, save_posterior
 from forcegp.robots import Robot
 
-BATCHES = [(), (4,), (2, 4)]
-STEP = 1e-5
+BATCHES, STEP = [(), (4,), (2, 4)], 1e-5
 
 
 @cache
@@ -78,8 +77,7 @@ class UnknownConformance:
     @classmethod
     def fitted(cls, data):
         model = data.model.with_forces(cls.prior)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NumericalWarning)  # so few iterations settle nothing
+        with warnings.catch_warnings(action="ignore", category=NumericalWarning):  # so few iterations settle nothing
             return fit(model, data, restarts=1, options=OptimizerOptions(iterations=3))
 
     def values(self, model, *states) -> torch.Tensor:

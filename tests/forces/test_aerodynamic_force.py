@@ -9,8 +9,7 @@ from forcegp.data import with_wind
 
 
 def test_features_are_those_of_the_formulas():
-    rows = flight([(3.0, -2.0, 0.0)], rows=40)
-    wind = np.array([3.0, -2.0, 0.0])
+    rows, wind = flight([(3.0, -2.0, 0.0)], rows=40), np.array([3.0, -2.0, 0.0])
     seen = with_wind(rows, np.broadcast_to(wind, (40, 3)))
     dynamics = seen.model.dynamics(*map(torch.tensor, (seen.q, seen.v, seen.u)))
     rotation = dynamics.state.kinematics.frame_pose("body")[:, :3, :3].numpy()
@@ -19,14 +18,10 @@ def test_features_are_those_of_the_formulas():
     sides = np.stack([rows.u @ [-0.1, 0.1, 0.1, -0.1], -rows.u @ [0.1, -0.1, 0.1, -0.1]], axis=1)
     yaw = 0.02 * rows.u @ [1.0, 1.0, -1.0, -1.0]
     expected = {
-        "velocity": air,
-        "drag": np.linalg.norm(air, axis=1, keepdims=True) * air,
-        "rotor-drag": np.sqrt(thrust) * air,
-        "angular-velocity": rows.v[:, 3:],
-        "thrust": np.concatenate([thrust, sides, yaw[:, None]], axis=1),
-        "height": rows.q[:, 2:3],
-        "attitude": rotation.reshape(-1, 9),
-    }
+        "velocity": air, "drag": np.linalg.norm(air, axis=1, keepdims=True) * air, "rotor-drag": np.sqrt(thrust) * air,
+        "angular-velocity": rows.v[:, 3:], "thrust": np.concatenate([thrust, sides, yaw[:, None]], axis=1),
+        "height": rows.q[:, 2:3], "attitude": rotation.reshape(-1, 9),
+    }  # fmt: skip
     prior = AerodynamicForce()
     assert prior.inputs == tuple(expected)
     features = prior.features(dynamics)
@@ -44,5 +39,4 @@ def test_rotors_of_a_body_that_does_not_fly():
     q, v = robot.neutral()[None], torch.full((1, robot.nv), 0.3, dtype=torch.float64)
     dynamics = model.dynamics(q, v, torch.full((1, len(model.inputs)), 2.0, dtype=torch.float64))
     velocity, drag = AerodynamicForce("blade", ("velocity", "rotor-drag")).features(dynamics)[0].split(3, dim=-1)
-    root = (dynamics.state.delivered.norm() ** 2 + 1e-4) ** 0.25
-    torch.testing.assert_close(drag, root * velocity)
+    torch.testing.assert_close(drag, (dynamics.state.delivered.norm() ** 2 + 1e-4) ** 0.25 * velocity)

@@ -20,11 +20,9 @@ MODEL = "chain"
 FRAME = FRAMES[MODEL]
 PLANE, SPHERE = Plane((0.2, -0.1, 1.0), 0.055), Sphere((0.1, 0.3, -0.2), 0.4)
 SURFACES = {
-    "plane": PLANE,
-    "sphere": SPHERE,
-    "any-plane": ImplicitSurface(lambda p: 3.0 * PLANE.value(p)),
+    "plane": PLANE, "sphere": SPHERE, "any-plane": ImplicitSurface(lambda p: 3.0 * PLANE.value(p)),
     "any-sphere": ImplicitSurface(lambda p: -2.0 * SPHERE.value(p) * (1.0 + 0.5 * p[0])),
-}
+}  # fmt: skip
 COEFFICIENT = TabulatedCurve((0.0, 0.2, 0.5, 3.0), (0.0, 0.12, 0.08, 0.11))
 JOINTS = (
     ("tilt", TabulatedCurve((-1.0, -0.1, 0.1, 1.0), (-2.0, -1.5, 1.5, 2.0))),

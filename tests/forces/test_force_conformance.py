@@ -4,15 +4,8 @@ import pytest
 from tests.forces.force_conformance import UnknownConformance
 from tests.forces.third_party_unknown import AirDrag
 
-from forcegp.forces import (
-    AerodynamicForce,
-    ContactFriction,
-    JointAccelerations,
-    JointForces,
-    JointFriction,
-    JointPositionForces,
-    ToolForces,
-)
+from forcegp import AerodynamicForce, ContactFriction
+from forcegp.forces import JointAccelerations, JointForces, JointFriction, JointPositionForces, ToolForces
 from forcegp.forces.contact_friction import ExpectedFriction, TabulatedCurve
 
 TIP = ("hand", (0.0, 0.0, 0.2))  # where the arm touches its plane

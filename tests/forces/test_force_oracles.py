@@ -11,18 +11,8 @@ from tests.mechanics.systems import model_with as model_of
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import FRAMES, MODELS
 
-from forcegp.forces import (
-    Actuation,
-    ContactFriction,
-    Coulomb,
-    JointFriction,
-    LoadFriction,
-    Payload,
-    RigidBodies,
-    Stribeck,
-    ToolForces,
-    Viscous,
-)
+from forcegp import ContactFriction, Coulomb
+from forcegp.forces import Actuation, JointFriction, LoadFriction, Payload, RigidBodies, Stribeck, ToolForces, Viscous
 from forcegp.mechanics import Contact, ImplicitSurface, Plane
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -128,8 +118,7 @@ class TestContactFriction:
         velocity = (J[:, :3] @ v[..., None])[..., 0]
         normal = dynamics.normals[:, 0] / dynamics.normals[:, 0].norm(dim=-1, keepdim=True)
         along = velocity - (velocity * normal).sum(-1, keepdim=True) * normal
-        expected = -2.5 * along / along.norm(dim=-1, keepdim=True)
-        torch.testing.assert_close(force, expected, rtol=1e-8, atol=1e-8)
+        torch.testing.assert_close(force, -2.5 * along / along.norm(dim=-1, keepdim=True), rtol=1e-8, atol=1e-8)
         torch.testing.assert_close(power, -2.5 * along.norm(dim=-1), rtol=1e-8, atol=0.0)
         (speed,) = ContactFriction().features(dynamics)
         torch.testing.assert_close(speed[:, 0], along.norm(dim=-1), rtol=1e-9, atol=0.0)

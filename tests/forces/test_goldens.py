@@ -112,8 +112,7 @@ def test_forces_that_files_state_and_thrusters(tmp_path):
     sprung = QUADROTOR.replace("</body></worldbody>", SPRUNG)
     for name, text in (("arm", ARM), ("chain", CHAIN), ("rotors", QUADROTOR), ("sprung", sprung)):
         (tmp_path / "robot.xml").write_text(text)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RobotFileWarning)
+        with warnings.catch_warnings(action="ignore", category=RobotFileWarning):
             model = Model.from_mjcf(tmp_path / "robot.xml")
         found[name] = {"u": model.inputs, "forces": [force_to_dict(force) for force in model.laws]}
     assert_unchanged("forces/files", found)

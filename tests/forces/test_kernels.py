@@ -91,8 +91,7 @@ def test_points_that_nearly_coincide_keep_their_difference(name):
     """A distance of 1e-9 from a difference of squares would be 1e-8 or nothing."""
     kernel, z = kernel_of(name, 1, 1.0), float64([[5.0], [5.0 + 2.0**-30]])
     missing = 1.0 - float(kernel_cross(kernel, z[:1], z[1:]).detach())
-    expected = 2.0**-30 if name == "matern-1/2" else 0.0
-    assert missing == pytest.approx(expected, rel=1e-5, abs=1e-15)
+    assert missing == pytest.approx(2.0**-30 if name == "matern-1/2" else 0.0, rel=1e-5, abs=1e-15)
 
 
 # ---------------------------------------------------------------- expressions

@@ -10,22 +10,9 @@ from tests.mechanics.systems import assert_close, robot, states
 from tests.robots.pinocchio_oracle import Oracle
 from tests.robots.robot_models import CHAIN, MODELS
 
+from forcegp import Coulomb, LoadFriction, Offset, RigidBodies
 from forcegp.errors import InvalidInput, UnknownName
-from forcegp.forces import (
-    Actuation,
-    Body,
-    Coulomb,
-    DirectionalFriction,
-    GearFriction,
-    Law,
-    LoadFriction,
-    Offset,
-    RigidBodies,
-    Rotor,
-    Spring,
-    Stribeck,
-    Viscous,
-)
+from forcegp.forces import Actuation, Body, DirectionalFriction, GearFriction, Law, Rotor, Spring, Stribeck, Viscous
 from forcegp.forces.joint_law import JointLaw
 from forcegp.forces.registry import FORCES, force_class
 from forcegp.mechanics import State

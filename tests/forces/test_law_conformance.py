@@ -6,30 +6,16 @@ import torch
 from tests.forces.law_conformance import LawConformance
 from tests.forces.third_party_law import HardeningSpring
 
-from forcegp.forces import (
-    FORCES,
-    Coefficient,
-    Coulomb,
-    DirectionalFriction,
-    GearFriction,
-    JointLaw,
-    LoadFriction,
-    Offset,
-    Pull,
-    Spring,
-    Stribeck,
-    Viscous,
-)
+from forcegp import Coulomb, LoadFriction, Offset, Spring
+from forcegp.forces import FORCES, Coefficient, DirectionalFriction, GearFriction, JointLaw, Pull, Stribeck, Viscous
 
 THREE = [0.5, 0.4, 0.3]
 PLAIN = {
-    "Viscous": Viscous(THREE),
-    "DirectionalFriction": DirectionalFriction(THREE),
-    "Coulomb": Coulomb(THREE, 0.2),
+    "Viscous": Viscous(THREE), "DirectionalFriction": DirectionalFriction(THREE), "Coulomb": Coulomb(THREE, 0.2),
     "DryFrictionThatFalls": Stribeck(THREE, [0.7, 0.4, 0.9], 0.6, 0.2),
     "Spring": Spring([2.0, 1.0, 3.0], [0.5, 0.2, 0.3]),
     "HardeningSpring": HardeningSpring([1.0, 2.0, 0.5], [3.0, 1.0, 2.0]),
-}
+}  # fmt: skip
 for name, law in PLAIN.items():
     globals()[f"Test{name}"] = type(f"Test{name}", (LawConformance,), {"law": law, "__module__": __name__})
 

@@ -51,26 +51,20 @@ NAMES = {
     "gp:aerodynamic:frame=hand:observe=0.2": AerodynamicForce("hand", observe=0.2),
 }  # fmt: skip
 EXPRESSIONS = {
-    "gp:joint:inputs=v/q,kernel=matern-3/2": JointForces(("v", "q"), "matern-3/2"),
-    "gp:joint:v": JointForces(("v",)),
+    "gp:joint:inputs=v/q,kernel=matern-3/2": JointForces(("v", "q"), "matern-3/2"), "gp:joint:v": JointForces(("v",)),
     "viscous:transmission=lift+pan/pan-0.5*lift": Viscous(transmission="lift+pan/pan-0.5*lift"),
     "gp: joint-friction : joints = lift / pan ": JointFriction(("lift", "pan")),
     "gp:tool-friction:inputs=position:contact=2": ToolForces(2, ("position",)),
     "gp:aerodynamic:hand:wind=0/-0.1/2e-1": AerodynamicForce("hand", wind=(0.0, -0.1, 0.2)),
     "gp:load-friction:load=false": ContactFriction(),
     "gp:tool-friction:kernel=(linear + matern-3/2)": ToolForces(kernel="linear + matern-3/2"),
-    "viscous:0.3": Viscous(0.3),
-    "coulomb:level=0.3/0.4/0.5": Coulomb((0.3, 0.4, 0.5)),
-    "gear:memory": GearFriction(memory=True),
-    "coulomb:0.5:memory=lift/bend": Coulomb(0.5, memory=("lift", "bend")),
-    "payload:hand:mass=1.5": Payload("hand", 1.5),
-    "rigid-bodies:learn=upper/hand": RigidBodies(("upper", "hand")),
-}
+    "viscous:0.3": Viscous(0.3), "coulomb:level=0.3/0.4/0.5": Coulomb((0.3, 0.4, 0.5)),
+    "gear:memory": GearFriction(memory=True), "coulomb:0.5:memory=lift/bend": Coulomb(0.5, memory=("lift", "bend")),
+    "payload:hand:mass=1.5": Payload("hand", 1.5), "rigid-bodies:learn=upper/hand": RigidBodies(("upper", "hand")),
+}  # fmt: skip
 MISTAKES = {
     "gp:joint-fricton": "no force 'joint-fricton' in 'gp:joint-fricton'; did you mean 'joint-friction'? Valid force",
-    "viscos": "did you mean 'viscous'",
-    "viscous,tool": "no force 'tool' in 'viscous,tool'",
-    "": "no force '' in ''",
+    "viscos": "did you mean 'viscous'", "viscous,tool": "no force 'tool' in 'viscous,tool'", "": "no force '' in ''",
     "viscous, ": "no force '' in 'viscous, '",
     "joint-friction": "'joint-friction' in 'joint-friction' is an unknown force; write gp:joint-friction",
     "gp:viscous": "'viscous' in 'gp:viscous' is a law with coefficients; write viscous",
@@ -80,22 +74,19 @@ MISTAKES = {
     "gp:joint:": "force 'joint' cannot take ''; write FIELD=VALUE",
     "gp:load-friction:load=yes": "force 'load-friction' has load=yes; give true or false",
     "gp:contact-friction:contact=first": "force 'contact-friction' has contact=first; give a whole number",
-    "gp:contact-friction:contact=-1": "a contact's number from 0",
-    "gp:aerodynamic:wind=0/0": "give 3 finite numbers",
+    "gp:contact-friction:contact=-1": "a contact's number from 0", "gp:aerodynamic:wind=0/0": "give 3 finite numbers",
     "gp:aerodynamic:wind=0/0/x": r"force 'aerodynamic' has wind=0/0/x; give numbers as in 0.0/0.0/0.0",
     "gp:joint:inputs=q/torque": "give one or more of 'q', 'v', 'u', each once",
     "gp:joint-friction:kernel=frictoin": "did you mean 'friction'",
-    "gp:joint-friction:joints=pan/pan": "each once, or None for all",
-    "gp:tool-friction:kernel=(linear": "'(linear'",
+    "gp:joint-friction:joints=pan/pan": "each once, or None for all", "gp:tool-friction:kernel=(linear": "'(linear'",
     "gp:tool-friction:kernel=linear)": "'linear)'",
     "gp:matern-3/2": "'matern-3/2' in 'gp:matern-3/2' is a kernel, not a force; write it as an option",
-}
+}  # fmt: skip
 
 
 def test_every_name_that_needs_no_columns_of_u_is_here():
     told = {name.removeprefix("gp:").partition(":")[0] for name in NAMES}
-    observed = {"actuation", "thrusters", "observed-wrench", "observed-wind"}
-    assert told == {*SHORT, *BUILT_IN} - observed
+    assert told == {*SHORT, *BUILT_IN} - {"actuation", "thrusters", "observed-wrench", "observed-wind"}
     assert all(is_unknown(name.removeprefix("gp:").partition(":")[0]) == name.startswith("gp:") for name in NAMES)
 
 
@@ -116,8 +107,7 @@ def test_several_are_written_with_commas():
 def test_mistakes_are_explained(expression):
     with pytest.raises(InvalidInput) as caught:
         parse_forces(expression)
-    pieces = MISTAKES[expression].split("|")
-    assert any(piece in str(caught.value) for piece in pieces), str(caught.value)
+    assert any(piece in str(caught.value) for piece in MISTAKES[expression].split("|")), str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -28,8 +28,7 @@ def motion(rows: int, seed: int, slow: float = 1.0) -> tuple[np.ndarray, np.ndar
     """Time, and q, v, a of sines with many reversals."""
     rng, time = np.random.default_rng(seed), DT * np.arange(rows)
     w, phase, size = rng.uniform(1.0, 5.0, (3, 3)), rng.uniform(0.0, 6.0, (3, 3)), rng.uniform(0.05, 0.3, (3, 3))
-    at = slow * w * time[:, None, None] + phase
-    w = slow * w
+    at, w = slow * w * time[:, None, None] + phase, slow * w
     return time, (size * np.sin(at)).sum(1), (size * w * np.cos(at)).sum(1), -(size * w * w * np.sin(at)).sum(1)
 
 
@@ -161,8 +160,7 @@ def test_scores_and_motions_know_the_past(lugre_log):
     )  # fmt: skip
     without, remembering = (scores.runs[name][0]["table"] for name in list(scores.runs)[1:])
     for quantity, most in (("acceleration", 0.5), ("position after 0.1 s", 0.8)):
-        ratio = np.array(remembering[quantity]["rmse"]) / without[quantity]["rmse"]
-        assert ratio.max() < most, quantity
+        assert (np.array(remembering[quantity]["rmse"]) / without[quantity]["rmse"]).max() < most, quantity
 
 
 def test_controllers_and_monitors_see_the_past(lugre_log):

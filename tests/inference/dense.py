@@ -19,8 +19,7 @@ def dense_covariance(W, noise, kernel_matrices):
 
 
 def dense_negative_log_likelihood(W, residual, noise, kernel_matrices):
-    S = dense_covariance(W, noise, kernel_matrices)
-    y, lower = residual.reshape(-1), torch.linalg.cholesky(S)
+    y, lower = residual.reshape(-1), torch.linalg.cholesky(dense_covariance(W, noise, kernel_matrices))
     quadratic = y @ torch.cholesky_solve(y[:, None], lower)[:, 0]
     return 0.5 * quadratic + lower.diagonal().log().sum() + 0.5 * y.numel() * math.log(2.0 * math.pi)
 
@@ -40,11 +39,9 @@ def precise_value_and_gradients(W, residual, noise, kernel_matrices):
         value += mpmath.mpf(y.size) / 2 * mpmath.log(2 * mpmath.pi)
         G = np.array(((inverse - alpha * alpha.T) / 2).tolist()).reshape(count, outputs, count, outputs)
         gradients = [
-            2 * np.einsum("idje,cij,jec->idc", G, K, w),
-            np.array(list(alpha)).reshape(count, outputs),
-            np.einsum("idid->d", G)[None],
-            *np.einsum("idc,idje,jec->cij", w, G, w),
-        ]
+            2 * np.einsum("idje,cij,jec->idc", G, K, w), np.array(list(alpha)).reshape(count, outputs),
+            np.einsum("idid->d", G)[None], *np.einsum("idc,idje,jec->cij", w, G, w),
+        ]  # fmt: skip
         return float(value), [torch.as_tensor(gradient.astype(np.float64)) for gradient in gradients]
 
 

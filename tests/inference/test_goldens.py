@@ -91,8 +91,7 @@ def test_engines_and_memory(monkeypatch):
 def test_what_is_added_to_a_diagonal():
     found = {}
     for power in (0, -13, -11, -9, -7):
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always")
+        with warnings.catch_warnings(record=True, action="always") as said:
             try:
                 jitter = factorize(lambda p=power: torch.diag(tensor(1.0, 2.0, -(10.0**p) if p else 1.0))).jitter
             except NumericalError as error:

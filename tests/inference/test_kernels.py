@@ -32,8 +32,7 @@ def periodic() -> gk.Kernel:
 
 
 KERNELS = {
-    "SE, one length scale": scaled_rbf,
-    "SE, one length scale per input": lambda: scaled_rbf(3),
+    "SE, one length scale": scaled_rbf, "SE, one length scale per input": lambda: scaled_rbf(3),
     "SE, logarithmic": log_scaled_rbf,
     "SE, some inputs": lambda: gk.ScaleKernel(gk.RBFKernel(ard_num_dims=2, active_dims=(0, 2))).double(),
     "SE, some inputs, one length scale": lambda: gk.ScaleKernel(gk.RBFKernel(active_dims=(0, 2))).double(),
@@ -45,8 +44,7 @@ KERNELS = {
     ).double(),
     "Matern alone": lambda: gk.MaternKernel(1.5, ard_num_dims=3).double(),
     "rational quadratic": lambda: gk.ScaleKernel(gk.RQKernel()).double(),
-    "periodic": lambda: gk.ScaleKernel(periodic()).double(),
-    "linear": lambda: gk.LinearKernel().double(),
+    "periodic": lambda: gk.ScaleKernel(periodic()).double(), "linear": lambda: gk.LinearKernel().double(),
     "periodic, one period per input": lambda: gk.PeriodicKernel(ard_num_dims=3).double(),
     "constant and Matern": lambda: (gk.ConstantKernel() + gk.MaternKernel(2.5)).double(),
     "sum": lambda: (gk.ScaleKernel(gk.RBFKernel()) + gk.LinearKernel()).double(),
@@ -55,7 +53,7 @@ KERNELS = {
         gk.RBFKernel(active_dims=(1,)) + gk.MaternKernel(2.5, active_dims=(0, 2))
     ).double(),
     "sum with a kernel that is called": lambda: (gk.ScaleKernel(gk.RQKernel()) + gk.RBFKernel()).double(),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
@@ -99,11 +97,9 @@ def test_features_far_from_zero_lose_nothing(shift):
         torch.testing.assert_close(gradient, reference, rtol=0.0, atol=1e-15 * shift + 1e-13)
     with torch.no_grad():
         torch.testing.assert_close(
-            kernel_cross(kernel, near[:2] + shift, far),
-            kernel_cross(kernel, near[:2], near),
-            rtol=0.0,
+            kernel_cross(kernel, near[:2] + shift, far), kernel_cross(kernel, near[:2], near), rtol=0.0,
             atol=1e-15 * shift,
-        )
+        )  # fmt: skip
 
 
 # ---------------------------------------------------------------- several latents

@@ -12,11 +12,9 @@ from forcegp.inference.inducing import InducingPosterior, pivoted_cholesky
 from forcegp.inference.likelihood import Terms
 
 SHAPES = {
-    "no constraint": {"constraints": 0},
-    "one constraint": {"constraints": 1},
-    "fewer latents than outputs": {"latents": 2},
-    "more latents than outputs": {"latents": 6, "outputs": 3},
-}
+    "no constraint": {"constraints": 0}, "one constraint": {"constraints": 1},
+    "fewer latents than outputs": {"latents": 2}, "more latents than outputs": {"latents": 6, "outputs": 3},
+}  # fmt: skip
 COUNT = 40
 
 

@@ -83,8 +83,7 @@ def test_exact_forms_are_the_sums_everywhere(expression, centers):
 
 def test_several_functions_are_prepared_at_once():
     """The roots of a compressed covariance: the same centres, one column of coefficients for each."""
-    given = latents("friction", normal(20, seed=7))
-    coefficients = normal(20, 3, seed=9)
+    given, coefficients = latents("friction", normal(20, seed=7)), normal(20, 3, seed=9)
     form, s = one_input_form(given, 0, coefficients), points(given.features[0][:, 0])
     close(form.values(s), given.kernels.dense[0].cross(s[:, None], given.features[0]) @ coefficients, 1e-12)
     torch.testing.assert_close(form.only(1).values(s)[:, 0], form.values(s)[:, 1], rtol=0, atol=1e-13)

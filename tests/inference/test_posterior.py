@@ -101,12 +101,9 @@ def test_mean_is_differentiable_in_the_features():
 
 @settings(max_examples=30)
 @given(
-    count=st.integers(1, 8),
-    outputs=st.integers(1, 4),
-    latents=st.integers(1, 5),
-    seed=st.integers(0, 10_000),
+    count=st.integers(1, 8), outputs=st.integers(1, 4), latents=st.integers(1, 5), seed=st.integers(0, 10_000),
     log_noise=st.floats(-12.0, 2.0),
-)
+)  # fmt: skip
 def test_covariance_is_positive_semi_definite_and_below_the_prior(count, outputs, latents, seed, log_noise):
     given_problem = problem(count=count, outputs=outputs, constraints=0, latents=latents, seed=seed)
     given_problem.noise = torch.full((1, outputs), 10.0**log_noise, dtype=torch.float64)
@@ -121,8 +118,7 @@ def test_covariance_is_positive_semi_definite_and_below_the_prior(count, outputs
 
 
 CPU = torch.device("cpu")
-SIZE = ProblemSize(rows=1000, outputs=2, rank=2, latents=3, features=9)
-GIB = 2**30
+SIZE, GIB = ProblemSize(rows=1000, outputs=2, rank=2, latents=3, features=9), 2**30
 
 
 @pytest.fixture

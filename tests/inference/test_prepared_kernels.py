@@ -41,8 +41,7 @@ def test_latents_are_grouped_by_their_centers(latent):
 def test_the_sums_as_c_have_values_slopes_and_roots(latent, lanes, tmp_path):
     """Every group in a program of its own, whose inputs are the features."""
     for group, part in zip(kernel_groups(latent), kernel_sums(latent), strict=True):
-        function = rows_of_call(part, lanes, tmp_path)
-        z = points(latent, 11)
+        function, z = rows_of_call(part, lanes, tmp_path), points(latent, 11)
         given = z[group[0]]
         outputs = [torch.empty(11, size, dtype=torch.float64) for size in function.outputs]
         assert function.rows([given], outputs) == 0

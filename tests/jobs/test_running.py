@@ -26,8 +26,7 @@ def results(tmp_path):
 
 
 def test_all_jobs_are_computed_once_and_in_order(results):
-    jobs = [next_to(square(3)), square(3), square(4)]
-    told = []
+    jobs, told = [next_to(square(3)), square(3), square(4)], []
     with watched(lambda *given: told.append(given)):
         assert run_jobs(results, jobs, at_once=2) == 3
     assert results.result("next/3")["value"] == 10

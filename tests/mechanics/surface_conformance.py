@@ -66,8 +66,7 @@ class SurfaceConformance:
         assert bool(((normal.norm(dim=-1) - 1.0).abs() < 1e-12).all()) == self.signed_distance
         if self.signed_distance:
             assert float((self.surface.hessian(p) @ normal[..., None]).abs().max()) < 1e-12
-            foot = p - self.surface.value(p)[:, None] * normal
-            assert float(self.surface.value(foot).abs().max()) < 1e-12
+            assert float(self.surface.value(p - self.surface.value(p)[:, None] * normal).abs().max()) < 1e-12
 
     def test_it_survives_a_file_exactly_or_says_that_it_cannot(self):
         if self.storable:

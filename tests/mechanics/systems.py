@@ -32,20 +32,17 @@ def contacts(kind: str, frame: str) -> tuple[Contact, ...]:
     """By name: none, one, three independent, the same twice, four corners of a plate on a plane (rank 3)."""
     plane, sphere, ball, _ = surfaces().values()
     return {
-        "none": (),
-        "one": (Contact(frame, POINT, plane),),
+        "none": (), "one": (Contact(frame, POINT, plane),),
         "three": (
-            Contact(frame, POINT, plane),
-            Contact(frame, (0.0, 0.1, 0.0), sphere),
+            Contact(frame, POINT, plane), Contact(frame, (0.0, 0.1, 0.0), sphere),
             Contact(frame, (-0.1, 0.0, 0.05), ball),
         ),
         "same twice": (Contact(frame, POINT, sphere), Contact(frame, POINT, sphere)),
         "four corners": tuple(Contact(frame, corner, plane) for corner in CORNERS),
-    }[kind]
+    }[kind]  # fmt: skip
 
 
-INDEPENDENT = ["none", "one", "three"]
-REDUNDANT = ["same twice", "four corners"]
+INDEPENDENT, REDUNDANT = ["none", "one", "three"], ["same twice", "four corners"]
 
 
 def model_with(model: str = "iiwa", kind: str = "one", **options: object) -> Model:
@@ -72,8 +69,7 @@ def regular_states(built: Model, count: int) -> tuple[torch.Tensor, torch.Tensor
         return tuple(x[:count] for x in candidates)
     singular = torch.linalg.svdvals(A)
     smallest = torch.where(singular > 1e-9 * singular[:, :1], singular, torch.inf).amin(-1)
-    best = (smallest / singular[:, 0]).topk(count).indices
-    return tuple(x[best] for x in candidates)
+    return tuple(x[(smallest / singular[:, 0]).topk(count).indices] for x in candidates)
 
 
 def solve_kkt(M, Q, A, b):

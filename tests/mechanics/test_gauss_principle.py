@@ -22,8 +22,7 @@ from forcegp.errors import NumericalError
 from forcegp.mechanics import Baumgarte, Contact, Sphere
 from forcegp.model import Model
 
-TOLERANCE = 1e-10
-ALL = [*INDEPENDENT, *REDUNDANT]
+TOLERANCE, ALL = 1e-10, [*INDEPENDENT, *REDUNDANT]
 
 
 @cache

@@ -51,8 +51,7 @@ def test_accelerations_and_foot_forces_are_those_of_the_equations_of_motion(walk
     assert pin.buildModelFromXML(LIMBS, pin.JointModelFreeFlyer()).nv == robot.nv
     for k in range(len(q)):
         M, bias = robot.mass_matrix_and_bias(q[k], v[k])
-        tau = torch.cat([torch.zeros(6), u[k, :3]]).double()
-        rows = []
+        tau, rows = torch.cat([torch.zeros(6), u[k, :3]]).double(), []
         for stands, frame, point in ((u[k, 3], "a_foot", POINT), (u[k, 4], "b_foot", (0.0, 0.0, 0.1))):
             if stands:
                 J = robot.frame_jacobian(q[k], frame, point)[:3]

@@ -92,30 +92,22 @@ def on_the_plane(model: Model, q: np.ndarray) -> np.ndarray:
 
 def arm_data(rows: int, seed: int, model: Model | None = None) -> Dataset:
     """Random states, the exact constrained acceleration and noise of standard deviation NOISE on it."""
-    model = model or arm_model()
-    generator = np.random.default_rng(seed)
+    model, generator = model or arm_model(), np.random.default_rng(seed)
     q = on_the_plane(model, generator.uniform([-1.0, 0.3, 0.3], [1.0, 1.2, 1.2], (rows, 3)))
     v, u = generator.normal(0.0, 0.7, (rows, 3)), generator.normal(0.0, 3.0, (rows, 3))
     states = [torch.tensor(x) for x in (q, v, u)]
     dynamics, Q_U = model.dynamics(*states), unknown_force(states[1])
     a = dynamics.acceleration(Q_U).numpy()
     return Dataset(
-        q=q,
-        v=v,
-        u=u,
-        a=a + generator.normal(0.0, NOISE, a.shape),
-        time=np.arange(rows) * 0.01,
-        model=model,
-        noise_std=np.full(3, NOISE),
-        truth={"a": a, "lambda": dynamics.multiplier(Q_U).numpy(), "Q_U": Q_U.numpy()},
-    )
+        q=q, v=v, u=u, a=a + generator.normal(0.0, NOISE, a.shape), time=np.arange(rows) * 0.01, model=model,
+        noise_std=np.full(3, NOISE), truth={"a": a, "lambda": dynamics.multiplier(Q_U).numpy(), "Q_U": Q_U.numpy()},
+    )  # fmt: skip
 
 
 def quick_fit(model: Model, data: Dataset | None = None, iterations: int = 3, **options: Any) -> Posterior:
     """What a short search finds, of which nothing is asked; by default of 30 rows with the tool on the plane."""
     search = OptimizerOptions(iterations=iterations)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         return fit(model, arm_data(30, 0) if data is None else data, restarts=1, options=search, **options)
 
 

@@ -13,8 +13,7 @@ URDF = """<robot name="satellite"><link name="hull"><inertial><origin xyz="0.02 
 ixz="0" iyz="0"/></inertial></link><joint name="shoulder" type="revolute"><origin xyz="0.2 0 0.1"/><parent link="hull"/>
 <child link="arm"/><axis xyz="0 1 0"/><limit lower="-9" upper="9" effort="9" velocity="9"/></joint></robot>"""
 PLACES = [(0.1, 0.2, 0.0), (-0.1, 0.0, 0.2), (0.0, -0.2, 0.1)]
-AXES = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)]
-DT = 0.02
+AXES, DT = [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)], 0.02
 
 
 def satellite(viscous: float = 0.2, dry: float = 0.3, mass: float = 8.0, switch: float = 0.3) -> Model:

@@ -8,8 +8,7 @@ from tests.posterior.arm import arm_model, unknown_force
 
 from forcegp.data import Dataset
 
-STEP = 0.002
-SENSOR = 2e-5
+STEP, SENSOR = 0.002, 2e-5
 
 
 @cache

@@ -12,15 +12,12 @@ from forcegp.forces import ContactFriction, JointForces, JointFriction, UnknownF
 from forcegp.mechanics import Contact, Plane, Sphere
 from forcegp.robots import Robot
 
-PRIOR = UnknownForces((JointFriction(), ContactFriction(), Weight()))
-NOISE = 0.05
+PRIOR, NOISE = UnknownForces((JointFriction(), ContactFriction(), Weight())), 0.05
 TIP = (0.0, 0.0, 0.2)
 OTHER_CONTACTS = {
-    "same": arm_model().contacts,
-    "sphere": (Contact("hand", TIP, Sphere((0.0, 0.0, -2.0), 2.4)),),
-    "none": (),
+    "same": arm_model().contacts, "sphere": (Contact("hand", TIP, Sphere((0.0, 0.0, -2.0), 2.4)),), "none": (),
     "two": (*arm_model().contacts, Contact("fore", (0.1, 0.0, 0.0), Plane((1.0, 0.0, 0.0), 0.1))),
-}
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

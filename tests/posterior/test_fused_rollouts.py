@@ -34,8 +34,7 @@ def starts() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
 
 
 def rolled_out(posterior, starts, **how):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NumericalWarning)
+    with warnings.catch_warnings(action="ignore", category=NumericalWarning):
         return posterior.rollout(*starts, DT, baumgarte=posterior.model.baumgarte, **how)
 
 

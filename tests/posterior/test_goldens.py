@@ -42,8 +42,7 @@ def moved(posterior, start, integrator) -> list:
 
 @pytest.mark.parametrize("case", POSTERIORS)
 def test_predictions_and_motions(case):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)  # of a past that is not known
+    with warnings.catch_warnings(action="ignore", category=DataWarning):  # of a past that is not known
         posterior = POSTERIORS[case]().with_settings(widening=1.0)
         rows = posterior.training
         q, v, u = (x[3:9] + 0.01 for x in (rows.q, rows.v, rows.u))

@@ -55,8 +55,7 @@ def test_each_component_takes_the_time_that_missed_least():
 @pytest.fixture(scope="module")
 def posterior():
     train = simulate_quadrotor(QuadrotorConfig(seconds=12.0, seed=1))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         return fit(train.model.with_forces(AerodynamicForce()), acting(train), points=50, restarts=1)
 
 
@@ -110,8 +109,7 @@ def test_what_cannot_be_observed_is_refused(posterior, test):
     with pytest.raises(InvalidInput, match="looks back"):
         observing(posterior, acting(test), seconds=-1.0)
     calm = test.model.with_forces(AerodynamicForce(observe=0.0))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         fitted = fit(calm, acting(test), points=30, restarts=1)
     assert observing(fitted, test) == (fitted, test)
 

@@ -8,8 +8,7 @@ from forcegp.errors import InvalidInput
 from forcegp.forces import ContactFriction, JointForces, JointFriction, RigidBodies, ToolForces
 from forcegp.posterior import Posterior
 
-DT = 0.02
-INTEGRATORS = ["symplectic-euler", "rk4", "implicit-midpoint"]
+DT, INTEGRATORS = 0.02, ["symplectic-euler", "rk4", "implicit-midpoint"]
 PRIORS = {
     "joint": JointForces(),  # has u among its features
     "friction under load": (JointFriction(), ContactFriction(load=True, expected=0.2)),

@@ -70,8 +70,7 @@ def system(seed: int) -> tuple[Model, Dataset, Dataset, np.ndarray]:
 def test_every_path_computes_the_same(seed, tmp_path):
     model, rows, test, truth = system(seed)
     forces = JointFriction() if seed % 2 else JointForces()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         how = {"restarts": 1, "options": OptimizerOptions(iterations=40)}
         posterior = fit(model.with_forces(forces), rows, points=len(rows), **how)
         predictor = posterior.predictor()

@@ -144,8 +144,7 @@ def test_wrong_arguments_are_named(posterior, start, changed, message):
 @pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4"])
 def test_feedback_is_asked_once_per_step_and_acts_until_the_next(posterior, start, integrator):
     q, v, u = start
-    gains = torch.linspace(0.5, 2.0, STEPS, dtype=torch.float64)
-    asked = []
+    gains, asked = torch.linspace(0.5, 2.0, STEPS, dtype=torch.float64), []
 
     def feedback(k, q, v):
         asked.append((k, q.clone(), v.clone()))

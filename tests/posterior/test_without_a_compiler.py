@@ -30,8 +30,7 @@ def test_everything_is_the_same_after_one_warning(posterior, states, monkeypatch
     assert len(given) == 1
     assert "\n" not in str(given[0].message)
     eager = posterior.predictor(compile=False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         for at in (states, [x[0] for x in states]):
             for name, more in (("mean", ()), ("__call__", ()), ("linearize", ()), ("step", (0.01,))):
                 found, expected = (getattr(of, name)(*at, *more) for of in (predictor, eager))

@@ -36,12 +36,9 @@ def case(request):
 
 
 FUNCTIONS = {
-    "mass_matrix": "q",
-    "bias_forces": "qv",
-    "gravity_forces": "q",
-    "inverse_dynamics": "qva",
+    "mass_matrix": "q", "bias_forces": "qv", "gravity_forces": "q", "inverse_dynamics": "qva",
     "forward_dynamics": "qvt",
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("function", FUNCTIONS)

@@ -29,23 +29,17 @@ def limbs(*names: str, root: str = "trunk", mass: float = 5.0, robot: str = "r",
 
 
 LOOSE = {
-    "legs": limbs("FL_foot", "FR_foot"),
-    "upper and lower leg": limbs("leftUpperLeg", "left_lowerLEG"),
-    "wheels": limbs("wheel_1", "rear_wheels"),
-    "propellers": limbs("a", "b", "c", joint="rotor_{}"),
-    "a humanoid without legs": limbs("arm", root="Pelvis"),
-    "a flying arm": limbs("arm", robot="flying_arm"),
-}
+    "legs": limbs("FL_foot", "FR_foot"), "upper and lower leg": limbs("leftUpperLeg", "left_lowerLEG"),
+    "wheels": limbs("wheel_1", "rear_wheels"), "propellers": limbs("a", "b", "c", joint="rotor_{}"),
+    "a humanoid without legs": limbs("arm", root="Pelvis"), "a flying arm": limbs("arm", robot="flying_arm"),
+}  # fmt: skip
 BOLTED = {
-    **{name: text() for name, text in MODELS.items()},
-    "a hand": limbs("index", "middle", "ring", "thumb", root="palm"),
-    "a gripper": limbs("left_finger", "right_finger"),
-    "a base footprint": limbs("arm", root="base_footprint"),
-    "one wheel": limbs("reaction_wheel", "arm"),
-    "rotors of two motors": limbs("arm", "rotor_1", "rotor_2"),
+    **{name: text() for name, text in MODELS.items()}, "a hand": limbs("index", "middle", "ring", "thumb", root="palm"),
+    "a gripper": limbs("left_finger", "right_finger"), "a base footprint": limbs("arm", root="base_footprint"),
+    "one wheel": limbs("reaction_wheel", "arm"), "rotors of two motors": limbs("arm", "rotor_1", "rotor_2"),
     "a console": limbs("console", "chip", "pushing_hippo"),
     "a massless base": limbs("l_foot", "r_foot", mass=0.0).replace(BODY.format(0.0), ""),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", LOOSE)
@@ -123,10 +117,8 @@ def test_the_remedy_keeps_what_was_given():
     with pytest.raises(RobotModelError, match=r"--lock joint_FR_foot=0\.123456789,slip=0") as caught:
         Robot.from_urdf_text(MANY, locked={"joint_FR_foot": 0.123456789}, inertias="nearest")
     assert caught.value.remedy == {
-        "locked": {"joint_FR_foot": 0.123456789, "slip": 0.0},
-        "base": "floating",
-        "inertias": "nearest",
-    }
+        "locked": {"joint_FR_foot": 0.123456789, "slip": 0.0}, "base": "floating", "inertias": "nearest",
+    }  # fmt: skip
 
 
 def test_what_must_be_corrected_in_the_file_leaves_no_remedy():

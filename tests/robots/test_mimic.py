@@ -12,11 +12,9 @@ from forcegp.robots import Robot
 
 # below its master, above it, on another branch, and a mimic of a mimic; of another kind; with damping
 TREE_MIMICS = {
-    "right_wrist": ("right_shoulder", 0.5, 0.2),
-    "torso": ("left_shoulder", -0.7, 0.0),
-    "second_finger": ("left_gripper", -1.0, 0.01),
-    "left_gripper": ("right_wrist", 0.3, -0.05),
-}
+    "right_wrist": ("right_shoulder", 0.5, 0.2), "torso": ("left_shoulder", -0.7, 0.0),
+    "second_finger": ("left_gripper", -1.0, 0.01), "left_gripper": ("right_wrist", 0.3, -0.05),
+}  # fmt: skip
 CHAIN_MIMICS = {"slide": ("tilt", 0.4, 0.1)}
 COUNT = 5
 

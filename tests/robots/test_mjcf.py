@@ -22,8 +22,7 @@ FOLLOWERS = {"gripper": {"right": ("left", -1.5, np.radians(10) + 0.02)}}
 
 def read(text, **options):
     """The robot, without its warning."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RobotFileWarning)
+    with warnings.catch_warnings(action="ignore", category=RobotFileWarning):
         return Robot.from_mjcf_text(text, **options)
 
 
@@ -49,8 +48,7 @@ ASSETS = Path(find_spec("gymnasium").submodule_search_locations[0]) / "envs" / "
 
 @pytest.mark.parametrize("path", sorted(ASSETS.glob("*.xml")), ids=lambda path: path.stem)
 def test_published_files_are_those_of_mujoco(path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what is left out, and an attribute that MuJoCo is about to drop
+    with warnings.catch_warnings(action="ignore"):  # what is left out, and an attribute that MuJoCo is about to drop
         robot, model = Robot.from_mjcf(path), mujoco.MjSpec.from_file(str(path)).compile()
     model.opt.density = model.opt.viscosity = 0.0
     same_dynamics(robot, MujocoOracle(model))
@@ -59,8 +57,7 @@ def test_published_files_are_those_of_mujoco(path):
 @pytest.mark.parametrize("name", ALL)
 def test_stored_robots_and_urdf_files_are_the_same_robot(name, tmp_path):
     robot = read(ALL[name])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RobotFileWarning)
+    with warnings.catch_warnings(action="ignore", category=RobotFileWarning):
         robot.to_urdf(tmp_path / "same.urdf")
     q, v, a = states(robot)
     options = {"gravity": robot.gravity}
@@ -91,18 +88,15 @@ LOSSES = {
     "springs (Model.from_mjcf has them) (1)": ('stiffness="2"', BALL, ""),
     "tendons (1)": ("", BALL, '<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>'),
     "laws of actuators (u holds joint forces) (1)": (
-        "",
-        BALL,
-        '<actuator><position name="servo" joint="j" kp="3"/></actuator>',
+        "", BALL, '<actuator><position name="servo" joint="j" kp="3"/></actuator>',
     ),
     "forces of a medium (1)": ("", BALL, '<option viscosity="1"/>'),
     "compensation of gravity (1)": ("", BALL + '<body name="b" gravcomp="1"><geom size=".1"/></body>', ""),
     "couplings of joints that are not linear (equality 0)": (
-        "",
-        BALL + '<body name="b"><joint name="k"/><geom size=".1"/></body>',
+        "", BALL + '<body name="b"><joint name="k"/><geom size=".1"/></body>',
         '<equality><joint joint1="j" joint2="k" polycoef="0 1 1 0 0"/></equality>',
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("what", LOSSES)
@@ -191,8 +185,7 @@ def test_files_include_others_and_are_found_by_their_root_element(tmp_path):
 
 
 def written(robot):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RobotFileWarning)
+    with warnings.catch_warnings(action="ignore", category=RobotFileWarning):
         return robot.to_mjcf()
 
 
@@ -256,8 +249,7 @@ def test_rotors_on_links_that_move_are_inputs(tmp_path, base, gear):
         f'{pod}</body></body></worldbody><actuator><motor name="left" site="r2" gear="{gear}"/>'
         f'<motor name="turn" joint="tilt" gear="3"/>{right}</actuator></mujoco>'
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+    with warnings.catch_warnings(action="error"):
         (tmp_path / "rotors.xml").write_text(text)
         model, plain = Model.from_mjcf(tmp_path / "rotors.xml"), mujoco.MjModel.from_xml_string(text)
     names = ("turn", *(("right",) if base else ()), "left")

@@ -15,8 +15,7 @@ from forcegp.robots.manifold import ConfigurationSpace
 
 LIMBS = Path(__file__).with_name("limbs.urdf").read_text()
 CARRIER = Path(__file__).with_name("carrier.urdf").read_text()
-ROOTS = {"floating": pin.JointModelFreeFlyer, "fixed": None}
-ROWS = 4
+ROOTS, ROWS = {"floating": pin.JointModelFreeFlyer, "fixed": None}, 4
 
 
 class Pair:

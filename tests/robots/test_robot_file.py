@@ -139,8 +139,7 @@ def test_the_repaired_robot_says_so_and_can_be_stored():
     with pytest.warns(RobotFileWarning, match=r"link 'arm'.*triangle.* \d+(\.\d+)? %"):
         robot = Robot.from_urdf_text(BROKEN, inertias="nearest")
     assert "<!-- rounded to death -->" in robot.to_urdf()
-    again = Model.from_json(Model(robot).to_json()).robot
-    q = torch.zeros(1).double()
+    again, q = Model.from_json(Model(robot).to_json()).robot, torch.zeros(1).double()
     assert again.mass_matrix(q).equal(robot.mass_matrix(q))
 
 

@@ -43,10 +43,8 @@ IXX = 'ixx="0.1"'
 ROD = '<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0"/>'  # along z, the axis of the hinge
 
 WRONG = {
-    "empty": ("", ["is empty", "<robot name"]),
-    "not xml": ("robot: small", ["not well-formed XML", "line 1"]),
-    "not a robot": ("<sdf/>", ["<sdf>, not <robot>"]),
-    "no links": ('<robot name="r"/>', ["no <link>"]),
+    "empty": ("", ["is empty", "<robot name"]), "not xml": ("robot: small", ["not well-formed XML", "line 1"]),
+    "not a robot": ("<sdf/>", ["<sdf>, not <robot>"]), "no links": ('<robot name="r"/>', ["no <link>"]),
     "nothing moves": ('<robot name="r"><link name="a"/></robot>', ["no movable joint"]),
     "entities": (ENTITIES, ["entity", "remove the <!DOCTYPE"]),
     "external dtd": ('<!DOCTYPE robot SYSTEM "file:///etc/passwd">' + SMALL, ["external"]),
@@ -85,8 +83,7 @@ WRONG = {
         ["joint 'hinge'", "<dynamics> damping is inf", "finite number"],
     ),
     "two parents": (
-        with_joint("second", "base", "arm"),
-        ["link 'arm' has two parents", "'hinge'", "'second'", "remove one"],
+        with_joint("second", "base", "arm"), ["link 'arm' has two parents", "'hinge'", "'second'", "remove one"],
     ),
     "loop beside the tree": (
         with_joint("1", "a", "b", '<link name="a"/><link name="b"/>').replace("</robot>", JOINT.format("2", "b", "a")),
@@ -96,7 +93,7 @@ WRONG = {
         changed('<link name="base"/>', '<link name="base"/><link name="stray"/>'),
         ["2 separate parts", "'base', 'stray'", "connect them"],
     ),
-}
+}  # fmt: skip
 IMPOSSIBLE = {
     "no inertia element": (re.sub("<inertia .*/>", "", SMALL), ["'arm'", "no <inertia>"]),
     "negative mass": (changed('"2"', '"-2"'), ["link 'arm'", "-2 kg is negative"]),

@@ -28,11 +28,9 @@ def posterior(train) -> Posterior:
 @pytest.fixture(scope="session")
 def without_mean(train) -> Posterior:
     return fit(
-        arm_model().with_forces(JointForces()).without_mean(),
-        train,
-        restarts=1,
+        arm_model().with_forces(JointForces()).without_mean(), train, restarts=1,
         options=OptimizerOptions(iterations=30),
-    )
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="session")

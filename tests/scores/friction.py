@@ -40,13 +40,9 @@ def friction_data(rows: int, seed: int, model: Model | None = None) -> Dataset:
     joints = -torch.tensor(joint_law(data.v))
     a = dynamics.acceleration(tool + joints).numpy()
     truth = {
-        "a": a,
-        "lambda": dynamics.multiplier(tool + joints).numpy(),
-        "Q_U": (tool + joints).numpy(),
-        "Q_U.tool-friction": tool.numpy(),
-        "force.tool-friction": force.numpy(),
-        "Q_U.joint-friction": joints.numpy(),
-    }
+        "a": a, "lambda": dynamics.multiplier(tool + joints).numpy(), "Q_U": (tool + joints).numpy(),
+        "Q_U.tool-friction": tool.numpy(), "force.tool-friction": force.numpy(), "Q_U.joint-friction": joints.numpy(),
+    }  # fmt: skip
     noise = np.random.default_rng(seed + 100).normal(0.0, NOISE, a.shape)
     return dataclasses.replace(data, a=a + noise, truth=truth)
 

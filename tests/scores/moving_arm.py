@@ -19,8 +19,7 @@ from forcegp.integration import integrator_named
 from forcegp.model import Model
 from forcegp.robots import Robot
 
-NOISE = 0.2
-STEP = 0.01
+NOISE, STEP = 0.2, 0.01
 
 
 def given_system() -> Model:
@@ -64,12 +63,9 @@ def moving_arm(seconds: float = 2.0, episodes: int = 2, seed: int = 0, stribeck:
         q, v = step.q, step.v
     arrays = {name: np.stack(values, axis=1).reshape(-1, 3) for name, values in found.items()}
     return Dataset(
-        **{**arrays, "a": arrays["a"] + NOISE * generator.normal(size=arrays["a"].shape)},
-        time=np.tile(time, episodes),
-        episode=np.repeat(np.arange(episodes), rows),
-        model=given_system(),
-        noise_std=np.full(3, NOISE),
-    )
+        **{**arrays, "a": arrays["a"] + NOISE * generator.normal(size=arrays["a"].shape)}, time=np.tile(time, episodes),
+        episode=np.repeat(np.arange(episodes), rows), model=given_system(), noise_std=np.full(3, NOISE),
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

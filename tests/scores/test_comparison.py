@@ -72,10 +72,8 @@ def test_every_kind_of_model_is_a_row_and_identified_is_always_among_them(found)
     parts = ("table", "stretches", "motions", "training_rows", "test_rows")
     runs = {name: [{p: run[p] for p in parts} for run in scores.finished(name)[:1]] for name in scores.models}
     told = {
-        "winner": [scores.winner.model, scores.winner.difference],
-        "facts": [*scores.facts()],
-        "lost": scores.failures,
-    }
+        "winner": [scores.winner.model, scores.winner.difference], "facts": [*scores.facts()], "lost": scores.failures,
+    }  # fmt: skip
     assert_unchanged("scores/comparison", {"runs": runs, **told}, rtol=1e-3)
     # identified, functions of few inputs, and what was fitted before use all rows, so one seed stands for all
     assert len(changed(folder)) == 1 + 3 + 2 * 2

@@ -49,11 +49,8 @@ def test_every_curve_has_a_panel_that_names_it_with_its_units(friction, data):
     figure = friction_curves_figure(friction, data)
     panels = [axes for axes in figure.axes if axes.get_visible()]
     assert [axes.get_title(loc="left") for axes in panels] == [
-        "joint-friction: pan",
-        "joint-friction: lift",
-        "joint-friction: bend",
-        "contact-friction: sliding",
-    ]
+        "joint-friction: pan", "joint-friction: lift", "joint-friction: bend", "contact-friction: sliding",
+    ]  # fmt: skip
     assert (panels[0].get_xlabel(), panels[0].get_ylabel()) == ("velocity [rad/s]", "torque [Nm]")
     assert (panels[3].get_xlabel(), panels[3].get_ylabel()) == ("sliding speed [m/s]", "force [N]")
     (legend,) = figure.legends

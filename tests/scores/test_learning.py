@@ -106,8 +106,7 @@ def test_noise_of_forces_is_learned_where_rows_show_it():
 
 def test_laws_are_refined_on_motions_and_a_short_log_says_how_far_intervals_are_calibrated():
     recorded = recording(line, 1, seconds=3.0)
-    model = replace(slide(1.0, 1.0), forces=(Actuation(), RigidBodies()))
-    told = []
+    model, told = replace(slide(1.0, 1.0), forces=(Actuation(), RigidBodies())), []
     with watched(lambda *words: told.append(words[:2])):
         posterior, notes = learn(named_model(model, ("viscous", "coulomb")), recorded, [Torques(), Motions(0.5)])
     assert posterior.settings["motions"]["seconds"] == 0.5

@@ -31,15 +31,12 @@ def sledge(mass: float) -> Model:
 
 def recording(rows: int = 101, episodes: int = 2, force: float = FORCE) -> Dataset:
     time, a = STEP * np.arange(rows), np.full((rows, 1), force / TRUE_MASS)
-    v = 0.1 + a * time[:, None]
-    q = 0.1 * time[:, None] + 0.5 * a * time[:, None] ** 2
+    v, q = 0.1 + a * time[:, None], 0.1 * time[:, None] + 0.5 * a * time[:, None] ** 2
     arrays = {"q": q, "v": v, "u": np.full((rows, 1), force), "a": a}
     return Dataset(
-        **{name: np.tile(values, (episodes, 1)) for name, values in arrays.items()},
-        time=np.tile(time, episodes),
-        episode=np.repeat(np.arange(episodes), rows),
-        model=sledge(TRUE_MASS),
-    )
+        **{name: np.tile(values, (episodes, 1)) for name, values in arrays.items()}, time=np.tile(time, episodes),
+        episode=np.repeat(np.arange(episodes), rows), model=sledge(TRUE_MASS),
+    )  # fmt: skip
 
 
 def posterior(mass: float, data: Dataset):
@@ -147,8 +144,7 @@ def pushed(forces, rows, seed=4, noise=0.0):
 @pytest.fixture(scope="module")
 def airborne():
     train = pushed([(0.0, 0.0, 0.0)], rows=200, noise=0.02)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         return fit(train.model.with_forces(AerodynamicForce(kernel="linear"), noise=0.02), train, points=60, restarts=1)
 
 

@@ -29,12 +29,9 @@ def recording(rows: int = 60, episodes: int = 3, seed: int = 0, **changes) -> Da
 
 @settings(max_examples=30, deadline=None)
 @given(
-    blocks=st.integers(2, 7),
-    wanted=st.sets(st.integers(1, 7), min_size=1),
-    guard=st.floats(0.0, 0.2),
-    episodes=st.integers(1, 3),
-    seed=st.integers(0, 50),
-)
+    blocks=st.integers(2, 7), wanted=st.sets(st.integers(1, 7), min_size=1), guard=st.floats(0.0, 0.2),
+    episodes=st.integers(1, 3), seed=st.integers(0, 50),
+)  # fmt: skip
 def test_blocks_share_no_row_and_keep_their_distance(blocks, wanted, guard, episodes, seed):
     data = recording(60, episodes, seed)
     wanted = sorted(number for number in wanted if number <= blocks)
