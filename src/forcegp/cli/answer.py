@@ -112,7 +112,7 @@ def answer_lines(
         *of_joints,
         *([("whole mass", weight)] if moving else []),
         ("payload", held),
-        *([("heavy links", each)] if (each := heavy_links(values, content["payload"])) else []),
+        *([("heavy links", heavy)] if (heavy := heavy_links(values, content["payload"])) else []),
         *causes.items(),
         ("models", f"error of q{ahead} / nRMSE of the acceleration (1: that of its mean), on unseen time: {errors}"),
         *left_of_torques(scores, best),
