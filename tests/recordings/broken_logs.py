@@ -235,12 +235,8 @@ BROKEN = {
     "huge number": Broken(setting("u_elbow", 7, 1e100), "'u_elbow' (u of joint 'elbow') is 1e+100 at row 7"),
     "huge time": Broken(scaled(1e300, "time"), "the median step is"),
     "time backwards": Broken(
-<<<<<<< HEAD
         csv(lambda x: x["time"].put([50, 51], x["time"][[51, 50]])),
         "runs backwards by 0.00195312 s at row 51 (line 53)"),
-=======
-        csv(lambda x: x["time"].put([50, 51], x["time"][[51, 50]])), "backwards by 0.00195312 s at row 51 (line 53)"),
->>>>>>> wv
     "time stands still": Broken(csv(lambda columns: columns["time"].fill(3.0)), "all rows have the same time stamp"),
     "ms given as s": Broken(scaled(1e3, "time"), "add --unit time=ms"),
     "unknown unit": Broken(GOOD, "no unit 'degrees' in the units of q; did you mean", f"{FLAGS} --unit q=degrees"),
