@@ -113,7 +113,13 @@ class Dataset(Summary):
         if given.shape != (rows,):
             raise DatasetError(f"episode has shape {given.shape}; expected ({rows},).")
         put("episode", _read_only(given.astype(np.int64)))
-        put("noise_std", _noise_std(self.noise_std, names))
+        if self.noise_std is not None:
+            put("noise_std", finite_columns("noise_std", self.noise_std, None, len(names), what="joints"))
+            for column in np.flatnonzero(self.noise_std <= 0)[:1]:
+                raise DatasetError(
+                    f"noise_std of joint {names[column]!r} is {self.noise_std[column]}; it must be > 0. Give None if "
+                    "it is not known or if there is no noise."
+                )
         if self.strokes is not None:
             past = real_array("strokes", self.strokes, "fiu", DatasetError).astype(np.float64)
             if past.ndim != 3 or past.shape[:2] != self.v.shape or not (np.abs(past) <= LARGEST_MEASURED).all():
@@ -214,19 +220,6 @@ class Dataset(Summary):
 
     def _fields(self) -> dict[str, Any]:
         return {item.name: getattr(self, item.name) for item in fields(self)}
-
-
-def _noise_std(given: object, joint_names: tuple[str, ...]) -> np.ndarray | None:
-    if given is None:
-        return None
-    values = finite_columns("noise_std", given, None, len(joint_names), what="joints")
-    if (values <= 0).any():
-        column = int((values <= 0).argmax())
-        raise DatasetError(
-            f"noise_std of joint {joint_names[column]!r} is {values[column]}; it must be > 0. Give None if it is not "
-            "known or if there is no noise."
-        )
-    return values
 
 
 def imu_place(name: str) -> tuple[str, list[float], Float[np.ndarray, "3 3"]]:
