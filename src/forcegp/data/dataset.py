@@ -133,7 +133,15 @@ class Dataset(Summary):
             allowed = "text, finite numbers, True, False, None, and lists or mappings of them"
             raise DatasetError(f"metadata cannot be written as JSON: {error}. Allowed: {allowed}.") from error
         put("time_ordered", bool(self.time_ordered))
-        _check_time(self.time, self.episode, self.time_ordered)
+        order = np.arange(rows) if self.time_ordered else np.lexsort((self.time, self.episode))
+        if (row := _first_disorder(self.time[order], self.episode[order])) is not None:
+            at, number = self.time[order][row], self.episode[order][row]
+            if not self.time_ordered:
+                raise DatasetError(f"time {at} s occurs twice in episode {number}; drop the repeated rows.")
+            raise DatasetError(
+                f"time does not increase at row {row} (episode {number}, time {at} s). "
+                "Sort the rows, drop stamps less than a nanosecond apart, or number a new recording as a new episode."
+            )
 
     def __len__(self) -> int:
         return len(self.q)
@@ -301,20 +309,6 @@ def _first_disorder(time: np.ndarray, episode: np.ndarray) -> int | None:
     order = np.argsort(episode, kind="stable")  # stable: keeps the order of rows inside an episode
     wrong = (np.diff(time[order]) < SHORTEST_STEP) & (np.diff(episode[order]) == 0)
     return int(order[1:][wrong].min()) if wrong.any() else None
-
-
-def _check_time(time: np.ndarray, episode: np.ndarray, ordered: bool) -> None:
-    order = np.arange(len(time)) if ordered else np.lexsort((time, episode))
-    row = _first_disorder(time[order], episode[order])
-    if row is None:
-        return
-    at, number = time[order][row], episode[order][row]
-    if not ordered:
-        raise DatasetError(f"time {at} s occurs twice in episode {number}; drop the repeated rows.")
-    raise DatasetError(
-        f"time does not increase at row {row} (episode {number}, time {at} s). "
-        "Sort the rows, drop stamps less than a nanosecond apart, or number a new recording as a new episode."
-    )
 
 
 def require_rows(name: str, rows: object, joint_names: Sequence[str], whose: str, example: str = "") -> None:
