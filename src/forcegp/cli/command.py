@@ -194,11 +194,13 @@ class Command(ABC):
         for given in (*inputs, *([] if path is None else [path])):
             if any(letter == "\0" or "\ud800" <= letter <= "\udfff" for letter in str(given)):
                 raise InvalidInput(f"the name {str(given)!r} holds NUL or is not UTF-8; give another, or rename it.")
+        if path is None:
+            return
+        here = Path(os.path.realpath(path))
         for other in inputs:
-            if path is None:
-                break
-            within = Path(os.path.realpath(other)).is_relative_to(os.path.realpath(path))
-            if _same(path, other) or (self.replaces and within):
+            there = Path(os.path.realpath(other))
+            same = there == here or (here.exists() and here.samefile(there))  # also by a hard link
+            if same or (self.replaces and there.is_relative_to(here)):
                 raise InvalidInput(
                     f"{path} would be written over {other}, which this command reads; choose another name."
                 )
@@ -305,10 +307,3 @@ class Command(ABC):
     @abstractmethod
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Do it and return what `--json` prints. Raises ForceGPError or OSError for what the user can mend."""
-
-
-def _same(one: Path, other: Path) -> bool:
-    """Whether two paths lead to the same file or folder, also by links."""
-    with contextlib.suppress(OSError):  # one of them does not exist
-        return one.samefile(other)
-    return os.path.realpath(one) == os.path.realpath(other)

@@ -113,7 +113,8 @@ class Fit(Command):
         evidence = forcegp.evidence.parse_evidence(self.evidence) if self.evidence else ()
         start, notes = time.monotonic(), []
         dataset = forcegp.Dataset.load(self.log)
-        given = self._known(dataset)
+        contacts, given = parse_contacts(self.contact), self.robot.chosen_model(dataset, self.log)
+        given = given.with_contacts(contacts) if self.contact else given
         self._check(terminal, dataset, given)
         recording = dataset
         dataset, note = self._rows(dataset, given)
@@ -147,11 +148,6 @@ class Fit(Command):
             complaint = f"--noise is {self.noise!r}; give learned, dataset or a number such as 0.1."
             [level] = numbers_of(self.noise, complaint, one=True)
         return forcegp.Noise(level, self.force_noise, learn=self.noise == "learned")
-
-    def _known(self, dataset: forcegp.Dataset) -> forcegp.Model:
-        """The dataset's own model, with the robot and contacts that the options give."""
-        contacts, model = parse_contacts(self.contact), self.robot.chosen_model(dataset, self.log)
-        return model.with_contacts(contacts) if self.contact else model
 
     def _check(self, terminal: Terminal, dataset: forcegp.Dataset, model: forcegp.Model) -> None:
         """One line on what would spoil the model; contacts are not warned of again by the fit."""

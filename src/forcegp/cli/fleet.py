@@ -76,11 +76,9 @@ class Fleet(Command):
                 shutil.rmtree(store.place(name))  # what was wrong may be mended
         with terminal.progress("running"):
             run_jobs(store, work, self.jobs)
-        rows = []
-        for name in lines:
-            kept = store.load(name)
-            about = {"log": name, "folder": str(self.out / name), "cpu_seconds": kept["cpu_seconds"]}
-            rows.append(about | kept["result"])
+        kept = {name: store.load(name) for name in lines}
+        rows = [{"log": name, "folder": str(self.out / name), "cpu_seconds": each["cpu_seconds"], **each["result"]}
+                for name, each in kept.items()]  # fmt: skip
         write_text(self.out / TABLE, table_of(rows))
         failed = {row["log"]: row["error"] for row in rows if row["error"]}
         done = f"{len(rows) - len(failed)} of {len(rows)} logs are done; numbers of each in {self.out / TABLE}"

@@ -101,7 +101,15 @@ class Score(Command):
         models |= {name: name for name in self.models.names()}
         rows, recording, model, split = raw, raw, None, None
         if fits:
-            rows, recording, model, split = self._prepared(terminal, raw, data)
+            model = self.robot.chosen_model(raw, data)
+            for note in forces_of(model):
+                terminal.note(note)
+            given, thin = replace(raw, model=model), self.filter.every is None
+            rows, recording = prepared_rows(terminal, self.filter.preparation(), given, thin=thin)
+            guard, cutoff = self.guard, forcegp.data.preparation_report(rows.metadata).get("cutoff")
+            if cutoff is not None:  # a filter mixes what lies on both sides of a border, two time constants wide
+                guard = max(guard, 2.5 * forcegp.data.LowPass(float(cutoff)).memory)
+            split = forcegp.scores.split_named(rows, self.split or "auto", guard)
         elif self.filter.every is not None:
             rows = forcegp.data.Preparation(every=self.filter.every).apply(raw)
         with terminal.progress(f"scoring {len(rows)} rows"):
@@ -133,20 +141,6 @@ class Score(Command):
         if self.out is not None:
             terminal.note(f"{time.monotonic() - start:.0f} s; the page: {self.out / 'report.md'}")
         return {name: value for name, value in content.items() if name != "runs"}
-
-    def _prepared(
-        self, terminal: Terminal, raw: forcegp.Dataset, data: Path
-    ) -> tuple[forcegp.Dataset, forcegp.Dataset, forcegp.Model, tuple[forcegp.scores.Split, ...]]:
-        """Rows to learn from and to score, the same at the full rate, the robot as given, and the split."""
-        model = self.robot.chosen_model(raw, data)
-        for note in forces_of(model):
-            terminal.note(note)
-        raw, preparation = replace(raw, model=model), self.filter.preparation()
-        rows, recording = prepared_rows(terminal, preparation, raw, thin=self.filter.every is None)
-        guard, cutoff = self.guard, forcegp.data.preparation_report(rows.metadata).get("cutoff")
-        if cutoff is not None:  # a filter mixes what lies on both sides of a border, two time constants wide
-            guard = max(guard, 2.5 * forcegp.data.LowPass(float(cutoff)).memory)
-        return rows, recording, model, forcegp.scores.split_named(rows, self.split or "auto", guard)
 
     def _of_one(
         self,

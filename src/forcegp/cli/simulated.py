@@ -206,8 +206,14 @@ class Reproduce(Command):
     """Pieces of work at once, each on one core."""
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
-        """Compute what is missing and write all summaries."""
-        root = _repository()
+        """Compute what is missing and write all summaries. Raises InvalidInput outside of a clone."""
+        places = Path(__file__).resolve().parents[3], Path.cwd()  # what the package, or the current folder, belongs to
+        root = next((str(place) for place in places if (place / EXPERIMENTS).is_file()), None)
+        if root is None:
+            raise InvalidInput(
+                "the experiments of the paper are not in the package but in its repository; run `git clone "
+                "https://github.com/forcegp/forcegp`, and the same command in the folder of that clone."
+            )
         if root not in sys.path:
             sys.path.insert(0, root)
         from benchmarks.paper.reproduction import NAME, PROGRAM, experiments_of, page_of, reproduce
@@ -220,14 +226,3 @@ class Reproduce(Command):
             summaries = reproduce(experiments, self.preset, out, **how)
         terminal.show(f"{out / page_of(experiments)} reports the results; figures, JSON and CSV are in {out / NAME}.")
         return {"out": str(out), "preset": self.preset, "figures": summaries}
-
-
-def _repository() -> str:
-    """The clone that this package, or the current folder, belongs to. Raises InvalidInput where neither is one."""
-    for root in (Path(__file__).resolve().parents[3], Path.cwd()):
-        if (root / EXPERIMENTS).is_file():
-            return str(root)
-    raise InvalidInput(
-        "the experiments of the paper are not in the package but in its repository; run `git clone "
-        "https://github.com/forcegp/forcegp`, and the same command in the folder of that clone."
-    )

@@ -21,8 +21,6 @@ HARDLY_ANY = 0.2  # share of rows that move along a surface, below which it is a
 BROKEN, NOISE = 0.2, 3.0
 """|A a - b| relative to the acceleration of the point, and to its noise, beyond which the contact does not hold."""
 
-LEAVE_OUT = "leave the contact out (`contacts=none`)."
-
 
 def rows_in_contact(dataset: Dataset) -> Dataset:
     """The rows in which the points of all contacts of `dataset.model` move along their surfaces, from q and v alone.
@@ -107,7 +105,7 @@ def _on_surfaces(
             touching[acts] &= along
             continue
         numbers = {"contact": index, "share": share, "distance": far}
-        remedy = f"Check its point, its surface and their units (m), or {LEAVE_OUT}"
+        remedy = "Check its point, its surface and their units (m), or leave the contact out (`contacts=none`)."
         what = f"contact {index} (frame {contact.frame!r}): {seen}"
         return touching, [wrong(about="contact", what=what, do=remedy, numbers=numbers)]
     return touching, []

@@ -113,7 +113,13 @@ class Dataset(Summary):
         if given.shape != (rows,):
             raise DatasetError(f"episode has shape {given.shape}; expected ({rows},).")
         put("episode", _read_only(given.astype(np.int64)))
-        put("noise_std", _noise_std(self.noise_std, names))
+        if self.noise_std is not None:
+            put("noise_std", finite_columns("noise_std", self.noise_std, None, len(names), what="joints"))
+            for column in np.flatnonzero(self.noise_std <= 0)[:1]:
+                raise DatasetError(
+                    f"noise_std of joint {names[column]!r} is {self.noise_std[column]}; it must be > 0. Give None if "
+                    "it is not known or if there is no noise."
+                )
         if self.strokes is not None:
             past = real_array("strokes", self.strokes, "fiu", DatasetError).astype(np.float64)
             if past.ndim != 3 or past.shape[:2] != self.v.shape or not (np.abs(past) <= LARGEST_MEASURED).all():
@@ -127,7 +133,15 @@ class Dataset(Summary):
             allowed = "text, finite numbers, True, False, None, and lists or mappings of them"
             raise DatasetError(f"metadata cannot be written as JSON: {error}. Allowed: {allowed}.") from error
         put("time_ordered", bool(self.time_ordered))
-        _check_time(self.time, self.episode, self.time_ordered)
+        order = np.arange(rows) if self.time_ordered else np.lexsort((self.time, self.episode))
+        if (row := _first_disorder(self.time[order], self.episode[order])) is not None:
+            at, number = self.time[order][row], self.episode[order][row]
+            if not self.time_ordered:
+                raise DatasetError(f"time {at} s occurs twice in episode {number}; drop the repeated rows.")
+            raise DatasetError(
+                f"time does not increase at row {row} (episode {number}, time {at} s). "
+                "Sort the rows, drop stamps less than a nanosecond apart, or number a new recording as a new episode."
+            )
 
     def __len__(self) -> int:
         return len(self.q)
@@ -216,19 +230,6 @@ class Dataset(Summary):
         return {item.name: getattr(self, item.name) for item in fields(self)}
 
 
-def _noise_std(given: object, joint_names: tuple[str, ...]) -> np.ndarray | None:
-    if given is None:
-        return None
-    values = finite_columns("noise_std", given, None, len(joint_names), what="joints")
-    if (values <= 0).any():
-        column = int((values <= 0).argmax())
-        raise DatasetError(
-            f"noise_std of joint {joint_names[column]!r} is {values[column]}; it must be > 0. Give None if it is not "
-            "known or if there is no noise."
-        )
-    return values
-
-
 def imu_place(name: str) -> tuple[str, list[float], Float[np.ndarray, "3 3"]]:
     """Frame, point [m] and axes of "imu.FRAME@x,y,z,roll,pitch,yaw", of which the end may lack. Raises InvalidInput."""
     frame, at, numbers = name.removeprefix(IMU).partition("@")
@@ -308,20 +309,6 @@ def _first_disorder(time: np.ndarray, episode: np.ndarray) -> int | None:
     order = np.argsort(episode, kind="stable")  # stable: keeps the order of rows inside an episode
     wrong = (np.diff(time[order]) < SHORTEST_STEP) & (np.diff(episode[order]) == 0)
     return int(order[1:][wrong].min()) if wrong.any() else None
-
-
-def _check_time(time: np.ndarray, episode: np.ndarray, ordered: bool) -> None:
-    order = np.arange(len(time)) if ordered else np.lexsort((time, episode))
-    row = _first_disorder(time[order], episode[order])
-    if row is None:
-        return
-    at, number = time[order][row], episode[order][row]
-    if not ordered:
-        raise DatasetError(f"time {at} s occurs twice in episode {number}; drop the repeated rows.")
-    raise DatasetError(
-        f"time does not increase at row {row} (episode {number}, time {at} s). "
-        "Sort the rows, drop stamps less than a nanosecond apart, or number a new recording as a new episode."
-    )
 
 
 def require_rows(name: str, rows: object, joint_names: Sequence[str], whose: str, example: str = "") -> None:

@@ -1,8 +1,7 @@
 """The dataset file: HDF5 (docs/how-to/data-format.md): numbers, texts and JSON, of which nothing is executed."""
 
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,9 @@ def write_fields(path: Path, fields: Mapping[str, Any], units: Mapping[str, Any]
         arrays["measured"] = np.stack([np.pad(x, ((0, 0), (0, 3 - x.shape[1]))) for x in fields["measured"].values()])
     if fields["strokes"] is not None and fields["transmission"] is None:
         arrays["strokes"] = fields["strokes"]
-    with atomic_file(path) as temporary, new_file(temporary) as file:
+    # in memory until it is whole: HDF5 2.0.0 that cannot write cannot close its file either, and crashes at the end
+    memory = {"driver": "core", "backing_store": False, "block_size": 2**24}
+    with atomic_file(path) as temporary, h5py.File("new", "w", **memory) as file:
         for name, values in arrays.items():
             file.create_dataset(name, data=values, **(COMPRESSION if values.size else {}))
         file.attrs["format"] = fixed_text(FORMAT)
@@ -46,6 +47,8 @@ def write_fields(path: Path, fields: Mapping[str, Any], units: Mapping[str, Any]
         file["joint_names"] = fixed_text(fields["model"].robot.joint_names)
         file["metadata"] = fixed_text(json.dumps(fields["metadata"]))
         file["model"] = fixed_text(fields["model"].to_json())
+        file.flush()
+        temporary.write_bytes(file.id.get_file_image())
 
 
 def fixed_text(text: Any) -> np.ndarray:
@@ -71,19 +74,6 @@ def is_dataset(path: Path) -> bool:
             return isinstance(kind := _attribute(file, "format"), str) and kind == FORMAT
     except (OSError, RuntimeError, KeyError, ValueError, TypeError):  # whatever h5py meets in a damaged file
         return False
-
-
-@contextmanager
-def new_file(path: Path) -> Iterator[h5py.File]:
-    """An HDF5 file that is written as a whole where the context ends. Raises OSError where the disk is full.
-
-    Until then it is in memory: HDF5 2.0.0 that cannot write cannot close its file either, and crashes at the end.
-    """
-    with h5py.File("new", "w", driver="core", backing_store=False, block_size=2**24) as file:
-        yield file
-        file.flush()
-        image = file.id.get_file_image()
-    path.write_bytes(image)
 
 
 def read_fields(path: Path) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 import forcegp.model
 from forcegp.data.dataset import IMU, Dataset, imu_place
 from forcegp.data.delay import LEAST_DELAY, lowest
-from forcegp.data.views import consecutive, tensors, whole_windows, window_means
+from forcegp.data.views import median_step, tensors, whole_windows, window_means
 from forcegp.doubts import Doubt, look, ok, wrong
 from forcegp.mechanics import AffineMap
 from forcegp.robots import Kinematics
@@ -51,8 +51,7 @@ def expected(dataset: Dataset, model: forcegp.model.Model, name: str) -> Float[n
 
 def short_means(dataset: Dataset, *values: Float[np.ndarray, "rows k"]) -> list[Float[np.ndarray, "windows k"]]:
     """Over a tenth of a second each."""
-    steps = np.diff(dataset.time)[consecutive(dataset)[:-1]]
-    width = int(max(1.0, SECONDS / np.median(steps))) if dataset.time_ordered and len(steps) else 1
+    width = int(max(1.0, SECONDS / median_step(dataset))) if dataset.time_ordered else 1
     first = whole_windows(dataset, width)
     return [window_means(x, first, width) for x in values]
 

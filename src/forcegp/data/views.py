@@ -320,12 +320,9 @@ def all_motions(dataset: Dataset, seconds: float, longest_step: float) -> tuple[
 
 def _even_steps(dataset: Dataset) -> tuple[float, Int[np.ndarray, " rows"]]:
     """The median step of time [s], and how many steps before each row are not of that length."""
-    pauses = np.diff(dataset.time)
-    own = pauses[consecutive(dataset)[:-1]]
-    if not own.size:
+    if not np.isfinite(dt := median_step(dataset)):
         raise InvalidInput("every episode has one row only; a rollout is compared with a motion of several rows.")
-    dt = float(np.median(own))
-    return dt, np.concatenate([[0], np.cumsum(np.abs(pauses - dt) > JITTER * dt)])
+    return dt, np.concatenate([[0], np.cumsum(np.abs(np.diff(dataset.time) - dt) > JITTER * dt)])
 
 
 def white_noise(log: Dataset, width: int = 1, signal: str = "a") -> Float[np.ndarray, " nv"] | None:

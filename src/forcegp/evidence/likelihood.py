@@ -100,14 +100,13 @@ class Standardization:
 
 def observed(dynamics: ConstrainedDynamics, names: Iterable[str]) -> AffineMap:
     """Accelerations, then what these sensors measure, forces at contacts or of IMUs, as functions of joint forces."""
-    a = dynamics.acceleration_map()
-
-    def of_imu(name: str) -> AffineMap:
-        felt = specific_force(dynamics.state.kinematics, name)
-        return AffineMap(felt(a.offset), felt.matrix @ a.matrix)
-
-    forces = {name: name.removeprefix(OF_SENSOR) for name in names}
-    parts = [a, *(of_imu(name) if name == place else dynamics.force_at(place) for name, place in forces.items())]
+    parts = [a := dynamics.acceleration_map()]
+    for name in names:
+        if name.startswith(OF_SENSOR):
+            parts.append(dynamics.force_at(name.removeprefix(OF_SENSOR)))
+        else:
+            felt = specific_force(dynamics.state.kinematics, name)
+            parts.append(AffineMap(felt(a.offset), felt.matrix @ a.matrix))
     offset, matrix = (torch.cat([part[k] for part in parts], dim=-1 - k) for k in (0, 1))
     return AffineMap(offset, matrix)
 

@@ -99,19 +99,17 @@ class ParameterSpace:
         of_bodies, rest = x[: self.bodies.size], x[self.bodies.size :]
         return of_bodies, np.split(rest, np.cumsum([len(term.size) for term in self.terms])[:-1]) if self.terms else []
 
-    def _joined(self, of_bodies: np.ndarray, of_terms: Sequence[np.ndarray]) -> np.ndarray:
-        return np.concatenate([of_bodies, *of_terms])
-
     @property
     def start(self) -> Float[np.ndarray, " k"]:
         """Where the search begins."""
-        return self._joined(np.zeros(self.bodies.size), [term.start for term in self.terms])
+        return np.concatenate([np.zeros(self.bodies.size), *(term.start for term in self.terms)])
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Least and largest coordinates."""
         free = np.full(self.bodies.size, np.inf)
-        return self._joined(-free, [t.low for t in self.terms]), self._joined(free, [t.high for t in self.terms])
+        least, most = (term.low for term in self.terms), (term.high for term in self.terms)
+        return np.concatenate([-free, *least]), np.concatenate([free, *most])
 
     def longest_steps(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         """Most that a coordinate should change at once: infinite for those that the torque is linear in.
@@ -120,7 +118,7 @@ class ParameterSpace:
         """
         each = [np.full_like(term.size, 1.0 if term.logarithm else np.inf) for term in self.terms]
         off = np.abs(x[: self.bodies.size].reshape(-1, 10)) * (np.arange(10) > 3)
-        return self._joined(np.maximum(1.0, off).ravel(), each)
+        return np.concatenate([np.maximum(1.0, off).ravel(), *each])
 
     def prior(self, x: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " entries"], Float[np.ndarray, "entries k"]]:
         """Distance from the prior in its standard deviations, and its Jacobian."""
@@ -131,7 +129,7 @@ class ParameterSpace:
         jacobian = np.vstack([jacobian, np.eye(self.bodies.size)[weighed] / SCALES])
         values = [(own - term.center) / term.spread for own, term in zip(of_terms, self.terms, strict=True)]
         slopes = [1.0 / term.spread for term in self.terms]
-        return self._joined(distance, values), block_diag(jacobian, np.diag(np.concatenate([[], *slopes])))
+        return np.concatenate([distance, *values]), block_diag(jacobian, np.diag(np.concatenate([[], *slopes])))
 
     def moved(self, x: Float[np.ndarray, " k"], step: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         """x + step to first order, along which parameters of bodies are straight (`Bodies.moved`)."""
@@ -141,14 +139,9 @@ class ParameterSpace:
     # --- what the coordinates are
 
     @cached_property
-    def names(self) -> tuple[str, ...]:
-        """Of the numbers that people read, in the order of `numbers`."""
-        return tuple(parameter.name for parameter in self.parameters)
-
-    @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Name, unit, start and prior of each number: ten of a body, and every entry of a coefficient."""
-        stated = self._joined(np.zeros(self.bodies.size), [term.center for term in self.terms])
+        """Name, unit, start and prior of each of `numbers`: ten of a body, and every entry of a coefficient."""
+        stated = np.concatenate([np.zeros(self.bodies.size), *(term.center for term in self.terms)])
         robot, starts = self.model.robot, self.numbers(stated)
         out, place = [], 0
         for each in self.carried:
@@ -289,8 +282,7 @@ class ParameterSpace:
 
     def added_inertia(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "nv nv"]:
         """What the rotors that are estimated add to the mass matrix."""
-        total = np.zeros((self.model.robot.nv,) * 2)
-        values = self.values(x)
+        values, total = self.values(x), np.zeros((self.model.robot.nv,) * 2)
         for index, law in self._estimated.items():
             if (basis := law.inertia_basis(self.model.robot)) is not None:
                 total += np.tensordot(values[index][next(iter(law.coefficients))].cpu().numpy(), basis.cpu().numpy(), 1)

@@ -174,8 +174,13 @@ class RecordedRows:
         bearing = model.bearing(at_u)
         if more := bool((bearing != at_u).any()):
             A = model.constraint(replace(self.state, u=bearing))[0]
-        self.open = self._unseen(A.cpu().numpy(), pushed) if sensed or pushed or more else self.held
+        self.open = self.held
         """Orthonormal rows (rows, m, nv): directions of joint forces that nothing measured, of contacts and pushes."""
+        if sensed or pushed or more:
+            hidden = A[:, [contact.frame not in sensed for contact in model.contacts]].cpu().numpy()
+            axes = np.broadcast_to(np.eye(robot.nv)[list(pushed)], (len(A), len(pushed), robot.nv))
+            rows = np.concatenate([hidden, axes], axis=1)
+            self.open, _ = independent_rows(rows, np.zeros(rows.shape[:2]))
         self.force, self.in_gears, self.inertia = 0.0 * self.v, 0.0 * self.v, np.zeros((robot.nv, robot.nv))
         for force in kept_laws(space, any_contact, sensed):
             own = force.force(self.state).detach().cpu().numpy()
@@ -194,12 +199,6 @@ class RecordedRows:
         self._beyond = np.array([not space.model.laws[term.law].in_gear for term in space.terms for _ in term.size])
         """Of the coordinates of laws: which of them are at the links' side of gears."""
         self._caches: dict[float | None, dict[Any, Any]] = {None: {}, 0.0: {}, 1.0: {}}
-
-    def _unseen(self, A: Float[np.ndarray, "rows m nv"], pushed: Sequence[int]) -> Float[np.ndarray, "rows r nv"]:
-        seen = [contact.frame in self.sensed for contact in self.space.model.contacts]
-        axes = np.broadcast_to(np.eye(A.shape[-1])[list(pushed)], (len(A), len(pushed), A.shape[-1]))
-        rows = np.concatenate([A[:, np.logical_not(seen)], axes], axis=1)
-        return independent_rows(rows, np.zeros(rows.shape[:2]))[0]
 
     @cached_property
     def _sensing(self) -> tuple[Float[np.ndarray, "rows k nv"], Float[np.ndarray, "rows k"]]:

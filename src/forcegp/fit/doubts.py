@@ -33,14 +33,7 @@ def check_forces(likelihood: MarginalLikelihood) -> None:
     B, features = checked_values(unknown, dynamics)
     if not (names := unknown.latent_names(robot)):
         return
-    _refuse_constant_features(likelihood, names, features)
-    terms = [number for number, which in enumerate(unknown.slices(robot)) for _ in range(which.stop - which.start)]
-    free = dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B)
-    Doubts(_hidden(names, terms, free, likelihood.observed.matrix @ B)).warn(stacklevel=5)
-
-
-def _refuse_constant_features(likelihood: MarginalLikelihood, names: Sequence[str], features: Sequence[Tensor]) -> None:
-    labels = likelihood.model.unknown.feature_names(likelihood.model.robot)
+    labels = unknown.feature_names(robot)
     for index, (name, z) in enumerate(zip(names, features, strict=True)):
         if z.shape[-1] and bool((z.var(0, correction=0).sqrt() <= CONSTANT * (1.0 + z.mean(0).abs())).all()):
             which = [f"feature {k}" for k in range(z.shape[-1])] if labels is None else labels[index]
@@ -50,6 +43,9 @@ def _refuse_constant_features(likelihood: MarginalLikelihood, names: Sequence[st
                 f"({values}), so its function cannot be learned; give data in which it changes, or leave this "
                 "prior (or this joint) out"
             )
+    terms = [number for number, which in enumerate(unknown.slices(robot)) for _ in range(which.stop - which.start)]
+    free = dynamics.inverse_lower.mT @ (dynamics.inverse_lower @ B)
+    Doubts(_hidden(names, terms, free, likelihood.observed.matrix @ B)).warn(stacklevel=5)
 
 
 def _hidden(names: Sequence[str], terms: Sequence[int], free: Tensor, effect: Tensor) -> Iterator[Doubt]:

@@ -137,8 +137,7 @@ def numbers_beside(
 def estimates_beside(space: ParameterSpace, fit: Fit, count: int) -> Estimates:
     """The numbers at the end, whose covariance is that of Laplace's approximation: functions count as unknown."""
     white = np.concatenate([fit.jacobian[:, 0], fit.residual], axis=-1)
-    found = Estimates.of_search(
+    return Estimates.of_search(
         space.parameters, space.numbers(fit.x), space.number_slopes(fit.x), white, (), space.prior(fit.x)[1],
         evidence="accelerations, beside unknown forces", rows=count, evaluations=fit.evaluations, settled=fit.settled,
     )  # fmt: skip
-    return found

@@ -46,11 +46,11 @@ class Actuation(PerJointLaw):
 
     @override
     def bound_to(self, robot: Robot) -> "Actuation":
+        gain = self.gain if self.is_exact else self._bound("gain", robot)
         if self.matrix is None:
-            if not robot.layout.groups:
-                return self._of(robot, None, robot.joint_names)
-            matrix = torch.eye(robot.nv, dtype=torch.float64, device=robot.device)[:, robot.space.single_rows]
-            return self._of(robot, matrix, robot.single_joint_names)
+            one = torch.eye(robot.nv, dtype=torch.float64, device=robot.device)
+            matrix = one[:, robot.space.single_rows] if robot.layout.groups else None
+            return Actuation(matrix, robot.single_joint_names, self.known, gain)
         matrix = as_numbers("Actuation matrix", self.matrix, robot, f"{robot.nv} rows of numbers")
         names = tuple(self.names) or tuple(f"actuator_{k + 1}" for k in range(matrix.shape[-1] if matrix.dim() else 0))
         if matrix.dim() != 2 or len(matrix) != robot.nv or not bool(torch.isfinite(matrix).all()):
@@ -60,10 +60,7 @@ class Actuation(PerJointLaw):
             )
         if len(names) != matrix.shape[1] or len(set(names)) != len(names):
             raise InvalidInput(f"Actuation names are {names}; give {matrix.shape[1]} different ones, one per column.")
-        return self._of(robot, matrix, names)
-
-    def _of(self, robot: Robot, matrix: Tensor | None, names: tuple[str, ...]) -> "Actuation":
-        return Actuation(matrix, names, self.known, self.gain if self.is_exact else self._bound("gain", robot))
+        return Actuation(matrix, names, self.known, gain)
 
     @property
     def is_exact(self) -> bool:
@@ -202,10 +199,6 @@ class Pull(Law):
     @override
     def direction(self, state: State) -> Float[Tensor, "*batch nv 3"]:
         return state.kinematics.frame_jacobian(self.frame, self.point)[..., :3, :].mT
-
-    @override
-    def features(self, state: State) -> tuple[Tensor, ...]:
-        return (state.v,)
 
     @override
     def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:

@@ -115,24 +115,19 @@ class ExpectedFriction:
         J = ToolPoint.of_contact(dynamics, contact).jacobian[..., :3, :]
         g = (rows * (J.mT @ direction[..., None])[..., 0]).sum(-1)
         growth = 1.0 + free.sign() * self.sliding(speed) * size * g
-        _warn_of_jamming(growth, contact)
+        jammed = growth.detach() < SMALLEST_SHARE
+        # no value may decide anything while torch transforms or records the function
+        traced = torch._C._are_functorch_transforms_active() or _get_current_dispatch_mode() is not None
+        if not traced and bool(jammed.any()):
+            warnings.warn(
+                f"{JAMMING} contact {contact} in {int(jammed.sum())} of {jammed.numel()} states: "
+                "friction and normal force lift each other almost without end, and the normal force is taken as "
+                f"{1.0 / SMALLEST_SHARE:g} times that without sliding friction. Check the contact's frame, point and "
+                "surface, leave such states out, or give a smaller coefficient, expected=COEFFICIENT (0 for none).",
+                NumericalWarning,
+                stacklevel=2,
+            )
         return size * free.abs() / growth.clamp_min(SMALLEST_SHARE)
-
-
-def _warn_of_jamming(growth: Tensor, contact: int) -> None:
-    """No warning while torch transforms or records the function, where no value may decide anything."""
-    if torch._C._are_functorch_transforms_active() or _get_current_dispatch_mode() is not None:
-        return
-    jammed = growth.detach() < SMALLEST_SHARE
-    if bool(jammed.any()):
-        warnings.warn(
-            f"{JAMMING} contact {contact} in {int(jammed.sum())} of {jammed.numel()} states: "
-            "friction and normal force lift each other almost without end, and the normal force is taken as "
-            f"{1.0 / SMALLEST_SHARE:g} times that without sliding friction. Check the contact's frame, point and "
-            "surface, leave such states out, or give a smaller coefficient, expected=COEFFICIENT (0 for none).",
-            NumericalWarning,
-            stacklevel=3,
-        )
 
 
 @dataclass(frozen=True)
@@ -185,8 +180,7 @@ class ContactFriction(ExpressedKernels):
     def point_force(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch 3 C"]:
         if self.contact >= len(dynamics.contacts):
             return dynamics.H.new_zeros(*dynamics.H.shape[:-2], 3, 1)
-        tangents, sliding = self._sliding(dynamics)
-        speed = _speed(sliding)
+        tangents, sliding, speed = self._sliding(dynamics)
         direction = tangents @ (sliding / speed)[..., None]
         if not self.load:
             return -direction
@@ -200,7 +194,7 @@ class ContactFriction(ExpressedKernels):
     def features(self, dynamics: ConstrainedDynamics) -> tuple[Float[Tensor, "*batch _"], ...]:
         if self.contact >= len(dynamics.contacts):  # the force is zero whatever its features are
             return (dynamics.state.q.new_zeros(*dynamics.state.q.shape[:-1], 1),)
-        return (_speed(self._sliding(dynamics)[1]),)
+        return (self._sliding(dynamics)[2],)
 
     @override
     def scalings(self, robot: Robot) -> tuple[Scaling, ...]:
@@ -214,15 +208,12 @@ class ContactFriction(ExpressedKernels):
     def latent_units(self, robot: Robot) -> tuple[str, ...]:
         return ("" if self.load else "N",)
 
-    def _sliding(self, dynamics: ConstrainedDynamics) -> tuple[Tensor, Tensor]:
-        """Tangents (..., 3, 2) and the velocity of the contact point along them (..., 2)."""
+    def _sliding(self, dynamics: ConstrainedDynamics) -> tuple[Tensor, Tensor, Tensor]:
+        """Tangents (..., 3, 2), the velocity of the contact point along them (..., 2), and its size (..., 1)."""
         where = ToolPoint.of_contact(dynamics, self.contact)
         tangents = contact_axes(dynamics, self.contact)[..., :2]
-        return tangents, (tangents.mT @ where.velocity(dynamics.state.v)[..., :3, None])[..., 0]
-
-
-def _speed(sliding: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 1"]:
-    return (sliding.square().sum(-1, keepdim=True) + SMALLEST_SPEED**2).sqrt()
+        sliding = (tangents.mT @ where.velocity(dynamics.state.v)[..., :3, None])[..., 0]
+        return tangents, sliding, (sliding.square().sum(-1, keepdim=True) + SMALLEST_SPEED**2).sqrt()
 
 
 Table = Callable[[str], TabulatedCurve]

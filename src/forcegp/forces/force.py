@@ -197,9 +197,9 @@ class Law(Force):
         """B: joint force (Nm or N) per unit of each amplitude; None where the amplitudes are the joint forces."""
         return None
 
-    @abstractmethod
     def features(self, state: State) -> tuple[Float[Tensor, "*batch _"], ...]:
-        """z: what the amplitudes depend on."""
+        """z: what the amplitudes depend on; velocities where a subclass has nothing else."""
+        return (state.v,)
 
     @abstractmethod
     def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Float[Tensor, "*batch k"]:
@@ -269,15 +269,12 @@ class Law(Force):
     @property
     def values(self) -> dict[str, Tensor]:
         """Coefficients by name; of those that are to be estimated the start: what a prior expects, else a default."""
-        return {name: self._value(name) for name in self.coefficients}
-
-    def _value(self, name: str) -> Tensor:
-        given, coefficient = getattr(self, name), self.coefficients[name]
-        if isinstance(given, Normal):
-            given = given.mean
-        elif isinstance(given, LogNormal):
-            given = given.median
-        return torch.as_tensor(coefficient.default if given is None else given, dtype=torch.float64)
+        found = {}
+        for name, coefficient in self.coefficients.items():
+            given = getattr(self, name)
+            given = given.mean if isinstance(given, Normal) else given.median if isinstance(given, LogNormal) else given
+            found[name] = torch.as_tensor(coefficient.default if given is None else given, dtype=torch.float64)
+        return found
 
     @property
     def learned(self) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from forcegp.errors import InvalidInput, UnknownName, require_known, usable_argu
 from forcegp.forces.force import joint_unit, slides
 from forcegp.forces.kernels import checked_kernel
 from forcegp.forces.unknown import ExpressedKernels, Scaling, SharedInputs, as_names
-from forcegp.mechanics import ConstrainedDynamics, Contact, State
+from forcegp.mechanics import ConstrainedDynamics, Contact
 from forcegp.robots import Robot
 
 QUANTITIES = {"q": "position", "v": "velocity", "a": "acceleration", "u": "force"}
@@ -57,7 +57,13 @@ class JointForces(SharedInputs):
     @override
     def columns(self, dynamics: ConstrainedDynamics) -> dict[str, Callable[[], Tensor]]:
         state = dynamics.state
-        return {"q": lambda: state.robot.posture(state.q), "v": lambda: state.v, "u": lambda: _driven(state)}
+        # of actuators at all joints of one degree of freedom; at the base of a robot that has none
+        driven = joint_indices(None, state.robot) if state.robot.layout.groups else []
+        return {
+            "q": lambda: state.robot.posture(state.q),
+            "v": lambda: state.v,
+            "u": lambda: state.delivered[..., driven] if driven else state.delivered,
+        }
 
     @override
     def labels(self, robot: Robot) -> dict[str, tuple[str, ...]]:
@@ -70,12 +76,6 @@ class JointForces(SharedInputs):
     @override
     def latent_units(self, robot: Robot) -> tuple[str, ...]:
         return joint_units("u", robot.joint_names, robot)
-
-
-def _driven(state: State) -> Float[Tensor, "*batch joints"]:
-    """Forces of the actuators at all joints of one degree of freedom; at the base of a robot that has none."""
-    rows = joint_indices(None, state.robot)
-    return state.delivered[..., rows] if rows and state.robot.layout.groups else state.delivered
 
 
 @dataclass(frozen=True)

@@ -96,11 +96,6 @@ class JointLaw(PerJointLaw):
         return None if self.transmission is None else torch.as_tensor(self.transmission).mT
 
     @override
-    def features(self, state: State) -> tuple[Tensor, ...]:
-        """The velocities."""
-        return (state.v,)
-
-    @override
     def bound_to(self: AnyJointLaw, robot: Robot) -> AnyJointLaw:
         numbers = {name: self._bound(name, robot) for name in self.coefficients}
         return replace(self, transmission=bound_transmission(type(self).__name__, self.transmission, robot), **numbers)

@@ -117,24 +117,23 @@ def parse_forces(expression: str | Sequence[str]) -> tuple[Force, ...]:
             joined[-1] += f":{word}"
         else:
             joined.append(word)
-    made = [_one(word, expression) for word in joined]
-    return tuple(force for several in made for force in (several if isinstance(several, tuple) else (several,)))
+    made: list[Force] = []
+    for word in joined:
+        unknown = word.startswith(UNKNOWN)
+        name, *options = split_outside(word.removeprefix(UNKNOWN), ":")
+        name = name.strip()
+        if name not in (*SHORT, *FORCES) or is_unknown(name) != unknown:
+            _refuse(name, unknown, expression)
+        kind, given = SHORT.get(name, (name, {}))
+        several = called(f"force {name!r}", force_class(kind), options, given)
+        made += several if isinstance(several, tuple) else (several,)
+    return tuple(made)
 
 
 def is_unknown(name: str) -> bool:
     """Whether a name without "gp:" is that of an unknown force."""
     kind = force_class(SHORT.get(name, (name, {}))[0])
     return not (isinstance(kind, type) and issubclass(kind, Law))
-
-
-def _one(text: str, expression: Any) -> Any:
-    unknown = text.startswith(UNKNOWN)
-    name, *options = split_outside(text.removeprefix(UNKNOWN), ":")
-    name = name.strip()
-    if name not in (*SHORT, *FORCES) or is_unknown(name) != unknown:
-        _refuse(name, unknown, expression)
-    kind, given = SHORT.get(name, (name, {}))
-    return called(f"force {name!r}", force_class(kind), options, given)
 
 
 def called(what: str, make: Callable[..., Any], options: Sequence[str], fixed: Mapping[str, Any] | None = None) -> Any:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -20,10 +20,6 @@ from forcegp.robots.urdf_file import replace_inertial
 
 class WholeLaw(Law):
     """A law that is no sum of amplitudes: `force_at` is its force, none unless a subclass has one."""
-
-    @override
-    def features(self, state: State) -> tuple[Tensor, ...]:
-        return (state.v,)
 
     @override
     def amplitude(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
@@ -90,6 +86,7 @@ class Payload(WholeLaw):
     mass: float | None = None
     center_of_mass: Sequence[float] | None = (0.0, 0.0, 0.0)
     inertia: Sequence[Sequence[float]] | None = None
+    prior: ClassVar[Body] = Body(WEAK)
 
     @usable_arguments("Payload")
     def __post_init__(self) -> None:
@@ -128,11 +125,6 @@ class Payload(WholeLaw):
         if self.link is not None and robot.frame(self.link)[0] < 0:
             raise InvalidInput(f"link {self.link!r} does not move, so nothing on it shows; give a moving one.")
         return self
-
-    @property
-    def prior(self) -> Body:
-        """Of a payload that is to be estimated: hardly any."""
-        return Body(WEAK)
 
     def usual(self, offset: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
         """Pseudo-inertia of a usual payload, of its mass if that is given, on a link with this pose in its body."""

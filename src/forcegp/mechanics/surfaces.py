@@ -97,7 +97,9 @@ class Sphere(Surface):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "center", _vector("Sphere center", self.center))
-        object.__setattr__(self, "radius", positive("Sphere radius", self.radius))
+        object.__setattr__(self, "radius", _number("Sphere radius", self.radius))
+        if self.radius <= 0.0:
+            raise InvalidInput(f"Sphere radius is {self.radius}; it must be positive (m).")
 
     @override
     def value(self, p: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -185,14 +187,6 @@ def _number(name: str, value: object) -> float:
         raise InvalidInput(f"{name} is {value!r}; give a number.") from None
     if not math.isfinite(number):
         raise InvalidInput(f"{name} is {value!r}; give a finite number.")
-    return number
-
-
-def positive(name: str, value: object) -> float:
-    """A finite number above 0, in m."""
-    number = _number(name, value)
-    if number <= 0.0:
-        raise InvalidInput(f"{name} is {number}; it must be positive (m).")
     return number
 
 

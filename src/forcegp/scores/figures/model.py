@@ -144,8 +144,12 @@ def _draw_curve(axes: Axes, posterior: Posterior, panel: CurvePanel, dataset: Da
     ticks = {"markersize": 5, "color": style.TRUTH, "alpha": 0.5, "transform": axes.get_xaxis_transform()}
     axes.plot(visited, np.full(len(visited), 0.025), "|", label="training velocities", **ticks)
     levels = [(mean - spread)[inside], (mean + spread)[inside]]
-    if dataset is not None and (truth := _truth(posterior, dataset, panel)) is not None:
-        true_at, force = (values[(truth[0] >= at[0]) & (truth[0] <= at[-1])] for values in truth)
+    key = f"Q_U.{panel.component}"
+    if dataset is not None and panel.joint is not None and key in dataset.truth and not posterior.carries_known_forces:
+        rows = dataset.rows(evenly(dataset, TRUE_POINTS))
+        true_at = rows.v[:, panel.joint]
+        truth = true_at, law_forces(dataset.model, panel.joint, true_at) - rows.truth[key][:, panel.joint]
+        true_at, force = (values[(true_at >= at[0]) & (true_at <= at[-1])] for values in truth)
         axes.plot(true_at, force, "o", label="true", color="#A8A8A8", markersize=4.0, markeredgewidth=0, zorder=1.8)
         levels.append(force)
     values = np.concatenate(levels)
@@ -154,16 +158,6 @@ def _draw_curve(axes: Axes, posterior: Posterior, panel: CurvePanel, dataset: Da
     axes.set_xlim(at[0], at[-1])
     axes.locator_params(axis="x", nbins=6)
     return feature, unit
-
-
-def _truth(posterior: Posterior, dataset: Dataset, panel: CurvePanel) -> tuple[np.ndarray, np.ndarray] | None:
-    """Velocity and true friction of a joint, with its laws, at rows of the Dataset; None where unknown."""
-    key = f"Q_U.{panel.component}"
-    if posterior.carries_known_forces or panel.joint is None or key not in dataset.truth:
-        return None
-    rows, model = dataset.rows(evenly(dataset, TRUE_POINTS)), dataset.model
-    at = rows.v[:, panel.joint]
-    return at, law_forces(model, panel.joint, at) - rows.truth[key][:, panel.joint]
 
 
 def model_pictures(posterior: Posterior, dataset: Dataset) -> tuple[list[style.Picture], list[str]]:
