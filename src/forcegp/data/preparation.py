@@ -30,7 +30,7 @@ from forcegp.summary import plain
 
 FEW = 2_000  # rows of a whole log
 SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
-EXPLAINED, SLOW = 1.2, 0.25
+EXPLAINED, SLOW = 1.1, 0.25
 """Times the noise of positions by which a sensor of a base may differ from them; of the cut-off, below which they hold.
 """
 BEYOND_BASE = 1.5
@@ -194,13 +194,17 @@ def _with_sensors_of_base(derived: Dataset, measured: Dataset, raw: Dataset, cut
     if not groups or max(np.bincount(np.unique(raw.episode, return_inverse=True)[1])) < FEWEST_ROWS:
         return derived
     noise, by_v = motion_spectrum(raw, "q").acceleration_noise(LowPass(cutoff)), differentiated(measured, "v").a
-    least = np.zeros(raw.nv)
-    for part in (slice(group.row + k, group.row + k + 3) for group in groups for k in (0, 3)):
-        if np.isfinite(noise[part]).any():  # fast motion hides that of an axis
-            least[part] = EXPLAINED * np.nanmedian(noise[part])
+    parts = [slice(group.row + k, group.row + k + 3) for group in groups for k in (0, 3)]
 
     def quieter(a: np.ndarray) -> np.ndarray:
-        return np.sqrt(np.square(a - derived.a).mean(0)) < least
+        """Entries of a base in whose linear or angular part this differs from positions by their noise alone."""
+        found = np.zeros(raw.nv, dtype=bool)
+        for part in parts:
+            known = np.isfinite(noise[part])  # fast motion hides that of an axis
+            off = float(np.square(a - derived.a)[:, part].mean())
+            if known.any() and np.ptp(a[:, part], axis=0).all():
+                found[part] = off < np.square(EXPLAINED * noise[part][known]).mean()
+        return found
 
     def raised(values: np.ndarray, slow: np.ndarray) -> np.ndarray:
         """What filtered values have above the slow part."""
