@@ -76,7 +76,8 @@ def test_auto_goes_from_a_flight_to_a_page(folder, forcegp):
     assert "a base that moves and 0 joints" in answer
     assert "u is taken to be on time: a delay is found" in answer
     assert "rotors follow within" in answer
-    assert answer.count("thrust coefficients are right") == 2  # of the whole mass and the payload
+    assert answer.count("thrust coefficients are right") == 1  # of the whole mass: there is no payload
+    assert "payload: none" in answer
     assert "dry friction" not in answer
     assert "forcegp excite" not in answer
     masses = [each["value"] for name, each in content["identified"]["parameters"].items() if name.endswith(".mass")]
