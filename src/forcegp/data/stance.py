@@ -33,8 +33,9 @@ CERTAIN, APART = 20.0, 1.5
 """How much likelier one class of forces is than the other; distance of their means over the sum of their widths."""
 FALLS, SURE = 0.2, 0.1
 """Of the weight: nothing bears this while a robot falls, something where it stands; noise up to which it decides."""
-LIFTED = 0.004
-"""m above or below the place where a foot stood last or stands next, from which on it does not drag, or noises."""
+LIFTED, USUAL = 0.004, 0.9
+"""m above or below the place where a foot stood last or stands next, from which on it does not drag, beside noise;
+quantile of what the rows ask of feet that are lifted, above which one that is not may bear."""
 FEW = 10
 MANY_OPEN = 0.25  # share of open rows that more than changes of stance leave
 
@@ -134,9 +135,13 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
     bears, unloaded = (force >= bearing[1], force <= bearing[0]) if np.isfinite(bearing).all() else (rests, moves)
     flags = np.full(force.shape, np.nan)
     flags[~moves & bears], flags[unloaded] = 1.0, 0.0
+    low = np.zeros(force.shape, dtype=bool)
     for rows in episodes:
-        own = _between(flags[rows], dataset.time[rows])
-        flags[rows] = np.where((own == 0.0) & _as_low(own, height[rows], drags), np.nan, own)
+        flags[rows] = _between(flags[rows], dataset.time[rows])
+        low[rows] = _as_low(flags[rows], height[rows], drags)
+    for own, as_low, needed in zip(flags.T, low.T, force.T, strict=True):
+        lifted = needed[(own == 0.0) & ~as_low]  # these bear nothing, whatever the rows ask of them
+        own[(own == 0.0) & as_low & (needed > (np.quantile(lifted, USUAL) if len(lifted) else 0.0))] = np.nan
     flags[moves & bears] = np.nan
     robot, whole, weight = model.robot, np.sum(asked, axis=0), 0.0
     if robot.base == "floating" and all(contact.switch for contact in model.contacts):  # which alone hold the robot up
