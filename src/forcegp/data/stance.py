@@ -33,7 +33,7 @@ CERTAIN, APART = 20.0, 1.5
 """How much likelier one class of forces is than the other; distance of their means over the sum of their widths."""
 FALLS, SURE = 0.2, 0.1
 """Of the weight: nothing bears this while a robot falls, something where it stands; noise up to which it decides."""
-LIFTED, USUAL = 0.004, 0.9
+LIFTED, USUAL = 0.004, 0.75
 """m above or below the place where a foot stood last or stands next, from which on it does not drag, beside noise;
 quantile of what the rows ask of feet that are lifted, above which one that is not may bear."""
 FEW = 10
