@@ -13,6 +13,7 @@ from forcegp.data.delay import estimate_delay, torques_of_joints
 from forcegp.data.filters import (
     PASSED,
     LowPass,
+    Signal,
     differentiated,
     episodes_in_order,
     low_pass,
@@ -31,8 +32,7 @@ from forcegp.summary import plain
 FEW = 2_000  # rows of a whole log
 SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
 EXPLAINED, SLOW = 1.1, 0.25
-"""Times the noise of positions by which a sensor of a base may differ from them; of the cut-off, below which they hold.
-"""
+"""Times their noise by which a sensor of a base may differ from positions; of the cut-off, below which these hold."""
 BEYOND_BASE = 1.5
 """The cut-off of a robot on contacts is at most so many times that of its base, whose accelerations are noise there."""
 
@@ -174,11 +174,11 @@ def _filtered(chosen: Preparation, dataset: Dataset) -> Dataset:
             # A filter lets joints creep while they rest, by more than friction remembers. In motion without rests
             # filtered positions fit filtered torques better: raw ones made a rotor 10 % too small.
             dataset = with_strokes(dataset)
-        low = low_pass(dataset, float(chosen.cutoff))
-        if chosen.differentiate == "v":
-            dataset = differentiated(low, "v")
-        else:
-            dataset = _with_sensors_of_base(differentiated(low, "q"), low, dataset, float(chosen.cutoff))
+        sensors = chosen.differentiate == "q" and bool(dataset.model.robot.space.groups)
+        signals: tuple[Signal, ...] = ("q", "u") if chosen.differentiate == "q" else ("q", "v", "u")
+        low = low_pass(dataset, float(chosen.cutoff), signals=("q", "v", "u", "a") if sensors else signals)
+        derived = differentiated(low, chosen.differentiate)
+        dataset = _with_sensors_of_base(derived, low, dataset, float(chosen.cutoff)) if sensors else derived
     if not chosen.delay and not chosen.lag:
         return dataset
     pushing = [*thruster_columns(dataset.model)]  # joints beside them do not follow so
@@ -191,7 +191,7 @@ def _with_sensors_of_base(derived: Dataset, measured: Dataset, raw: Dataset, cut
     Below `SLOW` of the cut-off all are those of positions, which have neither bias nor tilt.
     """
     groups = raw.model.robot.space.groups
-    if not groups or max(np.bincount(np.unique(raw.episode, return_inverse=True)[1])) < FEWEST_ROWS:
+    if max(np.bincount(np.unique(raw.episode, return_inverse=True)[1])) < FEWEST_ROWS:
         return derived
     noise, by_v = motion_spectrum(raw, "q").acceleration_noise(LowPass(cutoff)), differentiated(measured, "v").a
     parts = [slice(group.row + k, group.row + k + 3) for group in groups for k in (0, 3)]

@@ -106,8 +106,9 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
     What clearly moves is free if it does not bear; what rests stands if it bears, and is free if it bears nothing. Up
     to 0.1 s in between follow decided rows on both sides that agree; all else is open (NaN), with 30 ms about it and
     about a change; so are rows in which what stands contradicts the weight that is borne, or in which what is free has
-    the height, to 4 mm, at which it stood last or stands next: a foot that drags bears a little. Rest is slower than
-    1 cm/s or 2.3 times the noise of v. Raises ContactError without contacts that have a switch.
+    the height, to 4 mm, at which it stood last or stands next, and is asked for more than three quarters of the rows
+    of lifted feet: one that drags bears a little. Rest is slower than 1 cm/s or 2.3 times the noise of v. Raises
+    ContactError without contacts that have a switch.
     """
     model = dataset.model if model is None else model
     if not (names := model.switches):
@@ -229,6 +230,12 @@ def _bearing(force: np.ndarray, moves: np.ndarray, quiet: bool = True) -> Float[
     return usual if few else np.array([min(limits[0], np.quantile(force[moves], FREE)), limits[1]])
 
 
+def _beside(places: Int[np.ndarray, " k"], rows: Int[np.ndarray, " rows"]) -> tuple[np.ndarray, np.ndarray]:
+    """Of these places the last up to each row and the first from it on; at the ends the nearest."""
+    before = places[np.maximum(np.searchsorted(places, rows, side="right") - 1, 0)]
+    return before, places[np.minimum(np.searchsorted(places, rows), len(places) - 1)]
+
+
 def _as_low(
     flags: Float[np.ndarray, "rows switches"], height: Float[np.ndarray, "rows switches"], least: np.ndarray
 ) -> Bool[np.ndarray, "rows switches"]:
@@ -237,8 +244,7 @@ def _as_low(
     for own, z, out, lift in zip(flags.T, height.T, low.T, least, strict=True):
         stood = np.flatnonzero(own == 1.0)
         if len(stood):
-            after = stood[np.minimum(np.searchsorted(stood, rows), len(stood) - 1)]
-            before = stood[np.maximum(np.searchsorted(stood, rows, side="right") - 1, 0)]
+            before, after = _beside(stood, rows)
             out[:] = np.minimum(np.abs(z - z[before]), np.abs(z - z[after])) < lift
     return low
 
@@ -249,8 +255,7 @@ def _between(flags: np.ndarray, time: Float[np.ndarray, " rows"]) -> np.ndarray:
     for own, out in zip(flags.T, filled.T, strict=True):
         decided = np.flatnonzero(np.isfinite(own))
         if len(decided):
-            after = decided[np.minimum(np.searchsorted(decided, rows), len(decided) - 1)]
-            before = decided[np.maximum(np.searchsorted(decided, rows, side="right") - 1, 0)]
+            before, after = _beside(decided, rows)
             same = (own[before] == own[after]) & (time[after] - time[before] <= BETWEEN)
             out[same] = own[before[same]]
         unsure = np.isnan(out)
