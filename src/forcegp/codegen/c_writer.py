@@ -72,12 +72,19 @@ class Program:
 
 
 def write_function(
-    name: str, graph: Graph, outputs: Sequence[int], lanes: int, tables: Sequence[str] = (), most: int = STATEMENTS
+    name: str,
+    graph: Graph,
+    outputs: Sequence[int],
+    lanes: int,
+    tables: Sequence[str] = (),
+    most: int = STATEMENTS,
+    numbers: dict[str, int] | None = None,
 ) -> str:
     """`static void NAME(const double *const *t, long live, const real *x, real *y)`: y from x in `live` lanes.
 
     `t` are the tables of the C functions that the graph calls, in the order of their names in `tables`. A function
-    that it is cut into has at `most` so many statements.
+    that it is cut into has at `most` so many statements. Constants are in the text, or in the table `t[NUMBERS]`,
+    where `numbers` notes the place of each: the text is that of all graphs of this form then.
     """
     wanted, made = set(outputs), graph.nodes
     needed = [node for node in graph.needed(outputs) if node in wanted or made[node][0] not in LEAVES]
@@ -97,13 +104,18 @@ def write_function(
         def operand(node: int, here: set[int] = here) -> str:
             operation, *rest = graph.nodes[node]
             if operation == "constant":
-                return f"({_number(rest[0])})"
+                written = _number(rest[0])
+                if numbers is None or "/" in written:  # neither NaN nor infinity is a number
+                    return f"({written})"
+                return f"(n[{numbers.setdefault(written, len(numbers))}])"
             if operation == "input":
                 return f"x[{rest[0]}]"
             return f"x{node}" if node in here else f"w[{places[node][1]}]"
 
         text.append(f"static APART void {name}_{number}({arguments}, real *w) {{")
         text.append("  (void)t; (void)live; (void)x; (void)y; (void)w;")
+        if numbers is not None:
+            text.append("  const double *restrict const n = t[NUMBERS]; (void)n;")
         for node in nodes:
             operation, *rest = graph.nodes[node]
             if operation == "call":

@@ -191,7 +191,7 @@ class RowFunction:
     def __init__(
         self, library: ctypes.CDLL, inputs: int, outputs: Sequence[int], tables: Sequence[Tensor] = ()
     ) -> None:
-        self.library, self.inputs, self.outputs, self._held = library, inputs, tuple(outputs), tuple(tables)
+        self.library, self.inputs, self.outputs, self.tables = library, inputs, tuple(outputs), tuple(tables)
         self._tables = (ctypes.c_void_p * max(len(tables), 1))(*(x.data_ptr() for x in tables))
         self._evaluate = library.evaluate
         vectors = [ctypes.c_void_p, ctypes.c_long] * (inputs + len(outputs))

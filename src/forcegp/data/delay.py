@@ -24,6 +24,8 @@ MOST_ROWS = 5_000
 SIGNIFICANT = 3.0  # standard deviations by which a delay must differ from zero to be used
 FRICTION_WIDTHS = 0.01, 0.03, 0.1, 0.3, 1.0  # of dry friction, relative to the root mean square velocity
 STIFFNESSES = 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0  # of its memory, over the reciprocal deviation of the position
+MEMORIES = 2 * len(STIFFNESSES)
+"""The last of `torque_columns`, where strokes are known: those of memory."""
 REMEMBERS = 0.3
 """Square sum with friction that remembers, over that without, below which the delay is that beside memory.
 
@@ -116,8 +118,7 @@ def estimate_delay(dataset: Dataset, cutoff: float | None = None) -> Delay:
 
 def _told_apart(dataset: Dataset, largest: float, cutoff: float | None) -> Delay:
     """The delay under friction of velocity if it shows beside friction that remembers, too, else that beside memory."""
-    logs = replace(dataset, strokes=None), with_strokes(dataset)
-    (alone, left), (beside, least) = (_estimated(log, largest, cutoff) for log in logs)
+    (alone, left), (beside, least) = _estimated(with_strokes(dataset), largest, cutoff)
     if least < REMEMBERS * left:
         return beside
     used, width = alone.significant, 4.0 * beside.common_std
@@ -125,8 +126,8 @@ def _told_apart(dataset: Dataset, largest: float, cutoff: float | None) -> Delay
     return alone if not used or (not apart and (beside.significant or width <= APART)) else beside
 
 
-def _estimated(dataset: Dataset, largest: float, cutoff: float | None) -> tuple[Delay, float]:
-    """The delay, and the geometric mean over joints of what it leaves of the square sums."""
+def _estimated(dataset: Dataset, largest: float, cutoff: float | None) -> list[tuple[Delay, float]]:
+    """The delay, and the geometric mean over joints of what it leaves of the square sums; then both beside memory."""
     thin, shifts = max(1, -(-len(dataset) // MOST_ROWS)), np.linspace(-largest, largest, 2 * STEPS + 1)
     episodes = []
     for number, part, _ in episodes_in_order(dataset):
@@ -140,16 +141,22 @@ def _estimated(dataset: Dataset, largest: float, cutoff: float | None) -> tuple[
             f"least {10 * BLOCKS}. Record longer, or give the delay in s."
         )
     features = torque_columns(dataset, compared, cutoff)
-    profiles = np.full((dataset.nv, BLOCKS + 1, len(shifts)), np.nan)  # of all rows, and of all but one block
+    profiles = np.full((2, dataset.nv, BLOCKS + 1, len(shifts)), np.nan)  # of all rows, and of all but one block
     for joint in range(dataset.nv):
         splines = [(CubicSpline(dataset.time[own], dataset.u[own, joint]), dataset.time[at]) for own, at in episodes]
         shifted = np.concatenate([spline(at + shifts[:, None]) for spline, at in splines], axis=1)
         spread = np.square(shifted - shifted.mean(axis=1, keepdims=True)).sum(axis=1)
         if spread.min() > 1e-12 * np.square(shifted).sum(axis=1).max():  # else it has no delay
-            size = np.linalg.norm(features[joint], axis=0)
-            used = size > 1e-9 * size.max()
-            basis, values, _ = np.linalg.svd(features[joint][:, used] / size[used], full_matrices=False)
-            profiles[joint] = least_squares(basis[:, values > 1e-6 * values[0]], shifted.T)
+            for own, columns in zip(profiles, (features[joint][:, :-MEMORIES], features[joint]), strict=True):
+                size = np.linalg.norm(columns, axis=0)
+                used = size > 1e-9 * size.max()
+                basis, values, _ = np.linalg.svd(columns[:, used] / size[used], full_matrices=False)
+                own[joint] = least_squares(basis[:, values > 1e-6 * values[0]], shifted.T)
+    return [_from_profiles(each, shifts) for each in profiles]
+
+
+def _from_profiles(profiles: Float[np.ndarray, "nv parts shifts"], shifts: np.ndarray) -> tuple[Delay, float]:
+    """The best shift of all rows, and how much it differs without each block."""
     seconds = np.array([[lowest(profile, shifts) for profile in own] for own in profiles])
     # Noise of every joint is unknown: the likelihood of one delay is the product of powers of the residuals.
     finite = profiles[np.isfinite(profiles[:, 0, 0])]

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import Dataset
-from forcegp.data.delay import estimate_delay, torque_columns
+from forcegp.data.delay import ROWS_PER_PARAMETER, estimate_delay, torque_columns
 from forcegp.data.filters import LowPass, Signal, differentiated, episodes_in_order, low_pass, shifted, uniform_step
 from forcegp.data.strokes import with_strokes
 from forcegp.errors import DatasetError
@@ -195,7 +195,11 @@ def _judged(dataset: Dataset, cutoff: float, source: Literal["q", "v"]) -> tuple
     away, times = SETTLED / tried[0] + abs(delay), [rows.time for _, rows, _ in episodes_in_order(log)]
     inner = np.concatenate([(time >= time[0] + away) & (time <= time[-1] - away) for time in times])
     sides = [np.concatenate(np.array_split(np.arange(int(inner.sum())), FOLDS)[first::2]) for first in (0, 1)]
-    sharp = torque_columns(behind(tried[-1]))
+    taught = [np.flatnonzero(inner)[side[::4]] for side in sides]
+    chosen, sharp = np.union1d(*taught), torque_columns(behind(tried[-1]))
+    if len(chosen) <= ROWS_PER_PARAMETER * 10 * nv:  # their columns would be others than those of all rows
+        chosen = np.arange(len(log))
+    folds = [(np.isin(chosen, own), other) for own, other in zip(taught, sides[::-1], strict=True)]
 
     def judged(values: Float[np.ndarray, "rows columns"]) -> np.ndarray:
         own = [log.episode == number for number in log.episodes]
@@ -205,11 +209,11 @@ def _judged(dataset: Dataset, cutoff: float, source: Literal["q", "v"]) -> tuple
     seen = [judged(each) for each in sharp]
     for k, frequency in enumerate(tried):
         smooth = behind(frequency)
-        for joint, each in enumerate(torque_columns(smooth)):
+        for joint, each in enumerate(torque_columns(smooth, chosen)):
             size = np.linalg.norm(each, axis=0) + 1e-300
-            learned, u, left = each[inner] / size, smooth.u[inner, joint], 0.0
-            for one, other in (sides, sides[::-1]):
-                theta = np.linalg.lstsq(learned[one][::4], u[one][::4], rcond=1e-2)[0] / size
+            learned, u, left = each / size, smooth.u[chosen, joint], 0.0
+            for one, other in folds:
+                theta = np.linalg.lstsq(learned[one], u[one], rcond=1e-2)[0] / size
                 left += float(np.square(measured[other, joint] - seen[joint][other] @ theta).sum())
             shares[k, joint] = left / max(float(np.square(measured[:, joint]).sum()), 1e-300)
     mean = np.exp(np.log(np.maximum(shares[:, log.u.any(axis=0)], 1e-12)).mean(axis=1))

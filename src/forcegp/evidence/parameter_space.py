@@ -243,7 +243,7 @@ class ParameterSpace:
         for index, law in self._estimated.items():
             terms = [(own, term) for own, term in zip(of_terms, self.terms, strict=True) if term.law == index]
             if (basis := law.inertia_basis(self.model.robot)) is not None:
-                moved = np.einsum("pij,nj->nip", basis.cpu().numpy(), a)
+                moved = np.tensordot(a, basis.cpu().numpy(), (1, 2)).swapaxes(1, 2)
                 total += moved @ values[index][next(iter(law.coefficients))].cpu().numpy()
                 derivatives = [moved[:, :, list(term.joints or ())] for _, term in terms]
             else:

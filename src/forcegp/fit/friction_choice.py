@@ -158,6 +158,15 @@ def _folds(log: Dataset) -> np.ndarray:
     return out
 
 
+def _bordered(A: np.ndarray, across: np.ndarray, inner: np.ndarray) -> Float[np.ndarray, "k n n"]:
+    """The symmetric matrices [A, across; across^T, inner]."""
+    n = A.shape[-1]
+    out = np.empty((len(A), n + inner.shape[-1], n + inner.shape[-1]))
+    out[:, :n, :n], out[:, :n, n:], out[:, n:, n:] = A, across, inner
+    out[:, n:, :n] = across.swapaxes(1, 2)
+    return out
+
+
 Sums = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Of a joint under one sign, by stretch: its columns times those of bodies, times themselves, and times the torque."""
 
@@ -279,36 +288,41 @@ class _Regression:
         return best, self._residuals(j, parts, best, True)
 
     def _residuals(self, j: int, parts: tuple[str, ...], sign: tuple[float, int], held_out: bool) -> np.ndarray:
-        """Squared residuals in every stretch, by numbers from all rows or from the other stretches.
+        """Squared residuals in every stretch, by numbers from the other stretches; or their sum, by numbers from all.
 
         Those of the joint, or of all joints where the noise of accelerations makes their forces resemble each other.
         """
-        (A, b, others), (across, inner, right) = self.beside, self._open(j, parts, sign)
+
+        def summed(sums: np.ndarray) -> np.ndarray:
+            return sums if held_out else sums.sum(0, keepdims=True)
+
+        (A, b), others = map(summed, self.beside[:2]), self.beside[2]
+        across, inner, right = map(summed, self._open(j, parts, sign))
         if sign[0] not in self.across:
             nothing = np.zeros((self.count, others.shape[-1], len(SIGNED)))
             self.across[sign[0]] = self._by(others, self._columns(j, sign[0])) if self.coupled else nothing
-        across = np.concatenate([across, self.across[sign[0]][..., self._places(parts, sign[1])]], axis=1)
-        A = np.block([[A, across], [across.swapaxes(1, 2), inner]])
+        beside = summed(self.across[sign[0]][..., self._places(parts, sign[1])])
+        A = _bordered(A, np.concatenate([across, beside], axis=1), inner)
         b, n = np.concatenate([b, right], axis=1), b.shape[1]
-        own, own_A, own_b, squares = slice(None), A, b, self.squares[:, 0]
+        own, own_A, own_b, squares = slice(None), A, b, summed(self.squares[:, 0])
         if not self.coupled:
             first = self.inner.shape[-1]
-            own, across, squares = np.r_[0:first, n : b.shape[1]], across[:, :first], self.squares[:, j]
-            own_A = np.block([[self.inner[:, j], across], [across.swapaxes(1, 2), inner]])
-            own_b = np.concatenate([self.target[:, j], right], axis=1)
+            own, squares = np.r_[0:first, n : b.shape[1]], summed(self.squares[:, j])
+            own_A = _bordered(summed(self.inner[:, j]), across, inner)
+            own_b = np.concatenate([summed(self.target[:, j]), right], axis=1)
         whole, given = A.sum(0), b.sum(0)
         scale = np.sqrt(whole.diagonal().clip(1e-300))
-        out, x = np.zeros(self.count), np.zeros(len(whole))
-        for k in range(self.count):
-            if k == 0 or held_out:
-                without = (A[k], b[k]) if held_out else (0.0, 0.0)
-                normal = (whole - without[0]) / np.outer(scale, scale)
-                x = np.linalg.solve(normal + RIDGE * np.eye(len(x)), (given - without[1]) / scale) / scale
-                loads = "factor" not in parts or 0.0 <= x[n + 2] <= HIGHEST
-                slows = "root" not in parts or x[n + 1] + x[n + 2 + ("factor" in parts)] * self.root[j] >= 0.0
-                falls = "breakaway" not in parts or 0.0 <= x[-1] <= x[n + 1]  # by half at most
-                if not (loads and slows and falls):
-                    return np.full(self.count, np.inf)
+        out = np.zeros(len(A))
+        for k in range(len(A)):
+            without = (A[k], b[k]) if held_out else (0.0, 0.0)
+            normal = (whole - without[0]) / np.outer(scale, scale)
+            normal[np.diag_indices_from(normal)] += RIDGE
+            x = np.linalg.solve(normal, (given - without[1]) / scale) / scale
+            loads = "factor" not in parts or 0.0 <= x[n + 2] <= HIGHEST
+            slows = "root" not in parts or x[n + 1] + x[n + 2 + ("factor" in parts)] * self.root[j] >= 0.0
+            falls = "breakaway" not in parts or 0.0 <= x[-1] <= x[n + 1]  # by half at most
+            if not (loads and slows and falls):
+                return np.full(len(out), np.inf)
             out[k] = squares[k] - 2.0 * x[own] @ own_b[k] + x[own] @ own_A[k] @ x[own]
         return out
 

@@ -10,6 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+HIDDEN = 40.0
+"""Exponent from which on nothing is left of what was before: exp(-40) is less than rounding."""
+
 
 def after_step(
     z: Float[Tensor, "*batch nv"],
@@ -26,8 +29,13 @@ def after_strokes(
     sigma: Float[Tensor, "*#batch nv"] | Float[Tensor, ""],
     start: float = 0.0,
 ) -> Float[Tensor, "*batch nv"]:
-    """The state after these displacements (rad or m), the last one first, from `start` on; smooth in sigma."""
-    z = torch.full_like(strokes[..., 0], start)
-    for step in strokes.flip(-1).unbind(-1):
-        z = after_step(z, step, sigma)
-    return z
+    """The state after these displacements (rad or m), the last one first, from `start` on; smooth in sigma.
+
+    `after_step` of one after the other: each leaves its sign times by how much the later ones fall short of hiding it.
+    """
+    reach = torch.as_tensor(sigma)[..., None] * strokes.abs().cumsum(-1)
+    least = reach.detach().flatten(0, -2)
+    seen = int((least.amin(0) < HIDDEN).sum()) + 1 if len(least) else 1
+    decay = torch.exp(-reach[..., :seen])
+    later = torch.cat((torch.ones_like(decay[..., :1]), decay[..., :-1]), dim=-1)
+    return (strokes[..., :seen].sign() * (later - decay)).sum(-1) + start * decay[..., -1]

@@ -170,8 +170,6 @@ def one_input_form(
     constants: dict[tuple[int, ...], Tensor] = {}
     sides, rates, starts, polynomials = [], [], [], [np.zeros((len(knots) + 1, coefficients.shape[1], 0))]
     for number, term in enumerate(terms):
-        if not drawn and not term.factors and not bool(term.columns(centers[:, None]).any()):
-            continue  # nothing at any centre, as of what lies beyond them
         weights, envelope, root = coefficients * float(term.scale), [], widening * math.sqrt(float(term.scale))
         for feature in term.features:
             amplitude, curve = _curve(feature, centers)

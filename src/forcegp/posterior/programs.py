@@ -257,10 +257,11 @@ class Programs:
             found.append([made.apply("add", made.dot(h, dr), made.dot(g, change)) for h, g in zip(H, G, strict=True)])
         return made, {"a": there(a), "jacobian": [node for row in zip(*found, strict=True) for node in row]}
 
-    def c_source(self, kind: str, lanes: int, entry: str = "") -> str:
+    def c_source(self, kind: str, lanes: int, entry: str = "", numbers: dict[str, int] | None = None) -> str:
         """The C text of a program, or of a loop over it by an integrator's name, with the function `evaluate`.
 
-        `entry` is another text that calls `program(t, live, x, y)` instead.
+        `entry` is another text that calls `program(t, live, x, y)` instead. `numbers` as for `write_function`, in the
+        last table.
         """
         integrator = kind if kind in steps_of(self.space) else ""
         if integrator:
@@ -268,16 +269,17 @@ class Programs:
         program, slopes = self.program(kind), kind in WITH_SLOPES
         names = [part.name + ("_slopes" if slopes else "") for part in self.sums]
         text = [head(lanes), *(part.c_source(lanes, slopes) for part in self.sums)]
+        text.append(f"#define NUMBERS {len(self.sums) * (1 + (kind == 'covariance'))}")
         finish = None
         if kind == "covariance":
             text += [*(part.roots_source(lanes, self.rank) for part in self.sums), self.covariance_source()]
             finish = {"covariance": ("covariance", self.sizes[1] ** 2)}
-        text.append(write_function("program", program.graph, program.nodes, lanes, names))
+        text.append(write_function("program", program.graph, program.nodes, lanes, names, numbers=numbers))
         if integrator:
             words: dict[str, object] = dict(zip(("POSITIONS", "JOINTS", "GIVEN"), self.sizes, strict=True))
             words |= {"OUTPUTS": len(program.nodes), "LIMIT": SPEED_LIMIT}
             words["STEP"] = self.step_source(integrator, "program")
-            memory = self.memory_source(lanes)
+            memory = self.memory_source(lanes, numbers)
             words |= {"MEMORY": len(self.physics.model.memory.names), "COLUMN": self.physics.model.memory_column}
             words["REMEMBER"] = "remember(t, live, w, z);" if memory else ""
             text += [*self.motion_source(lanes), *memory, ROWS, filled(c_text(__name__, "rollout_loop.c"), words)]
@@ -314,12 +316,12 @@ class Programs:
         graph, (z,) = trace(after, given)
         return graph, z.tolist(), [len(each) for each in given]
 
-    def memory_source(self, lanes: int) -> list[str]:
+    def memory_source(self, lanes: int, numbers: dict[str, int] | None = None) -> list[str]:
         """The C function `remember`, where laws do."""
         if self.remembered is None:
             return []
         graph, nodes, _ = self.remembered
-        return [write_function("remember", graph, nodes, lanes)]
+        return [write_function("remember", graph, nodes, lanes, numbers=numbers)]
 
     def covariance_source(self, name: str = "covariance", rows: int = 0) -> str:
         """The C function that makes the covariance of so many outputs of its program, by default the acceleration's."""
@@ -351,9 +353,11 @@ class Programs:
             "forces": [nv, nv * nu + nv**2 + m * nv + 2 * m],
             "mean": [nv],
         }.get(kind, [0] * 4)  # a loop gives as much as it is asked for
-        text = self.c_source(kind, vector_unit()[0])
+        numbers: dict[str, int] = {}  # apart from the text: the program of other numbers is the same
+        text = self.c_source(kind, vector_unit()[0], numbers=numbers)
         library = load_library(f"predictor-{kind}", text, lambda _: text)
-        return RowFunction(library, 3 + (kind in steps_of(self.space)), outputs, self.tables(kind))
+        tables = [*self.tables(kind), aligned(np.array([*map(float.fromhex, numbers), 0.0]))]
+        return RowFunction(library, 3 + (kind in steps_of(self.space)), outputs, tables)
 
     def loops(self, integrator: str, samples: int = 0, seed: int = 0) -> list[RowFunction] | None:
         """Over the mean or each drawn function; None without such a step or form. Raises CompilerError."""
@@ -366,4 +370,6 @@ class Programs:
             codes = [replace(self, compressed=None, given=(self.traced, calls)) for calls in drawn]
         first, *others = codes  # whose texts are equal
         loop = first.function(integrator)
-        return [loop, *(RowFunction(loop.library, loop.inputs, loop.outputs, code.tables()) for code in others)]
+        numbers = loop.tables[-1]
+        own = [(loop.library, loop.inputs, loop.outputs, [*code.tables(), numbers]) for code in others]
+        return [loop, *(RowFunction(*each) for each in own)]
