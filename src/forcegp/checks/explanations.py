@@ -5,7 +5,7 @@ Causes of the torques alone (signs, factors) are found joint by joint in `search
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations, permutations
+from itertools import combinations, permutations, product
 from typing import Any
 
 import numpy as np
@@ -253,8 +253,11 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
     def moved(joint: int, x: float) -> Change:
         return lambda rows: replace(changed()(rows), q=rows.q + x * np.eye(rows.nv)[joint])
 
-    def geared(joint: int, x: float) -> Change:
-        return changed("qva", factor=np.where(np.arange(rows.nv) == joint, x, 1.0))
+    def geared(joint: int, x: float, power: float = 0.0) -> Change:
+        """Motion times x, and torque times x^power: a ratio through which both were computed keeps their product."""
+        own = np.arange(rows.nv) == joint
+        moved, turned = changed("qva", factor=np.where(own, x, 1.0)), changed("u", factor=np.where(own, x**power, 1.0))
+        return lambda rows: turned(moved(rows))
 
     for joint in _places(inputs.rotates):
         left, x = best([needed_torques(robot, moved(joint, y)(rows)) for y in zeros], waves, turns)
@@ -267,16 +270,20 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         if abs(x) > 0.05:
             cause = number("joint zero", what, joint, x, NUMBER + 0.3, do=do)
             found.append((left, cause, lambda joint=joint, x=x: now.after(moved(joint, x))))
-    for joint in np.flatnonzero(np.ptp(rows.q, axis=0) > 0.0).tolist():
+    for joint, power in product(np.flatnonzero(np.ptp(rows.q, axis=0) > 0.0).tolist(), (0.0, -1.0)):
         left, x = np.inf, 1.0
         for step in (1.0, 0.1):
             every = (x or 1.0) * RATIOS**step
-            left, x = best([needed_torques(robot, geared(joint, y)(rows)) for y in every], np.eye(len(every)), every)
+            own = np.where(np.arange(rows.nv) == joint, every[:, None] ** -power, 1.0)  # what u would have to be
+            taus = [one * needed_torques(robot, geared(joint, y)(rows)) for one, y in zip(own, every, strict=True)]
+            left, x = best(taus, np.eye(len(every)), every)
+        beside = f", and {1.0 / x:.4g} times its torques" if power and x else ""
         what = f"the torques fit positions and velocities of {names[joint]} that are {x:.4g} times the logged ones"
-        do = f"Correct its gear ratio, or the columns, as in forcegp import --q 'COLUMN * {x:.4g}'."
+        do = f"Correct its gear ratio, or the columns, as in forcegp import --q 'COLUMN * {x:.4g}'"
+        do += f" --u 'COLUMN * {1.0 / x:.4g}'." if beside else "."
         if x > 0.0 and abs(np.log(x)) > 0.05:
-            cause = number("gear ratio", what, joint, x, NUMBER + 0.4, do=do)
-            found.append((left, cause, lambda joint=joint, x=x: now.after(geared(joint, x))))
+            cause = number("gear ratio", what + beside, joint, x, NUMBER + (0.1 if power else 0.4), do=do)
+            found.append((left, cause, lambda joint=joint, x=x, power=power: now.after(geared(joint, x, power))))
     for body, drive in enumerate(robot.layout.drives):
         length = float(torch.linalg.vector_norm(robot.tree.rest[body, :3, 3, 0]))
         if length == 0.0 or robot.layout.parents[body] < 0:

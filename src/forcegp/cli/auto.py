@@ -26,7 +26,7 @@ from forcegp.cli.answer import FIRST, answer_lines, short_name, verdict
 from forcegp.cli.command import CONFIG, LOG, Command, options_of, unless_given
 from forcegp.cli.fit import write_estimates
 from forcegp.cli.logs import ColumnOptions, FilterOptions, prepared_rows
-from forcegp.cli.payload import LAWS, payload_dict, payload_text, with_payload
+from forcegp.cli.payload import LAWS, payload_dict, payload_text, with_payload, without_explained
 from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal, doubts_table, facts
 from forcegp.doubts import Doubt, Doubts, wrong
@@ -136,6 +136,7 @@ class Auto(Command):
                 given = with_choice_of(given, identified)  # these parts, whatever it carries
                 loaded = with_payload(given, recording, self.link)
                 payload, held = payload_dict(loaded, False), payload_text(loaded)
+                report = replace(report, doubts=without_explained(report.doubts, loaded, recording))
             except DatasetError as error:
                 held = f"not estimated: {error}"
         terminal.note(f"payload: {held}")

@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 
 import forcegp
 import forcegp.data
+import forcegp.evidence
 import forcegp.forces
 import forcegp.posterior
 import forcegp.scores
@@ -20,6 +21,7 @@ from forcegp.cli.fit import estimates_table, quick_doubts, write_estimates
 from forcegp.cli.logs import FilterOptions
 from forcegp.cli.robot_options import SYSTEM_FILE, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal
+from forcegp.doubts import Doubts
 from forcegp.errors import InvalidInput
 
 WINDOW = 0.4
@@ -31,6 +33,8 @@ SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which
 MOST_OPEN = 0.3  # of the robot's mass in half an interval, from which on a payload is not known
 FAR = 0.01  # m of half an interval, from which on a coordinate of a centre is shown with it
 MOST_FACTORS = 3  # of one cause that a person can look for
+SETTLED, MOST_ROWS = 0.005, 2_000  # share of a torque that needs no other cause, and rows that tell it
+ROBOTS_OWN = ("lengths", "masses", "centres of mass")  # which bodies that are identified explain as well
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,6 +165,17 @@ def payload_dict(found: Any, baseline: bool) -> dict[str, Any]:
     return {"link": payload.link, "baseline": baseline, "doubts": found.settings["doubts"], **found.estimates.to_dict()}
 
 
+def without_explained(doubts: Doubts, found: Any, rows: forcegp.Dataset) -> Doubts:
+    """Without factors of joints of which a payload, that was not known before, leaves next to nothing."""
+    mass, some = found.estimates["payload.mass"], rows.rows(slice(None, None, max(1, len(rows) // MOST_ROWS)))
+    if mass.value < max(SURE * mass.std, LEAST_PAYLOAD):
+        return doubts
+    left = forcegp.evidence.motion_residuals(some, found.model)[0].var(axis=0) / some.u.var(axis=0).clip(1e-300)
+    settled = {name for name, share in zip(rows.joint_names, left, strict=True) if share < SETTLED}
+    hidden = [x for x in doubts.of("torque constant", "masses") if x.level == "look" and settled.issuperset(x.joints)]
+    return Doubts(doubt for doubt in doubts if doubt not in hidden)
+
+
 def payload_text(found: Any) -> str:
     """Mass with its 95 % interval and place; or that there is none."""
     parts = {name: found.estimates[f"payload.{name}"] for name in ("mass", *(f"center_of_mass.{x}" for x in "xyz"))}
@@ -192,5 +207,5 @@ def other_causes(payload: Mapping[str, Any]) -> dict[str, str]:
     return {
         cause: what
         for cause, factors, what in causes
-        if factors <= MOST_FACTORS and (mass["value"] > mass["std"] or cause not in ("lengths", "masses"))
+        if factors <= MOST_FACTORS and (mass["value"] > mass["std"] or cause not in ROBOTS_OWN)
     }

@@ -297,7 +297,7 @@ def _minimized(
     Coordinates at a bound that the gradient pushes against stay there for a step; steps are clipped to the bounds.
     """
     low, high = bounds
-    here, damping, growth, idle, first = point(x), 1e-4, 5.0, 0, None
+    here, damping, idle, first = point(x), 1e-4, 0, None
     for evaluation in range(1, most + 1):
         damped = here.curvature + damping * np.diag(here.curvature.diagonal() + 1e-12)
         step = step_within(here.gradient, damped, low - here.x, high - here.x)
@@ -308,16 +308,13 @@ def _minimized(
             return here.x, evaluation, True, first
         trial = point(moved(here.x, step))
         gain = (here.cost - trial.cost) / abs(expected)
-        better = trial.cost < here.cost  # of a step that failed: what the quadratic model promised
-        idle = idle + 1 if (here.cost - trial.cost if better else abs(expected)) < content else 0
-        if better:
+        if trial.cost < here.cost:
+            idle = idle + 1 if here.cost - trial.cost < content else 0
             here = trial
         elif damping > 1e12:  # rounding hides any descent
             return here.x, evaluation, True, first
-        # trust the quadratic model more where it was right, less where it was wrong: Marquardt's rule, of which the
-        # factor doubles from failure to failure (H. B. Nielsen, "Damping parameter in Marquardt's method", 1999)
-        damping *= 0.2 if gain > 0.75 else 1.0 if gain > 0.25 else growth
-        damping, growth = max(damping, 1e-12), 5.0 if gain > 0.25 else 2.0 * growth
+        # Marquardt's rule: trust the quadratic model more where it was right, less where it was wrong
+        damping = max(0.2 * damping, 1e-12) if gain > 0.75 else damping if gain > 0.25 else 5.0 * damping
     return here.x, most, False, first or 0.0
 
 

@@ -31,6 +31,7 @@ from forcegp.mechanics import ConstrainedDynamics, Contact, Held, State
 from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE
 from forcegp.model import Model
 from forcegp.robots import Kinematics
+from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_of_pseudo_inertia
 
 
 def motion_residuals(
@@ -230,6 +231,15 @@ class RecordedRows:
         """What each body needs, without what is estimated of it."""
         Y = self.kinematics.torque_regressor(torch.as_tensor(np.array(a), device=self.kinematics.robot.device))
         return (Y.cpu().numpy() * self._stated).sum(-1)
+
+    def by_center(self, a: Rows) -> Float[np.ndarray, "rows nv entries"]:
+        """How that changes as the center of each body moves along x, y and z of its joint, per m."""
+        Y = self.kinematics.torque_regressor(torch.as_tensor(np.array(a), device=self.kinematics.robot.device)).cpu()
+        pseudo = pseudo_inertia_of_standard(torch.as_tensor(self._stated))
+        moved = torch.zeros(3, 1, 4, 4, dtype=pseudo.dtype)
+        moved[range(3), 0, range(3), 3] = 1.0
+        slopes = standard_of_pseudo_inertia(moved @ pseudo + pseudo @ moved.mT)
+        return torch.einsum("nibp,kbp->nibk", Y, slopes).flatten(2).numpy()
 
     def _terms(self, x: np.ndarray, a: Rows, load: float | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Torque of the laws that are estimated and its derivatives, under the measured load or one of all motors."""

@@ -119,22 +119,20 @@ CAUSES = {
     "gains": (0.2, "torques of the log times", "Check these drives; `gain` among the forces estimates them."),
     "lengths": (0.1, "lengths before the joints times", "Compare the URDF's lengths with the robot."),
     "masses": (0.2, "masses of the links times", "Give a baseline (a log without the payload), or identify all links."),
-    "gear ratio": (
-        0.2,
-        "positions and velocities of the log times",
-        "Correct it, as in forcegp import --q 'X * 1.2'.",
-    ),
-    "joint zero": (
-        0.1,
-        "positions of the log plus",
-        "Correct it, or the URDF, as in forcegp import --q 'X + 0.1'.",
-    ),
+    "centres of mass": (0.1, "centres of mass of the links plus", "Correct the URDF, or identify all links."),
+    "gear ratio": (0.2, "positions and velocities of the log times", "Correct it, as in forcegp import --q 'X * 1.2'."),
+    "joint zero": (0.1, "positions of the log plus", "Correct it, or the URDF, as in forcegp import --q 'X + 0.1'."),
 }
-"""Usual deviations of the logarithms of factors (of zeros in rad or m), what they are of, and what to do. All factors
-of a cause are tried, and each alone. Of two the first is named, unless the other explains a tenth more: what it
-explains less the half of the logarithm of the rows for each factor (Schwarz 1978)."""
+"""Usual deviations of the logarithms of factors (of zeros in rad or m, of centres in m), what they are of, and what to
+do. All factors of a cause are tried, and each alone; of centres those of each link. Of two the first is named, unless
+the other explains a tenth more, or as much by fewer numbers: what it explains less the half of the logarithm of the
+rows for each factor (Schwarz 1978)."""
+ADDED = {"joint zero": " rad", "centres of mass": " m"}
 ALONE, MOSTLY = {"gear ratio": 0.1, "joint zero": 0.05}, 0.3
 """Of these no two are tried at once, and one is so large at least, and explains this share of what is left."""
+NAMED = 0.5
+"""Share of what is left that gains, lengths, masses and centres explain, to be named: in logs of LuGre gears with
+rough masses, less was another cause than the true one, or none."""
 STEP = 1e-4
 """Of lengths, ratios and zeros, for derivatives."""
 WRONG = 0.03
@@ -150,8 +148,10 @@ def misfit(
     left: Sequence[Float[np.ndarray, "rows nv"]],
     white: Callable[[Sequence[np.ndarray]], np.ndarray],
     fit: Fit,
-) -> tuple[Doubt, Float[np.ndarray, " k"], float] | None:
+) -> tuple[Doubt | None, Float[np.ndarray, " k"], float] | None:
     """The cause that explains most, if far more than `model`; how far the coordinates move with it; and nats.
+
+    It has no doubt where less than `NAMED` is explained: what gears do beside a model is never one cause alone.
 
     `model` has the numbers of the fit, of torques of rows with accelerations `a` it leaves `left`, and `white` makes
     residuals of the fit of such torques. At the best x, causes c with columns C lower the whitened residual r (Frisch &
@@ -166,7 +166,8 @@ def misfit(
         return None  # of the torques of payloads, next to nothing is left
     options = dict[str, tuple[Any, ...]]()
     for cause, (usual, _, _) in CAUSES.items():
-        if (cause in ("gains", "masses") and not actuation.is_exact) or (cause != "gains" and moving):
+        of_bodies = cause in ("masses", "centres of mass")
+        if ((cause == "gains" or of_bodies) and not actuation.is_exact) or (cause != "gains" and moving):
             continue  # a factor of all masses is one of the gains that are estimated, or of all those of a base
         names, columns = zip(*(_columns(cause, model, *each) for each in zip(rows, a, left, strict=True)), strict=True)
         C = white(columns).reshape(r.size, -1)
@@ -175,21 +176,24 @@ def misfit(
         across, every = J.T @ C, np.arange(C.shape[1])
         own, slope = C.T @ C - across.T @ inverse @ across + np.eye(len(every)) / usual**2, C.T @ r
         tried = list[tuple[float, float, np.ndarray, np.ndarray]]()
-        for some in (*([] if moving or cause in ALONE else [every]), *every[:, None]):
+        single = every.reshape(-1, 3 if cause == "centres of mass" else 1)
+        for some in (*([] if moving or cause in (*ALONE, *ADDED) else [every]), *single):
             change = np.zeros(len(every))
             change[some] = -np.linalg.solve(own[np.ix_(some, some)], slope[some])
             more = -0.5 * float(slope @ change)
             tried.append((more - 0.5 * len(some) * np.log(r.size), more, change, -inverse @ (across @ change)))
         options[cause] = names[0], C, *max(tried, key=lambda each: each[0])
-    most = max((more for _, _, _, more, *_ in options.values()), default=0.0)
+    most, fewest = max((more for _, _, _, more, *_ in options.values()), default=0.0), (0, 0.0)
     for cause, (names, C, worth, more, *changes) in options.items():
         usual, said, do = CAUSES[cause]
         instead = _instead(rows[0].space, fit, C, usual, least, most) if cause == "gains" else None
         change, move = instead or changes
         off, factors = abs(change) > WRONG, np.exp(change) if instead is None else 1.0 + change
-        clearly = instead is not None or (worth > best and more > max(least, MOSTLY * cost * (cause in ALONE)))
+        count = int((change != 0.0).sum())
+        better = worth > best or (cause not in ALONE and count < fewest[0] and more > fewest[1])
+        clearly = instead is not None or (better and more > max(least, MOSTLY * cost * (cause in ALONE)))
         if clearly and off.any() and ALONE.get(cause, 0.0) < abs(change).max() < NO_STEP:
-            factors, unit = (change, " rad") if cause == "joint zero" else (factors, "")
+            factors, unit = (change, ADDED[cause]) if cause in ADDED else (factors, "")
             told = ", ".join(f"{factors[k]:.3g}{unit} ({names[k]})" for k in np.flatnonzero(off))
             less = f"leave {more / cost:.0%} less unexplained" if more < cost else "explain nearly all of it"
             less = less if instead is None else "do as well as any payload"
@@ -200,7 +204,8 @@ def misfit(
                 joints=tuple(np.array(names)[off].tolist()),
                 numbers={cause: {names[k]: float(factors[k]) for k in np.flatnonzero(change)}},
             )
-            best, found = 1.1 * worth, (doubt, move, more)
+            named = instead is not None or cause in ALONE or more >= NAMED * cost
+            best, fewest, found = 1.1 * worth, (count, more), (doubt if named else None, move, more)
             if instead is not None:
                 break
     return found
@@ -262,6 +267,8 @@ def _columns(
         return names, -np.stack(columns, axis=-1) if columns else np.zeros((*a.shape, 0))
     if cause == "masses":
         return [body.child for body in robot.layout.bodies], rows.by_body(a)
+    if cause == "centres of mass":
+        return [f"{body.child} along {axis}" for body in robot.layout.bodies for axis in "xyz"], rows.by_center(a)
     q, v, at = (torch.as_tensor(np.array(x), device=robot.device) for x in (rows.q, rows.v, a))
     names, columns = [], []
     for joint, name in enumerate(robot.joint_names if cause in ALONE and robot.space.is_vector_space else ()):

@@ -122,7 +122,7 @@ def fit_physical(
         left = equations.left(fit.x, fit.noise * gains if noise is None else noise)
         cause = misfit(found, equations.parts, equations.each(equations.a), *left, fit)
         bodies = list(doubts_of_payloads(space, fit, -np.inf if cause is None else cause[2]))
-        doubts += bodies if bodies or cause is None else [cause[0]]
+        doubts += bodies or ([] if cause is None or cause[0] is None else [cause[0]])
     estimates = _estimates(space, fit, equations, evidence, thick, changes, None if cause is None else cause[1])
     doubts += unseen.doubts(model)
     Doubts(doubts).warn(stacklevel=4)
