@@ -233,6 +233,7 @@ FAULTS: dict[str, tuple[str, tuple[Fault, ...]]] = {
     "zero": ("joint zero", (ZERO,)),
     "small zero": ("joint zero", (state(zero=one(-0.25, 0.0)),)),
     "gear ratio": ("gear ratio", (times("qv", one(0.625)),)),
+    "gear ratio of both": ("gear ratio", (times("qv", one(0.625)), times("u", one(1.6)))),
     "wall": ("gravity", (state(gravity=lambda _: np.array([9.81, 0.0, 0.0])),)),
     "ceiling": ("gravity", (state(gravity=lambda _: np.array([0.0, 0.0, 9.81])),)),
     "tilted by 40": ("gravity", (TILT,)),

@@ -260,6 +260,7 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "turns": (lambda d: at(d, "qva", [0.5 / np.pi] * 2), "turns"),
     "time in ms": (lambda d: replace(d, time=1000 * d.time), "velocity|acceleration|sampling"),
     "gear ratio of 1.6": (lambda d: at(d, "qva", [1.0, 0.625]), "gear ratio"),
+    "gear ratio of 1.4, of torques too": (lambda d: at(at(d, "qva", [1.0, 1 / 1.4]), "u", [1.0, 1.4]), "gear ratio"),
 }
 
 

@@ -5,12 +5,14 @@ import re
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
-from tests.fit.test_payload import CENTER, MASS, TEXT, loaded, log
+from tests.fit.test_payload import CENTER, MASS, TEXT, Found, loaded, log
 from tests.goldens.compare import assert_unchanged
 
 from forcegp import Dataset, Payload, Robot
-from forcegp.cli.payload import other_causes, payload_text
+from forcegp.cli.payload import other_causes, payload_text, without_explained
+from forcegp.doubts import Doubts, look, wrong
 
 
 @pytest.mark.parametrize(
@@ -33,6 +35,18 @@ def test_what_is_hardly_known_of_a_payload_is_said(half, far, told):
     robot = SimpleNamespace(mass=5.0, base="fixed", layout=SimpleNamespace(groups=()))
     model = SimpleNamespace(laws=[Payload("hand", 0.5)], robot=robot)
     assert payload_text(SimpleNamespace(estimates=each, model=model)) == told
+
+
+@pytest.mark.parametrize(("carried", "noise"), [(True, 0.0), (True, 0.05), (False, 0.0)])
+def test_a_payload_takes_back_factors_of_joints_that_it_explains(carried, noise):
+    """Not those of a joint of which more than .5 % of the torque stays, nor what is wrong for sure."""
+    data, one = log(loaded() if carried else TEXT, 1, noise=0.02), np.arange(6) == 2
+    data = replace(data, u=data.u * (1.0 + noise * one * np.sin(9.0 * data.time[:, None])))
+    found = Found(data, rows=400).posterior
+    told = {"about": "torque constant", "what": "w.", "do": "d.", "joints": ("elbow_joint",)}
+    doubts = Doubts(kind(**told) for kind in (look, wrong))
+    left = without_explained(doubts, found, data)
+    assert [each.level for each in left] == (["wrong"] if carried and not noise else ["wrong", "look"])
 
 
 @pytest.fixture(scope="module")
