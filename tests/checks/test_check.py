@@ -201,6 +201,20 @@ def test_the_seconds_of_a_push_are_named_and_left_out():
         assert len(without_pushes(touched, found).episodes) == episodes
 
 
+@pytest.mark.parametrize("stops", [True, False])
+def test_an_end_stop_is_told_by_where_it_holds_a_joint(stops):
+    """Its motor pushes on as the joint would have moved; the same torques without a stop are something else."""
+    log = clean(4, seconds=12.0)
+    end = log.q[:, 1].max() - 0.2 * np.ptp(log.q[:, 1])
+    over, one = np.maximum(log.q[:, [1]] - end, 0.0), np.eye(log.nv)[1]
+    held = (over > 0.0) * one * stops
+    log = replace(
+        log, q=log.q - over * held, v=log.v * (1.0 - held), a=log.a * (1.0 - held), u=log.u + 400.0 * over * one
+    )
+    [doubt] = check(log).doubts.of(UNKNOWN)
+    assert doubt.numbers.get("stops", {}) == ({log.joint_names[1]: pytest.approx(end, abs=1e-2)} if stops else {})
+
+
 def test_currents_are_in_a_wrong_unit_although_rotors_and_friction_explain_them():
     limits = '<limit lower="-9" upper="9" effort="9" velocity="9"/><axis xyz="'
     slides = PENDULUM.replace("continuous", "prismatic").replace('<axis xyz="', limits)

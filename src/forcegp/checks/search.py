@@ -29,6 +29,7 @@ DOUBTFUL = 2e-3  # share above which causes are tried
 HELD = 3.0  # of the dry friction and of what remains in motion, from which on no gear holds the joint
 WIDER = 0.0, 0.02, 0.03, 0.05  # of the log: by which its ends are moved, one after the other
 MOSTLY = 0.75  # share of what is left that sits somewhere
+AT_END = 0.01  # of a joint's motion, within which a stop holds it
 
 
 def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
@@ -201,11 +202,18 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         where += f", and elsewhere at most {100.0 * left:.2g} % stays: a contact, or a load, in these seconds"
         numbers["seconds"] = [float(x) for x in seconds.split(",")]
         do = f"Leave them out by forcegp import --without {seconds}, as forcegp auto does."
+    elif stops := {k: end for k in bad.tolist() if (end := _stop(root, k)) is not None}:
+        units = inputs.unit_of_each("q")
+        each = ", ".join(f"{inputs.names[k]} at {end:.3g} {units[k]}" for k, end in stops.items())
+        where += f"; next to nothing stays but at an end of the joint's motion ({each}): an end stop, or a contact"
+        do = "Leave these rows out by forcegp import --without, or record motion that ends before."
+        numbers["stops"] = {inputs.names[k]: end for k, end in stops.items()}
     else:
         fits = ((k, left_by_positions(rows.q, np.c_[tau[:, k], friction[:, k]], rows.u[:, k])) for k in bad.tolist())
         if names := inputs.named([k for k, (alone, beside) in fits if beside < EXPLAINED < alone]):
             where += f"; positions alone explain that of {listed(names)}: a cable, a hose, a balancer, or a spring"
-            do = "Give the robot what pulls there, or learn it: forcegp score --forces identified,gp:joint:inputs=q."
+            do = "Give the robot what pulls there, or learn it: "
+            do += "forcegp score LOG.h5 --forces identified,gp:joint:inputs=q."
             numbers["positions"] = names
     yield look(
         about=UNKNOWN,
@@ -215,6 +223,20 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         joints=inputs.named(bad),
         numbers=numbers,
     )
+
+
+def _stop(root: Explanation, joint: int) -> float | None:
+    """The end of a joint's motion at which alone something is left of its torque; None where there is none."""
+    rows, ones = root.log.rows, np.ones((len(root.log.rows), 1))
+    q, u = rows.q[:, joint], rows.u[:, joint]
+    columns = np.c_[root.log.tau[:, joint], root.log.friction[:, joint], ones, -ones]
+    for end in (float(q.min()), float(q.max())):
+        there = np.abs(q - end) <= AT_END * np.ptp(q)
+        if FEWEST_ROWS <= there.sum() < 0.5 * len(q):
+            left = np.square(u - columns @ positive_fit(columns[~there], u[~there])[0])
+            if left[~there].sum() <= (1.0 - MOSTLY) * left.sum() and left[~there].mean() <= EXPLAINED**2 * u.var():
+                return end
+    return None
 
 
 def _sticks(root: Explanation, joint: int) -> bool:
