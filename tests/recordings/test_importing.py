@@ -137,13 +137,31 @@ def test_joints_that_slide_are_in_metres(tmp_path):
     found = import_recordings([path], mapping, model=rail)
     np.testing.assert_allclose(found.q, data["q"], atol=1e-14)
     np.testing.assert_allclose(found.time, data["time"], atol=1e-14)
-    assert found.metadata["import"]["guessed"] == ["unit q=deg,mm, as the columns are called"]
+    assert found.metadata["import"]["guessed"] == ["unit q=deg,mm, as the log says", "unit time=ms, as the log says"]
     mapping = dataclasses.replace(mapping, unit={"q": ("deg", "m")})
     with pytest.raises(MistakenUnit, match="Then add `unit` q=deg,mm"):
         import_recordings([path], mapping, model=rail)
     mapping = dataclasses.replace(mapping, unit={"q": ("rad", "mm")})
     with pytest.raises(InvalidInput, match="q of joint 'elbow' is mm, but the joint turns"):
         imported(path, mapping)
+
+
+@pytest.mark.parametrize("side_by_side", [False, True])
+def test_a_line_of_units_counts_as_units_in_names_do(tmp_path, side_by_side):
+    data = motion()
+    columns = {"t": 1e3 * data["time"], "q1": np.rad2deg(data["q"][:, 0]), "q2": np.rad2deg(data["q"][:, 1])}
+    names, *rows = write_text(tmp_path / "log.csv", columns).read_text().splitlines()
+    stem = "log:" if side_by_side else ""
+    mapping = ColumnMapping(q=(f"{stem}q{{1..2}}",), u=("0",), time=f"{stem}t", side_by_side=side_by_side)
+    for head in ((names, "ms,deg,deg"), ("[ms],[°],[°]", names), (names, "ms,deg,deg", "clock,encoder,encoder")):
+        (tmp_path / "log.csv").write_text("\n".join([*head, *rows]))
+        found = imported(tmp_path / "log.csv", mapping)
+        np.testing.assert_allclose(found.q, data["q"], atol=1e-14)
+        done = found.metadata["import"]
+        assert done["guessed"] == ["unit q=deg, as the log says", "unit time=ms, as the log says"]
+        assert ["encoder" in note for note in done["recordings"][0]["notes"]] == [True] * (len(head) - 2)
+    stated = dataclasses.replace(mapping, unit={"q": ("mrad",)})
+    np.testing.assert_allclose(imported(tmp_path / "log.csv", stated).q, np.rad2deg(data["q"]) / 1e3, atol=1e-14)
 
 
 @pytest.mark.parametrize(("share", "units"), [(0.15, "deg,rad"), (0.05, "deg")])

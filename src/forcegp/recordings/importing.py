@@ -230,6 +230,11 @@ class SideBySide(Source):
         return {**super().vectors, **{name: tuple(columns) for name, columns in wholes.items()}}
 
     @override
+    def called(self, name: str) -> str:
+        source, column = self._owners[name]
+        return source.called(column)
+
+    @override
     def files(self) -> tuple[Path, ...]:
         return tuple(file for source in self.sources.values() for file in source.files())
 

@@ -21,7 +21,7 @@ from forcegp.doubts import stated_as
 from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
 from forcegp.recordings.source import Source
 
-UNIT_OF_A_NAME = re.compile(r"[\[(]([^\d\[(]+)[\])]$|_([A-Za-z]{2,})$")
+UNIT_OF_A_NAME = re.compile(r"[\[(]([^\d\[(][^\[(]*)[\])]$|_([A-Za-z]{2,})$")
 NUMBERED = re.compile(r"(?P<stem>(?P<word>.*?)[\[(_. ]*)(?P<number>\d{1,4})?[\])]?\s*$")
 COMMA = re.compile(r",(?![^{\[]*[}\]])(?=(?:[^`]*`[^`]*`)*[^`]*$)")
 EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body", "force": "foot=fx,fy,fz"}

@@ -75,6 +75,10 @@ class Source(ABC):
         """The column that is the time of these columns, if the format itself names it."""
         return None
 
+    def called(self, name: str) -> str:
+        """The name of a column with its unit, `q1 [deg]`, where the file states that elsewhere."""
+        return name
+
     def files(self) -> tuple[Path, ...]:
         """The files that this log consists of."""
         return (self.path,)

@@ -20,7 +20,7 @@ from pyarrow import csv as arrow_csv
 from typing_extensions import override
 
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput
-from forcegp.recordings.mapping import UNITS
+from forcegp.recordings.mapping import UNITS, named_unit
 from forcegp.recordings.source import (
     MOST_LOST,
     Columns,
@@ -73,6 +73,7 @@ class DelimitedText(Source):
         with reading(path, "text"), self._opened() as stream:
             self._notes = ["its letters are taken for cp1252"] if self.encoding == "cp1252" else []
             self._no_numbers: list[str] = []
+            self._units: dict[str, str] = {}
             self._look(stream.peek(1), headerless)
 
     def _opened(self) -> Any:
@@ -148,17 +149,27 @@ class DelimitedText(Source):
                 above or table[begin - 1 : begin],
                 key=lambda row: len({x.strip("[]() ").lower() for x in row if not _is_number(x)} - _UNITS),
             )
-            beside = [", ".join(dict.fromkeys(filter(None, row))) for row in above if row is not names]
-            self._notes += [f"a line beside the names is left out: {text:.80}" for text in beside if text]
             if len(names) + 1 == len(fields) and not fields[-1]:  # rows that end with a delimiter
                 names = [*names, ""]
             self._columns = [name or f"column{index + 1}" for index, name in enumerate(names)]
+            for row in (row for row in above if row is not names):
+                left_out = ", ".join(dict.fromkeys(filter(None, self._without_units(row))))
+                self._notes += [f"a line beside the names is left out: {left_out:.80}"] if left_out else []
         self._lines_before = places[begin]
         require_distinct(self.path, self._columns)
         whole = list(zip(self._columns, fields if self._lines_per_row == 1 else (), strict=False))
         self._long_integers = {name for name, text in whole if _LONG_INTEGER.fullmatch(text)}
         self._clocks = {name for name, text in whole if _TIME.fullmatch(text)}
         self._decimal = "," if any(_DECIMAL_COMMA.fullmatch(x) for row in table[begin:] for x in row) else "."
+
+    def _without_units(self, row: Sequence[str]) -> Sequence[str]:
+        """What is left of a line beside the names; if half of it are units, these are those of the columns."""
+        texts = [text.strip("[]() ") for text in row]
+        known = [any(named_unit(quantity, f"[{text}]") for quantity in UNITS) for text in texts]
+        if 2 * sum(known) < sum(map(bool, texts)):
+            return row
+        self._units |= dict(compress(zip(self._columns, texts, strict=True), known))
+        return [text for text, is_unit in zip(texts, known, strict=True) if not is_unit]
 
     def _fields(self, line: str) -> list[str]:
         if self._delimiter == BLANKS:
@@ -170,6 +181,10 @@ class DelimitedText(Source):
     @override
     def columns(self) -> tuple[str, ...]:
         return tuple(self._columns)
+
+    @override
+    def called(self, name: str) -> str:
+        return f"{name} [{self._units[name]}]" if name in self._units else name
 
     @override
     def notes(self) -> tuple[str, ...]:
