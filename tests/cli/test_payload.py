@@ -117,6 +117,10 @@ def test_a_payload_that_may_be_none_has_no_place(folder, forcegp):
         ("payload nothing.h5", "nothing.h5 is not a file"),
         ("payload loaded.h5 --link tool9", "tool9"),
         ("payload loaded.h5 --cutoff high", "--cutoff is 'high'"),
+        (
+            "payload loaded.h5 --cutoff none --delay 0 --forces viscous,gp:joint --out o",
+            "would hide a payload; name laws",
+        ),
     ],
 )
 def test_what_cannot_be_is_one_line(folder, forcegp, words, message):

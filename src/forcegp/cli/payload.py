@@ -77,6 +77,11 @@ class Payload(Command):
             notes.append("the log is of postures alone: no motion shows friction, of which each rest has its own share")
         words = ["gain", *words] if self.mass is not None and "gain" not in words else words
         model = forcegp.scores.named_model(model, words)
+        if model.unknown_forces:
+            raise InvalidInput(
+                f"--forces is {','.join(self.forces)}, with unknown functions, which would hide a payload; name laws "
+                "alone, such as viscous,gear,offset,rotor."
+            )
         if model.actuation.learned and baseline is not None and self.mass is None:
             raise InvalidInput(
                 "gains and all masses are unknown, so only their products are known; give --mass of the payload, or "
