@@ -3,6 +3,7 @@
 Whatever else the commands do is tested in this process by the fixture `forcegp`, which does not import torch anew.
 """
 
+import io
 import json
 import os
 import re
@@ -13,6 +14,7 @@ import pytest
 from tests.posterior.arm import URDF, arm_data
 
 from forcegp.cli.arguments import COMMANDS
+from forcegp.cli.main import main
 
 
 @pytest.fixture
@@ -66,12 +68,44 @@ def test_a_reader_that_has_seen_enough_is_no_error(executable, folder):
         assert (running.wait(), running.stderr.read()) == (0, b"")
 
 
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_letters_that_an_encoding_lacks_are_replaced(monkeypatch, encoding):
+    stream = io.TextIOWrapper(written := io.BytesIO(), encoding, errors="strict")
+    monkeypatch.setattr("sys.stdout", stream)
+    monkeypatch.setattr("forcegp.cli.arguments.DESCRIPTION", "λ ± –")
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    stream.flush()
+    assert ("? ± ?" if encoding == "latin-1" else "? ? ?").encode(encoding) in written.getvalue()
+    assert stream.errors == "strict", "a program that calls this goes on as it was"
+
+
+def test_an_interrupt_while_libraries_are_imported_is_one_line():
+    code = """
+import sys
+class Interrupted:
+    def find_spec(self, name, *_):
+        if name == "tyro":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupted())
+import forcegp.cli.main
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "forcegp: interrupted; nothing was begun.\n")
+
+
 def test_an_environment_that_libraries_do_not_take_is_one_sentence(tmp_path):
     words = [sys.executable, "-m", "forcegp", "robot", "no.urdf"]
     how = {"cwd": tmp_path, "capture_output": True, "text": True, "check": False}
     done = subprocess.run(words, env={**os.environ, "SOURCE_DATE_EPOCH": "x"}, **how)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "forcegp: SOURCE_DATE_EPOCH is 'x'; give whole seconds, or unset it.\n"
+    code = [
+        "-c",
+        "import sys; sys.argv = ['forcegp', '--version']; import forcegp.cli.main as m; m.main(); import pylab",
+    ]
+    done = subprocess.run([sys.executable, *code], env={**os.environ, "MPLBACKEND": "nonsense"}, **how)
+    assert (done.returncode, done.stderr) == (0, "")
     done = subprocess.run(words, env={**os.environ, "PYTHONWARNINGS": "error"}, **how)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "no such file" in done.stderr

@@ -9,11 +9,16 @@ import sys
 import traceback
 import warnings
 from collections.abc import Mapping, Sequence
+from typing import Any
 
-from forcegp.cli.arguments import parsed
-from forcegp.cli.command import Command, values_of
-from forcegp.cli.terminal import Terminal, with_option_names
-from forcegp.errors import ForceGPError, printable
+try:
+    from forcegp.cli.arguments import parsed
+    from forcegp.cli.command import Command, values_of
+    from forcegp.cli.terminal import Terminal, with_option_names
+    from forcegp.errors import ForceGPError, printable
+except KeyboardInterrupt:  # in the first tenth of a second, before `main` could tell
+    print("forcegp: interrupted; nothing was begun.", file=sys.stderr)
+    raise SystemExit(130) from None
 
 ARGUMENTS: Mapping[str, Mapping[str, str]] = {
     "excite": {"start": "posture", "motions": "tries", "surface": "avoid"},
@@ -48,6 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "r" if name == "stdin" else "w"))
     given = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments is None:  # this process draws in files alone, and matplotlib refuses names that it does not know
+        os.environ.pop("MPLBACKEND", None)
     if given == ["--version"]:
         from forcegp import __version__  # 30 ms that only this needs
 
@@ -60,6 +67,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not (epoch := os.environ.get("SOURCE_DATE_EPOCH", "0")).isdigit():  # which libraries read when imported
         return _fail(f"SOURCE_DATE_EPOCH is {epoch!r}; give whole seconds, or unset it.", USER_ERROR, debug)
     showwarning, terminate = warnings.showwarning, None
+    stdout: Any = sys.stdout
+    errors = getattr(stdout, "errors", None)
+    with contextlib.suppress(AttributeError):  # of a notebook, which takes every letter
+        stdout.reconfigure(errors="replace")  # letters that its encoding lacks: the result counts, not its signs
     with contextlib.suppress(ValueError):  # not in the main thread
         # so that temporary files are removed then, too
         terminate = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
@@ -94,6 +105,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(f"an error in forcegp itself, {what} (--debug shows where)", INTERNAL_ERROR, debug)
     finally:  # a program that calls this goes on as it was
         warnings.showwarning = showwarning
+        with contextlib.suppress(AttributeError, OSError):  # a full disk
+            stdout.reconfigure(errors=errors)
         if terminate is not None:
             signal.signal(signal.SIGTERM, terminate)
     return OK
