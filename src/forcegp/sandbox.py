@@ -17,7 +17,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from forcegp.errors import ForceGPError, RobotModelError
+from forcegp.errors import ForceGPError, RobotModelError, lacks_memory
 
 SECONDS = 30
 """CPU time of one file, and half of its wall time: whole robots with meshes take two."""
@@ -138,7 +138,7 @@ def _compiled(request: dict[str, Any]) -> dict[str, Any]:
             model = spec.compile()
     except (ValueError, TypeError, RuntimeError, IndexError, mujoco.FatalError) as error:
         reason = " ".join(str(error).removeprefix("Error: ").split())
-        if "unknown exception" in reason or "allocate memory" in reason:
+        if "unknown exception" in reason or lacks_memory(error):
             raise MemoryError(reason) from None
         missing = any(word in reason for word in ("file", "mesh", "resource"))
         return {"refused": reason, "meshes": needed if missing else []}

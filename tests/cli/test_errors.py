@@ -13,6 +13,7 @@ from tests.posterior.arm import URDF, arm_data
 
 from forcegp import scores
 from forcegp.cli.main import main
+from forcegp.errors import usable_arguments
 from forcegp.model import Model
 from forcegp.posterior import load_posterior
 from forcegp.robots import Robot
@@ -130,6 +131,7 @@ def test_interrupts_defects_and_a_lack_of_memory_are_told_apart(folder, monkeypa
     for error, code, told in (
         (KeyboardInterrupt(), 130, "interrupted; no partial output was kept"),
         (MemoryError("3 GiB"), 2, "out of memory (3 GiB); use fewer points or rows"),
+        (RuntimeError("can't allocate memory: 9 B"), 2, "out of memory (can't allocate memory: 9 B); use fewer points"),
         (ImportError("libx: cannot open shared object file"), 2, "a library cannot be loaded"),
         (RuntimeError("two\nlines"), 1, "an error in forcegp itself, RuntimeError: two lines (--debug shows where)"),
         (OSError(28, "No space left"), 2, "free some space, or write elsewhere"),
@@ -143,3 +145,5 @@ def test_interrupts_defects_and_a_lack_of_memory_are_told_apart(folder, monkeypa
         assert main(["check", "arm.h5"]) == code
         (line,) = capfd.readouterr().err.splitlines()
         assert told in line
+    with pytest.raises(MemoryError), usable_arguments("excitation"):
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory")

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import torch
 from tests.posterior.arm import URDF
+from tests.recordings.broken_logs import urdf
 from tests.robots.robot_models import TREE
 
+from forcegp.errors import NotEnoughMemory
 from forcegp.evidence import base_parameters, torque_regressor
 from forcegp.robots import Robot
 
@@ -31,3 +33,13 @@ def test_an_arm_of_three_turning_joints_has_fifteen():
     base = base_parameters(Robot.from_urdf_text(URDF))
     assert len(base) == 15
     assert 0 not in base  # it is never lifted
+
+
+def test_many_joints_take_little_memory_or_are_refused(monkeypatch):
+    """A chain in a vertical plane shows of every link inertia about its joint, and two first moments (ibid.)."""
+    text = urdf(*(f"joint_{k}" for k in range(40))).replace("<axis", '<origin xyz="0 0 0.2"/><axis')
+    monkeypatch.setattr("forcegp.inference.memory.free_memory", lambda _: 2**29)
+    assert len(base_parameters(Robot.from_urdf_text(text))) == 3 * 40
+    monkeypatch.setattr("forcegp.inference.memory.free_memory", lambda _: 2**20)
+    with pytest.raises(NotEnoughMemory, match=r"40 joints .* fewer joints"):
+        base_parameters(Robot.from_urdf_text(text))

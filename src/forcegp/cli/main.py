@@ -15,7 +15,7 @@ try:
     from forcegp.cli.arguments import parsed
     from forcegp.cli.command import Command, values_of
     from forcegp.cli.terminal import Terminal, with_option_names
-    from forcegp.errors import ForceGPError, printable
+    from forcegp.errors import ForceGPError, lacks_memory, printable
 except KeyboardInterrupt:  # in the first tenth of a second, before `main` could tell
     print("forcegp: interrupted; nothing was begun.", file=sys.stderr)
     raise SystemExit(130) from None
@@ -95,9 +95,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(message, USER_ERROR, debug)
     except OSError as error:
         return _fail(f"{error}{_REMEDIES.get(error.errno or 0, '')}", USER_ERROR, debug)
-    except MemoryError as error:
-        return _fail(f"out of memory ({error}); use fewer points or rows.", USER_ERROR, debug)
     except Exception as error:  # the last resort: one line also for a defect of ours, with its own exit code
+        if lacks_memory(error):
+            return _fail(f"out of memory ({error}); use fewer points or rows.", USER_ERROR, debug)
         if isinstance(error, ImportError) and "shared object" in str(error):
             remedy = "raise the limit of memory (ulimit -v), or install forcegp again"
             return _fail(f"a library cannot be loaded: {error}; {remedy}.", USER_ERROR, debug)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from forcegp.errors import NonPhysicalInertia
 from forcegp.forces import Body
+from forcegp.inference import require_memory
 from forcegp.robots import Robot
 from forcegp.robots.inertia import (
     physical_of_pseudo_inertia,
@@ -60,8 +61,10 @@ def body_names(robot: Robot) -> tuple[str, ...]:
 
 RANK_TOLERANCE = 1e-9
 """Diagonal entries of R below this fraction of the largest are zero, for columns of norm 1."""
-RANDOM_ROWS = 50
-"""Random states per joint that stand for every motion."""
+RANDOM_ROWS, ENTRIES = 50, 2**23
+"""Random states per joint that stand for every motion, fewer where their regressor has more entries than these; but
+at least 20, where 2 rows belong to every column."""
+COPIES = 6  # of the regressor at once
 
 
 def base_parameters(robot: Robot) -> tuple[int, ...]:
@@ -69,7 +72,11 @@ def base_parameters(robot: Robot) -> tuple[int, ...]:
 
     They are those of random states, the same ones every time.
     """
-    drawn = np.random.default_rng(0).normal(0.0, 2.0, (3, RANDOM_ROWS * robot.nv, robot.nv))
+    entries = 10 * max(robot.nv, 1) ** 2  # of the regressor at one state
+    states = min(RANDOM_ROWS * robot.nv, max(20, ENTRIES // entries))
+    remedy = "give a robot with fewer joints, others locked."
+    require_memory(8 * COPIES * states * entries, f"the regressor of {robot.nv} joints", remedy, robot.device)
+    drawn = np.random.default_rng(0).normal(0.0, 2.0, (3, states, robot.nv))
     turns, v, a = torch.tensor(drawn, device=robot.device)
     q = robot.space.integrate(robot.space.neutral(), turns)
     regressor = torque_regressor(robot, q, v, a).flatten(0, 1).cpu().numpy()

@@ -144,8 +144,7 @@ class SignalPlan:
     @property
     def columns(self) -> tuple[str, ...]:
         """Every column that is needed, each once."""
-        expressions = [item.expression for item in self.signals]
-        needed = [name for each in (self.time, *expressions) if each is not None for name in each.weights]
+        needed = [name for each in (self.time, *(x.expression for x in self.signals)) if each for name in each.weights]
         return tuple(dict.fromkeys([*needed, *([] if self.episode is None else [self.episode])]))
 
 
@@ -297,8 +296,7 @@ def _sensor(mapping: ColumnMapping, frame: str, source: Source, model: forcegp.M
 
 
 def _expressions(patterns: Sequence[str], joints: Sequence[str], source: Source, may_lack: bool) -> list[Expression]:
-    names: list[str] = []
-    columns, vectors = source.columns(), source.vectors
+    names, columns, vectors = list[str](), source.columns(), source.vectors
     for pattern in patterns:
         for text in expanded(pattern, joints, {*columns, *vectors}):
             by_name = [f"{text}.{joint}" for joint in joints]  # messages may list the joints in another order
