@@ -139,6 +139,7 @@ def test_interrupts_defects_and_a_lack_of_memory_are_told_apart(folder, monkeypa
     ):
 
         def fails(*_, error=error, **__):
+            np.square([1e300])  # about which NumPy warns
             raise error
 
         monkeypatch.setattr("forcegp.check", fails)

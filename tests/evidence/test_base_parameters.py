@@ -37,9 +37,9 @@ def test_an_arm_of_three_turning_joints_has_fifteen():
 
 def test_many_joints_take_little_memory_or_are_refused(monkeypatch):
     """A chain in a vertical plane shows of every link inertia about its joint, and two first moments (ibid.)."""
-    text = urdf(*(f"joint_{k}" for k in range(40))).replace("<axis", '<origin xyz="0 0 0.2"/><axis')
+    robot = Robot.from_urdf_text(urdf(*map("j{}".format, range(40))).replace("<axis", '<origin xyz="0 0 1"/><axis'))
     monkeypatch.setattr("forcegp.inference.memory.free_memory", lambda _: 2**29)
-    assert len(base_parameters(Robot.from_urdf_text(text))) == 3 * 40
+    assert len(base_parameters(robot)) == 3 * 40
     monkeypatch.setattr("forcegp.inference.memory.free_memory", lambda _: 2**20)
     with pytest.raises(NotEnoughMemory, match=r"40 joints .* fewer joints"):
-        base_parameters(Robot.from_urdf_text(text))
+        base_parameters(robot)

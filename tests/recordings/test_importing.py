@@ -146,22 +146,22 @@ def test_joints_that_slide_are_in_metres(tmp_path):
         imported(path, mapping)
 
 
-@pytest.mark.parametrize("side_by_side", [False, True])
-def test_a_line_of_units_counts_as_units_in_names_do(tmp_path, side_by_side):
-    data = motion()
-    columns = {"t": 1e3 * data["time"], "q1": np.rad2deg(data["q"][:, 0]), "q2": np.rad2deg(data["q"][:, 1])}
-    names, *rows = write_text(tmp_path / "log.csv", columns).read_text().splitlines()
-    stem = "log:" if side_by_side else ""
-    mapping = ColumnMapping(q=(f"{stem}q{{1..2}}",), u=("0",), time=f"{stem}t", side_by_side=side_by_side)
-    for head in ((names, "ms,deg,deg"), ("[ms],[°],[°]", names), (names, "ms,deg,deg", "clock,encoder,encoder")):
-        (tmp_path / "log.csv").write_text("\n".join([*head, *rows]))
-        found = imported(tmp_path / "log.csv", mapping)
-        np.testing.assert_allclose(found.q, data["q"], atol=1e-14)
-        done = found.metadata["import"]
-        assert done["guessed"] == ["unit q=deg, as the log says", "unit time=ms, as the log says"]
-        assert ["encoder" in note for note in done["recordings"][0]["notes"]] == [True] * (len(head) - 2)
-    stated = dataclasses.replace(mapping, unit={"q": ("mrad",)})
-    np.testing.assert_allclose(imported(tmp_path / "log.csv", stated).q, np.rad2deg(data["q"]) / 1e3, atol=1e-14)
+@pytest.mark.parametrize(
+    "head", ["NAMES\nms,deg,deg", "[ms],[°],[°]\nNAMES", "NAMES\nms,deg,deg\nclock,encoder,encoder"]
+)
+def test_a_line_of_units_counts_as_units_in_names_do(tmp_path, head):
+    data, path = motion(), tmp_path / "log.csv"
+    q1, q2 = np.rad2deg(data["q"]).T
+    names, rows = write_text(path, {"t": 1e3 * data["time"], "q1": q1, "q2": q2}).read_text().split("\n", 1)
+    path.write_text(f"{head.replace('NAMES', names)}\n{rows}")
+    mapping = ColumnMapping(q=("log:q{1..2}",), u=("0",), time="log:t", side_by_side=True)
+    found = imported(path, mapping)
+    np.testing.assert_allclose(found.q, data["q"], atol=1e-14)
+    done = found.metadata["import"]
+    assert done["guessed"] == ["unit q=deg, as the log says", "unit time=ms, as the log says"]
+    assert ["encoder" in note for note in done["recordings"][0]["notes"]] == [True] * ("encoder" in head)
+    stated = imported(path, ColumnMapping(q=("q1", "q2"), u=("0",), time="t", unit={"q": ("mrad",)}))
+    np.testing.assert_allclose(stated.q, np.rad2deg(data["q"]) / 1e3, atol=1e-14)
 
 
 @pytest.mark.parametrize(("share", "units"), [(0.15, "deg,rad"), (0.05, "deg")])

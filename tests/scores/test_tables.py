@@ -78,7 +78,9 @@ def test_models_side_by_side(scores):
 
 
 def test_the_page_holds_all_of_it(scores):
+    scores.about["notes"] = ["<img src=x onerror=alert(1)> of a&lt;b < 2 & more"]
     text = page(scores)
+    assert "* &lt;img src=x onerror=alert(1)> of a&amp;lt;b < 2 & more\n" in text
     assert "| ls | 0.4400 (0.4000–0.4800) |" in text
     assert "gp failed in 1 of 3 runs (s, seed 1): no luck" in text
     assert "| gp | 1.650 | 2.200 |" in text

@@ -41,6 +41,7 @@ _REMEDIES = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "; free som
 _REMEDIES |= dict.fromkeys(
     (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR), "; write to a folder where you may."
 )
+_REMEDIES[errno.EEXIST] = ", where a folder is needed: a file, or a link to nothing; remove it, or write elsewhere."
 """What to do about an OSError, by its number."""
 
 
@@ -78,6 +79,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # `forcegp --debug fit ...` means the same as `forcegp fit ... --debug`
         command = parse_arguments([*(word for word in given if word != "--debug"), *(["--debug"] if debug else [])])
         with Terminal(json=command.json, options=values_of(command)) as terminal, warnings.catch_warnings():
+            # of NumPy, about numbers that a sentence of ours refuses, or that are not finite where they are shown
+            warnings.filterwarnings("ignore", "(overflow|invalid value|divide by zero) encountered", RuntimeWarning)
             warnings.showwarning = lambda message, *_, **__: terminal.warn(str(message))
             command.check_paths()
             with command.alone():

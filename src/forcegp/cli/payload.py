@@ -20,7 +20,7 @@ from forcegp.cli.fit import estimates_table, quick_doubts, write_estimates
 from forcegp.cli.logs import FilterOptions
 from forcegp.cli.robot_options import SYSTEM_FILE, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal
-from forcegp.errors import InvalidInput
+from forcegp.errors import LARGEST, InvalidInput, require_number
 
 WINDOW = 0.4
 """Seconds that torques are averaged over: it takes noise of the acceleration, and leaves friction as sharp as it is."""
@@ -67,6 +67,8 @@ class Payload(Command):
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Prepare, estimate, write and show."""
         self.require_free(self.out)
+        if self.mass is not None:
+            require_number("--mass", self.mass, f"give kg, above 0 and below {LARGEST:g}", below=LARGEST)
         notes: list[str] = []
         model, rows = self._rows(terminal, self.log, notes)
         baseline = None if self.baseline is None else self._rows(terminal, self.baseline, notes)[1]

@@ -37,15 +37,22 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def rendered(template: Path, **values: Any) -> str:
-    """The text of a template, with the filters `formatted`, `number` and `table`; one blank line between paragraphs."""
+    """The text of a template, with the filters `formatted`, `number` and `table`; one blank line between paragraphs.
+
+    No value in it is read as HTML, which names of joints and files may hold.
+    """
     from jinja2 import Environment, StrictUndefined
 
-    pages = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    def plain(value: Any) -> Any:
+        return TAG.sub(r"&lt;", REFERENCE.sub("&amp;", value)) if isinstance(value, str) else value
+
+    pages = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=plain)
     pages.filters |= {"formatted": formatted, "number": number, "table": lambda rows, head: markdown_table(head, rows)}
     text = pages.from_string(template.read_text(encoding="utf-8"))
     return re.sub(r"\n{3,}", "\n\n", text.render(values)).strip() + "\n"
 
 
+TAG, REFERENCE = re.compile("<(?=[A-Za-z/!?])"), re.compile(r"&(?=#?\w+;)")
 Column = tuple[str, str, str, int]  # title, quantity, score and decimals; of a coverage in percent
 
 
