@@ -59,12 +59,9 @@ def body_names(robot: Robot) -> tuple[str, ...]:
     return tuple(robot.layout.bodies[body].child for body in carrying(robot))
 
 
-RANK_TOLERANCE = 1e-9
-"""Diagonal entries of R below this fraction of the largest are zero, for columns of norm 1."""
-RANDOM_ROWS, ENTRIES = 50, 2**23
-"""Random states per joint that stand for every motion, fewer where their regressor has more entries than these; but
-at least 20, where 2 rows belong to every column."""
-COPIES = 6  # of the regressor at once
+RANK_TOLERANCE = 1e-9  # diagonal entries of R below this fraction of the largest are 0, for columns of norm 1
+RANDOM_ROWS, FEWEST = 50, 20  # random states per joint, and of all, that stand for every motion
+ENTRIES, COPIES = 2**23, 6  # of a regressor at once; what more rows would need, and the steps of its decomposition
 
 
 def base_parameters(robot: Robot) -> tuple[int, ...]:
@@ -73,7 +70,7 @@ def base_parameters(robot: Robot) -> tuple[int, ...]:
     They are those of random states, the same ones every time.
     """
     entries = 10 * max(robot.nv, 1) ** 2  # of the regressor at one state
-    states = min(RANDOM_ROWS * robot.nv, max(20, ENTRIES // entries))
+    states = min(RANDOM_ROWS * robot.nv, max(FEWEST, ENTRIES // entries))
     remedy = "give a robot with fewer joints, others locked."
     require_memory(8 * COPIES * states * entries, f"the regressor of {robot.nv} joints", remedy, robot.device)
     drawn = np.random.default_rng(0).normal(0.0, 2.0, (3, states, robot.nv))

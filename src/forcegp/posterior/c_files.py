@@ -24,10 +24,7 @@ FILES = ("model.h", "model.hpp", "CMakeLists.txt", "example.c", "self_test.c", "
 
 
 def identifier(name: str) -> str:
-    """A name for C, C++ and files, of any text; none of `taken.txt`.
-
-    Its words are keywords, macros and what standard headers declare, other files, and those that CasADi does not take.
-    """
+    """A name for C, C++ and files, of any text, but no word of theirs, of CasADi or of standard headers (taken.txt)."""
     plain = re.sub(r"[^A-Za-z0-9]+", "_", name)[:60].strip("_").lower() or "robot"
     plain = plain if plain[0].isalpha() else f"robot_{plain}"
     return f"{plain}_model" if plain in c_text(__name__, "exported_c/taken.txt").split() else plain

@@ -209,6 +209,7 @@ class SideBySide(Source):
     def __init__(self, sources: Sequence[Source]) -> None:
         super().__init__(Path(", ".join(str(source.path) for source in sources)))
         self.sources = {source.path.name.split(".")[0]: source for source in sources}
+        self.units = {f"{stem}:{name}": unit for stem, x in self.sources.items() for name, unit in x.units.items()}
         if len(self.sources) < len(sources):
             raise InvalidInput(f"{self.path}: two files have the same name up to the first dot; rename one.")
 
@@ -228,11 +229,6 @@ class SideBySide(Source):
         """The vectors of each file, and the stem of each for all of its columns."""
         wholes = {name: [f"{name}:{x}" for x in source.columns()] for name, source in self.sources.items()}
         return {**super().vectors, **{name: tuple(columns) for name, columns in wholes.items()}}
-
-    @override
-    def called(self, name: str) -> str:
-        source, column = self._owners[name]
-        return source.called(column)
 
     @override
     def files(self) -> tuple[Path, ...]:

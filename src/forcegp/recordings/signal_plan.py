@@ -228,7 +228,7 @@ def signal_plan(
         require_known("column", episode, str(source.path), source.columns(), FileFormatError)
     name = next(iter(time.weights)) if time is not None and time.is_column else ""
     # stamps of ROS are whole nanoseconds; what is called nothing else is taken for seconds
-    said = named_unit("time", source.called(name)) if name else None
+    said = named_unit("time", name, source.units)
     usual = "ns" if name.endswith((":header.stamp", ":log_time")) else said or "s"
     [time_unit, *_] = mapping.unit.get("time", (usual,))
     if said not in (None, "s") and "time" not in mapping.unit:
@@ -339,7 +339,7 @@ def _signals(
         raise InvalidInput(
             f"{signal} has {len(expressions)} columns for {len(names)} {what} ({', '.join(names) or 'none'}); {remedy}"
         )
-    named = [named_unit(signal, source.called(*x.weights)) if x.is_column else None for x in expressions]
+    named = [named_unit(signal, *x.weights, source.units) if x.is_column else None for x in expressions]
     named = [x or columns[name] or "1" for x, name in zip(named, names, strict=True)]
     given = [log_unit(signal, name) for name in mapping.unit.get(signal, named)]
     signs, driven = mapping.sign.get(signal, (1.0,)), sum(signal != "u" or columns[name] != "1" for name in names)

@@ -73,7 +73,6 @@ class DelimitedText(Source):
         with reading(path, "text"), self._opened() as stream:
             self._notes = ["its letters are taken for cp1252"] if self.encoding == "cp1252" else []
             self._no_numbers: list[str] = []
-            self._units: dict[str, str] = {}
             self._look(stream.peek(1), headerless)
 
     def _opened(self) -> Any:
@@ -165,10 +164,10 @@ class DelimitedText(Source):
     def _without_units(self, row: Sequence[str]) -> Sequence[str]:
         """What is left of a line beside the names; if half of it are units, these are those of the columns."""
         texts = [text.strip("[]() ") for text in row]
-        known = [any(named_unit(quantity, f"[{text}]") for quantity in UNITS) for text in texts]
+        known = [any(named_unit(quantity, text, {text: text}) for quantity in UNITS) for text in texts]
         if 2 * sum(known) < sum(map(bool, texts)):
             return row
-        self._units |= dict(compress(zip(self._columns, texts, strict=True), known))
+        self.units = {**self.units, **dict(compress(zip(self._columns, texts, strict=True), known))}
         return [text for text, is_unit in zip(texts, known, strict=True) if not is_unit]
 
     def _fields(self, line: str) -> list[str]:
@@ -181,10 +180,6 @@ class DelimitedText(Source):
     @override
     def columns(self) -> tuple[str, ...]:
         return tuple(self._columns)
-
-    @override
-    def called(self, name: str) -> str:
-        return f"{name} [{self._units[name]}]" if name in self._units else name
 
     @override
     def notes(self) -> tuple[str, ...]:

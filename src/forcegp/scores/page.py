@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -37,14 +38,11 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def rendered(template: Path, **values: Any) -> str:
-    """The text of a template, with the filters `formatted`, `number` and `table`; one blank line between paragraphs.
-
-    No value in it is read as HTML, which names of joints and files may hold.
-    """
+    """The text of a template, with the filters `formatted`, `number` and `table`; one blank line between paragraphs."""
     from jinja2 import Environment, StrictUndefined
 
-    def plain(value: Any) -> Any:
-        return TAG.sub(r"&lt;", REFERENCE.sub("&amp;", value)) if isinstance(value, str) else value
+    def plain(value: Any) -> Any:  # names of joints and files may hold HTML
+        return HTML.sub(lambda found: escape(found[0]), value) if isinstance(value, str) else value
 
     pages = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=plain)
     pages.filters |= {"formatted": formatted, "number": number, "table": lambda rows, head: markdown_table(head, rows)}
@@ -52,7 +50,7 @@ def rendered(template: Path, **values: Any) -> str:
     return re.sub(r"\n{3,}", "\n\n", text.render(values)).strip() + "\n"
 
 
-TAG, REFERENCE = re.compile("<(?=[A-Za-z/!?])"), re.compile(r"&(?=#?\w+;)")
+HTML = re.compile(r"<(?=[A-Za-z/!?])|&(?=#?\w+;)")
 Column = tuple[str, str, str, int]  # title, quantity, score and decimals; of a coverage in percent
 
 
