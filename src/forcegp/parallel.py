@@ -21,8 +21,7 @@ Outcome = TypeVar("Outcome")
 Jobs: TypeAlias = int | Executor
 
 MOST_JOBS = 1024  # of own processes; more machines have executors
-IDLE_SECONDS = 300
-"""So long processes without work are kept for the next call."""
+IDLE_SECONDS = 300  # so long processes without work are kept for the next call
 
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "BLIS")}
 """Environment of an own process; the libraries read it when they are loaded."""

@@ -232,8 +232,7 @@ def _log_cholesky(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 THIN = 1e-5
 """Bodies with a second moment about the centre of mass below this fraction of that about the origin are thickened."""
-THICKNESS = 0.05
-"""Standard deviation of the mass that thickening adds, as a fraction of the body's size."""
+THICKNESS = 0.05  # standard deviation of the mass that thickening adds, as a fraction of the body's size
 
 
 def thickened(robot: Robot) -> tuple[Robot, tuple[str, ...]]:
