@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import signal
+import sys
 import warnings
 
 import numpy as np
@@ -99,13 +100,13 @@ def test_a_program_that_calls_main_goes_on_as_it_was(folder, capfd, words):
         pass
 
     before = signal.signal(signal.SIGTERM, handler)
-    shown, target = warnings.showwarning, os.fstat(1)
+    shown, target, errors = warnings.showwarning, os.fstat(1), sys.stdout.errors
     try:
         main([*words.split(), *QUICK])
         assert signal.getsignal(signal.SIGTERM) is handler
     finally:
         signal.signal(signal.SIGTERM, before)
-    assert warnings.showwarning is shown
+    assert (warnings.showwarning, sys.stdout.errors) == (shown, errors)
     assert os.path.samestat(os.fstat(1), target)
     capfd.readouterr()
     os.write(1, b"after")

@@ -87,9 +87,6 @@ def test_a_law_of_ones_own_acts_in_plants(monkeypatch):
     np.testing.assert_allclose(joint_law("quadratic:drag=0.6,viscous:0")(v), -0.6 * np.abs(v) * v, atol=1e-14)
     with pytest.raises(InvalidInput, match="joint_friction is 'payload:l7'; give laws of joints"):
         joint_law("payload:l7")
-
-
-def test_a_spring_pulls_joints_back_and_no_base():
     robot = Robot.from_urdf_text(ROBOT.urdf_text, base="floating")
     law, q = laws_of_joints("spring:2,viscous:0", robot, {"velocity": 0.1}), robot.neutral().numpy() + np.arange(14.0)
     np.testing.assert_array_equal(law(np.ones(13), q=q), np.r_[np.zeros(6), -2.0 * q[7:]])

@@ -106,14 +106,14 @@ class BaseParameters:
 
     def triangle(self, motion: Motion) -> np.ndarray:
         """R (k, k) of the QR decomposition of the regressor, of some samples after the other: all would fill GB."""
-        nv = len(self.scale)
-        R, some = np.zeros((0, len(self.columns) + 2 * nv)), max(1, ENTRIES // (10 * nv**2))
+        nv, R = len(self.scale), np.zeros((0, len(self.columns) + 2 * len(self.scale)))
+        some = max(1, ENTRIES // (10 * nv**2))
         for begin in range(0, len(motion.q), some):
             q, v, a = (torch.as_tensor(x[begin : begin + some]) for x in motion[1:4])
             Y = torque_regressor(self.model.robot, q, v, a)[..., self.columns]
             Y = torch.cat([Y, torch.diag_embed(v), torch.diag_embed((v / DRY).tanh())], dim=-1)
             Y = (Y.numpy() / self.scale[:, None]).reshape(-1, Y.shape[-1])
-            R = np.linalg.qr(np.concatenate([R, Y]), mode="r")
+            R = np.asarray(np.linalg.qr(np.concatenate([R, Y]), mode="r"))
         return R
 
     def score(self, motion: Motion) -> float:

@@ -339,7 +339,7 @@ def _signals(
         raise InvalidInput(
             f"{signal} has {len(expressions)} columns for {len(names)} {what} ({', '.join(names) or 'none'}); {remedy}"
         )
-    named = [named_unit(signal, *x.weights, source.units) if x.is_column else None for x in expressions]
+    named = [named_unit(signal, *x.weights, stated=source.units) if x.is_column else None for x in expressions]
     named = [x or columns[name] or "1" for x, name in zip(named, names, strict=True)]
     given = [log_unit(signal, name) for name in mapping.unit.get(signal, named)]
     signs, driven = mapping.sign.get(signal, (1.0,)), sum(signal != "u" or columns[name] != "1" for name in names)
