@@ -26,7 +26,8 @@ def identifier(name: str) -> str:
     """A name for C, C++ and files, of any text, but no word of theirs, of CasADi or of standard headers (taken.txt)."""
     plain = re.sub(r"[^A-Za-z0-9]+", "_", name)[:60].strip("_").lower() or "robot"
     plain = plain if plain[0].isalpha() else f"robot_{plain}"
-    return f"{plain}_model" if plain in c_text(__name__, "exported_c/taken.txt").split() else plain
+    taken = plain.endswith("_t") or plain in c_text(__name__, "exported_c/taken.txt").split()  # POSIX reserves ..._t
+    return f"{plain}_model" if taken else plain
 
 
 @dataclass(frozen=True)
