@@ -23,8 +23,7 @@ TEMPORARY = ".tmp"
 LOCK, OLD = ".lock", ".old"
 TRIAL = 2**16
 """Bytes that `require_writable` writes."""
-MARK = "Written by forcegp"
-"""Stands near the end of pages and robot files, which may be replaced."""
+MARK = "Written by forcegp"  # stands near the end of pages and robot files, which may be replaced
 HOLE = 100 << 20  # bytes that a file may lack of its size
 LARGEST_TEXT = 32 << 20
 """Bytes of JSON or of a list that forcegp wrote: digests, settings, results; most have some thousand."""

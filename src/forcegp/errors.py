@@ -164,6 +164,11 @@ def require_number(name: str, given: object, words: str, least: float = math.ulp
         raise InvalidInput(f"{name} is {given!r}; {words}.")
 
 
+def lacks_memory(error: Exception) -> bool:
+    """Whether memory ran out, which PyTorch and MuJoCo say in errors of any kind."""
+    return isinstance(error, MemoryError) or "allocate memory" in str(error) or "out of memory" in str(error)
+
+
 @contextlib.contextmanager
 def usable_arguments(of: str) -> Iterator[None]:
     """Also a decorator: what Python raises for values of another kind becomes an InvalidInput that names `of`."""
@@ -172,6 +177,8 @@ def usable_arguments(of: str) -> Iterator[None]:
     except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         if isinstance(error, ForceGPError):
             raise
+        if lacks_memory(error):
+            raise MemoryError(str(error)) from error
         raise InvalidInput(f"{of} was given a value of another kind: {error}; see help({of})") from error
 
 

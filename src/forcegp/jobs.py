@@ -28,8 +28,7 @@ from forcegp.errors import BackendError, DataWarning, FileFormatError, FitError,
 from forcegp.parallel import Jobs, executor_for, outcome_of, stop, submit
 from forcegp.progress import tell, watched
 
-CODE = (".py", ".c", ".h", ".jinja")
-"""Endings of the files that decide what a package computes."""
+CODE = (".py", ".c", ".h", ".jinja")  # endings of the files that decide what a package computes
 DESCRIPTION, JOBS, LOCK = "jobs.json", "jobs", ".lock"
 RESULT_FILE = "job.json"
 LIBRARIES = ("torch", "gpytorch", "scipy", "numpy")

@@ -20,8 +20,8 @@ from forcegp.errors import BackendError, InvalidInput
 Outcome = TypeVar("Outcome")
 Jobs: TypeAlias = int | Executor
 
-IDLE_SECONDS = 300
-"""So long processes without work are kept for the next call."""
+MOST_JOBS = 1024  # of own processes; more machines have executors
+IDLE_SECONDS = 300  # so long processes without work are kept for the next call
 
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "BLIS")}
 """Environment of an own process; the libraries read it when they are loaded."""
@@ -41,10 +41,10 @@ class ThisProcess(Executor):
 
 
 def checked_jobs(jobs: object) -> Jobs:
-    """The argument. Raises InvalidInput for anything but an executor or a whole number of at least 1."""
-    if isinstance(jobs, Executor) or (isinstance(jobs, int) and not isinstance(jobs, bool) and jobs >= 1):
+    """The argument. Raises InvalidInput for anything but an executor or a whole number from 1 to `MOST_JOBS`."""
+    if isinstance(jobs, Executor) or (isinstance(jobs, int) and not isinstance(jobs, bool) and 1 <= jobs <= MOST_JOBS):
         return jobs
-    raise InvalidInput(f"jobs is {jobs!r}; give the number of tasks at once, at least 1, or an Executor")
+    raise InvalidInput(f"jobs is {jobs!r}; give the number of tasks at once, 1 to {MOST_JOBS}, or an Executor")
 
 
 def executor_for(jobs: Jobs) -> Executor:

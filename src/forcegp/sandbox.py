@@ -17,17 +17,14 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from forcegp.errors import ForceGPError, RobotModelError
+from forcegp.errors import ForceGPError, RobotModelError, lacks_memory
 
-SECONDS = 30
-"""CPU time of one file, and half of its wall time: whole robots with meshes take two."""
-MEMORY = 1 << 30
-"""Bytes of address space; MuJoCo itself takes 130 MB."""
+SECONDS = 30  # CPU time of one file, and half of its wall time: whole robots with meshes take two
+MEMORY = 1 << 30  # bytes of address space; MuJoCo itself takes 130 MB
 LARGEST = {"nbody": 2_000, "njnt": 2_000, "nsite": 2_000, "ngeom": 20_000}
 """Parts of a compiled model: robots have some hundred."""
 
-ACTS = ("subprocess", "os", "socket", "ctypes", "shutil")
-"""First words of Python's audit events that no macro needs."""
+ACTS = ("subprocess", "os", "socket", "ctypes", "shutil")  # first words of Python's audit events that no macro needs
 
 
 def read_apart(
@@ -138,7 +135,7 @@ def _compiled(request: dict[str, Any]) -> dict[str, Any]:
             model = spec.compile()
     except (ValueError, TypeError, RuntimeError, IndexError, mujoco.FatalError) as error:
         reason = " ".join(str(error).removeprefix("Error: ").split())
-        if "unknown exception" in reason or "allocate memory" in reason:
+        if "unknown exception" in reason or lacks_memory(error):
             raise MemoryError(reason) from None
         missing = any(word in reason for word in ("file", "mesh", "resource"))
         return {"refused": reason, "meshes": needed if missing else []}

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import signal
+import sys
 import warnings
 
 import numpy as np
@@ -13,6 +14,7 @@ from tests.posterior.arm import URDF, arm_data
 
 from forcegp import scores
 from forcegp.cli.main import main
+from forcegp.errors import usable_arguments
 from forcegp.model import Model
 from forcegp.posterior import load_posterior
 from forcegp.robots import Robot
@@ -98,13 +100,13 @@ def test_a_program_that_calls_main_goes_on_as_it_was(folder, capfd, words):
         pass
 
     before = signal.signal(signal.SIGTERM, handler)
-    shown, target = warnings.showwarning, os.fstat(1)
+    shown, target, errors = warnings.showwarning, os.fstat(1), sys.stdout.errors
     try:
         main([*words.split(), *QUICK])
         assert signal.getsignal(signal.SIGTERM) is handler
     finally:
         signal.signal(signal.SIGTERM, before)
-    assert warnings.showwarning is shown
+    assert (warnings.showwarning, sys.stdout.errors) == (shown, errors)
     assert os.path.samestat(os.fstat(1), target)
     capfd.readouterr()
     os.write(1, b"after")
@@ -130,6 +132,7 @@ def test_interrupts_defects_and_a_lack_of_memory_are_told_apart(folder, monkeypa
     for error, code, told in (
         (KeyboardInterrupt(), 130, "interrupted; no partial output was kept"),
         (MemoryError("3 GiB"), 2, "out of memory (3 GiB); use fewer points or rows"),
+        (RuntimeError("can't allocate memory: 9 B"), 2, "out of memory (can't allocate memory: 9 B); use fewer points"),
         (ImportError("libx: cannot open shared object file"), 2, "a library cannot be loaded"),
         (RuntimeError("two\nlines"), 1, "an error in forcegp itself, RuntimeError: two lines (--debug shows where)"),
         (OSError(28, "No space left"), 2, "free some space, or write elsewhere"),
@@ -137,9 +140,12 @@ def test_interrupts_defects_and_a_lack_of_memory_are_told_apart(folder, monkeypa
     ):
 
         def fails(*_, error=error, **__):
+            np.square([1e300])  # about which NumPy warns
             raise error
 
         monkeypatch.setattr("forcegp.check", fails)
         assert main(["check", "arm.h5"]) == code
         (line,) = capfd.readouterr().err.splitlines()
         assert told in line
+    with pytest.raises(MemoryError), usable_arguments("excitation"):
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory")

@@ -50,6 +50,9 @@ def test_version_and_help_through_the_module(installed):
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert all(re.search(rf"^\W*{command}\s", done.stdout, re.M) for command in COMMANDS)
+    environment["PYTHONIOENCODING"] = "ascii"  # which lacks the letters of units
+    done = subprocess.run([*words[:3], "score", "--help"], env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr, "kg m?" in done.stdout) == (0, "", True)
 
 
 @pytest.mark.parametrize("closed", [">&-", ">&- 2>&- <&-"])
@@ -72,6 +75,13 @@ def test_an_environment_that_libraries_do_not_take_is_one_sentence(tmp_path):
     done = subprocess.run(words, env={**os.environ, "SOURCE_DATE_EPOCH": "x"}, **how)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "forcegp: SOURCE_DATE_EPOCH is 'x'; give whole seconds, or unset it.\n"
+    code = [sys.executable, "-c", "from forcegp.cli.main import main; main(); import matplotlib", "--version"]
+    done = subprocess.run(code, env={**os.environ, "MPLBACKEND": "nonsense"}, **how)
+    assert (done.returncode, done.stderr) == (0, "")
+    stops = "{'__getattr__': lambda *_: signal.raise_signal(signal.SIGINT)}"
+    code[2] = f"import signal, sys; sys.modules['tyro'] = type('', (), {stops})(); {code[2]}"
+    done = subprocess.run(code, **how)
+    assert (done.returncode, done.stderr) == (130, "forcegp: interrupted; nothing was begun.\n")
     done = subprocess.run(words, env={**os.environ, "PYTHONWARNINGS": "error"}, **how)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "no such file" in done.stderr

@@ -107,6 +107,9 @@ def test_locks_of_another_user_are_not_used(folder, no_work, monkeypatch, capfd)
     monkeypatch.setattr("tempfile.tempdir", str(folder))
     monkeypatch.setattr(os, "getuid", lambda: mine + 1)
     assert "belongs to another user; set TMPDIR" in refused(filled("fit", "new"), capfd)
+    monkeypatch.setattr(os, "getuid", lambda: mine + 2)
+    Path(f"forcegp-locks-{mine + 2}").symlink_to("nowhere")
+    assert "where a folder is needed: a file, or a link to nothing" in refused(filled("fit", "new"), capfd)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -131,6 +131,8 @@ def test_a_payload_that_may_be_none_has_no_place(folder, forcegp):
         ("payload nothing.h5", "nothing.h5 is not a file"),
         ("payload loaded.h5 --link tool9", "tool9"),
         ("payload loaded.h5 --cutoff high", "--cutoff is 'high'"),
+        ("payload loaded.h5 --mass 1e300", "--mass is 1e+300; give kg, above 0 and below 1e+09"),
+        ("payload loaded.h5 --cutoff none --delay 0 --forces gp:joint", "would hide a payload; name laws"),
     ],
 )
 def test_what_cannot_be_is_one_line(folder, forcegp, words, message):

@@ -8,7 +8,7 @@ from tests.goldens.compare import assert_unchanged
 from tests.posterior.arm import URDF, arm_data, arm_model, quick_fit
 
 from forcegp import Contact, Dataset, Plane, excitation
-from forcegp.control.informative_motions import far_apart
+from forcegp.control.informative_motions import BaseParameters, far_apart
 from forcegp.errors import InvalidInput
 from forcegp.forces import JointFriction
 
@@ -74,6 +74,13 @@ def test_a_bare_robot_moves_so_that_its_parameters_show():
     (least, _), (more, condition) = determinant(1), determinant(30)
     assert more > least + 3.0
     assert 1.0 < condition < 1e3
+
+
+def test_samples_one_after_the_other_show_what_all_show(monkeypatch):
+    found, columns = excitation(FREE.robot, **FEW, limits=LIMITS), BaseParameters(FREE, np.ones(3))
+    whole = columns.triangle(found.motion)
+    monkeypatch.setattr("forcegp.control.informative_motions.ENTRIES", 700)
+    np.testing.assert_allclose(np.abs(columns.triangle(found.motion)), np.abs(whole), atol=1e-10 * np.abs(whole).max())
 
 
 def test_what_is_expected_is_what_an_update_gives_whatever_is_measured(posterior, chosen):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from tests.posterior.arm import URDF
+from tests.recordings.broken_logs import urdf
 from tests.robots.robot_models import TREE
 
 from forcegp.evidence import base_parameters, torque_regressor
@@ -31,3 +32,12 @@ def test_an_arm_of_three_turning_joints_has_fifteen():
     base = base_parameters(Robot.from_urdf_text(URDF))
     assert len(base) == 15
     assert 0 not in base  # it is never lifted
+
+
+def test_many_joints_take_little_memory_or_are_refused(monkeypatch):
+    robot = Robot.from_urdf_text(urdf(*map("j{}".format, range(40))).replace("<axis", '<origin xyz="0 0 1"/><axis'))
+    monkeypatch.setattr("forcegp.inference.memory.free_memory", lambda _: 2**29)
+    assert len(base_parameters(robot)) == 3 * 40, "in a plane an inertia and two moments each (ibid.)"
+    monkeypatch.setattr("forcegp.inference.memory.free_memory", lambda _: 2**20)
+    with pytest.raises(MemoryError, match=r"40 joints .* fewer joints"):
+        base_parameters(robot)

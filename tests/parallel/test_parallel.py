@@ -129,7 +129,7 @@ def test_what_cannot_travel_is_told():
         list(mapped(tasks.seeded_sum, [(k for k in range(2))], 2))
 
 
-@pytest.mark.parametrize("wrong", [0, -2, 1.5, True, "2", None])
+@pytest.mark.parametrize("wrong", [0, -2, 1.5, True, "2", None, 10**20])
 def test_wrong_jobs_are_told(wrong):
-    with pytest.raises(InvalidInput, match=rf"jobs is {wrong!r}; give .*at least 1, or an Executor"):
+    with pytest.raises(InvalidInput, match=rf"jobs is {wrong!r}; give .* 1 to 1024, or an Executor"):
         checked_jobs(wrong)

@@ -315,7 +315,7 @@ def test_without_a_compiler_it_is_written_and_says_that_nothing_was_compared(pos
     ("given", "found"),
     [
         ("LBR-iiwa 7", "lbr_iiwa_7"), ("7dof", "robot_7dof"), ("", "robot"), ("math", "math_model"),
-        ("Jac", "jac_model"), ("über-Arm 2", "ber_arm_2"), ("a" * 300, "a" * 60),
+        *((x, f"{x}_model") for x in ("new", "log", "id_t")), ("über-Arm 2", "ber_arm_2"), ("a" * 300, "a" * 60),
     ],
 )  # fmt: skip
 def test_names_for_c(given, found):

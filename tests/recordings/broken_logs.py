@@ -226,6 +226,7 @@ BROKEN = {
     "two of one name": Broken(lambda folder: twins(archive(folder)), "holds two arrays of one name", ARRAYS),
     "rows of any length": Broken(
         written("log.json", b"[" + b"[1],[1,2]," * 9999 + b"[1]]"), "lists of different", ARRAYS),
+    "own names": Broken(written("log.jsonl", b"\n".join(b'{"k%d": 1}' % k for k in range(2000))), "2000 names", ARRAYS),
     "month 13": Broken(
         written("log.csv", b"time,q_a,u_a\n" + b"2024-13-45 1:00:00,0,0\n" * 9), "'time', the time, is missing", ONE),
     "a long gap": Broken(

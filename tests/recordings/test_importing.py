@@ -137,13 +137,27 @@ def test_joints_that_slide_are_in_metres(tmp_path):
     found = import_recordings([path], mapping, model=rail)
     np.testing.assert_allclose(found.q, data["q"], atol=1e-14)
     np.testing.assert_allclose(found.time, data["time"], atol=1e-14)
-    assert found.metadata["import"]["guessed"] == ["unit q=deg,mm, as the columns are called"]
+    assert found.metadata["import"]["guessed"] == ["unit q=deg,mm, as the log says", "unit time=ms, as the log says"]
     mapping = dataclasses.replace(mapping, unit={"q": ("deg", "m")})
     with pytest.raises(MistakenUnit, match="Then add `unit` q=deg,mm"):
         import_recordings([path], mapping, model=rail)
     mapping = dataclasses.replace(mapping, unit={"q": ("rad", "mm")})
     with pytest.raises(InvalidInput, match="q of joint 'elbow' is mm, but the joint turns"):
         imported(path, mapping)
+
+
+@pytest.mark.parametrize("head", ["NAMES\nms,deg,deg", "[ms],[°],[°]\nNAMES", "NAMES\nms,deg,deg\ntop,arm,arm"])
+def test_a_line_of_units_counts_as_units_in_names_do(tmp_path, head):
+    path, time, q = tmp_path / "log.csv", 1e3 * motion()["time"], np.rad2deg(motion()["q"])
+    names, rows = write_text(path, {"t": time, "q1": q[:, 0], "q2": q[:, 1]}).read_text().split("\n", 1)
+    path.write_text(f"{head.replace('NAMES', names)}\n{rows}")
+    found = imported(path, ColumnMapping(q=("log:q{1..2}",), u=("0",), time="log:t", side_by_side=True))
+    np.testing.assert_allclose(found.q, np.deg2rad(q), atol=1e-14)
+    assert found.metadata["import"]["guessed"] == ["unit q=deg, as the log says", "unit time=ms, as the log says"]
+    notes = found.metadata["import"]["recordings"][0]["notes"]
+    assert ["arm" in note for note in notes] == [True] * ("arm" in head)
+    stated = ColumnMapping(q=("q1", "q2"), u=("0",), time="t", unit={"q": ("rad",)})
+    np.testing.assert_array_equal(imported(path, stated).q, q)
 
 
 @pytest.mark.parametrize(("share", "units"), [(0.15, "deg,rad"), (0.05, "deg")])

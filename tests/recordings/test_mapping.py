@@ -130,7 +130,7 @@ def test_lists_are_split_at_the_commas_that_separate():
     ("quantity", "name", "given", "si"),
     [
         ("q", "deg", 180.0, np.pi), ("v", "rpm", 60.0, 2 * np.pi), ("u", "mNm", 3.0, 3e-3),
-        ("a", "deg/s²", 180.0, np.pi), ("time", "us", 5.0, 5e-6),
+        ("a", "deg/s²", 180.0, np.pi), ("a", "deg/s^2", 180.0, np.pi), ("time", "us", 5.0, 5e-6),
     ],
 )  # fmt: skip
 def test_units(quantity, name, given, si):

@@ -41,7 +41,7 @@ def scores() -> Scores:
         "ls": [run(0, 2.0), run(1, 2.2), run(2, 2.4, diverged=1)],
         "gp": [run(0, 0.5), run(1, 0.0, error="no luck"), run(2, 0.6)],
     }
-    about = {"rows": 100, "seeds": [0, 1, 2], "machine": "here", "forcegp": "0"}
+    about = {"rows": 100, "seeds": [0, 1, 2], "machine": "here", "forcegp": "0", "notes": ["<b>x</b> a&lt;b < 2 & c"]}
     return Scores(models=models, runs=runs, joint_names=("a", "b"), units=UNITS, about=about)
 
 
@@ -79,6 +79,7 @@ def test_models_side_by_side(scores):
 
 def test_the_page_holds_all_of_it(scores):
     text = page(scores)
+    assert "\n* &lt;b>x&lt;/b> a&amp;lt;b < 2 & c\n" in text
     assert "| ls | 0.4400 (0.4000–0.4800) |" in text
     assert "gp failed in 1 of 3 runs (s, seed 1): no luck" in text
     assert "| gp | 1.650 | 2.200 |" in text

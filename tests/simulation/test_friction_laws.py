@@ -13,6 +13,7 @@ from forcegp.forces.force import Coefficient
 from forcegp.forces.joint_law import JointLaw
 from forcegp.forces.registry import FORCES
 from forcegp.simulation import KukaSurfaceConfig
+from forcegp.simulation.joint_friction import laws_of_joints
 from forcegp.simulation.kuka_surface import PointFriction, joint_friction_of, multiplier_with_friction
 
 STRIBECK = PointFriction(coulomb=0.3, static=0.5, breakaway_velocity=0.1, smoothing=1e-6)
@@ -86,6 +87,9 @@ def test_a_law_of_ones_own_acts_in_plants(monkeypatch):
     np.testing.assert_allclose(joint_law("quadratic:drag=0.6,viscous:0")(v), -0.6 * np.abs(v) * v, atol=1e-14)
     with pytest.raises(InvalidInput, match="joint_friction is 'payload:l7'; give laws of joints"):
         joint_law("payload:l7")
+    robot = Robot.from_urdf_text(ROBOT.urdf_text, base="floating")
+    law, q = laws_of_joints("spring:2,viscous:0", robot, {"velocity": 0.1}), robot.neutral().numpy() + np.arange(14.0)
+    np.testing.assert_array_equal(law(np.ones(13), q=q), np.r_[np.zeros(6), -2.0 * q[7:]])
 
 
 def problem(seed: int):

@@ -40,7 +40,7 @@ def unless_given(metavar: str, default: str, constructor: type | None = None) ->
 
 
 def split_list(text: str, goes_on: str | None = None) -> list[str]:
-    """Entries between commas. What matches `goes_on`, or is in parentheses, continues an entry. Raises ValueError."""
+    """Entries between commas. What matches `goes_on`, or is in parentheses, continues an entry. Raises InvalidInput."""
     entries: list[str] = []
     for piece in text.split(","):
         open_ = bool(entries) and entries[-1].count("(") > entries[-1].count(")")
@@ -49,7 +49,7 @@ def split_list(text: str, goes_on: str | None = None) -> list[str]:
         else:
             entries.append(piece.strip())
     if "" in entries:
-        raise ValueError(f"{text!r} holds an empty entry; write one comma between two entries, as in a,b.")
+        raise InvalidInput(f"{text!r} holds an empty entry; write one comma between two entries, as in a,b.")
     return entries
 
 

@@ -9,11 +9,16 @@ import sys
 import traceback
 import warnings
 from collections.abc import Mapping, Sequence
+from typing import Any
 
-from forcegp.cli.arguments import parsed
-from forcegp.cli.command import Command, values_of
-from forcegp.cli.terminal import Terminal, with_option_names
-from forcegp.errors import ForceGPError, printable
+try:
+    from forcegp.cli.arguments import parsed
+    from forcegp.cli.command import Command, values_of
+    from forcegp.cli.terminal import Terminal, with_option_names
+    from forcegp.errors import ForceGPError, lacks_memory, printable
+except KeyboardInterrupt:  # in the first tenth of a second, before `main` could tell
+    print("forcegp: interrupted; nothing was begun.", file=sys.stderr)
+    raise SystemExit(130) from None
 
 ARGUMENTS: Mapping[str, Mapping[str, str]] = {
     "excite": {"start": "posture", "motions": "tries", "surface": "avoid"},
@@ -36,6 +41,7 @@ _REMEDIES = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "; free som
 _REMEDIES |= dict.fromkeys(
     (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR), "; write to a folder where you may."
 )
+_REMEDIES[errno.EEXIST] = ", where a folder is needed: a file, or a link to nothing; remove it, or write elsewhere."
 """What to do about an OSError, by its number."""
 
 
@@ -48,6 +54,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), "r" if name == "stdin" else "w"))
     given = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments is None:  # this process draws in files alone, and matplotlib refuses names that it does not know
+        os.environ.pop("MPLBACKEND", None)
     if given == ["--version"]:
         from forcegp import __version__  # 30 ms that only this needs
 
@@ -60,6 +68,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not (epoch := os.environ.get("SOURCE_DATE_EPOCH", "0")).isdigit():  # which libraries read when imported
         return _fail(f"SOURCE_DATE_EPOCH is {epoch!r}; give whole seconds, or unset it.", USER_ERROR, debug)
     showwarning, terminate = warnings.showwarning, None
+    stdout: Any = sys.stdout
+    errors = getattr(stdout, "errors", None)
+    with contextlib.suppress(AttributeError):  # of a notebook, which takes every letter
+        stdout.reconfigure(errors="replace")  # letters that its encoding lacks: the result counts, not its signs
     with contextlib.suppress(ValueError):  # not in the main thread
         # so that temporary files are removed then, too
         terminate = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
@@ -67,6 +79,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # `forcegp --debug fit ...` means the same as `forcegp fit ... --debug`
         command = parse_arguments([*(word for word in given if word != "--debug"), *(["--debug"] if debug else [])])
         with Terminal(json=command.json, options=values_of(command)) as terminal, warnings.catch_warnings():
+            # of NumPy, about numbers that a sentence of ours refuses, or that are not finite where they are shown
+            warnings.filterwarnings("ignore", "(overflow|invalid value|divide by zero) encountered", RuntimeWarning)
             warnings.showwarning = lambda message, *_, **__: terminal.warn(str(message))
             command.check_paths()
             with command.alone():
@@ -84,9 +98,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(message, USER_ERROR, debug)
     except OSError as error:
         return _fail(f"{error}{_REMEDIES.get(error.errno or 0, '')}", USER_ERROR, debug)
-    except MemoryError as error:
-        return _fail(f"out of memory ({error}); use fewer points or rows.", USER_ERROR, debug)
     except Exception as error:  # the last resort: one line also for a defect of ours, with its own exit code
+        if lacks_memory(error):
+            return _fail(f"out of memory ({error}); use fewer points or rows.", USER_ERROR, debug)
         if isinstance(error, ImportError) and "shared object" in str(error):
             remedy = "raise the limit of memory (ulimit -v), or install forcegp again"
             return _fail(f"a library cannot be loaded: {error}; {remedy}.", USER_ERROR, debug)
@@ -94,6 +108,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(f"an error in forcegp itself, {what} (--debug shows where)", INTERNAL_ERROR, debug)
     finally:  # a program that calls this goes on as it was
         warnings.showwarning = showwarning
+        with contextlib.suppress(AttributeError, OSError):  # a full disk
+            stdout.reconfigure(errors=errors)
         if terminate is not None:
             signal.signal(signal.SIGTERM, terminate)
     return OK

@@ -22,12 +22,11 @@ from forcegp.cli.logs import FilterOptions
 from forcegp.cli.robot_options import SYSTEM_FILE, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal
 from forcegp.doubts import Doubts
-from forcegp.errors import InvalidInput
+from forcegp.errors import LARGEST, InvalidInput, require_number
 
 WINDOW = 0.4
 """Seconds that torques are averaged over: it takes noise of the acceleration, and leaves friction as sharp as it is."""
-WIDER = 2.3
-"""Where a base moves, times the windows of a fit: a mass needs less of what is fast than rotors do."""
+WIDER = 2.3  # where a base moves, times the windows of a fit: a mass needs less of what is fast than rotors do
 LAWS = "viscous", "gear", "offset", "rotor"
 SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
 MOST_OPEN = 0.3  # of the robot's mass in half an interval, from which on a payload is not known
@@ -71,6 +70,8 @@ class Payload(Command):
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Prepare, estimate, write and show."""
         self.require_free(self.out)
+        if self.mass is not None:
+            require_number("--mass", self.mass, f"give kg, above 0 and below {LARGEST:g}", below=LARGEST)
         notes: list[str] = []
         model, rows = self._rows(terminal, self.log, notes)
         baseline = None if self.baseline is None else self._rows(terminal, self.baseline, notes)[1]
@@ -81,6 +82,11 @@ class Payload(Command):
             notes.append("the log is of postures alone: no motion shows friction, of which each rest has its own share")
         words = ["gain", *words] if self.mass is not None and "gain" not in words else words
         model = forcegp.scores.named_model(model, words)
+        if model.unknown_forces:
+            raise InvalidInput(
+                f"--forces is {','.join(self.forces)}, with unknown functions, which would hide a payload; name laws "
+                "alone, such as viscous,gear,offset,rotor."
+            )
         if model.actuation.learned and baseline is not None and self.mass is None:
             raise InvalidInput(
                 "gains and all masses are unknown, so only their products are known; give --mass of the payload, or "

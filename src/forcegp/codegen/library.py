@@ -30,8 +30,7 @@ COMMANDS = ("cc", "gcc", "clang")
 PACKAGES = (
     "Debian, Ubuntu: apt install gcc; Fedora: dnf install gcc; macOS: xcode-select --install; conda: conda install gcc"
 )
-LONGEST = 600.0
-"""Seconds after which a compiler hangs: our longest program takes it a fiftieth of that."""
+LONGEST = 600.0  # seconds after which a compiler hangs: our longest program takes it a fiftieth of that
 WITHOUT = "or do without it: a robot itself, predictor(compile=False), export_c(unchecked=True)"
 ELSEWHERE = "choose another folder (the environment variable XDG_CACHE_HOME, robot.compile(folder=...))"
 MOST_LANES, STATES_PER_THREAD = 8, 2048  # fewer states are done before another thread has started

@@ -22,7 +22,7 @@ from forcegp.data import Dataset
 from forcegp.data.dataset import require_rows
 from forcegp.data.views import farthest_point_sampling
 from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
-from forcegp.evidence.bodies import base_parameters, torque_regressor
+from forcegp.evidence.bodies import ENTRIES, base_parameters, torque_regressor
 from forcegp.inference.memory import blas_threads
 from forcegp.inference.posterior import exact, with_only
 from forcegp.integration.integrators import check_time_step
@@ -104,16 +104,21 @@ class BaseParameters:
         at = self.model.dynamics(q, v, 0.0 * a)
         return ((at.M @ a[..., None])[..., 0] - at.Q_K).numpy()
 
-    def regressor(self, motion: Motion) -> np.ndarray:
-        """Of all samples, (rows, k)."""
-        q, v, a = map(torch.as_tensor, motion[1:4])
-        Y = torque_regressor(self.model.robot, q, v, a)[..., self.columns]
-        Y = torch.cat([Y, torch.diag_embed(v), torch.diag_embed((v / DRY).tanh())], dim=-1)
-        return (Y.numpy() / self.scale[:, None]).reshape(-1, Y.shape[-1])
+    def triangle(self, motion: Motion) -> np.ndarray:
+        """R (k, k) of the QR decomposition of the regressor, of some samples after the other: all would fill GB."""
+        nv, R = len(self.scale), np.zeros((0, len(self.columns) + 2 * len(self.scale)))
+        some = max(1, ENTRIES // (10 * nv**2))
+        for begin in range(0, len(motion.q), some):
+            q, v, a = (torch.as_tensor(x[begin : begin + some]) for x in motion[1:4])
+            Y = torque_regressor(self.model.robot, q, v, a)[..., self.columns]
+            Y = torch.cat([Y, torch.diag_embed(v), torch.diag_embed((v / DRY).tanh())], dim=-1)
+            Y = (Y.numpy() / self.scale[:, None]).reshape(-1, Y.shape[-1])
+            R = np.asarray(np.linalg.qr(np.concatenate([R, Y]), mode="r"))
+        return R
 
     def score(self, motion: Motion) -> float:
         """What is to be small: minus log det of the information."""
-        return -float(np.linalg.slogdet(np.linalg.qr(self.regressor(motion), mode="r"))[1])
+        return -float(np.linalg.slogdet(self.triangle(motion))[1])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -328,8 +333,8 @@ def excitation(
             f"none of {motions} motions shows all base parameters; give more seconds, limits or motions."
         )
     if isinstance(teaches, BaseParameters):
-        Y = teaches.regressor(best)
-        return replace(draft, motion=best, condition=float(np.linalg.cond(Y / np.linalg.norm(Y, axis=0))))
+        R = teaches.triangle(best)
+        return replace(draft, motion=best, condition=float(np.linalg.cond(R / np.linalg.norm(R, axis=0))))
     before, after = teaches.posterior, teaches.after(best, teaches.posterior)
     spread = np.stack([teaches.spread(x) for x in (before, after)])
     return replace(draft, motion=best, model=before, expected=after, spread=spread)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from forcegp.errors import NonPhysicalInertia
 from forcegp.forces import Body
+from forcegp.inference import require_memory
 from forcegp.robots import Robot
 from forcegp.robots.inertia import (
     physical_of_pseudo_inertia,
@@ -58,10 +59,9 @@ def body_names(robot: Robot) -> tuple[str, ...]:
     return tuple(robot.layout.bodies[body].child for body in carrying(robot))
 
 
-RANK_TOLERANCE = 1e-9
-"""Diagonal entries of R below this fraction of the largest are zero, for columns of norm 1."""
-RANDOM_ROWS = 50
-"""Random states per joint that stand for every motion."""
+RANK_TOLERANCE = 1e-9  # diagonal entries of R below this fraction of the largest are 0, for columns of norm 1
+RANDOM_ROWS, FEWEST = 50, 20  # random states per joint, and of all, that stand for every motion
+ENTRIES, COPIES = 2**23, 6  # of a regressor at once; what more rows would need, and the steps of its decomposition
 
 
 def base_parameters(robot: Robot) -> tuple[int, ...]:
@@ -69,7 +69,11 @@ def base_parameters(robot: Robot) -> tuple[int, ...]:
 
     They are those of random states, the same ones every time.
     """
-    drawn = np.random.default_rng(0).normal(0.0, 2.0, (3, RANDOM_ROWS * robot.nv, robot.nv))
+    entries = 10 * max(robot.nv, 1) ** 2  # of the regressor at one state
+    states = min(RANDOM_ROWS * robot.nv, max(FEWEST, ENTRIES // entries))
+    remedy = "give a robot with fewer joints, others locked."
+    require_memory(8 * COPIES * states * entries, f"the regressor of {robot.nv} joints", remedy, robot.device)
+    drawn = np.random.default_rng(0).normal(0.0, 2.0, (3, states, robot.nv))
     turns, v, a = torch.tensor(drawn, device=robot.device)
     q = robot.space.integrate(robot.space.neutral(), turns)
     regressor = torque_regressor(robot, q, v, a).flatten(0, 1).cpu().numpy()
@@ -228,8 +232,7 @@ def _log_cholesky(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 THIN = 1e-5
 """Bodies with a second moment about the centre of mass below this fraction of that about the origin are thickened."""
-THICKNESS = 0.05
-"""Standard deviation of the mass that thickening adds, as a fraction of the body's size."""
+THICKNESS = 0.05  # standard deviation of the mass that thickening adds, as a fraction of the body's size
 
 
 def thickened(robot: Robot) -> tuple[Robot, tuple[str, ...]]:

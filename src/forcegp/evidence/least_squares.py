@@ -16,8 +16,7 @@ from torch import Tensor
 
 from forcegp.errors import NumericalError
 
-ROWS = 2000
-"""Rows that levels are found from at most, evenly spread."""
+ROWS = 2000  # rows that levels are found from at most, evenly spread
 LEAST, MOST = 1e-3, 1e2
 """Smallest and largest standard deviation, relative to that of all residuals: where constraints hide directions, a step
 of the search that goes further has a covariance that rounding makes singular."""
@@ -91,16 +90,12 @@ def _covariance(inverse: Tensor, acceleration: Tensor, force: Tensor) -> Tensor:
     return torch.diag_embed(acceleration.square()) + (inverse * force.square()) @ inverse.mT
 
 
-ROUNDS = 16
-"""Most rounds of reweighting."""
-MOST_EVALUATIONS = 300
-"""Of the residuals in one round."""
+ROUNDS = 16  # most rounds of reweighting
+MOST_EVALUATIONS = 300  # of the residuals in one round
 CONTENT, ROUGHLY = 0.01, 1.0
 """Two steps in a row that lower the objective by less than so many nats end a round; `ROUGHLY` as noise changes."""
-PASSES = 20
-"""Over the noise of residuals, in each round, where unknown forces are left out."""
-LEAST_NOISE = 1e-6
-"""Noise that is this fraction of the residual at the start counts as none: the data are exact."""
+PASSES = 20  # over the noise of residuals, in each round, where unknown forces are left out
+LEAST_NOISE = 1e-6  # noise that is this fraction of the residual at the start counts as none: the data are exact
 SHARED = 2.0
 """Rows that the level of noise that all joints share, relative to their sizes, counts as where rows are few."""
 SETTLED, NEARLY = 1e-3, 0.03

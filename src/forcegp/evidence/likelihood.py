@@ -20,8 +20,7 @@ from forcegp.mechanics import AffineMap, ConstrainedDynamics
 from forcegp.model import Model
 from forcegp.noise import ACCELERATION, FORCE, STATED, Noise
 
-CONSTANT = 1e-12
-"""Spread of a feature, relative to 1 plus its size, below which it is constant."""
+CONSTANT = 1e-12  # spread of a feature, relative to 1 plus its size, below which it is constant
 RESIDUAL_FLOOR = 1e-6
 """Smallest start variance of a latent over the largest: one that the start residual misses can still grow."""
 

@@ -26,10 +26,8 @@ from forcegp.robots.inertia import physical_of_pseudo_inertia
 
 LINEAR_SPREAD = 10.0
 """Standard deviation of the weak prior on numbers that are not logarithms, in their sizes: as large as the torques."""
-SCALES = 1e-4
-"""Half the relative error of a mass that was weighed: of scales, far below that of any log."""
-FARTHEST = 25.0
-"""Largest coordinate of a number that is estimated on a log scale about a median: a factor of 7e10."""
+SCALES = 1e-4  # half the relative error of a mass that was weighed: of scales, far below that of any log
+FARTHEST = 25.0  # largest coordinate of a number that is estimated on a log scale about a median: a factor of 7e10
 
 
 @dataclass(frozen=True, eq=False)

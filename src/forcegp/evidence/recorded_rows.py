@@ -63,8 +63,7 @@ def motion_residuals(
     return force.cpu().numpy(), missed.cpu().numpy()
 
 
-SENSOR_SHARE = 0.02
-"""Of what a sensor measures: its standard deviation, where nobody states it."""
+SENSOR_SHARE = 0.02  # of what a sensor measures: its standard deviation, where nobody states it
 
 
 def share_of(values: Float[np.ndarray, "rows k"]) -> float:
@@ -103,8 +102,7 @@ def _under_load(state: State, load: Tensor) -> State:
     return replace(state, delivered_by=lambda _: load)
 
 
-FIRST = 1e-2
-"""Of the root mean square of the residual forces, what rough searches take for noise of forces."""
+FIRST = 1e-2  # of the root mean square of the residual forces, what rough searches take for noise of forces
 Positions = Float[np.ndarray, "rows nq"]
 Rows = Float[np.ndarray, "rows nv"]
 Inputs = Float[np.ndarray, "rows nu"]

@@ -24,11 +24,9 @@ MOST_EXACT_ROWS = 1500
 MOST_EXACT_ENTRIES = 16_000
 """Size rN of the covariance beyond which factorising it takes minutes, and many inducing points are taken."""
 
-FEW_FEATURES = 3
-"""Features of a latent up to which inducing points can be expected to leave nothing out."""
+FEW_FEATURES = 3  # features of a latent up to which inducing points can be expected to leave nothing out
 
-MANY_POINTS = 1000
-"""Inducing points of a latent with more features: measured, docs/how-to/large-data.md."""
+MANY_POINTS = 1000  # inducing points of a latent with more features: measured, docs/how-to/large-data.md
 
 ENOUGH = 0.02
 """Prior variance of a row in units of its noise that inducing points may leave out: docs/how-to/large-data.md."""

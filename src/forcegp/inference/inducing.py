@@ -18,8 +18,7 @@ from forcegp.inference.dense_kernels import DenseKernel, LatentKernels
 from forcegp.inference.likelihood import CholeskyFactor, Terms, factorize
 from forcegp.inference.posterior import BLOCK_BYTES, LatentPosterior
 
-ROUNDING = 1e-13
-"""Remainders below this fraction of the largest k(z, z) are rounding."""
+ROUNDING = 1e-13  # remainders below this fraction of the largest k(z, z) are rounding
 
 
 def pivoted_cholesky(
@@ -51,8 +50,7 @@ def pivoted_cholesky(
         return torch.tensor(indices, dtype=torch.long, device=z.device)
 
 
-CANDIDATES = 20_000
-"""Rows among which inducing points are sought, spread evenly over all."""
+CANDIDATES = 20_000  # rows among which inducing points are sought, spread evenly over all
 
 
 @dataclass(frozen=True, eq=False)

@@ -209,11 +209,9 @@ class Terms(NamedTuple):
         return deflate(W_white, y_white)
 
 
-PANEL_BYTES = 4 * 2**20
-"""Working memory of one panel of rows; measured flat between 2 and 8 MiB, slower outside."""
+PANEL_BYTES = 4 * 2**20  # working memory of one panel of rows; measured flat between 2 and 8 MiB, slower outside
 
-INNER = 256
-"""Rows of L^-1 that are multiplied at once, the inner dimension of products of N x N matrices."""
+INNER = 256  # rows of L^-1 that are multiplied at once, the inner dimension of products of N x N matrices
 
 
 def negative_log_likelihood(

@@ -10,8 +10,7 @@ from threadpoolctl import threadpool_limits
 
 from forcegp.errors import NotEnoughMemory
 
-CGROUP = Path("/sys/fs/cgroup")
-"""Where Linux states what a container may use (control groups, version 2)."""
+CGROUP = Path("/sys/fs/cgroup")  # where Linux states what a container may use (control groups, version 2)
 
 USABLE = 0.9
 """Fraction of the free memory that a computation may plan with; the rest is for what else happens meanwhile."""

@@ -17,17 +17,14 @@ from forcegp.progress import tell
 
 Objective = Callable[[Mapping[str, Tensor]], Tensor]
 
-LINE_SEARCH_FAILED = 2
-"""scipy's L-BFGS-B: neither converged (0) nor stopped by a limit (1)."""
+LINE_SEARCH_FAILED = 2  # scipy's L-BFGS-B: neither converged (0) nor stopped by a limit (1)
 
-HALTED = 99
-"""The status that scipy gives where its callback ended the search."""
+HALTED = 99  # the status that scipy gives where its callback ended the search
 
 GRADIENT, MEMORY = 1e-4, 200
 """Largest gradient entry at which a search has converged, and iterations that make up the curvature."""
 
-SLOW_ITERATIONS = 5
-"""Iterations over which the progress of a search is judged."""
+SLOW_ITERATIONS = 5  # iterations over which the progress of a search is judged
 
 SOME_FAILURES = 10
 """A line search that strays now and then meets this many points without a value at most; more of them are a wall."""

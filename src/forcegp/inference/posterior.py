@@ -24,8 +24,7 @@ from forcegp.inference.likelihood import (
     solve_deflated,
 )
 
-BLOCK_BYTES = 64 * 2**20
-"""Working memory of one block of test points."""
+BLOCK_BYTES = 64 * 2**20  # working memory of one block of test points
 
 
 class LatentPosterior(ABC):

@@ -21,11 +21,9 @@ from forcegp.codegen.tracing import trace
 from forcegp.inference.dense_kernels import squared_exponential_parameters
 from forcegp.inference.posterior import BLOCK_BYTES, ExactPosterior, LatentPosterior
 
-PADDING = 8
-"""Centres are filled up to a multiple of the most lanes, with weights of zero."""
+PADDING = 8  # centres are filled up to a multiple of the most lanes, with weights of zero
 
-BLOCK = 64
-"""Centres whose kernels are held at once."""
+BLOCK = 64  # centres whose kernels are held at once
 
 Formulas = tuple[Callable[[Tensor, Tensor], Tensor], Callable[[Tensor], Tensor], tuple[float, ...]]
 """(z (1, d), z_j (1, d)) -> the kernels of all latents at that pair, less a level each; z -> k(z, z); the levels."""
@@ -200,10 +198,8 @@ class KernelSum:
         return filled(sections(__name__, "kernel_loop.c")["kept" if keep else "summed"], words)
 
 
-ROUNDING = 1e-7
-"""Standard deviations below this fraction of the prior's are rounding: nothing there can be uncertain."""
-DIRECTIONS = 128
-"""Of so many directions the leading ones are computed at once."""
+ROUNDING = 1e-7  # standard deviations below this fraction of the prior's are rounding: nothing there can be uncertain
+DIRECTIONS = 128  # of so many directions the leading ones are computed at once
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,18 +18,16 @@ from forcegp.posterior.prediction import require_actuated
 from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.programs import WITH_SLOPES, Programs
 
-STORED = 10
-"""States of the self-test."""
+STORED = 10  # states of the self-test
 FILES = ("model.h", "model.hpp", "CMakeLists.txt", "example.c", "self_test.c", "README.txt")
-TAKEN = ("math", "string", "stdio", "stddef", "stdarg", "features", "example", "self_test", "jac", "hess", "null")
-"""Names of other files, and those that CasADi does not take."""
 
 
 def identifier(name: str) -> str:
-    """A name for C and for files, of any text."""
+    """A name for C, C++ and files, of any text, but no word of theirs, of CasADi or of standard headers (taken.txt)."""
     plain = re.sub(r"[^A-Za-z0-9]+", "_", name)[:60].strip("_").lower() or "robot"
     plain = plain if plain[0].isalpha() else f"robot_{plain}"
-    return f"{plain}_model" if plain in TAKEN else plain
+    taken = plain.endswith("_t") or plain in c_text(__name__, "exported_c/taken.txt").split()  # POSIX reserves ..._t
+    return f"{plain}_model" if taken else plain
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,7 @@ NUMPY, HDF5, MATLAB, PARQUET = "a NumPy archive", "an HDF5 file", "a MATLAB file
 INTERNAL = "#"  # begins names under which MATLAB keeps the contents of cells
 REFERENCE = np.dtype(object)
 MOST_RAGGED = 10_000  # lists of different lengths in one, such as episodes
+MOST_MISSING = 10**6  # numbers of a table of which its lines hold hardly any: each has names of its own
 
 Arrays = Mapping[str, tuple[tuple[int, ...], Callable[[], np.ndarray]]]
 """By full name, shape and content of every array of numbers in a file."""
@@ -279,8 +280,11 @@ def _numbers(value: Any, name: str) -> Iterator[tuple[str, np.ndarray]]:
         parts = [dict(_numbers(inside, "")) for inside in value]
         shapes = {key: own.shape for part in parts for key, own in part.items()}
         if all(own.shape == shapes[key] and own.size < len(parts) for part in parts for key, own in part.items()):
+            if len(shapes) * len(parts) > max(MOST_MISSING, LARGEST_EXPANSION * sum(map(len, parts))):
+                raise ValueError(f"{len(parts)} entries of a list have {len(shapes)} names, each of them few")
             for key, shape in shapes.items():
-                yield name + key, np.array([part.get(key, np.full(shape, np.nan)) for part in parts])
+                lost = np.full(shape, np.nan)
+                yield name + key, np.array([part.get(key, lost) for part in parts])
         else:
             for number, part in enumerate(parts, 1):
                 yield from ((f"{name}/{number}{key}", own) for key, own in part.items())

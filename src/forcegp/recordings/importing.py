@@ -209,6 +209,7 @@ class SideBySide(Source):
     def __init__(self, sources: Sequence[Source]) -> None:
         super().__init__(Path(", ".join(str(source.path) for source in sources)))
         self.sources = {source.path.name.split(".")[0]: source for source in sources}
+        self.units = {f"{stem}:{name}": unit for stem, x in self.sources.items() for name, unit in x.units.items()}
         if len(self.sources) < len(sources):
             raise InvalidInput(f"{self.path}: two files have the same name up to the first dot; rename one.")
 

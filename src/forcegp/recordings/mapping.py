@@ -21,7 +21,7 @@ from forcegp.doubts import stated_as
 from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
 from forcegp.recordings.source import Source
 
-UNIT_OF_A_NAME = re.compile(r"[\[(]([^\d\[(]+)[\])]$|_([A-Za-z]{2,})$")
+UNIT_OF_A_NAME = re.compile(r"[\[(]([^\d\[(][^\[(]*)[\])]$|_([A-Za-z]{2,})$")
 NUMBERED = re.compile(r"(?P<stem>(?P<word>.*?)[\[(_. ]*)(?P<number>\d{1,4})?[\])]?\s*$")
 COMMA = re.compile(r",(?![^{\[]*[}\]])(?=(?:[^`]*`[^`]*`)*[^`]*$)")
 EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body", "force": "foot=fx,fy,fz"}
@@ -87,9 +87,9 @@ def log_unit(quantity: str, name: str) -> LogUnit:
     return units[spelled]
 
 
-def named_unit(quantity: str, column: str) -> str | None:
-    """The unit that the name of a column ends with, as in `pos [mm]` and `pos_mm`; None where it is none."""
-    found = UNIT_OF_A_NAME.search(column.strip())
+def named_unit(quantity: str, column: str, stated: Mapping[str, str] = {}) -> str | None:
+    """The unit of a column that is stated, or ends its name, as in `pos [mm]` and `pos_mm`; None where it is none."""
+    found = UNIT_OF_A_NAME.search(f"[{stated[column]}]" if column in stated else column.strip())
     try:
         return None if found is None else log_unit(quantity, found[1] or found[2]).name
     except InvalidInput:

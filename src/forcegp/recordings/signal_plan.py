@@ -144,8 +144,7 @@ class SignalPlan:
     @property
     def columns(self) -> tuple[str, ...]:
         """Every column that is needed, each once."""
-        expressions = [item.expression for item in self.signals]
-        needed = [name for each in (self.time, *expressions) if each is not None for name in each.weights]
+        needed = [name for each in (self.time, *(x.expression for x in self.signals)) if each for name in each.weights]
         return tuple(dict.fromkeys([*needed, *([] if self.episode is None else [self.episode])]))
 
 
@@ -216,21 +215,24 @@ def signal_plan(
     signals = tuple(
         item
         for name, expressions in found.items()
-        for item in _signals(mapping, name, expressions, log[name], order[name], joints, turned)
+        for item in _signals(mapping, source, name, expressions, log[name], order[name], joints, turned)
     )
     signals += tuple(item for frame in mapping.force for item in _sensor(mapping, frame, source, model))
     for name in found.keys() - mapping.unit.keys():
         if any(x.unit.per_si != 1.0 for x in signals if x.signal == name):
             units = ",".join(in_short(name, [x.unit.name for x in signals if x.signal == name]))
-            guessed.append(f"unit {name}={units}, as the columns are called")
+            guessed.append(f"unit {name}={units}, as the log says")
     lacking = {name: [x.expression is LACKING for x in signals if x.signal == name != "u"] for name in found}
     episode = mapping.episode or (EPISODE if EPISODE in source.columns() else None)
     if episode is not None:
         require_known("column", episode, str(source.path), source.columns(), FileFormatError)
     name = next(iter(time.weights)) if time is not None and time.is_column else ""
     # stamps of ROS are whole nanoseconds; what is called nothing else is taken for seconds
-    usual = "ns" if name.endswith((":header.stamp", ":log_time")) else named_unit("time", name) or "s"
+    said = named_unit("time", name, source.units)
+    usual = "ns" if name.endswith((":header.stamp", ":log_time")) else said or "s"
     [time_unit, *_] = mapping.unit.get("time", (usual,))
+    if said not in (None, "s") and "time" not in mapping.unit:
+        guessed.append(f"unit time={said}, as the log says")
     return SignalPlan(
         joints=tuple(order["v"]),
         positions=tuple(log["q"]),
@@ -294,8 +296,7 @@ def _sensor(mapping: ColumnMapping, frame: str, source: Source, model: forcegp.M
 
 
 def _expressions(patterns: Sequence[str], joints: Sequence[str], source: Source, may_lack: bool) -> list[Expression]:
-    names: list[str] = []
-    columns, vectors = source.columns(), source.vectors
+    names, columns, vectors = list[str](), source.columns(), source.vectors
     for pattern in patterns:
         for text in expanded(pattern, joints, {*columns, *vectors}):
             by_name = [f"{text}.{joint}" for joint in joints]  # messages may list the joints in another order
@@ -311,6 +312,7 @@ def _expressions(patterns: Sequence[str], joints: Sequence[str], source: Source,
 
 def _signals(
     mapping: ColumnMapping,
+    source: Source,
     signal: str,
     expressions: list[Expression],
     columns: Mapping[str, str | None],
@@ -337,7 +339,7 @@ def _signals(
         raise InvalidInput(
             f"{signal} has {len(expressions)} columns for {len(names)} {what} ({', '.join(names) or 'none'}); {remedy}"
         )
-    named = [named_unit(signal, next(iter(x.weights))) if x.is_column else None for x in expressions]
+    named = [named_unit(signal, *x.weights, stated=source.units) if x.is_column else None for x in expressions]
     named = [x or columns[name] or "1" for x, name in zip(named, names, strict=True)]
     given = [log_unit(signal, name) for name in mapping.unit.get(signal, named)]
     signs, driven = mapping.sign.get(signal, (1.0,)), sum(signal != "u" or columns[name] != "1" for name in names)

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -36,6 +37,8 @@ class Source(ABC):
 
     lenient = False
     """Whether rows that cannot be read, up to MOST_LOST of them, are left out."""
+    units: Mapping[str, str] = MappingProxyType({})
+    """Those that the file states by column, beside its names."""
     row_word: ClassVar[str] = "row"
     """What one row is called in messages."""
 

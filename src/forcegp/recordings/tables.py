@@ -20,7 +20,7 @@ from pyarrow import csv as arrow_csv
 from typing_extensions import override
 
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput
-from forcegp.recordings.mapping import UNITS
+from forcegp.recordings.mapping import UNITS, named_unit
 from forcegp.recordings.source import (
     MOST_LOST,
     Columns,
@@ -45,8 +45,7 @@ _TIME = re.compile(
 )
 _UNITS = {unit.lower() for units in UNITS.values() for unit in units} | {"%", "sec", "°", "°/s", "-", "", "degrees"}
 _REMEDY = "Repair or remove it, or leave such rows out by `bad_rows` skip."
-LAST_LINES = 20
-"""Of those that are looked at: they are rows, whatever stands above."""
+LAST_LINES = 20  # of those that are looked at: they are rows, whatever stands above
 _CONVERSION = re.compile(
     r"In CSV column #(\d+): Row #(\d+): CSV conversion error to \w+: invalid value '(.*)'", re.DOTALL
 )
@@ -148,17 +147,27 @@ class DelimitedText(Source):
                 above or table[begin - 1 : begin],
                 key=lambda row: len({x.strip("[]() ").lower() for x in row if not _is_number(x)} - _UNITS),
             )
-            beside = [", ".join(dict.fromkeys(filter(None, row))) for row in above if row is not names]
-            self._notes += [f"a line beside the names is left out: {text:.80}" for text in beside if text]
             if len(names) + 1 == len(fields) and not fields[-1]:  # rows that end with a delimiter
                 names = [*names, ""]
             self._columns = [name or f"column{index + 1}" for index, name in enumerate(names)]
+            for row in (row for row in above if row is not names):
+                left_out = ", ".join(dict.fromkeys(filter(None, self._without_units(row))))
+                self._notes += [f"a line beside the names is left out: {left_out:.80}"] if left_out else []
         self._lines_before = places[begin]
         require_distinct(self.path, self._columns)
         whole = list(zip(self._columns, fields if self._lines_per_row == 1 else (), strict=False))
         self._long_integers = {name for name, text in whole if _LONG_INTEGER.fullmatch(text)}
         self._clocks = {name for name, text in whole if _TIME.fullmatch(text)}
         self._decimal = "," if any(_DECIMAL_COMMA.fullmatch(x) for row in table[begin:] for x in row) else "."
+
+    def _without_units(self, row: Sequence[str]) -> Sequence[str]:
+        """What is left of a line beside the names; if half of it are units, these are those of the columns."""
+        texts = [text.strip("[]() ") for text in row]
+        known = [any(named_unit(quantity, text, {text: text}) for quantity in UNITS) for text in texts]
+        if 2 * sum(known) < sum(map(bool, texts)):
+            return row
+        self.units = {**self.units, **dict(compress(zip(self._columns, texts, strict=True), known))}
+        return [text for text, is_unit in zip(texts, known, strict=True) if not is_unit]
 
     def _fields(self, line: str) -> list[str]:
         if self._delimiter == BLANKS:

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +41,16 @@ def rendered(template: Path, **values: Any) -> str:
     """The text of a template, with the filters `formatted`, `number` and `table`; one blank line between paragraphs."""
     from jinja2 import Environment, StrictUndefined
 
-    pages = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    def plain(value: Any) -> Any:  # names of joints and files may hold HTML
+        return HTML.sub(lambda found: escape(found[0]), value) if isinstance(value, str) else value
+
+    pages = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=plain)
     pages.filters |= {"formatted": formatted, "number": number, "table": lambda rows, head: markdown_table(head, rows)}
     text = pages.from_string(template.read_text(encoding="utf-8"))
     return re.sub(r"\n{3,}", "\n\n", text.render(values)).strip() + "\n"
 
 
+HTML = re.compile(r"<(?=[A-Za-z/!?])|&(?=#?\w+;)")
 Column = tuple[str, str, str, int]  # title, quantity, score and decimals; of a coverage in percent
 
 

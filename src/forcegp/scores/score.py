@@ -94,16 +94,17 @@ def score(
     before = {name: each for name, each in named if isinstance(each, Posterior)}
     if before and len(before) == len(given) and split is None:
         known = {name: candidate(name, each, each.model, "") for name, each in before.items()}
-        if folder is not None:
-            digests = {name: each.digest for name, each in known.items()}
-            how = {"rows_sha256": fingerprint(log), "models": digests, "horizons": horizons, "integrator": integrator}
-            JobStore.open(Path(folder), KIND, how, overwrite=overwrite)
+        digests = {name: each.digest for name, each in known.items()}
+        how = {"rows_sha256": fingerprint(log), "models": digests, "horizons": horizons, "integrator": integrator}
         log, recording = decided(log), decided(recording or log)
         motions = held_out_motions(recording, np.ones(len(recording), dtype=bool), horizons or (), starts)
-        runs = {}
-        for place, (name, posterior) in enumerate(before.items()):  # one run of each, on all rows
+        for posterior in before.values():
             require_rows("log", log, posterior.joint_names, "the model")
             integrator_named(integrator, posterior.model)
+        if folder is not None:  # where nothing is left if the arguments are refused
+            JobStore.open(Path(folder), KIND, how, overwrite=overwrite)
+        runs = {}
+        for place, (name, posterior) in enumerate(before.items()):  # one run of each, on all rows
             run = {"split": "all rows", "seed": 0, "error": None, "cpu_seconds": None}
             run |= {"training_rows": len(posterior.training)}
             with part(place, len(before), name):

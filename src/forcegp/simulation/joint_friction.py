@@ -17,7 +17,7 @@ Numbers = Mapping[str, Any]
 """Coefficients by name, one number or one per joint; "velocity" stands for velocities that have no number here."""
 
 Friction = Callable[..., Float[np.ndarray, "*batch nv"]]
-"""(v, u or None), (..., nv) each, u [Nm or N] of the actuators -> joint forces with the sign that accelerates."""
+"""(v, u, q), u [Nm or N] of the actuators, in joints; u, and q of a fixed base, may be None for 0 -> joint forces."""
 
 
 def laws_of_joints(expression: str, robot: Robot, numbers: Numbers) -> Friction:
@@ -37,9 +37,9 @@ def laws_of_joints(expression: str, robot: Robot, numbers: Numbers) -> Friction:
             found[name] = numbers.get(name, usual) if given is None else given
         known.append(law.with_values(found).bound_to(robot))
 
-    def friction(v: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
-        at = torch.tensor(v)
-        state = State(torch.zeros_like(at), at, torch.zeros_like(at) if u is None else torch.tensor(u), robot)
+    def friction(v: np.ndarray, u: np.ndarray | None = None, q: np.ndarray | None = None) -> np.ndarray:
+        at_u, at_q = (torch.tensor(np.zeros_like(v) if each is None else each) for each in (u, q))
+        state = State(at_q, torch.tensor(v), at_u, robot)
         return sum((law.force(state).numpy() for law in known), np.zeros_like(v))
 
     return friction

@@ -225,7 +225,7 @@ def simulate_episode(config: KukaSurfaceConfig, robot: Robot, plant: RigidBodyDy
             normal = table.gradient(torch.from_numpy(state.position)).numpy()
             asked = asked - config.pressing_force * (normal @ state.jacobian[:3])
         u = np.clip(asked, -limits, limits) - config.joint_damping * v
-        joint_torques = laws(v, u)
+        joint_torques = laws(v, u, q)
         forces = contact.forces(state, u + joint_torques)
         a = np.linalg.solve(state.mass, u + joint_torques + forces.push - state.bias)
         rows.append({"q": q, "v": v, "u": u, "a": a, "joint_torques": joint_torques, **forces._asdict()})

@@ -80,7 +80,7 @@ def _episode(robot: Robot, model: Model, config: QuadrupedConfig, episode: int, 
     kinematics = robot.kinematics(q, v)
     drift = torch.stack([kinematics.frame_bias_acceleration(f"{leg}_foot")[:, :3] for leg in LEGS], 1)
     a = torch.cat([dV, joints(dV, ddx - drift)], -1)
-    Q_U = torch.as_tensor(laws_of_joints(str(config.joint_friction), robot, FRICTION)(v.numpy()))
+    Q_U = torch.as_tensor(laws_of_joints(str(config.joint_friction), robot, FRICTION)(v.numpy(), q=q.numpy()))
     needed = robot.inverse_dynamics(q, v, a) - Q_U
     A = (J * stands[..., None, None]).flatten(1, 2)
     weight = -float(robot.gravity[2]) * robot.mass
