@@ -2,6 +2,7 @@
 
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -27,8 +28,7 @@ from forcegp.posterior import Posterior
 
 PARTS = "memory", "factor", "root", "direction", "breakaway"
 """Of `GearFriction`, and of the law beside it."""
-BLOCKS = 10
-"""Stretches of the log, each predicted from the others."""
+BLOCKS = 10  # stretches of the log, each predicted from the others
 CLEARLY, LIKELY = 1.5, 0.5
 """Standard errors over the stretches by which a part must lower the squared residual; and memory, which gears have."""
 LEAST, LITTLE = 0.05, 0.007
@@ -46,8 +46,7 @@ SEEN, RIDGE = 0.003, 1e-7
 """Of the torque of bodies, the least that counts over the largest; and what is added to the normal equations."""
 MOST_ROWS, MOST_EQUATIONS = 10_000, 70_000
 """Of the log that are asked, evenly spread: each knows its past."""
-FIRST_ROWS = 2000
-"""Rows of the first fit."""
+FIRST_ROWS = 2000  # of the first fit
 STIFFNESS = tuple(np.geomspace(10.0, 10000.0, 13).tolist())
 """Of the memory, over the reciprocal root mean square position."""
 
@@ -105,8 +104,7 @@ def choose_friction(
     bare = _without(model, Viscous, DryFriction, DirectionalFriction)
     torque = motion_residuals(replace(log, strokes=None), bare)[0]
     state = bare.state(*(torch.as_tensor(np.array(x), device=bare.robot.device) for x in (log.q, log.v, log.u)))
-    strokes = log.strokes
-    regression = _Regression(_precision(model, log, noise), law, log, state, torque)
+    regression, strokes = _Regression(_precision(model, log, noise), law, log, state, torque), log.strokes
     single, few = np.isin(log.joint_names, bare.robot.single_joint_names), []
     moving = [j for j in np.flatnonzero(single).tolist() if regression.v[:, j].any()]
     for j in moving:
@@ -125,10 +123,10 @@ def choose_friction(
         if strokes is not None and alike:  # gears are alike: what the others remember over may do here
             regression.remember(j, strokes[:, j], [float(np.median(alike))])
             regression.choose(j, parts)
-    chosen = [regression.parts.get(j, ()) for j in range(len(log.joint_names))]
-    parts_found, ratios = tuple(chosen), tuple(regression.ratios)
-    sigma, falls = regression.sigma, tuple((regression.speed * np.array(FALLS)[regression.fall]).tolist())
-    return FrictionChoice(tuple(log.joint_names), parts_found, ratios, tuple(few), sigma, falls, log.transmission)
+    chosen = tuple(regression.parts.get(j, ()) for j in range(log.nv))
+    found = chosen, tuple(regression.ratios), tuple(few), regression.sigma
+    falls = tuple((regression.speed * np.array(FALLS)[regression.fall]).tolist())
+    return FrictionChoice(tuple(log.joint_names), *found, falls, log.transmission)
 
 
 def _precision(model: Model, log: Dataset, noise: Noise | None) -> Float[np.ndarray, "rows nv nv"]:
@@ -160,11 +158,8 @@ def _folds(log: Dataset) -> np.ndarray:
 
 def _bordered(A: np.ndarray, across: np.ndarray, inner: np.ndarray) -> Float[np.ndarray, "k n n"]:
     """The symmetric matrices [A, across; across^T, inner]."""
-    n = A.shape[-1]
-    out = np.empty((len(A), n + inner.shape[-1], n + inner.shape[-1]))
-    out[:, :n, :n], out[:, :n, n:], out[:, n:, n:] = A, across, inner
-    out[:, n:, :n] = across.swapaxes(1, 2)
-    return out
+    rows = (A, across), (across.swapaxes(1, 2), inner)
+    return np.concatenate([np.concatenate(row, axis=2) for row in rows], axis=1)
 
 
 Sums = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -292,10 +287,7 @@ class _Regression:
 
         Those of the joint, or of all joints where the noise of accelerations makes their forces resemble each other.
         """
-
-        def summed(sums: np.ndarray) -> np.ndarray:
-            return sums if held_out else sums.sum(0, keepdims=True)
-
+        summed = np.asarray if held_out else partial(np.sum, axis=0, keepdims=True)
         (A, b), others = map(summed, self.beside[:2]), self.beside[2]
         across, inner, right = map(summed, self._open(j, parts, sign))
         if sign[0] not in self.across:
@@ -306,18 +298,15 @@ class _Regression:
         b, n = np.concatenate([b, right], axis=1), b.shape[1]
         own, own_A, own_b, squares = slice(None), A, b, summed(self.squares[:, 0])
         if not self.coupled:
-            first = self.inner.shape[-1]
-            own, squares = np.r_[0:first, n : b.shape[1]], summed(self.squares[:, j])
+            own, squares = np.r_[0 : self.inner.shape[-1], n : b.shape[1]], summed(self.squares[:, j])
             own_A = _bordered(summed(self.inner[:, j]), across, inner)
             own_b = np.concatenate([summed(self.target[:, j]), right], axis=1)
-        whole, given = A.sum(0), b.sum(0)
+        whole, given, out = A.sum(0), b.sum(0), np.zeros(len(A))
         scale = np.sqrt(whole.diagonal().clip(1e-300))
-        out = np.zeros(len(A))
         for k in range(len(A)):
-            without = (A[k], b[k]) if held_out else (0.0, 0.0)
-            normal = (whole - without[0]) / np.outer(scale, scale)
-            normal[np.diag_indices_from(normal)] += RIDGE
-            x = np.linalg.solve(normal, (given - without[1]) / scale) / scale
+            normal, right = (whole - A[k], given - b[k]) if held_out else (whole, given)
+            ridge = RIDGE * np.eye(len(scale))
+            x = np.linalg.solve(normal / np.outer(scale, scale) + ridge, right / scale) / scale
             loads = "factor" not in parts or 0.0 <= x[n + 2] <= HIGHEST
             slows = "root" not in parts or x[n + 1] + x[n + 2 + ("factor" in parts)] * self.root[j] >= 0.0
             falls = "breakaway" not in parts or 0.0 <= x[-1] <= x[n + 1]  # by half at most
