@@ -220,6 +220,21 @@ def test_gears_that_stick_are_no_unknown_cause_and_more_than_they_hold_is_one(ti
     assert [(each.about, each.joints) for each in found if each.level != "ok"] == [(about, ("joint2",))]
 
 
+@pytest.mark.parametrize(("begin", "told"), [(12.0, [("excitation", ("joint2",))]), (6.0, [])])
+def test_a_joint_that_moves_once_is_judged_by_its_motion(begin, told):
+    """Its friction is not taken from rest, nor does it change with the time that it stood still."""
+    q, time = clean(two_links(), 3).q.copy(), np.arange(2000) / 100.0
+    q = np.stack([0.5 * np.sin(2.1 * time) + 0.3 * np.sin(3.7 * time), 0.3 * np.ones(2000)], axis=1)
+    moves = (time > begin) & (time < 15.0)
+    q[moves, 1] += 0.4 * (1.0 - np.cos(4.0 * np.pi * (time[moves] - begin) / 3.0))
+    data = with_motion(two_links(), q, 100.0, 3, 0.0)
+    held = np.cumsum(np.sin(0.7 * time)) / 300.0  # less than gears hold
+    dry = np.where(moves, 3.0 * np.tanh(data.v[:, 1] / 0.05) + 2.0 * data.v[:, 1], held)
+    found = [x for x in check(replace(data, u=data.u + np.c_[0.0 * dry, dry])).doubts if x.level != "ok"]
+    assert [(x.about, x.joints) for x in found] == told
+    assert all(x.numbers["seconds"] == pytest.approx([begin, 15.0], abs=0.2) for x in found)
+
+
 def test_friction_that_remembers_is_no_push():
     """About a turn it is far from any that velocities make, for seconds here."""
     data = between_postures(arm_model().robot, 3, 24.0)

@@ -92,11 +92,15 @@ class CheckInput:
         """The names of the joints with these numbers."""
         return tuple(self.names[joint] for joint in joints)
 
+    @property
+    def step(self) -> int:
+        """From row to row of `compared`, of which up to `most_rows` are looked at."""
+        return max(1, -(-len(self.compared or ()) // self.most_rows))
+
     def rows(self) -> Dataset:
-        """Up to `most_rows` rows of `compared`, evenly over the log."""
+        """These rows, evenly over the log."""
         assert self.compared is not None
-        data = self.compared
-        return data.rows(slice(None, None, max(1, -(-len(data) // self.most_rows))))
+        return self.compared.rows(slice(None, None, self.step))
 
     @property
     def cutoff(self) -> float | None:

@@ -8,9 +8,9 @@ import numpy as np
 
 from forcegp.checks.check_input import CheckInput
 from forcegp.checks.explanations import SIGN, candidates, changed
-from forcegp.checks.fits import EXPLAINED, FAR, MUCH_MORE, NOISE, RESTS, WORSE, Explanation
+from forcegp.checks.fits import EXPLAINED, FAR, FEWEST_ROWS, MUCH_MORE, NOISE, RESTS, WORSE, Explanation
 from forcegp.checks.residuals import left_by_positions
-from forcegp.checks.torques import LEAST, WIDTHS, Comparison, positive_fit, stretch, torque_noise
+from forcegp.checks.torques import AT_REST, LEAST, WIDTHS, Comparison, in_motion, positive_fit, stretch, torque_noise
 from forcegp.data import Dataset
 from forcegp.data.views import white_noise
 from forcegp.doubts import Doubt, listed, look, wrong
@@ -20,9 +20,7 @@ from forcegp.forces import Actuation, Coulomb, Offset, RigidBodies, Rotor, Visco
 from forcegp.model import Model
 
 UNKNOWN = "unknown cause"
-FEWEST_ROWS = 30
 BRAKED = 1e-3  # rad or m of a joint that no row moves
-AT_REST = 0.1  # of the root mean square velocity of a joint
 GAIN = np.log(4.0)  # by which the product over all joints of what remains must fall at least
 BEAM, DEPTH = 3, 3  # explanations that are continued, and causes of one
 DOUBTFUL = 2e-3  # share above which causes are tried
@@ -103,14 +101,23 @@ def _all_turned(root: Explanation, inputs: CheckInput) -> tuple[Explanation, lis
 
 
 def moving(rows: Dataset) -> Dataset:
-    """The rows in which some joint moves: at rest, stiction holds any torque. All, where they are too few."""
-    speed = np.abs(rows.v) / np.maximum(np.sqrt(np.square(rows.v).mean(axis=0)), 1e-300)
-    moves = speed.max(axis=1) > AT_REST
+    """The rows in which some joint moves. All, where they are too few."""
+    moves = in_motion(rows).any(axis=1)
     return rows.rows(moves) if moves.sum() >= FEWEST_ROWS else rows
 
 
+def _rows(inputs: CheckInput) -> Dataset:
+    """Some rows, evenly over the log, and of a joint that moves in few of them others of its motion."""
+    assert inputs.compared is not None
+    data, step = inputs.compared, inputs.step
+    moves, chosen = in_motion(data), np.arange(0, len(data), step)
+    for own in map(np.flatnonzero, moves[:, moves[::step].sum(axis=0) < FEWEST_ROWS].T):
+        chosen = np.union1d(chosen, own[:: max(1, len(own) // FEWEST_ROWS)])
+    return data.rows(chosen)
+
+
 def _root(inputs: CheckInput) -> Explanation:
-    rows = moving(inputs.rows())
+    rows = moving(_rows(inputs))
     rows = replace(rows, u=np.where(np.ptp(rows.q, axis=0) < BRAKED, 0.0, rows.u))  # no motor measures what brakes hold
     log = Comparison(robot=inputs.robot, laws=inputs.laws, rows=rows, given=rows).after(changed())
     seen = white_noise(inputs.mended, signal="u") if inputs.log.time_ordered else None
