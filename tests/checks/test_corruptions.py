@@ -106,7 +106,10 @@ def test_two_mistakes_are_both_named():
     assert after < 0.1 * before  # of the log as it is, without any factor
 
 
-@pytest.mark.parametrize("x", ["1e3 9.55 mm/s,rpm", "1e3 10 mm/s,rad/s", "1e2 1 cm/s,rad/s", "1 10 ", "2 9.5 mm/s,rpm"])
+@pytest.mark.parametrize(
+    "x",
+    ["1e3 9.55 mm/s,rpm", "1e3 10 mm/s,rad/s", "1e2 1 cm/s,rad/s", "1 10 ", "2 9.5 mm/s,rpm", "1e3 -9.55 mm/s,rpm"],
+)
 def test_units_of_velocities_are_found_joint_by_joint_and_before_those_of_torques(x):
     rail, gear, unit = x.split(" ")
     data = at(clean(ROBOTS["crane"](), 4, noise="qvu"), "v", [float(rail), float(gear)])
@@ -121,6 +124,8 @@ def test_the_factor_of_a_torque_has_an_interval():
     [found] = said(replace(data, u=data.u * np.array([1.0, 1.6])))
     assert found.numbers["factor"]["joint2"] == pytest.approx(1.6, abs=found.numbers["error_95"][0])
     assert found.numbers["error_95"][0] < 0.03
+    for largest, told in ((4.5e-3, True), (8e-3, False)):  # a load makes more of kNm than masses do
+        assert ("--unit u=kNm." in said(replace(data, u=data.u * np.array([1.2e-3, largest])))[0].do) == told
 
 
 @pytest.mark.parametrize("degrees", [10.0, 40.0])

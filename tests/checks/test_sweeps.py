@@ -26,6 +26,7 @@ from forcegp.checks.signals import (
     target_doubts,
     without_registers,
 )
+from forcegp.checks.single_rows import single_row_doubts
 from forcegp.checks.torque_doubts import elastic_doubts, held_points, torque_doubts
 from forcegp.data import Dataset
 from forcegp.doubts import LEVELS
@@ -74,6 +75,43 @@ def test_frozen_channels(rate):
         found[name] = numbers(signal_doubts(seen(swing(u=stopped))))
     found["held"] = [levels(signal_doubts(seen(swing(u=u[np.arange(1000) // k * k])))) for k in (2, 3)]
     assert_unchanged(f"checks/frozen {rate:g}", found)
+
+
+@pytest.mark.parametrize(("turns", "frozen"), [(40, True), (20, False)])
+def test_a_torque_that_stands_still_while_its_joint_turns_and_rests_is_frozen(turns, frozen):
+    u, v = swing().u[:, 0].copy(), swing().v[:, 0].copy()
+    u[300:400], v[300 + turns : 400] = u[300], 1e-6 * np.random.default_rng(0).normal(size=100 - turns)
+    assert (levels(signal_doubts(seen(swing(u=u, v=v))), "frozen") > 0) == frozen
+
+
+@pytest.mark.parametrize(("counts", "still"), [(4, True), (8, False)])
+def test_a_joint_whose_encoder_dithers_by_counts_stands_still_and_is_not_frozen(counts, still):
+    generator = np.random.default_rng(1)
+    q = 0.3 + 2e-5 * np.repeat(generator.integers(0, counts + 1, 40), 25)
+    v, u = (size * generator.normal(size=1000) for size in (1e-3, 0.2))
+    found = signal_doubts(seen(swing(q=q, v=v, u=u)))
+    assert [(x.about, x.level) for x in found if x.about == "constant channel"] == [
+        ("constant channel", "look")
+    ] * still
+
+
+@pytest.mark.parametrize(
+    ("size", "rows", "told"),
+    [(30, [500], True), (15, [500], False), (30, [200, 400, 600, 800], True), (30, range(100, 900, 100), False)],
+)
+@pytest.mark.parametrize("name", "qvu")
+def test_single_rows_far_from_their_neighbours_are_named(name, size, rows, told):
+    x = getattr(swing(), name)[:, 0].copy()
+    x[[*rows]] += size * np.abs(np.diff(x, 2)).max() / 2.0
+    found = single_row_doubts(seen(swing(**{name: x})))
+    assert [each.numbers["rows"] for each in found] == [[*rows]] * told
+    assert not told or f"--without {rows[0] / 100 - 0.005:.5f},{rows[0] / 100 + 0.005:.5f}" in found[0].do
+
+
+def test_steps_bounces_chatter_and_counts_are_no_spikes():
+    u, rows = swing().u[:, 0], np.arange(1000)
+    for x in (u + (rows > 500), u + 0.1 * abs(rows - 500), u + (rows % 500 < 20) * (-1.0) ** rows, np.round(u, 1)):
+        assert not single_row_doubts(seen(swing(u=x)))
 
 
 @pytest.mark.parametrize(("more", "frozen"), [(0, False), (1, True)])

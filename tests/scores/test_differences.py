@@ -75,7 +75,13 @@ def cell(seed: int, force: float | None, diverged: int = 0, motion: float = 0.1)
         return run
     squared = [[motion**2] * 3, [None] * diverged + [4.0 * motion**2] * (3 - diverged)]
     stretches = [force**2, 0.25 * force**2]
-    return {**run, "error": None, "stretches": stretches, "motions": {"horizons": [0.1, 1.0], "squared": squared}, "table": {}}
+    return {
+        **run,
+        "error": None,
+        "stretches": stretches,
+        "motions": {"horizons": [0.1, 1.0], "squared": squared},
+        "table": {},
+    }
 
 
 KINDS = {"urdf": "given", "ls": "identified", "ls2": "identified", "gp": "force prior", "net": "black box"}

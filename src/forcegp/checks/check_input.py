@@ -17,6 +17,8 @@ from forcegp.forces import JointLaw
 from forcegp.model import Model
 from forcegp.robots import Robot
 
+QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
+EVERY_QUANTITY = {**QUANTITY, "a": "acceleration"}
 GAP = 5.0  # median steps without a row at which a motion is taken for two
 COMPARED = 0.5  # of the cut-off: where torques are compared
 LONGEST_TRIM = 0.1  # most that is trimmed from either end, as a share of the shortest stretch
