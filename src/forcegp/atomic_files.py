@@ -21,10 +21,8 @@ from forcegp.errors import FileFormatError, InvalidInput
 
 TEMPORARY = ".tmp"
 LOCK, OLD = ".lock", ".old"
-TRIAL = 2**16
-"""Bytes that `require_writable` writes."""
-MARK = "Written by forcegp"
-"""Stands near the end of pages and robot files, which may be replaced."""
+TRIAL = 2**16  # bytes that `require_writable` writes
+MARK = "Written by forcegp"  # stands near the end of pages and robot files, which may be replaced
 HOLE = 100 << 20  # bytes that a file may lack of its size
 LARGEST_TEXT = 32 << 20
 """Bytes of JSON or of a list that forcegp wrote: digests, settings, results; most have some thousand."""

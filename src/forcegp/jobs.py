@@ -28,8 +28,7 @@ from forcegp.errors import BackendError, DataWarning, FileFormatError, FitError,
 from forcegp.parallel import Jobs, executor_for, outcome_of, stop, submit
 from forcegp.progress import tell, watched
 
-CODE = (".py", ".c", ".h", ".jinja")
-"""Endings of the files that decide what a package computes."""
+CODE = (".py", ".c", ".h", ".jinja")  # endings of the files that decide what a package computes
 DESCRIPTION, JOBS, LOCK = "jobs.json", "jobs", ".lock"
 RESULT_FILE = "job.json"
 LIBRARIES = ("torch", "gpytorch", "scipy", "numpy")
@@ -74,8 +73,6 @@ def machine() -> str:
 class Job:
     """One piece of work, the smallest that is kept.
 
-    Fields
-    ------
     name: its place in the store.
     task: "package.module:function" of a function `(store, spec, folder, *arguments)`, which may write files to `folder`
         and returns plain JSON values.

@@ -13,8 +13,7 @@ from forcegp.errors import InvalidInput, require_type, usable_arguments
 ACCELERATION = "noise.log_acceleration"
 FORCE = "noise.log_force"
 SENSOR, PUSHES = "noise.log_sensor", "noise.log_pushes"
-STATED = SENSOR, PUSHES
-"""What no search changes."""
+STATED = SENSOR, PUSHES  # what no search changes
 
 
 @dataclass(frozen=True)

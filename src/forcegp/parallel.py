@@ -20,8 +20,7 @@ from forcegp.errors import BackendError, InvalidInput
 Outcome = TypeVar("Outcome")
 Jobs: TypeAlias = int | Executor
 
-IDLE_SECONDS = 300
-"""So long processes without work are kept for the next call."""
+IDLE_SECONDS = 300  # so long processes without work are kept for the next call
 
 ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "BLIS")}
 """Environment of an own process; the libraries read it when they are loaded."""

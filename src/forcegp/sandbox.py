@@ -19,15 +19,12 @@ from typing import Any
 
 from forcegp.errors import ForceGPError, RobotModelError
 
-SECONDS = 30
-"""CPU time of one file, and half of its wall time: whole robots with meshes take two."""
-MEMORY = 1 << 30
-"""Bytes of address space; MuJoCo itself takes 130 MB."""
+SECONDS = 30  # CPU time of one file, and half of its wall time: whole robots with meshes take two
+MEMORY = 1 << 30  # bytes of address space; MuJoCo itself takes 130 MB
 LARGEST = {"nbody": 2_000, "njnt": 2_000, "nsite": 2_000, "ngeom": 20_000}
 """Parts of a compiled model: robots have some hundred."""
 
-ACTS = ("subprocess", "os", "socket", "ctypes", "shutil")
-"""First words of Python's audit events that no macro needs."""
+ACTS = ("subprocess", "os", "socket", "ctypes", "shutil")  # first words of Python's audit events that no macro needs
 
 
 def read_apart(

@@ -26,7 +26,6 @@ from forcegp.checks.signals import (
     target_doubts,
     without_registers,
 )
-from forcegp.checks.single_rows import single_row_doubts
 from forcegp.checks.torque_doubts import elastic_doubts, held_points, torque_doubts
 from forcegp.data import Dataset
 from forcegp.doubts import LEVELS
@@ -103,15 +102,16 @@ def test_a_joint_whose_encoder_dithers_by_counts_stands_still_and_is_not_frozen(
 def test_single_rows_far_from_their_neighbours_are_named(name, size, rows, told):
     x = getattr(swing(), name)[:, 0].copy()
     x[[*rows]] += size * np.abs(np.diff(x, 2)).max() / 2.0
-    found = single_row_doubts(seen(swing(**{name: x})))
-    assert [each.numbers["rows"] for each in found] == [[*rows]] * told
+    log = swing(**{name: x})
+    found = signal_doubts(CheckInput.quick(log, MODEL))
+    assert [each.numbers["rows"] for each in found if each.about == "spike"] == [len(rows)] * told
     assert not told or f"--without {rows[0] / 100 - 0.005:.5f},{rows[0] / 100 + 0.005:.5f}" in found[0].do
 
 
 def test_steps_bounces_chatter_and_counts_are_no_spikes():
     u, rows = swing().u[:, 0], np.arange(1000)
     for x in (u + (rows > 500), u + 0.1 * abs(rows - 500), u + (rows % 500 < 20) * (-1.0) ** rows, np.round(u, 1)):
-        assert not single_row_doubts(seen(swing(u=x)))
+        assert not signal_doubts(CheckInput.quick(swing(u=x), MODEL))
 
 
 @pytest.mark.parametrize(("more", "frozen"), [(0, False), (1, True)])

@@ -23,8 +23,7 @@ RESTS = 0.5  # share of what friction leaves that a torque must explain, for a f
 ROUGH = 2.5  # factor either way that wrong masses make of a torque
 FAR, MUCH_MORE = 3.0, 30.0
 """Factors that wrong masses do not explain: less torque than bodies need cannot be; more may be a rotor's inertia."""
-CHOICES = np.array([0.0, SIGN, NUMBER, SIGN + NUMBER])
-"""Cost of a torque as it is, turned, times a factor, and both."""
+CHOICES = np.array([0.0, SIGN, NUMBER, SIGN + NUMBER])  # cost of a torque as it is, turned, times a factor, and both
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,17 +8,10 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from forcegp.checks.check_input import QUICK_ROWS, CheckInput
+from forcegp.checks.check_input import QUICK_ROWS, STILL, CheckInput
 from forcegp.checks.moving_base import base_doubts, carried_doubts, stance_doubts, unmeasured_base_doubts
 from forcegp.checks.search import UNKNOWN, Explanation, search
-from forcegp.checks.signals import (
-    STILL,
-    motion_doubts,
-    sampling_doubts,
-    signal_doubts,
-    target_doubts,
-    without_registers,
-)
+from forcegp.checks.signals import motion_doubts, sampling_doubts, signal_doubts, target_doubts, without_registers
 from forcegp.checks.torque_doubts import TOUCHES, elastic_doubts, held_points, push, torque_doubts, without_stops
 from forcegp.checks.torques import in_motion
 from forcegp.data import Dataset, contact_doubts

@@ -107,18 +107,8 @@ def moving(rows: Dataset) -> Dataset:
     return rows.rows(moves) if moves.sum() >= FEWEST_ROWS else rows
 
 
-def _rows(inputs: CheckInput) -> Dataset:
-    """Some rows, evenly over the log, and of a joint that moves in few of them others of its motion."""
-    assert inputs.compared is not None
-    data, step = inputs.compared, inputs.step
-    moves, chosen = in_motion(data), np.arange(0, len(data), step)
-    for own in map(np.flatnonzero, moves[:, moves[::step].sum(axis=0) < FEWEST_ROWS].T):
-        chosen = np.union1d(chosen, own[:: max(1, len(own) // FEWEST_ROWS)])
-    return data.rows(chosen)
-
-
 def _root(inputs: CheckInput) -> Explanation:
-    rows = moving(_rows(inputs))
+    rows = moving(inputs.rows())
     rows = replace(rows, u=np.where(np.ptp(rows.q, axis=0) < BRAKED, 0.0, rows.u))  # no motor measures what brakes hold
     log = Comparison(robot=inputs.robot, laws=inputs.laws, rows=rows, given=rows).after(changed())
     seen = white_noise(inputs.mended, signal="u") if inputs.log.time_ordered else None
@@ -169,7 +159,7 @@ def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -
         off = off[(best.exact[off] <= EXPLAINED) & (best.shares[off] > RESTS)]
     if len(off) < (1 if explained else 2):
         return
-    less = next((u for u, s in UNITS if (np.abs(np.log(np.abs(factors[off]) / s)) < np.log(LOADED)).all()), "")
+    less = next((u for u, s in UNITS if all(1.0 / LOADED < abs(x) / s < LOADED for x in factors[off])), "")
     units = [less + si for si in inputs.unit_of_each("u")]
     unit = units[0] if len({*units}) == 1 else ",".join(units)
     loaded = f"With a load it may be in {unit}: forcegp import --unit u={unit}. " if less else ""

@@ -8,14 +8,16 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from forcegp.checks.check_input import DEGREE, EVERY_QUANTITY, QUANTITY, STEPS, CheckInput
-from forcegp.checks.single_rows import single_row_doubts
+from forcegp.checks.check_input import DEGREE, STEPS, STILL, CheckInput
 from forcegp.checks.torques import needed_torques
 from forcegp.data import Dataset, differentiate, low_pass, preparation_report
 from forcegp.data.delay import lowest
 from forcegp.data.views import consecutive, ends_of_range, resolution, runs
 from forcegp.doubts import Doubt, Level, listed, look, ok, wrong
 
+QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
+EVERY_QUANTITY = {**QUANTITY, "a": "acceleration"}
+FINE = 3  # digits of a time beyond half a step
 ROUNDING = 1e-12  # of the largest value of any joint
 HELD_STEPS = 0.5  # share of equal successive values from which on a signal moves in steps, such as a held command
 FROZEN_SECONDS = 0.1
@@ -30,7 +32,7 @@ def signal_doubts(inputs: CheckInput) -> list[Doubt]:
     """Constant, frozen and clipped channels, angles that jump."""
     joints = range(inputs.log.nv)
     frozen = chain.from_iterable(_frozen(inputs, name, joint) for name in QUANTITY for joint in joints)
-    return [*_jumps(inputs), *single_row_doubts(inputs), *_constant(inputs), *frozen, *_clipped(inputs)]
+    return [*_jumps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *_clipped(inputs)]
 
 
 FEWEST_VALUES, GAPS = 5, 8  # on either side of a gap, and how many gaps are looked at
@@ -114,6 +116,35 @@ def _jumps(inputs: CheckInput) -> Iterator[Doubt]:
         )
 
 
+def _dropped(inputs: CheckInput) -> Iterator[Doubt]:
+    """Rows of a signal that were lost and read 0, and single ones that are far from those before and after."""
+    time = inputs.log.time
+    for about in ("drop-outs", "spike"):
+        lost = dict[str, np.ndarray]()
+        for name, rows in inputs.dropped.items():
+            own = rows & ((getattr(inputs.log, name)[:, : rows.shape[1]] == 0.0) == (about == "drop-outs"))
+            lost |= {name: own} if own.any() else {}
+        if not lost:
+            continue
+        every = np.any(list(lost.values()), axis=0)
+        rows, names = np.flatnonzero(every.any(axis=1)), inputs.named(np.flatnonzero(every.any(axis=0)))
+        seen = f"{len(rows)} rows ({100.0 * len(rows) / len(every):.2g} %) read exactly 0 between values far from 0"
+        remedy = "They were not measured: leave these rows out, and look at the logger."
+        if about == "spike":
+            seen = f"{len(rows)} single value{'s' if len(rows) > 1 else ''} far from those just before and after"
+            half = 0.5 * float(np.median(np.diff(time)))
+            ends = (f"{time[k] + x:.{FINE - int(np.log10(half))}f}" for k in rows for x in (-half, half))
+            remedy = f"Such a value is wrong: leave it out, by forcegp import --without {','.join(ends)}."
+        yield wrong(
+            about=about,
+            what=f"{seen}, in {listed(tuple(EVERY_QUANTITY[name] for name in lost))} of {listed(names)}; the first is "
+            f"row {rows[0]} at {time[rows[0]]:.3f} s.",
+            do=remedy,
+            joints=names,
+            numbers={"rows": len(rows), "row": int(rows[0]), "quantities": list(lost)},
+        )
+
+
 def _constant(inputs: CheckInput) -> Iterator[Doubt]:
     log = inputs.log
     rests, counts = _still(log, "v") & _still(log, "q") | _dithers(log), np.flatnonzero(_dithers(log))
@@ -160,7 +191,6 @@ def _still(log: Dataset, name: str) -> np.ndarray:
     return np.ptp(values, axis=0) <= ROUNDING * np.abs(values).max(initial=0.0)
 
 
-STILL = 0.02, 0.002  # range in rad or m below which a joint does not move
 COUNTS = 5.5  # steps of an encoder between which a joint that stands still may go to and fro
 
 

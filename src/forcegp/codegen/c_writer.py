@@ -48,8 +48,7 @@ _ATANH = _horner([2.0 / (2 * n + 1) for n in range(11, 0, -1)], "z")
 STATEMENTS = 500  # per part
 LONG_PART = 2500  # of dynamics, whose values are used again soon: 10-20 % faster, compiled as fast
 
-ROWS = c_text(__name__, "rows.h")
-"""Between rows of numbers, one per state, and lanes."""
+ROWS = c_text(__name__, "rows.h")  # between rows of numbers, one per state, and lanes
 
 SCALAR_NAMES = {"absolute": "fabs", "power": "pow"}
 INFIX = {"add": "+", "subtract": "-", "multiply": "*", "divide": "/"}

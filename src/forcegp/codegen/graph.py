@@ -16,8 +16,7 @@ from forcegp.errors import InvalidInput
 Slopes = Mapping[tuple[int, int], int]
 """(value, operand) of a call -> the output that is the derivative of the one in the other; 0 where there is none."""
 
-ZERO, ONE = 0, 1
-"""Numbers of the nodes that hold these constants."""
+ZERO, ONE = 0, 1  # numbers of the nodes that hold these constants
 
 NAMED = ("sin", "cos", "tan", "sqrt", "tanh", "asinh", "exp", "log", "log1p", "expm1")
 UNARY: dict[str, Any] = {"negate": operator.neg, "absolute": abs, **{name: getattr(math, name) for name in NAMED}}

@@ -30,11 +30,9 @@ MOVING = frozenset(
 )
 """Operations that are the same on node numbers: nodes 0 and 1 hold 0.0 and 1.0."""
 
-CREATION = ("dtype", "layout", "device", "pin_memory", "memory_format")
-"""Keywords without an effect on values."""
+CREATION = ("dtype", "layout", "device", "pin_memory", "memory_format")  # keywords without an effect on values
 
-INDEXED = ("index", "index_select", "gather")
-"""Those whose further tensors are indices, which must be known."""
+INDEXED = ("index", "index_select", "gather")  # those whose further tensors are indices, which must be known
 
 OUTWARDS = (Tensor.numpy, Tensor.tolist, Tensor.__array__)
 BRANCH = "a branch on the values of a tensor, or numbers taken out of it"

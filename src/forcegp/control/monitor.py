@@ -27,8 +27,7 @@ Motion = tuple[Any, Any, Any]
 Residuals = tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor]
 """As of `_torques`, filtered (T - 1 - settle, nv); velocities in the middle of all steps; and M a, filtered."""
 
-BLOCK = 2.0
-"""Seconds of free motion of which the largest distance counts once: what follows upon it resembles it."""
+BLOCK = 2.0  # seconds of free motion of which the largest distance counts once: what follows upon it resembles it
 LEAST_BLOCKS = 20
 SLOW = tuple(np.geomspace(0.01, 0.5, 8).tolist())
 """Of the root mean square velocity, over what errors of friction near rest may fade: Stribeck's velocity, or a part."""

@@ -17,10 +17,8 @@ from forcegp.model import Model
 from forcegp.robots.manifold import ConfigurationSpace
 
 MOST_STEPS, MOST_TRIALS = 200, 12
-TOLERANCE = 1e-9
-"""x counts as found after a step so small, relative to 1 + |x|."""
-SMALLEST_SLOPE = 0.1
-"""Smallest real part of an eigenvalue of a Jacobian that is used."""
+TOLERANCE = 1e-9  # x counts as found after a step so small, relative to 1 + |x|
+SMALLEST_SLOPE = 0.1  # smallest real part of an eigenvalue of a Jacobian that is used
 OVERSHOOT = 0.5
 
 Rows = Callable[[Tensor], Tensor]
@@ -122,10 +120,8 @@ Integrator = Callable[[Acceleration, Tensor, Tensor, float], Step]
 
 There q' = v or, on a manifold, v is the velocity in body axes, and steps are those of Lie group methods.
 """
-VECTORS = ConfigurationSpace(0)
-"""Positions that add up; their number does not matter."""
-NO_ROOT = "Newton's method found no solution of the implicit step"
-"""Why a step can have no end."""
+VECTORS = ConfigurationSpace(0)  # positions that add up; their number does not matter
+NO_ROOT = "Newton's method found no solution of the implicit step"  # why a step can have no end
 
 
 def symplectic_euler(space: ConfigurationSpace, acceleration: Acceleration, q: Tensor, v: Tensor, dt: float) -> Step:
@@ -198,8 +194,7 @@ def _all(q: Tensor) -> Tensor:
     return torch.ones(q.shape[0], dtype=torch.bool, device=device)
 
 
-SPEED_LIMIT = 100.0
-"""A motion with a joint faster than this (rad/s or m/s) has diverged: no robot moves so fast."""
+SPEED_LIMIT = 100.0  # A motion with a joint faster than this (rad/s or m/s) has diverged: no robot moves so fast
 
 
 Feedback = Callable[[int, Tensor, Tensor], Tensor]

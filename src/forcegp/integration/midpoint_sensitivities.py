@@ -14,8 +14,7 @@ from torch import Tensor
 from forcegp.integration.integrators import VECTORS, implicit_midpoint
 
 MOST_PASSES = 20
-TOLERANCE = 1e-9
-"""Change of a middle velocity, relative to the largest, at which the motions are found."""
+TOLERANCE = 1e-9  # change of a middle velocity, relative to the largest, at which the motions are found
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,8 +18,7 @@ from forcegp.posterior.prediction import require_actuated
 from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.programs import WITH_SLOPES, Programs
 
-STORED = 10
-"""States of the self-test."""
+STORED = 10  # states of the self-test
 FILES = ("model.h", "model.hpp", "CMakeLists.txt", "example.c", "self_test.c", "README.txt")
 TAKEN = ("math", "string", "stdio", "stddef", "stdarg", "features", "example", "self_test", "jac", "hess", "null")
 """Names of other files, and those that CasADi does not take."""

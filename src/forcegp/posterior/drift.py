@@ -30,21 +30,17 @@ Posterior = Any
 BETWEEN = 0.03
 """Deviation of a friction level between records, relative, where a log has one: 2.9 % on an axis recorded twice (EMPS).
 Of several it counts as much as one of them."""
-BLOCKS, FEWEST = 80, 8
-"""Of a log; of those that show a joint's friction, fewer tell no drift."""
+BLOCKS, FEWEST = 80, 8  # of a log; of those that show a joint's friction, fewer tell no drift
 ROWS = 10_000
 SHOWN = 3.84
 """Twice the nats that a drift must explain: without any it is in 2.5 % of joints (Self & Liang 1987, at a bound)."""
 LASTING = 2.0
 """Seconds for which errors of a model may resemble each other, as those of a posture do: longer ones are drift."""
-SEEN = 0.02
-"""Information about a level in a block, relative to the best one, below which the joint rests in it."""
+SEEN = 0.02  # information about a level in a block, relative to the best one, below which the joint rests in it
 
-REACH = 1.96
-"""Deviations in a 95 % interval."""
+REACH = 1.96  # deviations in a 95 % interval
 
-EXACT = 1e-12
-"""Noise of a log without any, relative to squares of friction."""
+EXACT = 1e-12  # noise of a log without any, relative to squares of friction
 NAMES = "rate", "noise", "between", "level", "bias"
 PerJoint = list[float]
 

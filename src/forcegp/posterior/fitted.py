@@ -32,16 +32,14 @@ from forcegp.noise import ACCELERATION
 from forcegp.posterior.drift import Drift
 from forcegp.summary import Summary, listed, rounded
 
-STRETCHES = 20
-"""Of time; residuals of different ones count as independent."""
+STRETCHES = 20  # of time; residuals of different ones count as independent
 REACH = float(student.ppf(0.975, STRETCHES - 1))
 """Standard deviations from the estimate to the ends of its 95 % interval."""
 HELD = 0.5
 """A number whose standard deviation is above this fraction of its prior's is one that the log does not decide."""
 SEEN = 1.0
 """Information of the log about a coordinate, in that of its prior, below which the rows do not show it at all."""
-NAMED = 0.3
-"""Correlation from which on another number is named as one that does the same."""
+NAMED = 0.3  # correlation from which on another number is named as one that does the same
 
 Decider = Literal["log", "prior"]
 

@@ -20,8 +20,7 @@ from forcegp.posterior.fitted import DEVIATIONS
 from forcegp.robots.arguments import broadcast_batch, real_tensor, require_finite
 from forcegp.summary import Summary, listed
 
-ROWS_PER_BLOCK = 4096
-"""States that are predicted at once; bounds the memory of long recordings."""
+ROWS_PER_BLOCK = 4096  # states that are predicted at once; bounds the memory of long recordings
 Rows = Float[Tensor, "rows nv"]
 """One number per state and joint."""
 Positions = Float[Tensor, "rows nq"]

@@ -37,8 +37,7 @@ INSTEAD_OF_TRANSFORMS = (
     "compile=False"
 )
 BY_TORCH = "predictions are computed by torch, some hundred times slower"
-BLOCK = 256
-"""States that torch works on at once, so that their kernel values stay in the processor's cache."""
+BLOCK = 256  # states that torch works on at once, so that their kernel values stay in the processor's cache
 
 
 @dataclass(frozen=True, eq=False, repr=False)

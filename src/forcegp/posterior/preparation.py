@@ -20,10 +20,8 @@ from forcegp.posterior.programs import Physics
 from forcegp.robots.manifold import ConfigurationSpace
 
 COVARIANCES = ("auto", "compressed", "exact", "none")
-SAMPLES, CHECKS = 300, 150
-"""States that choose the compressed covariance, and others that show how good it is."""
-STEP = 0.3
-"""Length of a step away from a training state, in differences of two others."""
+SAMPLES, CHECKS = 300, 150  # states that choose the compressed covariance, and others that show how good it is
+STEP = 0.3  # length of a step away from a training state, in differences of two others
 
 TOLERANCE, LARGEST_RANK = 0.01, 1536
 """By how much standard deviations of a compressed covariance exceed the exact ones at most, where the rank suffices."""

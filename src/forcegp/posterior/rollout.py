@@ -34,8 +34,7 @@ from forcegp.robots.manifold import ConfigurationSpace
 STEPS_TO_COMPILE = 2000
 """Steps of some milliseconds each, and as many for every contact; fewer are done before a program is compiled."""
 TOGETHER, FUNCTIONS = 10, 3  # motions, and unknown functions, that cost as much as one step again
-ROWS_PER_BLOCK = 4096
-"""States whose constraint is evaluated at once."""
+ROWS_PER_BLOCK = 4096  # states whose constraint is evaluated at once
 
 AccelerationFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(q, v, u) -> a, all of one shape."""

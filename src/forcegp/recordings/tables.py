@@ -45,8 +45,7 @@ _TIME = re.compile(
 )
 _UNITS = {unit.lower() for units in UNITS.values() for unit in units} | {"%", "sec", "°", "°/s", "-", "", "degrees"}
 _REMEDY = "Repair or remove it, or leave such rows out by `bad_rows` skip."
-LAST_LINES = 20
-"""Of those that are looked at: they are rows, whatever stands above."""
+LAST_LINES = 20  # of those that are looked at: they are rows, whatever stands above
 _CONVERSION = re.compile(
     r"In CSV column #(\d+): Row #(\d+): CSV conversion error to \w+: invalid value '(.*)'", re.DOTALL
 )

@@ -26,10 +26,8 @@ from forcegp.scores.figures import style
 
 FRAMES_PER_SECOND = 30.0
 MOST_FRAMES = 450
-LONGEST_ARROW = 0.4
-"""Of the reach of the robot, for a force that is large in its group."""
-LARGE = 98.0
-"""Percentile of the largest force of each row: peaks do not make all other arrows short."""
+LONGEST_ARROW = 0.4  # of the reach of the robot, for a force that is large in its group
+LARGE = 98.0  # percentile of the largest force of each row: peaks do not make all other arrows short
 NOT_SHOWN = (Actuation, Thrusters, ObservedWrench, RigidBodies, Rotor)
 """Known forces that are no finding at a joint: what motors do, wind on a base, and inertia."""
 
@@ -196,10 +194,8 @@ def _at_point(name: str, place: torch.Tensor, mean: torch.Tensor, covariance: to
 LINK, DARK_LINK = (150, 157, 166), (118, 126, 136)
 COLORS = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0))
 """Okabe and Ito (2008), as the figures, for groups of arrows."""
-PALE = 0.55
-"""How far the colour of an interval goes towards white."""
-OPACITY = 0.6
-"""Of links: arrows along the axes of joints begin inside of them."""
+PALE = 0.55  # how far the colour of an interval goes towards white
+OPACITY = 0.6  # of links: arrows along the axes of joints begin inside of them
 
 
 def recording(recorded: RecordedScene) -> str:

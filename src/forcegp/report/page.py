@@ -55,8 +55,7 @@ def write_page(path: str | Path, page: Page, *, overwrite: bool = True) -> None:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
-SECONDS = 10.0
-"""Of the recording in the scene."""
+SECONDS = 10.0  # of the recording in the scene
 
 
 def model_page(posterior: Posterior, dataset: Dataset, *, shapes: str | Path | None = None, **texts: Any) -> Page:

@@ -21,8 +21,7 @@ MOST_FACES = 2500
 """Faces of one link, so that the page of a report stays small; finer meshes lose vertices that lie close together."""
 FINEST, COARSER = 200.0, 1.4
 """Cells of the first grid over the diagonal of a mesh, and how much larger those of the next one are."""
-THICKNESS = 0.035
-"""Radius of a capsule relative to the reach of the robot."""
+THICKNESS = 0.035  # radius of a capsule relative to the reach of the robot
 SHORTEST = 1e-4  # m
 
 

@@ -15,10 +15,8 @@ from torch import Tensor
 
 from forcegp.errors import ForceGPError, InvalidInput, RobotFileWarning, RobotModelError, UnknownName, require_known
 
-LARGEST = 2**63 - 1
-"""Of the integers that every library takes."""
-LISTED = 12
-"""Problems of one kind that a message lists; the error has all of them."""
+LARGEST = 2**63 - 1  # of the integers that every library takes
+LISTED = 12  # problems of one kind that a message lists; the error has all of them
 
 
 def is_sequence(given: object) -> TypeGuard[Iterable[Any]]:

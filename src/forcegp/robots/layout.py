@@ -23,8 +23,7 @@ BaseChoice = Literal["fixed", "floating"]
 Loops = Sequence[tuple[str, str, str]]
 """Names of equalities that hold two links together, and these."""
 WORLDS = ("world", "map", "odom", "ground", "universe")
-WORD = r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+"
-"""Words of a name: FL foot, upper Leg, front left wheel."""
+WORD = r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+"  # words of a name: FL foot, upper Leg, front left wheel
 LIMB = r".*(foot|feet|toe|leg|wheel|ankle|knee|thigh|calf)s?|[lr]?hips?|shin|sole"
 """To walk or drive with; `base_footprint` is none."""
 ROTOR = r".*(rotor|propeller)s?"
@@ -32,12 +31,9 @@ BODY = r"pelvis|flying|drone|uav|quadrotor|.*copter"
 ENOUGH = {LIMB: 2, ROTOR: 3, BODY: 1}
 """So many tell. Rotors count on the links that stand still: motors of arms have some in other places."""
 WORLD = -1
-BASE = "base"
-"""Name of the joint between the world and a base that moves."""
-OUTSIDE = "(world)"
-"""What carries such a base; no link of the robot."""
-MOST_BODIES = 1000
-"""Matrices of all pairs of bodies are kept for a robot."""
+BASE = "base"  # name of the joint between the world and a base that moves
+OUTSIDE = "(world)"  # what carries such a base; no link of the robot
+MOST_BODIES = 1000  # matrices of all pairs of bodies are kept for a robot
 
 
 def check_base(description: RobotDescription, standing: Sequence[str], problems: Problems) -> None:

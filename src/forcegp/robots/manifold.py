@@ -14,8 +14,7 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput
 
-LARGEST_NORM_ERROR = 1e-4
-"""By so much the length of a quaternion may differ from 1: logs are rounded."""
+LARGEST_NORM_ERROR = 1e-4  # by so much the length of a quaternion may differ from 1: logs are rounded
 QUATERNION = ("qx", "qy", "qz", "qw")
 POSITIONS = ("x", "y", "z", *QUATERNION)
 VELOCITIES = ("x", "y", "z", "rx", "ry", "rz")

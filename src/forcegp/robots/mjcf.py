@@ -24,10 +24,8 @@ from forcegp.robots.urdf import MOST_TAGS, Joint, free_joint, numbers, parse_xml
 from forcegp.robots.urdf_file import read_text
 from forcegp.sandbox import read_apart
 
-DEEPEST = 20
-"""Files that include files; each is read by a function that calls itself."""
-SMALLEST = 2e-15
-"""kg m^2; MuJoCo takes no smaller inertia, so that ideal rods and points get this one."""
+DEEPEST = 20  # files that include files; each is read by a function that calls itself
+SMALLEST = 2e-15  # kg m^2; MuJoCo takes no smaller inertia, so that ideal rods and points get this one
 KINDS = {"floating": "free", "prismatic": "slide", "revolute": "hinge", "continuous": "hinge"}
 
 

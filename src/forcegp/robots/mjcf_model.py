@@ -14,8 +14,7 @@ from forcegp.robots.manifold import VELOCITIES
 from forcegp.robots.urdf import numbers
 from forcegp.robots.urdf_file import inertial_element
 
-KINDS = {0: "floating", 2: "prismatic", 3: "revolute"}
-"""Of MuJoCo's joints (mjtJoint) in URDF."""
+KINDS = {0: "floating", 2: "prismatic", 3: "revolute"}  # of MuJoCo's joints (mjtJoint) in URDF
 WORLD = "world"
 
 

@@ -14,14 +14,12 @@ from forcegp.errors import LARGEST, RobotModelError, require_known
 from forcegp.robots.arguments import Problems
 from forcegp.robots.inertia import rotation_from_rpy, transform
 
-MOST_TAGS = 200_000
-"""A robot file of two hundred joints has some ten thousand."""
+MOST_TAGS = 200_000  # A robot file of two hundred joints has some ten thousand
 FAR, LIGHT = 10.0, 1e-9
 """Lengths in m and masses in kg that are named: of a file in millimetres or grams, or with a slip of the pen."""
 MECHANICS = ("inertial", "origin", "parent", "child", "axis", "limit", "dynamics", "mimic")
 """Parts of a link or joint that are read."""
-DEFINITIONS = ("}arg", "}property", "}macro")
-"""Elements of xacro that add nothing by themselves."""
+DEFINITIONS = ("}arg", "}property", "}macro")  # elements of xacro that add nothing by themselves
 FARTHEST = 1e9  # m; squares of larger numbers overflow
 LIGHTEST = 1e-20  # kg; what is lighter is a slip, and divides badly
 MOVABLE = ("revolute", "continuous", "prismatic")

@@ -17,10 +17,8 @@ from forcegp.robots.layout import Layout
 from forcegp.robots.urdf import RobotDescription, numbers, parse_urdf, with_prefixes
 from forcegp.sandbox import read_apart
 
-HEAVIEST = 1e9
-"""kg and kg m^2, of one link: far from where products of inertias overflow."""
-LARGEST_FILE = 16 << 20
-"""Bytes; robot files have some hundred thousand."""
+HEAVIEST = 1e9  # kg and kg m^2, of one link: far from where products of inertias overflow
+LARGEST_FILE = 16 << 20  # bytes; robot files have some hundred thousand
 IN_THE_FILE = (
     ". Correct its <inertial> element (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>)"
 )

@@ -158,8 +158,6 @@ class Winner(NamedTuple):
 class Scores(Summary):
     """One table: model x run (split and seed) x quantity x score x joint, and paired differences of models.
 
-    Fields
-    ------
     models: name -> "kind" and "summary".
     runs: name -> one entry per split and seed, with "table" (`accuracy.row_scores`, `motions.motion_scores`),
         "stretches" and "motions" for differences, "warnings", and "error" where it failed.

@@ -158,8 +158,7 @@ def joint_acceleration(config: KukaSurfaceConfig, state: ArmState, reference: Ai
     return posture + jacobian.T @ np.linalg.solve(jacobian @ jacobian.T, residual)
 
 
-RATE = 240
-"""Rows per second."""
+RATE = 240  # rows per second
 
 Columns = Mapping[str, np.ndarray]
 
