@@ -74,14 +74,8 @@ def cell(seed: int, force: float | None, diverged: int = 0, motion: float = 0.1)
     if force is None:
         return run
     squared = [[motion**2] * 3, [None] * diverged + [4.0 * motion**2] * (3 - diverged)]
-    stretches = [force**2, 0.25 * force**2]
-    return {
-        **run,
-        "error": None,
-        "stretches": stretches,
-        "motions": {"horizons": [0.1, 1.0], "squared": squared},
-        "table": {},
-    }
+    motions = {"horizons": [0.1, 1.0], "squared": squared}
+    return {**run, "error": None, "stretches": [force**2, 0.25 * force**2], "motions": motions, "table": {}}
 
 
 KINDS = {"urdf": "given", "ls": "identified", "ls2": "identified", "gp": "force prior", "net": "black box"}
@@ -170,9 +164,8 @@ def test_motions_are_compared_over_the_horizons_that_all_splits_last_for():
         long["motions"]["squared"][1] = [1.0 - error] * 3  # after 1 s, and the other way round
         short["motions"] = {"horizons": [0.1], "squared": short["motions"]["squared"][:1]}
         cells[name] = [long, short]
-    found = scores(cells)
-    assert found.difference("motion", "gp", "ls").value == pytest.approx(0.5)
-    assert found.best_of(("force prior", "identified"), "motion") == "gp"
+    assert scores(cells).difference("motion", "gp", "ls").value == pytest.approx(0.5)
+    assert scores(cells).best_of(("force prior", "identified"), "motion") == "gp"
 
 
 def test_a_model_that_is_usable_in_more_joints_is_taken_whatever_its_motions():

@@ -103,8 +103,8 @@ def _all_turned(root: Explanation, inputs: CheckInput) -> tuple[Explanation, lis
 
 def moving(rows: Dataset) -> Dataset:
     """The rows in which some joint moves. All, where they are too few."""
-    moves = in_motion(rows).any(axis=1)
-    return rows.rows(moves) if moves.sum() >= FEWEST_ROWS else rows
+    moves = np.flatnonzero(in_motion(rows).any(axis=1))
+    return rows.rows(moves) if len(moves) >= FEWEST_ROWS else rows
 
 
 def _root(inputs: CheckInput) -> Explanation:
