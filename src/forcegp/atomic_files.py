@@ -21,8 +21,7 @@ from forcegp.errors import FileFormatError, InvalidInput
 
 TEMPORARY = ".tmp"
 LOCK, OLD = ".lock", ".old"
-TRIAL = 2**16
-"""Bytes that `require_writable` writes."""
+TRIAL = 2**16  # bytes that `require_writable` writes
 MARK = "Written by forcegp"  # stands near the end of pages and robot files, which may be replaced
 HOLE = 100 << 20  # bytes that a file may lack of its size
 LARGEST_TEXT = 32 << 20

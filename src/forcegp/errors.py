@@ -131,8 +131,7 @@ def require_plausible(stored: Any, name: str = "") -> None:
 
 ACTING = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 """What acts on a terminal; compiled here, for at its first use there may be no memory left to say so."""
-LONGEST_TEXT = 4000
-"""Letters in one text on a terminal."""
+LONGEST_TEXT = 4000  # letters in one text on a terminal
 
 
 def printable(text: str) -> str:

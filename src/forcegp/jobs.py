@@ -73,8 +73,6 @@ def machine() -> str:
 class Job:
     """One piece of work, the smallest that is kept.
 
-    Fields
-    ------
     name: its place in the store.
     task: "package.module:function" of a function `(store, spec, folder, *arguments)`, which may write files to `folder`
         and returns plain JSON values.

@@ -5,8 +5,7 @@ from collections.abc import Iterable, Mapping
 from html import escape
 from math import isfinite
 
-WIDTH = 100
-"""Longest text that stands on one line."""
+WIDTH = 100  # longest text that stands on one line
 
 
 class Summary:

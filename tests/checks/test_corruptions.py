@@ -106,7 +106,9 @@ def test_two_mistakes_are_both_named():
     assert after < 0.1 * before  # of the log as it is, without any factor
 
 
-@pytest.mark.parametrize("x", ["1e3 9.55 mm/s,rpm", "1e3 10 mm/s,rad/s", "1e2 1 cm/s,rad/s", "1 10 ", "2 9.5 mm/s,rpm"])
+@pytest.mark.parametrize(
+    "x", ["1e3 -9.55 mm/s,rpm", "1e3 10 mm/s,rad/s", "1e2 1 cm/s,rad/s", "1 10 ", "2 9.5 mm/s,rpm"]
+)
 def test_units_of_velocities_are_found_joint_by_joint_and_before_those_of_torques(x):
     rail, gear, unit = x.split(" ")
     data = at(clean(ROBOTS["crane"](), 4, noise="qvu"), "v", [float(rail), float(gear)])
@@ -121,6 +123,8 @@ def test_the_factor_of_a_torque_has_an_interval():
     [found] = said(replace(data, u=data.u * np.array([1.0, 1.6])))
     assert found.numbers["factor"]["joint2"] == pytest.approx(1.6, abs=found.numbers["error_95"][0])
     assert found.numbers["error_95"][0] < 0.03
+    for largest, told in ((4.5e-3, True), (8e-3, False)):  # a load makes more of kNm than masses do
+        assert ("--unit u=kNm." in said(replace(data, u=data.u * np.array([1.2e-3, largest])))[0].do) == told
 
 
 @pytest.mark.parametrize("degrees", [10.0, 40.0])
@@ -218,6 +222,18 @@ def test_gears_that_stick_are_no_unknown_cause_and_more_than_they_hold_is_one(ti
     force = np.std(data.u[:, 1]) * np.array(held)[19::20] * np.where(np.abs(data.v[:, 1]) < 1e-9, times, 1.0)
     found = check(replace(data, u=data.u + np.stack([0.0 * force, force], axis=1))).doubts
     assert [(each.about, each.joints) for each in found if each.level != "ok"] == [(about, ("joint2",))]
+
+
+@pytest.mark.parametrize(("begin", "told"), [(12.0, True), (6.0, False)])
+def test_a_joint_that_moves_once_is_judged_by_its_motion(begin, told):
+    time = np.arange(2000) / 100.0
+    moves = (time > begin) & (time < 15.0)
+    once = np.where(moves, 0.7 - 0.4 * np.cos(4.0 * np.pi * (time - begin) / 3.0), 0.3)
+    data = with_motion(two_links(), np.stack([0.5 * np.sin(2.1 * time), once], axis=1), 100.0, 3, 0.0)
+    dry = np.where(moves, 3.0 * np.tanh(data.v[:, 1] / 0.05), np.cumsum(np.sin(0.7 * time)) / 300.0)  # less than slips
+    found = [x for x in check(replace(data, u=data.u + np.c_[0.0 * dry, dry])).doubts if x.level != "ok"]
+    seen = [("excitation", ("joint2",), pytest.approx([begin, 15.0], abs=0.2))] * told
+    assert [(x.about, x.joints, x.numbers["seconds"]) for x in found] == seen
 
 
 def test_friction_that_remembers_is_no_push():

@@ -76,6 +76,39 @@ def test_frozen_channels(rate):
     assert_unchanged(f"checks/frozen {rate:g}", found)
 
 
+@pytest.mark.parametrize(("turns", "frozen"), [(40, True), (20, False)])
+def test_a_torque_that_stands_still_while_its_joint_turns_and_rests_is_frozen(turns, frozen):
+    u, v = swing().u[:, 0].copy(), swing().v[:, 0].copy()
+    u[300:400], v[300 + turns : 400] = u[300], 1e-6 * np.random.default_rng(0).normal(size=100 - turns)
+    assert (levels(signal_doubts(seen(swing(u=u, v=v))), "frozen") > 0) == frozen
+
+
+@pytest.mark.parametrize(("counts", "still"), [(4, True), (8, False)])
+def test_a_joint_whose_encoder_dithers_by_counts_stands_still_and_is_not_frozen(counts, still):
+    generator = np.random.default_rng(1)
+    q = 0.3 + 2e-5 * np.repeat(generator.integers(0, counts + 1, 40), 25)
+    found = signal_doubts(seen(swing(q=q, v=1e-3 * generator.normal(size=1000), u=generator.normal(size=1000))))
+    assert ([(x.about, x.level) for x in found] == [("constant channel", "look")]) == still
+
+
+@pytest.mark.parametrize("name", "qvu")
+@pytest.mark.parametrize(
+    ("size", "rows", "told"), [(30, [200, 500], 1), (15, [500], 0), (30, [*range(99, 800, 99)], 0)]
+)
+def test_single_rows_far_from_their_neighbours_are_named(name, size, rows, told):
+    x = getattr(swing(), name)[:, 0].copy()
+    x[[*rows]] += size * np.abs(np.diff(x, 2)).max() / 2.0
+    found = signal_doubts(CheckInput.quick(swing(**{name: x}), MODEL))
+    assert [each.numbers["rows"] for each in found if each.about == "spike"] == [len(rows)] * told
+    assert not told or f"--without {rows[0] / 100 - 0.005:.5f},{rows[0] / 100 + 0.005:.5f}" in found[0].do
+
+
+def test_steps_bounces_chatter_and_counts_are_no_spikes():
+    u, k = swing().u[:, 0], np.arange(1000)
+    for x in (u + (k > 500), u + 0.1 * abs(k - 500), u + (k % 500 < 20) * (-1.0) ** k, np.round(u, 1)):
+        assert not signal_doubts(CheckInput.quick(swing(u=x), MODEL))
+
+
 @pytest.mark.parametrize(("more", "frozen"), [(0, False), (1, True)])
 def test_a_velocity_that_stands_still_while_its_encoder_counts_evenly_is_right(more, frozen):
     v, count = 2.0 * np.cos(2.0 * np.arange(1000) / 100.0), 0.003

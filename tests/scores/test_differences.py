@@ -74,8 +74,8 @@ def cell(seed: int, force: float | None, diverged: int = 0, motion: float = 0.1)
     if force is None:
         return run
     squared = [[motion**2] * 3, [None] * diverged + [4.0 * motion**2] * (3 - diverged)]
-    stretches = [force**2, 0.25 * force**2]
-    return {**run, "error": None, "stretches": stretches, "motions": {"squared": squared}, "table": {}}
+    motions = {"horizons": [0.1, 1.0], "squared": squared}
+    return {**run, "error": None, "stretches": [force**2, 0.25 * force**2], "motions": motions, "table": {}}
 
 
 KINDS = {"urdf": "given", "ls": "identified", "ls2": "identified", "gp": "force prior", "net": "black box"}
@@ -155,6 +155,17 @@ def test_a_model_whose_motions_diverge_is_not_the_best():
     kinds = {"a": "force prior", "b": "force prior"}
     cells = {"a": [cell(0, 1.0, diverged=2, motion=0.01)], "b": [cell(0, 1.0, diverged=0, motion=0.5)]}
     assert scores(cells, kinds).best_of(("force prior",), "motion") == "b"
+
+
+def test_motions_are_compared_over_the_horizons_that_all_splits_last_for():
+    cells = {}
+    for name, error in (("ls", 0.2), ("gp", 0.1)):
+        long, short = ({**cell(0, 1.0, motion=error), "split": split} for split in "st")
+        long["motions"]["squared"][1] = [1.0 - error] * 3  # after 1 s, and the other way round
+        short["motions"] = {"horizons": [0.1], "squared": short["motions"]["squared"][:1]}
+        cells[name] = [long, short]
+    assert scores(cells).difference("motion", "gp", "ls").value == pytest.approx(0.5)
+    assert scores(cells).best_of(("force prior", "identified"), "motion") == "gp"
 
 
 def test_a_model_that_is_usable_in_more_joints_is_taken_whatever_its_motions():

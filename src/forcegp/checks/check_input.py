@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from forcegp.checks.torques import in_motion
 from forcegp.data import Dataset, Preparation, preparation_report, resample, uniform_step
 from forcegp.data.dataset import ROTATION, TRANSLATION
 from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST, motion_spectrum
@@ -21,6 +22,7 @@ GAP = 5.0  # median steps without a row at which a motion is taken for two
 COMPARED = 0.5  # of the cut-off: where torques are compared
 LONGEST_TRIM = 0.1  # most that is trimmed from either end, as a share of the shortest stretch
 MOST_ROWS = 250  # rows on which torques are compared: neighbouring rows hold the same information
+FEW_MOVE = 30  # of these, in which each joint moves
 QUICK_ROWS = 200  # the same before a fit
 HALF_CUTOFF = COMPARED**2.5  # noise of an acceleration that is differenced twice, relative to that at the whole cut-off
 DEGREE = np.pi / 180.0
@@ -30,6 +32,12 @@ SMOOTH_SECONDS, SMOOTH_ROWS = 0.03, 15  # of the running mean before a fit: SciP
 JUMP = 10.0  # steps that nine of ten rows stay below, by which a signal that is not measured jumps to 0
 LEAST_JUMP = 0.02  # and by more than this share of its range
 FEWEST_DROPS = 2
+STILL = 0.02, 0.002  # range in rad or m below which a joint does not move
+FAR_OFF, MOST_SPIKES = (
+    20.0,
+    5,
+)  # times all others of a signal, by which so few rows are off the middle of their neighbours
+BACK = 0.4  # of that, by which each neighbour is off as well: half of it, unlike at a kink or a step
 STEPS = 2.5  # of its resolution by which a channel in steps changes from row to row
 
 
@@ -93,10 +101,13 @@ class CheckInput:
         return tuple(self.names[joint] for joint in joints)
 
     def rows(self) -> Dataset:
-        """Up to `most_rows` rows of `compared`, evenly over the log."""
+        """Up to `most_rows` rows of `compared`, evenly over the log, and others of joints that move in few of them."""
         assert self.compared is not None
-        data = self.compared
-        return data.rows(slice(None, None, max(1, -(-len(data) // self.most_rows))))
+        step, moves = max(1, -(-len(self.compared) // self.most_rows)), in_motion(self.compared)
+        chosen = np.arange(0, len(moves), step)
+        for own in map(np.flatnonzero, moves[:, moves[::step].sum(axis=0) < FEW_MOVE].T):
+            chosen = np.union1d(chosen, own[:: max(1, len(own) // FEW_MOVE)])
+        return self.compared.rows(chosen)
 
     @property
     def cutoff(self) -> float | None:
@@ -180,7 +191,7 @@ def _mended(dataset: Dataset) -> dict[str, Any]:
 
 
 def _drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
-    """Where a signal is exactly 0 between values far from 0: it was not measured, or lost on its way."""
+    """Where a signal is exactly 0 between values far from 0, or else jumps and comes back: it was not measured."""
     values = getattr(dataset, name)
     if name == "u":  # the last columns may be switches of contacts, which are 0 by right
         values = values[:, : min(dataset.nv, len(dataset.model.actuators))]
@@ -199,7 +210,20 @@ def _drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
         sudden = (steps[into] > usual) & (steps[out] > usual) & follows[into] & follows[out]
         for start, stop in zeros[sudden] if sudden.sum() >= FEWEST_DROPS else []:
             lost[start:stop, joint] = True
+    if not lost.any() and not (name == "q" and (np.abs(np.diff(values, axis=0)) > np.pi).any()):  # an angle that wraps
+        for joint in range(values.shape[1]):
+            lost[_spikes(values[:, joint], follows), joint] = True
     return lost
+
+
+def _spikes(x: np.ndarray, follows: np.ndarray) -> np.ndarray:
+    """Single rows of a signal that are far from those before and after, unlike all others."""
+    off = np.zeros(len(x))
+    off[1:-1] = np.where(follows[:-1] & follows[1:], np.abs(x[1:-1] - 0.5 * (x[2:] + x[:-2])), 0.0)
+    alone = np.flatnonzero(np.minimum(off[:-2], off[2:]) > BACK * off[1:-1]) + 1
+    tops, rest = alone[np.argsort(-off[alone])][:MOST_SPIKES], off.copy()
+    rest[np.add.outer(tops, [-1, 0, 1])] = 0.0
+    return tops[off[tops] > max(FAR_OFF * rest.max(), STEPS * resolution(x))] if rest.any() else tops[:0]
 
 
 def _few_stretches(dataset: Dataset) -> Dataset:

@@ -143,8 +143,7 @@ def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator
 
 
 UNITS = ("m", 1e3), ("k", 1e-3)
-SLOWEST, FASTEST = 1.0, 5500.0
-"""Rates of logs [Hz] that need no other unit of time."""
+SLOWEST, FASTEST = 1.0, 5500.0  # rates of logs [Hz] that need no other unit of time
 
 
 def _delays(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:

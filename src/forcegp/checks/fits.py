@@ -8,10 +8,12 @@ import torch
 from jaxtyping import Float, Int
 
 from forcegp.checks.explanations import NUMBER, SIGN, Cause, changed
-from forcegp.checks.torques import LEAST, Comparison, positive_fit, positive_solution
+from forcegp.checks.torques import LEAST, Comparison, in_motion, positive_fit, positive_solution
 
 NOISE = 3.0  # how much of the power of the noise is left to every explanation
 WORSE = 1.05  # share from which on predicting nothing is better
+FEWEST_ROWS = 30  # that are compared
+RARELY = 0.5  # share of rows in which a joint moves, below which these are what is divided
 BLOCKS, T_95 = 4, 3.18  # of the log, each of which is predicted from the others; Student's t of one less
 ATTENUATED = 0.01  # of a factor: noise of accelerations makes it smaller
 FREE = 4.0  # share that an explanation may leave, over what a robot with any masses and any friction would
@@ -21,8 +23,7 @@ RESTS = 0.5  # share of what friction leaves that a torque must explain, for a f
 ROUGH = 2.5  # factor either way that wrong masses make of a torque
 FAR, MUCH_MORE = 3.0, 30.0
 """Factors that wrong masses do not explain: less torque than bodies need cannot be; more may be a rotor's inertia."""
-CHOICES = np.array([0.0, SIGN, NUMBER, SIGN + NUMBER])
-"""Cost of a torque as it is, turned, times a factor, and both."""
+CHOICES = np.array([0.0, SIGN, NUMBER, SIGN + NUMBER])  # cost of a torque as it is, turned, times a factor, and both
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +146,7 @@ class Explanation:
         if not np.ptp(u) > 0.0:
             return 0.0
         scaled = rough or self.chosen[joint] >= 2
-        for block in np.array_split(np.arange(len(u)), BLOCKS):
+        for block in self._blocks(joint):
             rest = np.setdiff1d(np.arange(len(u)), block)
             middle = [x[rest].mean(axis=0) for x in (u, tau, friction)]
             factor = 1.0
@@ -157,11 +158,20 @@ class Explanation:
             left += np.square(target[block] - (friction[block] - middle[2]) @ number).sum()
         return float(left / power)
 
+    def _blocks(self, joint: int) -> list[np.ndarray]:
+        """Successive rows, as many in each, or with as much of the motion of a joint that mostly rests.
+
+        What rests alone teaches no friction.
+        """
+        moves, rows = in_motion(self.log.rows)[:, joint], np.arange(len(self.log.rows))
+        own = np.flatnonzero(moves) if BLOCKS <= moves.sum() < RARELY * len(moves) else rows
+        return np.split(rows, [part[0] for part in np.array_split(own, BLOCKS)[1:]])
+
     def error_of_factor(self, joint: int) -> float:
         """Half of its 95 % interval, by what each block of the log changes (jackknife)."""
         u, tau, friction = self.log.rows.u[:, joint], self.log.tau[:, joint], self.log.friction[:, joint]
-        rows, columns = np.arange(len(u)), np.c_[tau, friction]
-        rests = [np.setdiff1d(rows, block) for block in np.array_split(rows, BLOCKS)]
+        columns = np.c_[tau, friction]
+        rests = [np.setdiff1d(np.arange(len(u)), block) for block in self._blocks(joint)]
         found = [positive_fit(columns[x] - columns[x].mean(axis=0), u[x] - u[x].mean())[0][0] for x in rests]
         return float(np.hypot(T_95 * np.std(found) * (BLOCKS - 1) ** 0.5, ATTENUATED * np.mean(found)))
 

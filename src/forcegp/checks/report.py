@@ -8,11 +8,12 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from forcegp.checks.check_input import QUICK_ROWS, CheckInput
+from forcegp.checks.check_input import QUICK_ROWS, STILL, CheckInput
 from forcegp.checks.moving_base import base_doubts, carried_doubts, stance_doubts, unmeasured_base_doubts
 from forcegp.checks.search import UNKNOWN, Explanation, search
 from forcegp.checks.signals import motion_doubts, sampling_doubts, signal_doubts, target_doubts, without_registers
 from forcegp.checks.torque_doubts import TOUCHES, elastic_doubts, held_points, push, torque_doubts, without_stops
+from forcegp.checks.torques import in_motion
 from forcegp.data import Dataset, contact_doubts
 from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import require_rows
@@ -197,11 +198,11 @@ def _chain(names: Sequence[str]) -> Model:
 
 
 HELD = 0.02  # range of a joint in one stretch, relative to its largest, below which it was held there
-STILL = 0.02, 0.002  # range in rad or m below which a joint does not move
+BRIEF = 0.25  # of the log, in which all of a joint's motion lies
 
 
 def excitation_doubts(inputs: CheckInput) -> Iterator[Doubt]:
-    """Joints that hardly move."""
+    """Joints that hardly move, or once."""
     if inputs.prepared is None:
         return
     spans = np.ptp(inputs.prepared.q, axis=0)
@@ -216,6 +217,15 @@ def excitation_doubts(inputs: CheckInput) -> Iterator[Doubt]:
             numbers={"ranges": spans.tolist(), "still": still},
         )
     yield from _held(inputs, still)
+    moves, count = in_motion(inputs.prepared), len(inputs.prepared)
+    for name, own in zip(inputs.names, map(np.flatnonzero, moves.T), strict=True):
+        if name not in still and own[-1] - own[0] < BRIEF * count:
+            begin, end = inputs.prepared.time[own[[0, -1]]].tolist()
+            what = (
+                f"{name} moves only from {begin:.1f} to {end:.1f} s: no other time tells whether its friction is right."
+            )
+            do = "Move it in other parts of the log, too."
+            yield look(about="excitation", what=what, do=do, joints=(name,), numbers={"seconds": [begin, end]})
 
 
 def _held(inputs: CheckInput, still: list[str]) -> Iterator[Doubt]:

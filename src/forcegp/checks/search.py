@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from forcegp.checks.check_input import CheckInput
-from forcegp.checks.explanations import SIGN, candidates, changed
-from forcegp.checks.fits import EXPLAINED, FAR, MUCH_MORE, NOISE, RESTS, WORSE, Explanation
+from forcegp.checks.explanations import SIGN, UNITS, candidates, changed
+from forcegp.checks.fits import EXPLAINED, FAR, FEWEST_ROWS, MUCH_MORE, NOISE, RESTS, WORSE, Explanation
 from forcegp.checks.residuals import left_by_positions
-from forcegp.checks.torques import LEAST, WIDTHS, Comparison, positive_fit, stretch, torque_noise
+from forcegp.checks.torques import AT_REST, LEAST, WIDTHS, Comparison, in_motion, positive_fit, stretch, torque_noise
 from forcegp.data import Dataset
 from forcegp.data.views import white_noise
 from forcegp.doubts import Doubt, listed, look, wrong
@@ -20,10 +20,9 @@ from forcegp.forces import Actuation, Coulomb, Offset, RigidBodies, Rotor, Visco
 from forcegp.model import Model
 
 UNKNOWN = "unknown cause"
-FEWEST_ROWS = 30
 BRAKED = 1e-3  # rad or m of a joint that no row moves
-AT_REST = 0.1  # of the root mean square velocity of a joint
 GAIN = np.log(4.0)  # by which the product over all joints of what remains must fall at least
+LOADED = 5.0  # factor by which a load, too, changes what the motion needs
 BEAM, DEPTH = 3, 3  # explanations that are continued, and causes of one
 DOUBTFUL = 2e-3  # share above which causes are tried
 HELD = 3.0  # of the dry friction and of what remains in motion, from which on no gear holds the joint
@@ -104,10 +103,9 @@ def _all_turned(root: Explanation, inputs: CheckInput) -> tuple[Explanation, lis
 
 
 def moving(rows: Dataset) -> Dataset:
-    """The rows in which some joint moves: at rest, stiction holds any torque. All, where they are too few."""
-    speed = np.abs(rows.v) / np.maximum(np.sqrt(np.square(rows.v).mean(axis=0)), 1e-300)
-    moves = speed.max(axis=1) > AT_REST
-    return rows.rows(moves) if moves.sum() >= FEWEST_ROWS else rows
+    """The rows in which some joint moves. All, where they are too few."""
+    moves = np.flatnonzero(in_motion(rows).any(axis=1))
+    return rows.rows(moves) if len(moves) >= FEWEST_ROWS else rows
 
 
 def _root(inputs: CheckInput) -> Explanation:
@@ -162,15 +160,19 @@ def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -
         off = off[(best.exact[off] <= EXPLAINED) & (best.shares[off] > RESTS)]
     if len(off) < (1 if explained else 2):
         return
+    less = next((u for u, s in UNITS if all(1.0 / LOADED < abs(x) / s < LOADED for x in factors[off])), "")
+    units = [less + si for si in inputs.unit_of_each("u")]
+    unit = units[0] if len({*units}) == 1 else ",".join(units)
+    loaded = f"With a load it may be in {unit}: forcegp import --unit u={unit}. " if less else ""
     joints, factors, errors = inputs.named(off), factors[off], [*map(best.error_of_factor, off.tolist())]
     each = ", ".join(f"{name} {x:.4g} ± {error:.1g}" for name, x, error in zip(joints, factors, errors, strict=True))
     yield Doubt(
         level="wrong" if not explained or factors.min() < 1.0 / FAR or factors.max() > MUCH_MORE else "look",
         about="torque constant" if len(off) == 1 else "torque unit",
         what=f"the measured torque is a multiple of what the motion needs, if masses are right: {each}.",
-        do="Such factors point to torque before the gears (multiply by the gear ratio), motor current (multiply by the "
-        "torque constant), a rotor inertia that is missing, or wrong masses; compare with the data sheet, or let "
-        "forcegp payload --forces gain,viscous,gear,offset,rotor estimate the constants of all joints.",
+        do=f"{loaded}Such factors point to torque before the gears (multiply by the gear ratio), motor current "
+        "(multiply by the torque constant), a missing rotor inertia, or wrong masses; compare with the data sheet, or "
+        "let forcegp payload --forces gain,viscous,gear,offset,rotor estimate the constants of all joints.",
         joints=joints,
         numbers={"factor": dict(zip(joints, factors.tolist(), strict=True)), "error_95": errors},
     )

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from forcegp.checks.check_input import DEGREE, STEPS, CheckInput
+from forcegp.checks.check_input import DEGREE, STEPS, STILL, CheckInput
 from forcegp.checks.torques import needed_torques
 from forcegp.data import Dataset, differentiate, low_pass, preparation_report
 from forcegp.data.delay import lowest
@@ -17,6 +17,7 @@ from forcegp.doubts import Doubt, Level, listed, look, ok, wrong
 
 QUANTITY = {"q": "position", "v": "velocity", "u": "torque"}
 EVERY_QUANTITY = {**QUANTITY, "a": "acceleration"}
+FINE = 3  # digits of a time beyond half a step
 ROUNDING = 1e-12  # of the largest value of any joint
 HELD_STEPS = 0.5  # share of equal successive values from which on a signal moves in steps, such as a held command
 FROZEN_SECONDS = 0.1
@@ -116,34 +117,47 @@ def _jumps(inputs: CheckInput) -> Iterator[Doubt]:
 
 
 def _dropped(inputs: CheckInput) -> Iterator[Doubt]:
-    """Rows of a signal that were lost and read 0."""
-    lost = {name: rows for name, rows in inputs.dropped.items() if rows.any()}
-    if not lost:
-        return
-    every = np.any(list(lost.values()), axis=0)
-    rows = every.any(axis=1)
-    first, share = int(np.argmax(rows)), 100.0 * rows.mean()
-    yield wrong(
-        about="drop-outs",
-        what=f"{int(rows.sum())} rows ({share:.2g} %) read exactly 0 between values that are far from 0, in "
-        f"{listed(tuple(EVERY_QUANTITY[name] for name in lost))}; the first is row {first} at "
-        f"{inputs.log.time[first]:.3f} s.",
-        do="They were not measured: leave these rows out, and look at the logger.",
-        joints=inputs.named(np.flatnonzero(every.any(axis=0))),
-        numbers={"rows": int(rows.sum()), "row": first, "quantities": list(lost)},
-    )
+    """Rows of a signal that were lost and read 0, and single ones that are far from those before and after."""
+    time = inputs.log.time
+    for about in ("drop-outs", "spike"):
+        lost = dict[str, np.ndarray]()
+        for name, rows in inputs.dropped.items():
+            own = rows & ((getattr(inputs.log, name)[:, : rows.shape[1]] == 0.0) == (about == "drop-outs"))
+            lost |= {name: own} if own.any() else {}
+        if not lost:
+            continue
+        every = np.any(list(lost.values()), axis=0)
+        rows, names = np.flatnonzero(every.any(axis=1)), inputs.named(np.flatnonzero(every.any(axis=0)))
+        seen = f"{len(rows)} rows ({100.0 * len(rows) / len(every):.2g} %) read exactly 0 between values far from 0"
+        remedy = "They were not measured: leave these rows out, and look at the logger."
+        if about == "spike":
+            seen = f"{len(rows)} single value{'s' if len(rows) > 1 else ''} far from those just before and after"
+            half = 0.5 * float(np.median(np.diff(time)))
+            ends = (f"{time[k] + x:.{FINE - int(np.log10(half))}f}" for k in rows for x in (-half, half))
+            remedy = f"Such a value is wrong: leave it out, by forcegp import --without {','.join(ends)}."
+        yield wrong(
+            about=about,
+            what=f"{seen}, in {listed(tuple(EVERY_QUANTITY[name] for name in lost))} of {listed(names)}; the first is "
+            f"row {rows[0]} at {time[rows[0]]:.3f} s.",
+            do=remedy,
+            joints=names,
+            numbers={"rows": len(rows), "row": int(rows[0]), "quantities": list(lost)},
+        )
 
 
 def _constant(inputs: CheckInput) -> Iterator[Doubt]:
     log = inputs.log
-    rests = _still(log, "v") & _still(log, "q")
+    rests, counts = _still(log, "v") & _still(log, "q") | _dithers(log), np.flatnonzero(_dithers(log))
     for name, quantity in QUANTITY.items():
         told = rests if name in "va" else False  # of its position
         values, dead = getattr(log, name), np.flatnonzero(_still(log, name) & np.logical_not(told))
+        dead = np.union1d(dead, counts) if name == "q" else dead
         if not len(dead):
             continue
         names, all_of_them = inputs.named(dead), len(dead) == log.nv
         seen = f"the {quantity} of {listed(names)} never changes (it is {values[0, dead[0]] + 0.0:.6g} in every row)."
+        if name == "q" and np.isin(dead, counts).all():
+            seen = f"{listed(names)} stands still: its position changes by counts of its encoder alone."
         places = ",".join(f"{each}={log.q[:, k].mean() + 0.0:.4g}" for each, k in zip(names, dead, strict=True))
         remedy = f"Right for a joint that was held; then forcegp import --lock {places}. Else the channel is dead."
         passive = name == "u" and not values[:, dead].any()
@@ -177,12 +191,22 @@ def _still(log: Dataset, name: str) -> np.ndarray:
     return np.ptp(values, axis=0) <= ROUNDING * np.abs(values).max(initial=0.0)
 
 
+COUNTS = 5.5  # steps of an encoder between which a joint that stands still may go to and fro
+
+
+def _dithers(log: Dataset) -> np.ndarray:
+    """Which joints stand still but for counts of their encoder."""
+    spans = np.ptp(log.q, axis=0)
+    counts = [span and span / resolution(x) for span, x in zip(spans, log.q.T, strict=True)]
+    return (spans > 0.0) & (spans < np.where(log.turns, *STILL)) & (np.array(counts) < COUNTS)
+
+
 def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
     """A channel that stands still, to the last digit, while the joint's other channels show that it moves."""
     log = inputs.log
     values, follows = getattr(log, name)[:, joint], consecutive(log)[:-1]
     held = np.diff(values) == 0
-    if np.ptp(values) == 0.0 or not follows.any() or (name == "u" and held.mean() > HELD_STEPS):
+    if np.ptp(values) == 0.0 or _dithers(log)[joint] or not follows.any() or (name == "u" and held.mean() > HELD_STEPS):
         return
     others = np.any([np.diff(getattr(log, other)[:, joint]) != 0 for other in QUANTITY if other != name], axis=0)
     step = float(np.median(np.diff(log.time)[follows]))
@@ -204,7 +228,8 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
         jump = abs(values[end + 1] - values[begin]) if end < len(held) else np.inf
         sticks = jump < 0.5 * abs(gone[-1]) if name == "q" else jump < STEPS * resolution(values)
         far = np.ptp(gone) > 0.25 * np.abs(speed[begin:end]).sum() * step
-        if min(moves[begin:end].mean(), others[begin:end].mean()) > 0.5 and far and not sticks:
+        least = 0.25 if name == "u" else 0.5  # a joint turns and rests while its torque does not
+        if moves[begin:end].mean() > least and others[begin:end].mean() > 0.5 and far and not sticks:
             start, length = begin, end - begin
     if not length or values[start] in (values.min(), values.max()):
         return
@@ -369,13 +394,13 @@ def _differences(
         sort = "sign" if factor < 0.0 else "factor" if abs(factor - 1.0) > CLOSE else "late" if late else ""
         kind = "other" if left > UNEXPLAINED else sort if left < FEW else ""
         usual = FACTORS if inputs.rotates[joint] else SLIDING
-        known = next((x for x in usual if abs(factor / x - 1.0) < CLOSE and kind == "factor"), 0.0)
+        known = next((x for x in usual if abs(abs(factor) / x - 1.0) < CLOSE and kind in ("factor", "sign")), 0.0)
         guess, unit = usual.get(known if name == "v" else 0.0, ("", None))
         if kind:
             groups.setdefault((kind, known, guess, unit), []).append(joint)
     what, units = EVERY_QUANTITY[name], {x: inputs.stated_units(x) for x in "qv"}
     for (_, known, _, unit), joints in groups.items():
-        if unit and (len(joints) == len(fits) or all(abs(fits[k][0] / known - 1.0) < SURE for k in joints)):
+        if unit and (len(joints) == len(fits) or all(abs(abs(fits[k][0]) / known - 1.0) < SURE for k in joints)):
             signal, word = ("q", "deg") if known == DEGREE else ("v", unit)
             kin = {k for k in of if inputs.rotates[k] == inputs.rotates[joints[0]]}  # also those that stand still
             alike, si = kin if kin & fits.keys() <= {*joints} else joints, inputs.unit_of_each(signal)
@@ -405,11 +430,9 @@ def _differences(
         factors = [fits[joint][0] for joint in joints]
         if max(factors) - min(factors) >= CLOSE * abs(factor):
             seen += f" Factors: {', '.join(f'{each:.3g}' for each in factors)}."
-        correction: dict[str, Any] = {}
-        if name == "v" and kind == "sign" and abs(factor + 1.0) < CLOSE:
-            correction = {"sign": {"v": tuple(-1.0 if each in named else 1.0 for each in inputs.names)}}
-        elif unit and other:
-            correction = {"unit": other}
+        correction: dict[str, Any] = {"unit": other} if unit and other else {}
+        if name == "v" and kind == "sign" and (unit or abs(factor + 1.0) < CLOSE):
+            correction |= {"sign": {"v": tuple(-1.0 if each in named else 1.0 for each in inputs.names)}}
         each = [
             {"quantity": name, "factor": f, "delay": s if np.isfinite(s) else None, "unexplained": left}
             for f, s, left in (fits[joint] for joint in joints)

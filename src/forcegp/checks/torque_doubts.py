@@ -8,8 +8,9 @@ import torch
 from jaxtyping import Float
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
+from forcegp.checks.fits import RARELY
 from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, UNKNOWN, Explanation
-from forcegp.checks.torques import WIDTHS, Comparison, stretch, with_gravity
+from forcegp.checks.torques import WIDTHS, Comparison, in_motion, stretch, with_gravity
 from forcegp.data import Dataset, estimate_delay, with_strokes
 from forcegp.data.views import consecutive, rests
 from forcegp.doubts import Doubt, listed, look, ok, wrong
@@ -42,6 +43,7 @@ def _drift(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     """Friction that is another at the end of the log than at its beginning, in a robot of any masses.
 
     Blocks of time that are left out decide, of all joints together and the change in the median joint, or of each.
+    Joints that mostly rest tell nothing: stiction holds any torque.
     """
     rows, robot, count = found.log.rows, found.log.robot, len(found.log.rows)
     if count < FEWEST_ROWS:
@@ -51,7 +53,8 @@ def _drift(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     time = (rows.time - rows.time.mean()) / max(float(np.ptp(rows.time)), 1e-300)
     block, changed, told = np.arange(count) * BLOCKS // count, dict[str, float](), dict[str, float]()
     friction_of = np.concatenate([found.log.friction, _remembered(found, inputs)], axis=-1)
-    for joint in np.flatnonzero((found.chosen == 0) & (found.shares > DOUBTFUL)):
+    often = in_motion(rows).mean(axis=0) >= RARELY
+    for joint in np.flatnonzero((found.chosen == 0) & (found.shares > DOUBTFUL) & often):
         u, friction, name = rows.u[:, joint], friction_of[:, joint], rows.joint_names[joint]
         steady, moved = np.c_[bodies[:, joint], np.ones(count)], np.c_[friction, friction * time[:, None]]
         left = []

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.optimize import nnls
 
 from forcegp.data import Dataset
@@ -19,6 +19,8 @@ from forcegp.robots import Robot
 
 RIDGE = 1e-10  # of a column's square sum, in equations that may be singular
 WIDTHS = 0.03, 0.1, 0.3  # of the root mean square velocity: where dry friction turns over
+
+AT_REST = 0.1  # of the root mean square velocity of a joint
 
 Change = Callable[[Dataset], Dataset]
 
@@ -83,6 +85,11 @@ class Comparison:
         return columns - columns.mean(axis=0)
 
 
+def in_motion(rows: Dataset) -> Bool[np.ndarray, "rows nv"]:
+    """In which rows each joint moves: at rest, stiction holds any torque."""
+    return np.abs(rows.v) > AT_REST * np.sqrt(np.square(rows.v).mean(axis=0))
+
+
 def needed_torques(robot: Robot, rows: Dataset) -> Float[np.ndarray, "rows nv"]:
     """What the rigid bodies need at these rows [Nm or N]."""
     with torch.no_grad():
@@ -129,6 +136,7 @@ def torque_noise(robot: Robot, rows: Dataset, noise: Float[np.ndarray, " nv"]) -
     return np.sqrt(np.square(M).mean(axis=0) @ np.square(noise))
 
 
+UNSEEN = 1e-5  # of a power, which the other rows lack: what only moves in a stretch
 EDGES = 25  # rows between which a stretch is sought first
 LEAST = 1e-4  # shares of a power below this are all the same
 
@@ -145,7 +153,9 @@ def stretch(signals: Float[np.ndarray, "rows k"]) -> tuple[float, float, int, in
 
     def told(first: int, last: int) -> tuple[float, float, int, int]:
         own, inside = last - first, sums[last] - sums[first]
-        number, left = positive_solution(sums[-1] - inside)
+        rest = sums[-1] - inside
+        rest *= np.outer(*2 * (np.diag(rest) > UNSEEN * np.diag(sums[-1]),))  # else rounding is all there is
+        number, left = positive_solution(rest)
         number = np.append(-number, 1.0)
         each = np.array([left / (count - own), number @ inside @ number / own]) / (whole / count + 1e-300)
         gain = float(-np.log(np.maximum(each, LEAST)) @ (count - own, own))

@@ -34,8 +34,7 @@ from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUn
 from forcegp.scores.scores import USABLE
 
 MOST_CORRECTIONS = 8
-SCORES = ("models", "joint_names", "units", "recommended", "winner", "failures")
-"""What the answer holds of the scores."""
+SCORES = ("models", "joint_names", "units", "recommended", "winner", "failures")  # what the answer holds of the scores
 EXPLAINED = 0.1
 """Share of a torque that is left, up to which learning from accelerations is not worth a third of the whole time: of
 25 logs (benchmarks.confusion, 0.4 to 3 % left) it changed errors of motions by 4 % and of accelerations by 2 %."""

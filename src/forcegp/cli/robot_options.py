@@ -197,8 +197,7 @@ class SearchOptions:
 
 # ---------------------------------------------------------------------- what the robot touches
 
-SYNTAX = {"plane": "nx,ny,nz,offset", "sphere": "cx,cy,cz,radius"}
-"""Numbers of each surface in m: plane n . p = offset."""
+SYNTAX = {"plane": "nx,ny,nz,offset", "sphere": "cx,cy,cz,radius"}  # numbers of each surface in m: plane n . p = offset
 CONTACTS = "FRAME@x,y,z:SURFACE,..."
 EXAMPLE = "lbr_iiwa_link_7@0,0,0.1:plane:0,0,1,0.055"
 FEET, FLAT, BALL = "FRAME@x,y,z,...", ":flat", ":ball="  # behind the frame: does not turn; rolls, with its radius in m

@@ -34,8 +34,7 @@ LONGEST = 600.0  # seconds after which a compiler hangs: our longest program tak
 WITHOUT = "or do without it: a robot itself, predictor(compile=False), export_c(unchecked=True)"
 ELSEWHERE = "choose another folder (the environment variable XDG_CACHE_HOME, robot.compile(folder=...))"
 MOST_LANES, STATES_PER_THREAD = 8, 2048  # fewer states are done before another thread has started
-NOT_FINITE, NOT_POSITIVE, RESULT_NOT_FINITE = 1, 2, 4
-"""What a program reports of its states: bits of its return value."""
+NOT_FINITE, NOT_POSITIVE, RESULT_NOT_FINITE = 1, 2, 4  # what a program reports of its states: bits of its return value
 # Lanes and compiler options by the vector unit that torch found.
 VECTOR_UNITS = {"AVX512": (8, ("-mavx512f", "-mavx512dq", "-mavx512vl", "-mfma")), "AVX2": (4, ("-mavx2", "-mfma"))}
 OPTIONS = ("-std=gnu11", "-O2", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-fPIC", "-shared")

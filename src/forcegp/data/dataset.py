@@ -36,8 +36,7 @@ def units_for(robot: forcegp.robots.Robot) -> dict[str, Any]:
     return {name: texts[0] if len(set(texts)) == 1 else texts for name, texts in each.items()} | {"time": "s"}
 
 
-LARGEST_MEASURED = 1e15
-"""Whatever its SI unit, no sensor measures more; squares of squares of it are finite."""
+LARGEST_MEASURED = 1e15  # whatever its SI unit, no sensor measures more; squares of squares of it are finite
 BEYOND = f"above {LARGEST_MEASURED:g}: of another unit, or of another register."
 SHORTEST_STEP = 1e-9  # s
 
@@ -53,8 +52,6 @@ class Dataset(Summary):
     Arrays are copied to float64, made read-only and checked; a Dataset that exists is valid. In row k, `a` is the
     acceleration that the state `(q, v)` and the actuator forces `u` of the same row produce.
 
-    Fields
-    ------
     q, v, u: (rows, nv) positions, velocities and actuator forces [units]. Where the base moves, q has the columns
         `model.robot.position_names`, and u the columns `model.inputs`.
     a: (rows, nv) measured acceleration, with its noise.

@@ -24,8 +24,7 @@ MOST_ROWS = 5_000
 SIGNIFICANT = 3.0  # standard deviations by which a delay must differ from zero to be used
 FRICTION_WIDTHS = 0.01, 0.03, 0.1, 0.3, 1.0  # of dry friction, relative to the root mean square velocity
 STIFFNESSES = 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0  # of its memory, over the reciprocal deviation of the position
-MEMORIES = 2 * len(STIFFNESSES)
-"""The last of `torque_columns`, where strokes are known: those of memory."""
+MEMORIES = 2 * len(STIFFNESSES)  # the last of `torque_columns`, where strokes are known: those of memory
 REMEMBERS = 0.3
 """Square sum with friction that remembers, over that without, below which the delay is that beside memory.
 
@@ -34,8 +33,7 @@ memory a delay is less sharp, though: where a low-pass filter of dry friction al
 """
 ROWS_PER_PARAMETER = 3
 
-APART = 0.01
-"""Width of the 95 % interval of a delay [s] beyond which the log is said not to tell it."""
+APART = 0.01  # width of the 95 % interval of a delay [s] beyond which the log is said not to tell it
 WORTH = 0.95
 """Unexplained torque with the common delay, relative to that without, above which the delay explains nothing."""
 

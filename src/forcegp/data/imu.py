@@ -25,8 +25,7 @@ from forcegp.robots.inertia import rpy_from_rotation
 STANDARD = 9.80665  # m/s^2 in a g
 AGREES, WRONG = 0.02, 0.05
 """Of what an IMU measures: the disagreement with the log that is none, and from which on it is wrong."""
-EXPLAINS, SMALL = 0.3, 0.35
-"""Of the disagreement: what another reading may leave; rad that are still no other axes."""
+EXPLAINS, SMALL = 0.3, 0.35  # of the disagreement: what another reading may leave; rad that are still no other axes
 SECONDS, MOST_ROWS = 0.1, 4000
 """Over which both are averaged, since a derived acceleration is noisy; rows on which a delay is sought."""
 SHIFTS, LATE = np.linspace(-0.05, 0.05, 101), 0.8

@@ -13,10 +13,8 @@ from forcegp.mechanics import State
 
 COUNT = 12
 """Strokes that a row remembers: of more, what friction still feels is smaller than 12 encoder steps times sigma."""
-STEPS = 2.0
-"""Steps of an encoder within which a reversal counts as none."""
-NOISES = 8.0
-"""Standard deviations of white noise in positions within which a reversal counts as none."""
+STEPS = 2.0  # steps of an encoder within which a reversal counts as none
+NOISES = 8.0  # standard deviations of white noise in positions within which a reversal counts as none
 ORDERS, AGREE = (5, 6), 1.25
 """Differences of both orders find the same noise up to this factor; where motion or rounding dominates they do not."""
 NORMAL = 0.6745  # median of absolute values of a standard normal variable

@@ -29,8 +29,7 @@ from forcegp.robots.arguments import finite_vector, is_sequence
 
 SMALLEST_SHARE = 0.1
 """Smallest 1 + mu g: where it nears 0, friction and normal force lift each other without end (jamming)."""
-JAMMING = "the expected friction nearly jams"
-"""How the warning of it begins."""
+JAMMING = "the expected friction nearly jams"  # how the warning of it begins
 
 
 @dataclass(frozen=True)

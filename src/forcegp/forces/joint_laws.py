@@ -184,8 +184,7 @@ class Stribeck(DryFriction):
         return c + b * torch.exp(-((features[0] / v_s) ** 2))
 
 
-HIGHEST = 0.5
-"""Largest share of the load that friction takes: beyond it something else is explained."""
+HIGHEST = 0.5  # largest share of the load that friction takes: beyond it something else is explained
 
 
 @dataclass(frozen=True, eq=False)

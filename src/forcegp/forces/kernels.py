@@ -104,8 +104,7 @@ def constant(dimension: int, variance: float | Tensor) -> ConstantKernel:
     return kernel
 
 
-WIDTH = 0.1
-"""Start value of the velocity at which dry friction is developed, as a fraction of the rms velocity."""
+WIDTH = 0.1  # start value of the velocity at which dry friction is developed, as a fraction of the rms velocity
 
 WIDTH_LOG_SPREAD = 1.0
 NOWHERE = 1e9  # the largest velocity before any is visited

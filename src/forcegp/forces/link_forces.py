@@ -74,8 +74,7 @@ def require_contact(force: str, contact: int, contacts: Sequence[Contact]) -> No
 
 
 TANGENTS = ("tangent-1", "tangent-2")
-SMALLEST_SPEED = 1e-6
-"""m/s, below which a direction of motion means nothing: far below any velocity scale of friction."""
+SMALLEST_SPEED = 1e-6  # m/s, below which a direction of motion means nothing: far below any velocity scale of friction
 
 
 @dataclass(frozen=True)

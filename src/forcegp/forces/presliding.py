@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-HIDDEN = 40.0
-"""Exponent from which on nothing is left of what was before: exp(-40) is less than rounding."""
+HIDDEN = 40.0  # exponent from which on nothing is left of what was before: exp(-40) is less than rounding
 
 
 def after_step(

@@ -67,10 +67,8 @@ class RigidBodies(WholeLaw):
         return {robot.layout.links[link].body: body for link, body in self.learn.items()}
 
 
-USUAL = 0.5, 0.05
-"""Mass in kg and size in m of the payload at which a search begins."""
-WEAK = 0.01
-"""Weight of the prior on a payload: a factor of e in its mass costs 0.02 nats."""
+USUAL = 0.5, 0.05  # mass in kg and size in m of the payload at which a search begins
+WEAK = 0.01  # weight of the prior on a payload: a factor of e in its mass costs 0.02 nats
 
 
 @dataclass(frozen=True, eq=False)

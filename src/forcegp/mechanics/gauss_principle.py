@@ -213,8 +213,7 @@ class State:
         return self.u if self.delivered_by is None else self.delivered_by(self)
 
 
-REDUNDANCY_TOLERANCE = 1e-9
-"""Singular values of A~ below this fraction of the largest belong to redundant constraints."""
+REDUNDANCY_TOLERANCE = 1e-9  # singular values of A~ below this fraction of the largest belong to redundant constraints
 
 
 class AffineMap(NamedTuple):

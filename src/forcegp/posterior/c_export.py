@@ -22,8 +22,7 @@ from forcegp.posterior.preparation import rows_for, sample_states
 from forcegp.posterior.programs import Physics, require_step
 
 STATES = 300  # states at which the program is compared
-MEAN_TOLERANCE = 5e-12
-"""Largest difference relative to the largest value, unless `rounding` is larger."""
+MEAN_TOLERANCE = 5e-12  # largest difference relative to the largest value, unless `rounding` is larger
 LOOSER = {"covariance": 1e3, "linearize": 1e2, "step": 1e3, "step_jacobian": 1e3, "deviations": 1e3}
 LOOSER |= {"components": 10.0, "inverse_dynamics": 1e2}
 """How many times as much as the mean these may differ: more cancels in them."""

@@ -34,8 +34,6 @@ ROUND_RATE = 1e-3  # a median rate within 0.1 % of one with three digits is take
 class ImportOptions:
     """How stamps become rows.
 
-    Fields
-    ------
     gap: seconds without a row, or a message of one of several topics, that begin another episode; None: ten steps.
     rate: "auto" gives uneven rows even times at the median of the recordings' median rates, a number (Hz) all rows at
         that rate; "log" keeps every stamp.

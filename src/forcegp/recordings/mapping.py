@@ -113,8 +113,6 @@ AXES = {"v": ("body", "world"), "a": ("body", "world", "imu"), "force": ("world"
 class ColumnMapping:
     """What the columns of a log mean. A value in SI is `sign * unit * (combination of columns)`.
 
-    Fields
-    ------
     time, step: a column or combination that is the time, or the time in s between two rows; one of both.
     q, v, u, a: per signal, its columns: patterns (`pos{1..7}`), names of vectors, combinations (`theta2 - theta1`), or
         one constant. None: v and a are differentiated, the others are looked for by the names of the joints.

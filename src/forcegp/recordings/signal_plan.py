@@ -72,8 +72,6 @@ class JointSignal:
 class Layout:
     """What is left to do about signals once they are read: those of a base are turned, what lacks is differentiated.
 
-    Fields
-    ------
     space: of the positions.
     bases: joints of several degrees of freedom whose parent is the world.
     axes: of v and a, those of the linear and of the angular part.

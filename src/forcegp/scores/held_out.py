@@ -33,8 +33,6 @@ class Split:
 
     Because it is given in times, it divides a recording and its decimated version at the same moments.
 
-    Fields
-    ------
     name: short, unlike those of other splits of the same data; a file name may hold it.
     words: what was done, as part of a sentence.
     held_out: the stretches to predict: episode, begin <= t, and t < end [s], infinite at the ends of a recording.

@@ -222,8 +222,6 @@ SUMMARIES: Mapping[Kind, str] = {
 class Candidate:
     """One model of a comparison.
 
-    Fields
-    ------
     given: forces by name, beside those of the robot as given or identified; a model to fit; or a posterior as it is.
     kind, summary: what it is, for verdicts and for the page.
     identification: the name of the identification that it builds on (`identified_model`); None for none.

@@ -158,8 +158,6 @@ class Winner(NamedTuple):
 class Scores(Summary):
     """One table: model x run (split and seed) x quantity x score x joint, and paired differences of models.
 
-    Fields
-    ------
     models: name -> "kind" and "summary".
     runs: name -> one entry per split and seed, with "table" (`accuracy.row_scores`, `motions.motion_scores`),
         "stretches" and "motions" for differences, "warnings", and "error" where it failed.
@@ -242,12 +240,14 @@ class Scores(Summary):
         return [name for name in self.joint_names if name in still or (left.get(name) or 0.0) > USABLE]
 
     def errors(self, criterion: str, model: str) -> dict[tuple[str, int], Float[np.ndarray, "horizons stretches"]]:
-        """Squared errors by split and seed; one horizon but for motions."""
+        """Squared errors by split and seed; one horizon but for motions, of which those that all splits last for."""
         out = {}
         for run in self.finished(model):
             values = [run["stretches"]]
             if criterion == "motion":
-                values = [] if run["motions"] is None else run["motions"]["squared"]
+                motions = run["motions"] or {"horizons": [], "squared": []}
+                by_horizon = dict(zip(motions["horizons"], motions["squared"], strict=True))
+                values = [by_horizon[h] for h in self.horizons if by_horizon]
             array = np.array(values, dtype=np.float64)
             if array.size:
                 out[run["split"], run["seed"]] = array
