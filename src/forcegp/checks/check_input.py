@@ -33,10 +33,8 @@ JUMP = 10.0  # steps that nine of ten rows stay below, by which a signal that is
 LEAST_JUMP = 0.02  # and by more than this share of its range
 FEWEST_DROPS = 2
 STILL = 0.02, 0.002  # range in rad or m below which a joint does not move
-FAR_OFF, MOST_SPIKES = (
-    20.0,
-    5,
-)  # times all others of a signal, by which so few rows are off the middle of their neighbours
+FAR_OFF = 20.0  # times all others, by which a single value is off the middle of its neighbours
+MOST_SPIKES = 5  # of a signal: more are its nature
 BACK = 0.4  # of that, by which each neighbour is off as well: half of it, unlike at a kink or a step
 STEPS = 2.5  # of its resolution by which a channel in steps changes from row to row
 
