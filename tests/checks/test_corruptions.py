@@ -29,7 +29,7 @@ from forcegp.checks import check, quick_check
 from forcegp.checks.check_input import CheckInput
 from forcegp.checks.explanations import _units
 from forcegp.checks.search import search
-from forcegp.checks.torque_doubts import _remembered, held_points
+from forcegp.checks.torque_doubts import _remembered, held_points, without_stops
 from forcegp.data import Dataset
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -234,6 +234,18 @@ def test_a_joint_that_moves_once_is_judged_by_its_motion(begin, told):
     found = [x for x in check(replace(data, u=data.u + np.c_[0.0 * dry, dry])).doubts if x.level != "ok"]
     seen = [("excitation", ("joint2",), pytest.approx([begin, 15.0], abs=0.2))] * told
     assert [(x.about, x.joints, x.numbers["seconds"]) for x in found] == seen
+
+
+def test_joints_that_move_in_turn_stand_on_no_brakes():
+    """While one moves, stiction holds the others: rows that show neither their friction nor what postures need."""
+    rng, (held, q) = np.random.default_rng(0), np.zeros((2, 1500, 3))
+    for k, begin in enumerate(range(0, 1500, 200)):  # moves of 1.2 s, rests of .8 s
+        share = np.clip((np.arange(1500 - begin) / 120.0), 0.0, 1.0)
+        q[begin:, k % 3] += rng.uniform(-0.6, 0.6, 3)[k % 3] * 0.5 * (1.0 - np.cos(np.pi * share))
+        held[begin:, k % 3] = rng.uniform(-1.0, 1.0)
+    data = with_motion(arm_model().robot, q, 100.0, 0, 0.0)
+    dry = 40.0 * np.where(np.abs(data.v) > 1e-3, np.tanh(data.v / 0.02), held)
+    assert not without_stops(replace(data, u=data.u + dry))[1]
 
 
 def test_friction_that_remembers_is_no_push():

@@ -266,6 +266,9 @@ TOUCHES = ok(
 )
 
 
+SLIDES = 0.1  # of the root mean square velocity of a joint, from which on its dry friction is that of motion
+
+
 def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, list[Doubt]]:
     """The log without rests whose torques are not those of this posture, and what is said of them.
 
@@ -285,10 +288,16 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
         slow = np.sqrt(np.square(v).mean()) + 1e-300
         dry = np.stack([np.tanh(v / (width * slow)) for width in WIDTHS], axis=1)
         both = np.c_[columns[:, k], a, v, dry]
-        size = np.linalg.norm(both, axis=0) + 1e-300
-        number = np.linalg.lstsq(both / size, u, rcond=1e-6)[0] / size
-        most = np.abs(dry @ number[-len(WIDTHS) :]).max() + np.std(u - both @ number)
-        held |= np.abs(at.u[:, k] - standing[:, k] @ number[: columns.shape[-1]]) > HELD * most
+        slides = np.abs(v) > SLIDES * slow  # elsewhere stiction holds it, while others move, which may be less
+        slides |= slides.sum() < both.shape[1]
+        size = np.linalg.norm(both[slides], axis=0) + 1e-300
+        basis, sizes, turn = np.linalg.svd(both[slides] / size, full_matrices=False)
+        seen, count = sizes > 1e-6 * sizes[0], columns.shape[-1]
+        inverse = turn[seen].T / sizes[seen]
+        number = inverse @ (basis[:, seen].T @ u[slides]) / size
+        far = np.square(standing[:, k] / size[:count] @ inverse[:count]).sum(axis=1)  # a posture unlike those of motion
+        most = np.abs(dry @ number[-len(WIDTHS) :]).max() + np.std((u - both @ number)[slides])
+        held |= np.abs(at.u[:, k] - standing[:, k] @ number[:count]) > HELD * most * np.sqrt(1.0 + far)
     stops = [each for each in found if held[np.isin(still, each)].mean() > 0.5]
     if not stops:
         return log, []
