@@ -47,11 +47,10 @@ class ProblemSize:
     @classmethod
     def of(cls, terms: Terms) -> "ProblemSize":
         """From the data; the rank is that of some of the rows."""
-        W, features = terms.W, terms.features
-        rows, outputs, latents = W.shape
-        some = W[:: max(1, rows // 100)]
+        rows, outputs, latents = terms.W.shape
+        some = terms.W[:: max(1, rows // 100)]
         rank = int(torch.linalg.matrix_rank(some, rtol=1e-12).max()) if some.numel() else 0
-        return cls(rows, outputs, rank, latents, max((z.shape[-1] for z in features), default=0))
+        return cls(rows, outputs, rank, latents, max((z.shape[-1] for z in terms.features), default=0))
 
 
 class Engine(ABC):
