@@ -6,7 +6,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from typing_extensions import override
@@ -125,8 +125,7 @@ class Inducing(Engine):
 ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Exact, Inducing)}
 
 
-@dataclass(frozen=True)
-class Choice:
+class Choice(NamedTuple):
     """An engine and why it was chosen, in one sentence."""
 
     engine: Engine
