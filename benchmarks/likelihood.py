@@ -62,7 +62,7 @@ class Problem:
         self.parameters = [parameter for kernel in self.kernels for parameter in kernel.parameters()] + [self.log_noise]
 
     def deflated(self) -> tuple[torch.Tensor, ...]:
-        matrices = [taken_apart(kernel).matrix(self.features) for kernel in self.kernels]
+        matrices = [taken_apart(kernel).cross(self.features, self.features) for kernel in self.kernels]
         value = negative_log_likelihood(self.W, self.residual, (2.0 * self.log_noise).exp()[None], matrices)
         return (value.detach(), *torch.autograd.grad(value, self.parameters))
 
@@ -78,7 +78,7 @@ class Problem:
         return (value.detach(), *torch.autograd.grad(value, self.parameters))
 
     def cholesky(self) -> tuple[torch.Tensor, ...]:
-        matrices = [taken_apart(kernel).matrix(self.features) for kernel in self.kernels]
+        matrices = [taken_apart(kernel).cross(self.features, self.features) for kernel in self.kernels]
         with torch.no_grad():
             value, K_gradients, noise_gradient = self._by_hand([K.detach() for K in matrices])
         kernels = torch.autograd.grad(matrices, self.parameters[:-1], K_gradients)

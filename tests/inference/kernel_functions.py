@@ -7,7 +7,7 @@ from forcegp.inference.dense_kernels import taken_apart
 
 
 def kernel_matrix(kernel: Kernel, z: Tensor) -> Tensor:
-    return taken_apart(kernel).matrix(z)
+    return taken_apart(kernel).cross(z, z)
 
 
 def kernel_cross(kernel: Kernel, z: Tensor, other: Tensor) -> Tensor:

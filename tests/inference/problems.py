@@ -87,7 +87,7 @@ def condition(given_problem: Problem) -> ExactPosterior:
 
 def rows_of_call(part: KernelSum, lanes: int, folder: Path) -> RowFunction:
     """A latent as a compiled program from features to values, slopes and prior variances."""
-    graph = Graph(part.features)
+    graph = Graph(part.centers.shape[-1])
     values = part.call(graph, graph.inputs, True)
     slopes = [node for row in jacobian(graph, values, graph.inputs) for node in row]
     outputs = {"f": values, "J": slopes, "k": part.variance(graph, graph.inputs)}

@@ -122,20 +122,17 @@ def write_function(
                 text.append(f"  real c{node}[{graph.outputs_of[node]}]; {{ const real z[] = {{{given}}};")
                 text.append(f"  {rest[0]}(t[{tables.index(rest[0])}], live, z, c{node}); }}")
                 continue
-            if operation not in LEAVES:
-                if operation == "output":
-                    made = f"c{rest[0]}[{rest[1]}]"
-                elif operation == "look up":
-                    table = f"{name}_table{looked_up.setdefault(rest[0], len(looked_up))}"
-                    text.append(f"  real x{node}; for (int k = 0; k < LANES; k++)")
-                    place = f"AT({operand(rest[1])}, k)"  # NaN where a state has overflowed
-                    inside = f"{place} >= 0.0 && {place} < {len(rest[0])}.0"
-                    text.append(f"    AT(x{node}, k) = {inside} ? {table}[(int){place}] : NAN;")
-                    made = ""
-                else:
-                    made = c_value(graph, node, operand, lambda x, of=operand: _as_real(graph, x, of), lanes)
-                if made:
-                    text.append(f"  const real x{node} = {made};")
+            if operation == "look up":
+                table = f"{name}_table{looked_up.setdefault(rest[0], len(looked_up))}"
+                text.append(f"  real x{node}; for (int k = 0; k < LANES; k++)")
+                place = f"AT({operand(rest[1])}, k)"  # NaN where a state has overflowed
+                inside = f"{place} >= 0.0 && {place} < {len(rest[0])}.0"
+                text.append(f"    AT(x{node}, k) = {inside} ? {table}[(int){place}] : NAN;")
+            elif operation == "output":
+                text.append(f"  const real x{node} = c{rest[0]}[{rest[1]}];")
+            elif operation not in LEAVES:
+                value = c_value(graph, node, operand, lambda x, of=operand: _as_real(graph, x, of), lanes)
+                text.append(f"  const real x{node} = {value};")
             text += [f"  y[{position}] = {_as_real(graph, node, operand)};" for position in stores.get(node, ())]
             if node in places:
                 text.append(f"  w[{places[node][1]}] = x{node};")

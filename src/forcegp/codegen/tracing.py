@@ -54,17 +54,26 @@ def trace(
     recorded = _Recording(graph)
     for x, part in zip(examples, nodes, strict=True):
         recorded.note(x, _Numbers(part.view(x.shape)))
-    with torch.no_grad(), _InsideTorch(recorded), recorded:
+    with torch.no_grad(), StraightLineAlgebra(recorded), recorded:
         results = list(function(*examples))
     return graph, [_numbers(graph, recorded.numbers_of(x)).nodes for x in results]
 
 
 class StraightLineAlgebra(TorchFunctionMode):
-    """Within it, the functions of torch.linalg that Gauss' principle uses are those of this module."""
+    """Within it, the functions of torch.linalg that Gauss' principle uses are those of this module.
+
+    What takes `recorded` numbers out of torch, where they would be constants without a word, is refused.
+    """
+
+    def __init__(self, recorded: "_Recording | None" = None) -> None:
+        super().__init__()
+        self.recorded = recorded
 
     @override
     def __torch_function__(self, func: Any, types: Any, args: tuple = (), kwargs: dict[str, Any] | None = None) -> Any:
         kwargs = kwargs or {}
+        if func in OUTWARDS and self.recorded is not None and self.recorded.numbers_of(args[0]) is not args[0]:
+            raise _refused(BRANCH)
         if func is torch.linalg.cholesky:
             return cholesky(*args)
         if func is torch.linalg.solve_triangular and not kwargs.get("upper", False) and kwargs.get("left", True):
@@ -149,20 +158,6 @@ def _unit(row: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
     length = torch.where(kept, torch.where(kept, square, torch.ones_like(square)).sqrt(), torch.zeros_like(square))
     unit = row / torch.where(kept, length, torch.ones_like(length))[..., None]
     return torch.where(kept[..., None], unit, 0.0 * row), length
-
-
-class _InsideTorch(StraightLineAlgebra):
-    """Refuses what takes recorded numbers out of torch, where they would be constants without a word."""
-
-    def __init__(self, recorded: "_Recording") -> None:
-        super().__init__()
-        self.recorded = recorded
-
-    @override
-    def __torch_function__(self, func: Any, types: Any, args: tuple = (), kwargs: dict[str, Any] | None = None) -> Any:
-        if func in OUTWARDS and self.recorded.numbers_of(args[0]) is not args[0]:
-            raise _refused(BRANCH)
-        return super().__torch_function__(func, types, args, kwargs)
 
 
 class _Recording(TorchDispatchMode):

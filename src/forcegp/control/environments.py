@@ -13,7 +13,6 @@ from typing_extensions import override
 
 from forcegp.control.tracking import per_joint, usual_integrator
 from forcegp.errors import InvalidInput, require_number, require_type
-from forcegp.integration.integrators import check_time_step
 from forcegp.posterior import load_posterior
 from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.predictor import Predictor
@@ -56,11 +55,11 @@ class RobotVectorEnv(VectorEnv):
         self.predictor = model
         self.num_envs = whole_number("num_envs", num_envs, 1)
         self.steps = None if steps is None else whole_number("steps", steps, 1)
-        check_time_step(dt)
+        words = f"one step lasts {LONGEST:g} s at most; a time step is above 0"
+        require_number("dt", dt, words, below=LONGEST * (1.0 + 1e-9))
         self.dt, self.reward, self.terminated, self.start = dt, reward, terminated, start
         robot = self.predictor.posterior.model.robot
         robot.require_vectors("environments")
-        require_number("dt", float(dt), f"one step lasts {LONGEST:g} s at most", below=LONGEST * (1.0 + 1e-9))
         self.integrator = integrator or usual_integrator(model, dt)
         limits = [joint.effort_limit for joint in robot.joints] if torque_limits is None else torque_limits
         self._limits = limits = per_joint("torque_limits", limits, robot.nv).numpy()
@@ -94,10 +93,8 @@ class RobotVectorEnv(VectorEnv):
         motion = self.predictor.rollouts(q, v, u[:, None], self.dt, integrator=self.integrator, threads=1)
         q_next, v_next = motion.q[:, 1].numpy(), motion.v[:, 1].numpy()
         lasted = anew | np.isfinite(q_next + v_next).all(axis=1)
-        self.q, self.v = q_next, v_next
-        if anew.any() or not lasted.all():
-            moves = (lasted & ~anew)[:, None]
-            self.q, self.v = np.where(moves, q_next, q), np.where(moves, v_next, v)
+        moves = (lasted & ~anew)[:, None]
+        self.q, self.v = np.where(moves, q_next, q), np.where(moves, v_next, v)
         rewards, over = np.zeros(self.num_envs), ~lasted | self._beyond(self.q, self.v)
         if self.reward is not None:
             rewards = self._one_each("reward", self.reward(q, v, u, self.q, self.v), "fiub", "finite numbers")

@@ -4,6 +4,7 @@ The covariance of a Gaussian process depends on where its data are alone. Withou
 takes its place (D-optimality; Swevers et al. 1997). Motions are cubic B-splines, in the hull of their points.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,7 +22,7 @@ from forcegp.control.tracking import per_joint
 from forcegp.data import Dataset
 from forcegp.data.dataset import require_rows
 from forcegp.data.views import farthest_point_sampling
-from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
+from forcegp.errors import InvalidInput, require_known, require_number, require_type, usable_arguments
 from forcegp.evidence.bodies import ENTRIES, base_parameters, torque_regressor
 from forcegp.inference.memory import blas_threads
 from forcegp.inference.posterior import exact, with_only
@@ -30,7 +31,6 @@ from forcegp.mechanics import Contact
 from forcegp.model import Model
 from forcegp.posterior.posterior import Posterior
 from forcegp.posterior.prediction import inverse_dynamics
-from forcegp.posterior.update import learn_more_rows
 from forcegp.progress import tell
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, whole_number
@@ -80,7 +80,7 @@ class LearnedForces:
         q, v, _, u = (x[some] for x in motion[1:])
         a, time = posterior.predict(q, v, u, covariance=False).mean.numpy(), np.arange(float(len(q)))
         noise, model = posterior.noise_std.numpy(), posterior.model
-        return learn_more_rows(posterior, Dataset(q=q, v=v, u=u, a=a, time=time, noise_std=noise, model=model))
+        return posterior.with_rows(Dataset(q=q, v=v, u=u, a=a, time=time, noise_std=noise, model=model))
 
     def spread(self, posterior: Posterior) -> np.ndarray:
         """Standard deviation of each joint's acceleration (nv,), root mean square over the states."""
@@ -293,8 +293,7 @@ def excitation(
     known.robot.require_vectors("planned motions")
     robot, rng = known.robot, np.random.default_rng(whole_number("seed", seed, 0))
     for name, value, most in (("seconds", seconds, LONGEST), ("clearance", clearance, 1e9)):
-        if not isinstance(value, int | float) or not 0.0 < value <= most:
-            raise InvalidInput(f"{name} is {value!r}; give a positive number of at most {most:g}.")
+        require_number(name, value, f"give a positive number of at most {most:g}", below=math.nextafter(most, math.inf))
     if start is None:
         half = np.array([(x.upper - x.lower) / 2.0 for x in robot.joints])
         lowest = np.array([x.lower if np.isfinite(x.lower) else 0.0 for x in robot.joints])

@@ -262,12 +262,7 @@ class ContactMonitor:
     def _torques(self, q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """M a - Q_K - Q_U at rows, M, and M Cov(a) M of what the posterior leaves open."""
         if self.past.memory.names:
-            rows = []
-            for row in q:
-                self.past.see(row)
-                rows.append(self.past.z)
-            first = self.past.column
-            u = torch.cat([u[:, :first], torch.stack(rows), u[:, first:]], dim=1)
+            u = self.past.beside(u, torch.stack([self.past.see(row) for row in q]))
         at = joint_forces(self.model, q, v, u)
         M = at.M
         extra = M @ self.model(q, v, u)[1] @ M if self.open and isinstance(self.model, Predictor) else None

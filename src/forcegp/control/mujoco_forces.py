@@ -3,7 +3,6 @@
 import ctypes
 import json
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import mujoco as untyped
@@ -69,9 +68,7 @@ class MujocoForces:
         mujoco.set_mjcb_passive(ctypes.cast(self._library.passive, kind))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         mujoco.set_mjcb_passive(None)
         if self._library.evaluate(self._tables) and kind is None:
             raise NumericalError("a learned force was not finite: a state left what its tables hold, or diverged.")

@@ -67,7 +67,7 @@ class Controller:
         """These torques (nv,) within limits. Raises NumericalError where one is not finite."""
         if not bool(asked.isfinite().all()):
             raise NumericalError("the torques of this controller are not finite; check its gains and the state.")
-        self.last = torch.minimum(torch.maximum(asked, -self.torque_limits), self.torque_limits)
+        self.last = asked.clamp(-self.torque_limits, self.torque_limits)
         self.saturated = self.last != asked
         return self.last.clone()
 
@@ -182,25 +182,25 @@ class Past:
         self.z = torch.zeros(len(self.memory.names), dtype=torch.float64)
         self._last: Tensor | None = None
 
-    def see(self, q: Float[Tensor, " nq"]) -> None:
-        """The joints are at q now."""
+    def see(self, q: Float[Tensor, " nq"]) -> Float[Tensor, " m"]:
+        """The joints are at q now: what is remembered then."""
         if self.memory.names and self._last is not None:
             step = self.memory.robot.difference(self._last, q)
             moved = torch.where(step.abs() > self.least, step, 0.0)
             self.z = self.memory.after(self.z, moved, 0.0)
             q = self.memory.robot.space.integrate(self._last, moved)
         self._last = q.clone()
+        return self.z
 
-    def beside(self, u: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch nu"]:
+    def beside(self, u: Float[Tensor, "*batch k"], z: Float[Tensor, "*#batch m"]) -> Float[Tensor, "*batch nu"]:
         """u of the actuators with the columns of the memory."""
-        z = self.z.expand(*u.shape[:-1], -1)
-        return torch.cat([u[..., : self.column], z, u[..., self.column :]], dim=-1) if self.memory.names else u
+        return torch.cat([u[..., : self.column], z.expand(*u.shape[:-1], -1), u[..., self.column :]], dim=-1)
 
 
 def joint_forces(model: Moving, q: Tensor, v: Tensor, u: Tensor, past: Past | None = None) -> JointForces:
     """Known and learned forces at a state (nv,) or states (n, nv) and what they act on; u without its `past`."""
     if past is not None and past.memory.names:
-        at = joint_forces(model, q, v, past.beside(u))
+        at = joint_forces(model, q, v, past.beside(u, past.z))
         kept = [j for j in range(at.dQ_du.shape[-1]) if not 0 <= j - past.column < len(past.z)]
         return at._replace(dQ_du=at.dQ_du[..., kept])
     if isinstance(model, Predictor):
@@ -210,7 +210,7 @@ def joint_forces(model: Moving, q: Tensor, v: Tensor, u: Tensor, past: Past | No
 
 
 def torques_for(
-    model: Moving, q: Tensor, v: Tensor, needed: Tensor, u: Tensor, at: JointForces, past: Past | None = None
+    model: Moving, q: Tensor, v: Tensor, needed: Tensor, u: Tensor, at: JointForces, past: Past
 ) -> Float[Tensor, " nv"] | None:
     """The u (nv,) that gives the forces `needed` at q, v, by Newton's method from u, where they are `at`, or None."""
     if not bool(needed.isfinite().all()):
@@ -397,8 +397,7 @@ class MPPI(Controller):
         noise = self._colour @ normal * self._scales[:, None, None] * self.noise
         noise[0] = 0.0  # the plan itself takes part, and the best sequence of the last call
         noise[1] = self._best - plan
-        torques = plan + noise
-        torques = torch.minimum(torch.maximum(torques, -self.torque_limits), self.torque_limits)
+        torques = (plan + noise).clamp(-self.torque_limits, self.torque_limits)
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore", NumericalWarning)  # of sequences that diverge: they cost infinitely much
             motions = self.predictor.rollouts(q, v, torques, self.dt, integrator=self.integrator, threads=1)

@@ -91,10 +91,6 @@ class DenseKernel(NamedTuple):
     cross: Callable[[Tensor, Tensor], Tensor]
     diagonal: Callable[[Tensor], Tensor]
 
-    def matrix(self, z: Float[Tensor, "n d"]) -> Float[Tensor, "n n"]:
-        """k(z_i, z_j)."""
-        return self.cross(z, z)
-
 
 def taken_apart(kernel: Kernel) -> DenseKernel:
     """The kernel as sums, products and leaves whose formulas are evaluated here; any other kernel is called."""
@@ -109,11 +105,10 @@ def taken_apart(kernel: Kernel) -> DenseKernel:
             )
         if isinstance(kernel, gp.ScaleKernel) and kind is gp.ScaleKernel:
             base = taken_apart(kernel.base_kernel)
-
-            def scaled_by(value: Tensor) -> Tensor:
-                return cast(Tensor, kernel.outputscale) * value
-
-            return DenseKernel(lambda z, other: scaled_by(base.cross(z, other)), lambda z: scaled_by(base.diagonal(z)))
+            return DenseKernel(
+                lambda z, other: cast(Tensor, kernel.outputscale) * base.cross(z, other),
+                lambda z: cast(Tensor, kernel.outputscale) * base.diagonal(z),
+            )
         found, phi = embedding(kernel), weight_features(kernel)
     if found is not None:
         embed, smoothness = found
@@ -126,17 +121,6 @@ def taken_apart(kernel: Kernel) -> DenseKernel:
     if phi is not None:
         return DenseKernel(lambda z, other: phi(z) @ phi(other).mT, lambda z: phi(z).square().sum(-1))
     return DenseKernel(lambda z, other: kernel(z, other).to_dense(), lambda z: cast(Tensor, kernel(z, z, diag=True)))
-
-
-class _Call(torch.nn.Module):
-    """A function of kernels as a call of a module that holds them, so that `functional_call` covers all of it."""
-
-    def __init__(self, kernels: torch.nn.Module, function: Callable[..., Any]) -> None:
-        super().__init__()
-        self.kernels, self.function = kernels, function
-
-    def forward(self, *arguments: Any) -> Any:
-        return self.function(*arguments)
 
 
 class LatentKernels(torch.nn.Module):
@@ -166,19 +150,21 @@ class LatentKernels(torch.nn.Module):
     def __getitem__(self, index: int) -> Kernel:
         return cast(Kernel, self.kernels[index])
 
-    def forward(self, features: Sequence[Float[Tensor, "N _"]]) -> list[Float[Tensor, "N N"]]:
-        """One dense matrix per latent."""
-        return [kernel.matrix(z) for kernel, z in zip(self.dense, features, strict=True)]
+    def forward(self, features: Sequence[Float[Tensor, "N _"]], function: Callable[[], Any] | None = None) -> Any:
+        """One dense matrix (N, N) per latent, or what the `function` returns, so that `functional_call` covers it."""
+        if function is not None:
+            return function()
+        return [kernel.cross(z, z) for kernel, z in zip(self.dense, features, strict=True)]
 
     def matrices(
         self, parameters: Mapping[str, Tensor], features: Sequence[Float[Tensor, "N _"]]
     ) -> list[Float[Tensor, "N N"]]:
         """The matrices at `parameters` (names as in `initial_parameters`), differentiable in them."""
-        return self._at(parameters, lambda: self.forward(features))
+        return self._at(parameters, features)
 
     def log_prior(self, parameters: Mapping[str, Tensor]) -> Float[Tensor, ""]:
         """Log density of the GPyTorch priors registered on the kernels, at `parameters`; 0 where there are none."""
-        return self._at(parameters, self._log_prior)
+        return self._at(parameters, (), self._log_prior)
 
     def initial_parameters(self) -> dict[str, Tensor]:
         """The unconstrained parameters by name, detached copies."""
@@ -195,10 +181,9 @@ class LatentKernels(torch.nn.Module):
             value.copy_(parameters[name].detach().reshape(value.shape))
         return self
 
-    def _at(self, parameters: Mapping[str, Tensor], function: Callable[[], Any]) -> Any:
-        """`function()` while these kernels have `parameters`."""
-        named = {name: parameters[name] for name, _ in self.named_parameters()}
-        return functional_call(_Call(self.kernels, function), named, ())
+    def _at(self, parameters: Mapping[str, Tensor], *arguments: Any) -> Any:
+        """`forward` while these kernels have `parameters`."""
+        return functional_call(self, {name: parameters[name] for name, _ in self.named_parameters()}, arguments)
 
     def _log_prior(self) -> Tensor:
         named = [entry for kernel in self for entry in kernel.named_priors()]  # once where latents share a kernel

@@ -6,7 +6,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from typing_extensions import override
@@ -45,11 +45,10 @@ class ProblemSize:
     @classmethod
     def of(cls, terms: Terms) -> "ProblemSize":
         """From the data; the rank is that of some of the rows."""
-        W, features = terms.W, terms.features
-        rows, outputs, latents = W.shape
-        some = W[:: max(1, rows // 100)]
+        rows, outputs, latents = terms.W.shape
+        some = terms.W[:: max(1, rows // 100)]
         rank = int(torch.linalg.matrix_rank(some, rtol=1e-12).max()) if some.numel() else 0
-        return cls(rows, outputs, rank, latents, max((z.shape[-1] for z in features), default=0))
+        return cls(rows, outputs, rank, latents, max((z.shape[-1] for z in terms.features), default=0))
 
 
 class Engine(ABC):
@@ -124,8 +123,7 @@ class Inducing(Engine):
 ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Exact, Inducing)}
 
 
-@dataclass(frozen=True)
-class Choice:
+class Choice(NamedTuple):
     """An engine and why it was chosen, in one sentence."""
 
     engine: Engine

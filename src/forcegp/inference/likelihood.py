@@ -256,9 +256,8 @@ class DeflatedSystem:
 
 def solve_deflated(deflation: Deflation, kernel_matrices: Sequence[Float[Tensor, "N N"]]) -> DeflatedSystem:
     """Build and factorise T, then alpha = T^-1 t and beta_ic = sum_a C_iac alpha_ia."""
-    count, rank, _ = deflation.C.shape
     factor = factorize(lambda: deflated_covariance(deflation.C, kernel_matrices))
-    alpha = factor.solve(deflation.t.reshape(-1, 1)).reshape(count, rank)
+    alpha = factor.solve(deflation.t.reshape(-1, 1)).reshape(deflation.t.shape)
     return DeflatedSystem(deflation, factor, alpha, torch.einsum("irc,ir->ic", deflation.C, alpha))
 
 

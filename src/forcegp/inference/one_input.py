@@ -318,8 +318,7 @@ def latent_calls(latent: LatentPosterior, compressed: CompressedCovariance | Non
     sums = kernel_sums(latent)
     factors = [None] * len(sums) if compressed is None else compressed.factors
     for part, F in zip(sums, factors, strict=True):
-        rank = 0 if F is None else F.shape[-1]
-        roots = None if F is None else torch.nn.functional.pad(F, (0, -rank % PADDING))
+        roots = None if F is None else torch.nn.functional.pad(F, (0, -F.shape[-1] % PADDING))
         index = part.latents[0]
         functions = one_input_form(latent, index) if len(part.latents) == 1 else None
         if functions is None:

@@ -122,7 +122,7 @@ class ExactPosterior(LatentPosterior):
         """Cov(f_c(z_i), f_d(z_j)) at all of n points, by latent. Rasmussen & Williams 2006, eq. 2.26."""
         C = torch.cat([self.data_covariance(index, z) for index, z in enumerate(features)], dim=-1)
         V = self.factor.solve_lower(C)
-        prior = torch.block_diag(*[kernel.matrix(z) for kernel, z in zip(self.kernels.dense, features, strict=True)])
+        prior = torch.block_diag(*[kernel.cross(z, z) for kernel, z in zip(self.kernels.dense, features, strict=True)])
         return prior - V.mT @ V
 
     @override

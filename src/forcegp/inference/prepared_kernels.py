@@ -8,7 +8,8 @@ combinations of the data: never below the exact one. B holds leading left singul
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import or_
 
 import numpy as np
 import torch
@@ -48,11 +49,6 @@ class KernelSum:
     level: tuple[float, ...]
     roots: Float[Tensor, "G N R"] | None = None
 
-    @property
-    def features(self) -> int:
-        """How many numbers z has."""
-        return self.centers.shape[-1]
-
     def call(self, graph: Graph, z: Sequence[int], slopes: bool) -> list[int]:
         """The nodes of E f_c at features z, as a call of the C function; with `slopes` it can be differentiated."""
         name = self.name + ("_slopes" if slopes else "")
@@ -70,12 +66,8 @@ class KernelSum:
         """Of every node of the pair: 1 if it depends on z, 2 on the centre, 3 on both, 0 on none."""
         found: list[int] = []
         for node, (operation, *rest) in enumerate(self.pair.nodes):
-            if operation == "input":
-                found.append(1 if rest[0] < self.features else 2)
-            else:
-                found.append(0)
-                for operand in self.pair.operands(node):
-                    found[node] |= found[operand]
+            own = 0 if operation != "input" else 1 if rest[0] < self.centers.shape[-1] else 2
+            found.append(reduce(or_, (found[operand] for operand in self.pair.operands(node)), own))
         return found
 
     def _frontier(self, kind: int) -> list[int]:
@@ -131,7 +123,7 @@ class KernelSum:
 
     def row_values(self) -> list[np.ndarray]:
         """The numbers of every row, one per centre."""
-        inputs = [*np.zeros((self.features, 1)), *self.centers.numpy().T]
+        inputs = [*np.zeros((self.centers.shape[-1], 1)), *self.centers.numpy().T]
         with np.errstate(all="ignore"):
             found = interpreted(self.pair, self.rows, inputs, FUNCTIONS)
         return [np.broadcast_to(x, len(self.centers)) for x in found]
@@ -163,7 +155,6 @@ class KernelSum:
         """One state and several centres at a time with `one`, else several states."""
         graph, dependence, keep = self.pair, self._dependence(), not owner
         state, centre, step = ("double", "real", "LANES") if one else ("real", "double", "1")
-        G = len(self.latents)
         operands = {node: k for k, node in enumerate(self.operands)}
         rows = {node: k for k, node in enumerate(self.rows)}
 
@@ -187,7 +178,7 @@ class KernelSum:
         words["ROWS"] = [f"const {centre} c{k} = {load.format(k)};" for k in range(len(rows))]
         words["NODES"] = [f"const real x{n} = {c_value(graph, n, operand, as_real, lanes)};" for n in made_of_both]
         words["STARTS"] = [f"real s{k} = R(0.0);" for k in range(len(made))]
-        words["WEIGHTS"] = [f"const {centre} w{g} = {load.format(len(rows) + g)};" for g in range(G)]
+        words["WEIGHTS"] = [f"const {centre} w{g} = {load.format(len(rows) + g)};" for g in range(len(self.latents))]
         words["SUMS"] = [f"s{k} += w{owner[k]} * {as_real(node)};" for k, node in enumerate(made) if owner]
         words["ENDS"] = [f"f[{k}] = {total.format(k)};" for k in range(len(made))]
         stored = enumerate(zip(made, self.level, strict=False))
@@ -338,9 +329,8 @@ def kernel_groups(latent: LatentPosterior) -> tuple[tuple[int, ...], ...]:
         if squared_exponential_parameters(kernel) is None:
             alone.append((index,))
             continue
-        same = next((group for group in shared if torch.equal(latent.features[group[0]], centers)), None)
-        if same is None:
-            shared.append([index])
-        else:
-            same.append(index)
+        same = next((group for group in shared if torch.equal(latent.features[group[0]], centers)), [])
+        if not same:
+            shared.append(same)
+        same.append(index)
     return (*alone, *map(tuple, shared))

@@ -157,10 +157,7 @@ def implicit_midpoint(space: ConfigurationSpace, acceleration: Acceleration, q: 
     def moved(at: Tensor, share: float) -> Tensor:
         return space.integrate(q, share * dt * at)
 
-    def residual(at: Tensor) -> Tensor:
-        return at - v - 0.5 * dt * acceleration(moved(at, 0.5), at)
-
-    middle, found = find_roots(residual, v)
+    middle, found = find_roots(lambda at: at - v - 0.5 * dt * acceleration(moved(at, 0.5), at), v)
     return Step(moved(middle, 1.0), 2.0 * middle - v, acceleration(q, v), found)
 
 

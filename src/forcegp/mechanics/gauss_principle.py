@@ -250,7 +250,13 @@ class ConstrainedDynamics:
     def __post_init__(self) -> None:
         """Gauss' principle for M and A a = b. NumericalError where M is not positive definite or A not finite."""
         identity = torch.eye(self.M.shape[-1], dtype=self.M.dtype, device=self.M.device)
-        inverse_lower = factors(self.M)[1]
+        try:
+            lower = torch.linalg.cholesky(self.M)
+        except torch.linalg.LinAlgError:
+            raise NumericalError(
+                "the mass matrix is not positive definite; check the inertias, masses and armature of the robot"
+            ) from None
+        inverse_lower = torch.linalg.solve_triangular(lower, identity.expand_as(self.M), upper=False)
         A_white = self.A @ inverse_lower.mT
         if self.A.shape[-2]:
             try:
@@ -324,15 +330,3 @@ class ConstrainedDynamics:
     def multiplier(self, Q_U: Float[Tensor, "*#batch nv"]) -> Float[Tensor, "*batch m"]:
         """lambda = (A M^-1 A^T)^+ (b - A M^-1 (Q_K + Q_U)); the constraint force is A^T lambda."""
         return self.multiplier_map()(Q_U)
-
-
-def factors(M: Float[Tensor, "*batch nv nv"]) -> tuple[Float[Tensor, "*batch nv nv"], Float[Tensor, "*batch nv nv"]]:
-    """L and L^-1 of M = L L^T, lower triangular. Raises NumericalError where M is not positive definite."""
-    try:
-        lower = torch.linalg.cholesky(M)
-    except torch.linalg.LinAlgError:
-        raise NumericalError(
-            "the mass matrix is not positive definite; check the inertias, masses and armature of the robot"
-        ) from None
-    identity = torch.eye(M.shape[-1], dtype=M.dtype, device=M.device)
-    return lower, torch.linalg.solve_triangular(lower, identity.expand_as(M), upper=False)

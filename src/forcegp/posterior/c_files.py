@@ -88,12 +88,13 @@ class CFiles:
         nq, nv, nu = self.code.sizes
         start = [", ".join(map(repr, x.tolist())) for x in split(checks[0].states[0], self.code.sizes)]
         program = sections(__name__, "exported_c/model.c")
-        stepped = "" if self.dt is None else self.code.step_source(self.integrator, self._stepped)
+        implicit = self.integrator == "implicit-midpoint"
+        stepped = "" if self.dt is None else self.code.step_source(self.integrator, "slopes" if implicit else "mean")
         words: dict[str, object] = {"NAME": self.name, "NV": nv, "NQ": nq, "NU": nu, "DT": self.dt}
         words |= dict(zip(("START_Q", "START_V", "START_U"), start, strict=True))
         words |= dict(zip(("STORED", "CALLS"), self._stored(checks), strict=True))
         words |= {"STEP": stepped, "SLOPES": program[self.integrator], "CHECKED": said}
-        words |= {"COMMENT": self._comment(said), "IMPLICIT": int(self.integrator == "implicit-midpoint")}
+        words |= {"COMMENT": self._comment(said), "IMPLICIT": int(implicit)}
         words |= {"SOURCE": _plain(source or "not named"), "VERSION": importlib.metadata.version("forcegp")}
         moving = not self.code.space.is_vector_space
         words |= {"ALL": nq + nv + nu, "X": nq + nv, "COLUMNS": 2 * nv + nu, "TITLE": self._title}
@@ -122,10 +123,6 @@ class CFiles:
             text = filled(c_text(__name__, f"exported_c/{file}"), words)
             (folder / file.replace("model", self.name)).write_text(text, encoding="ascii")
 
-    @property
-    def _stepped(self) -> str:
-        return "slopes" if self.integrator == "implicit-midpoint" else "mean"
-
     def _of_monitor(self, program: Mapping[str, str]) -> dict[str, object]:
         """What stands for a calibrated monitor of contacts."""
         if (monitor := self.monitor) is None:
@@ -140,7 +137,7 @@ class CFiles:
         """Tables and static functions."""
         names, code = [], self.code
         wanted = {"covariance": "mean_and_terms"} if "covariance" in self.kinds else {}
-        slopes = self.jacobian or (self.dt is not None and self._stepped == "slopes")
+        slopes = self.jacobian or (self.dt is not None and self.integrator == "implicit-midpoint")
         wanted |= {"mean": "mean"} | ({"linearize": "slopes"} if slopes else {})
         wanted |= {kind: kind for kind in ("components", "deviations") if kind in self.kinds}
         wanted |= {"forces": "forces_at"} if self.solvable or self.monitor is not None else {}

@@ -32,9 +32,6 @@ STATES = 100
 TOLERANCE, STEP_TOLERANCE = 1e-11, 1e-8
 """Largest difference from `predict`, relative to the largest value; implicit steps end at 1e-9."""
 
-OPERATORS = {**ARITHMETIC, **COMPARED, "negate": operator.neg}
-NAMES = {"absolute": "fabs"}
-
 
 def casadi_function(
     posterior: Posterior, *, steps: float | None = None, integrator: str = "symplectic-euler", name: str | None = None
@@ -189,6 +186,7 @@ def expressed(
             value = casadi.if_else(place >= number, entry, value)
         return value
 
-    special = {**OPERATORS, "choose": casadi.if_else, "look up": looked_up}
-    functions = {name: getattr(casadi, NAMES.get(name, name)) for name in FUNCTIONS if name not in special}
+    special = {**ARITHMETIC, **COMPARED, "negate": operator.neg, "absolute": casadi.fabs}
+    special |= {"choose": casadi.if_else, "look up": looked_up}
+    functions = {name: getattr(casadi, name) for name in FUNCTIONS if name not in special}
     return interpreted(graph, nodes, inputs, functions | special, known)

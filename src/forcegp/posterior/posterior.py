@@ -15,9 +15,13 @@ from torch import Tensor
 from forcegp.data import Dataset, with_memory
 from forcegp.data.dataset import FORCE as OF_SENSOR
 from forcegp.data.dataset import require_rows
+from forcegp.data.views import decided
 from forcegp.errors import DataWarning, InvalidInput, NumericalError, require_known, require_type, usable_arguments
+from forcegp.evidence.likelihood import TrainingData, check_distance
 from forcegp.forces import Force
-from forcegp.inference.memory import blas_threads
+from forcegp.inference import exact
+from forcegp.inference.memory import blas_threads, require_memory
+from forcegp.inference.posterior import with_rows
 from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.integration.integrators import Feedback, steps_by
 from forcegp.mechanics import AffineMap, Baumgarte, ConstrainedDynamics, Contact
@@ -25,7 +29,6 @@ from forcegp.model import Model
 from forcegp.noise import ACCELERATION, FORCE, PUSHES, Noise
 from forcegp.posterior.drift import followed
 from forcegp.posterior.fitted import Fitted
-from forcegp.posterior.joint_forces import hidden_forces, joint_forces_given
 from forcegp.posterior.observed_wrench import rows_of_own_system
 from forcegp.posterior.prediction import (
     ROWS_PER_BLOCK,
@@ -38,7 +41,9 @@ from forcegp.posterior.prediction import (
     Prediction,
     Rows,
     curve_features,
+    hidden_forces,
     join_predictions,
+    joint_forces_given,
     state_rows,
     state_tensor,
     without_past,
@@ -47,7 +52,6 @@ from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.preparation import prepared_predictor, rows_for
 from forcegp.posterior.programs import Physics, Programs
 from forcegp.posterior.rollout import Rollout, accelerations, checked_start, flat_feedback, loops_for, moved
-from forcegp.posterior.update import learn_more_rows
 from forcegp.robots.arguments import whole_number
 
 
@@ -280,7 +284,35 @@ class Posterior(Fitted):
         example = ", for example Dataset(q=q, v=v, u=u, a=a, time=t, model=posterior.model)"
         require_rows("rows", rows, self.model.robot.joint_names, "the model", example)
         own, rows = replace(self, target=None), rows_of_own_system(self, with_memory(rows, self.model))
-        return followed(replace(learn_more_rows(own, rows), target=self.target), rows)
+        return followed(replace(own.with_rows(rows), target=self.target), rows)
+
+    def with_rows(self, rows: Dataset) -> "Posterior":
+        """Conditioned on rows of its own system, too: exactly, at the parameters that it has, in bounded memory."""
+        rows = decided(rows)
+        latent, training = exact(self.latent, "learning from more rows"), self.training
+        count, rank, latents = latent.system.deflation.C.shape
+        size, new = rank * (count + len(rows)), rank * len(rows)
+        # the factor, blocks of new rows, their copies
+        needed = 8 * (size**2 + 2 * new * size + latents * len(rows) ** 2)
+        require_memory(needed, f"a posterior of {count} + {len(rows)} rows", "give fewer rows", training.q.device)
+        # with the standardization at hand instead of one that is computed again
+        reference = training if training.reference is None else training.reference
+        added = TrainingData.of(rows, training.q.device, training.sensed)
+        added = replace(added, reference=reference, correlated_rows=training.correlated_rows)
+        known = self.likelihood
+        known.model.check_states(added.q, added.v, added.u)
+        check_distance(known.model, added)
+        more = replace(known, training=added, fixed_standardization=known.standardization)
+        with torch.no_grad(), blas_threads(training.q.numel()):
+            terms = more.terms(self.hyperparameters)
+            latent = with_rows(latent, terms._replace(noise=terms.noise.expand(len(terms.W), *terms.noise.shape[1:])))
+        both = training, more.training
+        sensed = {name: torch.cat([x.sensed[name] for x in both]) for name in training.sensed}
+        pairs = {name: [getattr(x, name) for x in both] for name in (*"qvua", "strokes")}
+        joined = {name: None if any(x is None for x in pair) else torch.cat(pair) for name, pair in pairs.items()}
+        learned = replace(training, **joined, sensed=sensed, reference=more.training.reference)
+        changes = {"points": len(latent.system.alpha), "rows_added": self.settings.get("rows_added", 0) + len(rows)}
+        return replace(self, likelihood=replace(more, training=learned), latent=latent).with_settings(**changes)
 
     def with_model(self, model: Model) -> "Posterior":
         """The same unknown forces in another model (robot, contacts, laws, stabilisation) with the same joints.

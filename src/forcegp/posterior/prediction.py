@@ -1,6 +1,6 @@
-"""Predictions as values: of accelerations, of every force by itself, and of the u that makes an acceleration."""
+"""Predictions as values: of accelerations, of forces, also given accelerations, and of the u that makes them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
@@ -11,10 +11,10 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput, NumericalError
-from forcegp.evidence.likelihood import FAR_FROM_SURFACE
+from forcegp.evidence.likelihood import FAR_FROM_SURFACE, observed
 from forcegp.forces import Actuation
 from forcegp.integration.integrators import find_roots, rows_jacobian
-from forcegp.mechanics import ConstrainedDynamics
+from forcegp.mechanics import AffineMap, ConstrainedDynamics
 from forcegp.model import Model
 from forcegp.posterior.fitted import DEVIATIONS
 from forcegp.robots.arguments import broadcast_batch, real_tensor, require_finite
@@ -145,16 +145,15 @@ def without_past(
         return found
     moved = [at(mean + unit, False) for unit in torch.eye(len(memory.names)).to(mean)]
 
-    def wider(of: Callable[[Prediction], Gaussian | None]) -> Gaussian | None:
-        here = of(found)
+    def wider(name: str) -> Gaussian | None:
+        here: Gaussian | None = getattr(found, name)
         if here is None or here.covariance is None:
             return here
-        slopes = torch.stack([of(each).mean - here.mean for each in moved], dim=-1)  # type: ignore[union-attr]  # as here
+        slopes = torch.stack([getattr(each, name).mean - here.mean for each in moved], dim=-1)
         return Gaussian(here.mean, here.covariance + (slopes * variance[:, None]) @ slopes.mT)
 
-    names = ("multiplier", "contact_force", "unknown_force")
-    wide = {name: wider(lambda each, name=name: getattr(each, name)) for name in names}  # type: ignore[misc]  # bound
-    acceleration = wider(lambda each: Gaussian(each.mean, each.covariance))
+    wide = {name: wider(name) for name in ("multiplier", "contact_force", "unknown_force")}
+    acceleration = wider("acceleration")
     assert acceleration is not None, "every model predicts it"
     made = replace(found, mean=acceleration.mean, covariance=acceleration.covariance, **wide)
     if made.unseen is None or found.multiplier is None or made.multiplier is None:
@@ -341,3 +340,55 @@ def curve_features(latent: str, given: Any, visited: Tensor, points: int) -> Ten
     if z.dim() != 2 or z.shape[-1] != count or not bool(torch.isfinite(z).all()):
         raise InvalidInput(f"features of {latent!r} have shape {tuple(z.shape)}; give finite numbers (n, {count})")
     return z
+
+
+def joint_forces_given(
+    latents: Gaussian,
+    B: Float[Tensor, "rows nv C"],
+    extra: Float[Tensor, "*rows nv nv"] | None,
+    acceleration: AffineMap,
+    seen: tuple[Rows, Float[Tensor, " nv"]] | None,
+) -> tuple[Gaussian, Gaussian]:
+    """Joint forces B f + e with e ~ N(0, `extra`), and B f alone: given accelerations that were `seen`, if any.
+
+    a = offset + H (B f + e) + N(0, s^2) with (a, s) = `seen`: a normal distribution conditioned on a part of it
+    (Rasmussen & Williams 2006, eq. A.6).
+    """
+    learned = latents.through(B)
+    if extra is None:
+        extra = torch.zeros_like(acceleration.matrix[..., :1, :1])
+    whole = Gaussian(learned.mean, None if learned.covariance is None else learned.covariance + extra)
+    if seen is None:
+        return whole, learned
+    assert whole.covariance is not None, "as above"
+    a, std = seen
+    H, missed = acceleration.matrix, a - acceleration(learned.mean)
+    V = H @ whole.covariance @ H.mT + torch.diag_embed(std.square())
+
+    def given(prior: Gaussian, across: Tensor) -> Gaussian:
+        gain = torch.linalg.solve(V, across.mT).mT
+        covariance: Tensor = prior.covariance - gain @ across.mT  # type: ignore[operator]  # `predict` computes it
+        return Gaussian(prior.mean + (gain @ missed[..., None])[..., 0], 0.5 * (covariance + covariance.mT))
+
+    assert learned.covariance is not None, "as above"
+    return given(whole, whole.covariance @ H.mT), given(learned, learned.covariance @ H.mT)
+
+
+SHARP = 1e-9
+"""Of what evidence shows of hidden torques, the variance that conditioning on it leaves: rounding."""
+
+
+def hidden_forces(
+    hidden: Float[Tensor, " nv"], dynamics: ConstrainedDynamics, sensors: Sequence[str]
+) -> Float[Tensor, "rows nv nv"]:
+    """The covariance of joint forces of these standard deviations that nothing showed.
+
+    What changes accelerations, or what `sensors` measure, was seen and is not among them: N(0, h^2) given that
+    H e = 0 and C e = 0, which is (A h^-2 A^T)^-1 for the multipliers of independent contacts.
+    """
+    prior, G = torch.diag(hidden.square()), observed(dynamics, sensors).matrix
+    across = prior @ G.mT
+    V = G @ across
+    V = V + SHARP * V.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(V.shape[-1]).to(V)
+    left = prior - across @ torch.linalg.solve(V, across.mT)
+    return 0.5 * (left + left.mT)

@@ -307,13 +307,9 @@ class Programs:
         memory, space = self.physics.model.memory, self.space
         if not memory.names:
             return None
-
-        def after(z: Tensor, q: Tensor, q1: Tensor, dt: Tensor) -> list[Tensor]:
-            return [memory.after(z, space.difference(q, q1), dt)]
-
         q = space.neutral()
         given = [q.new_zeros(len(memory.names)), q, q, q.new_ones(1)]
-        graph, (z,) = trace(after, given)
+        graph, (z,) = trace(lambda z, q, q1, dt: [memory.after(z, space.difference(q, q1), dt)], given)
         return graph, z.tolist(), [len(each) for each in given]
 
     def memory_source(self, lanes: int, numbers: dict[str, int] | None = None) -> list[str]:

@@ -268,14 +268,13 @@ def checked_start(
         if name == "u" and tensor.dim() < 2:
             raise InvalidInput(f"u has shape {tuple(tensor.shape)}; it must be (..., T, {size}), one row per step.")
     q, v, forces = given.values()
-    steps = forces.shape[-2]
-    if not steps:
+    if not forces.shape[-2]:
         raise InvalidInput("u has no rows; a rollout has at least one step.")
     batch = broadcast_batch({"q0": q.shape[:-1], "v0": v.shape[:-1], "u": forces.shape[:-2]})
     if not batch.numel():
         raise InvalidInput(f"q0 has shape {tuple(q.shape)}: no motion at all; give at least one initial state.")
     q, v = (x.expand(*batch, -1).reshape(-1, x.shape[-1]) for x in (q, v))
-    forces = forces.expand(*batch, -1, -1).reshape(batch.numel(), steps, forces.shape[-1]).movedim(1, 0).contiguous()
+    forces = forces.expand(*batch, -1, -1).reshape(batch.numel(), *forces.shape[-2:]).movedim(1, 0).contiguous()
     return q, v, forces, batch
 
 

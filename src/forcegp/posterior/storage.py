@@ -102,7 +102,7 @@ def load_posterior(path: str | Path) -> Posterior:
                 raise ValueError(f"{name} is {value.dtype} or has values that are not finite")
             if name.startswith((TRAINING, REFERENCE)) and bool((value.abs() > LARGEST_MEASURED).any()):
                 raise ValueError(f"{name} has values {BEYOND.rstrip('.')}")
-        model = _model(path / ROBOT, document["model"])
+        model = Model.from_dict({**document["model"], "urdf": read_text(path / ROBOT)})
         training = _rows(TRAINING, tensors, model)
         if any(name.startswith(REFERENCE) for name in tensors):
             training = replace(training, reference=_rows(REFERENCE, tensors, model))
@@ -120,15 +120,12 @@ def load_posterior(path: str | Path) -> Posterior:
         if wanted != there:
             raise ValueError("its parameters are not those of its model")
         if "target" in document:
-            posterior = posterior.with_model(_model(path / TARGET, document["target"]))
+            target = Model.from_dict({**document["target"], "urdf": read_text(path / TARGET)})
+            posterior = posterior.with_model(target)
             posterior = posterior.with_settings(**settings)  # as it was stored
     except UNUSABLE as error:
         raise FileFormatError(f"{path} is incomplete or damaged: {error}; fit the model again") from None
     return posterior
-
-
-def _model(urdf: Path, stored: Mapping[str, Any]) -> Model:
-    return Model.from_dict({**stored, "urdf": read_text(urdf)})
 
 
 def _rows(prefix: str, tensors: Mapping[str, torch.Tensor], model: Model) -> TrainingData:

@@ -18,8 +18,8 @@ from forcegp.errors import required_extra
 from forcegp.forces import Actuation, AerodynamicForce, ObservedWrench, RigidBodies, Rotor, Thrusters, Unknown
 from forcegp.mechanics import ConstrainedDynamics
 from forcegp.mechanics.gauss_principle import placed
-from forcegp.posterior.joint_forces import joint_forces_given
 from forcegp.posterior.posterior import Posterior
+from forcegp.posterior.prediction import Gaussian, joint_forces_given
 from forcegp.report.shapes import LinkShape, link_shapes, poses_of_links, reach
 from forcegp.robots import Robot
 from forcegp.scores.figures import style
@@ -131,8 +131,7 @@ def learned_forces(posterior: Posterior, dynamics: ConstrainedDynamics) -> list[
         if (point := term.point_force(dynamics)) is None:
             of_joints[which] = True
         else:
-            force = latents.entries(which).through(point)
-            groups.append(_at_point(name, _place(term, dynamics), force.mean, force.covariance))
+            groups.append(_at_point(name, _place(term, dynamics), latents.entries(which).through(point)))
     forces = [force for force in posterior.model.laws if not isinstance(force, NOT_SHOWN)]
     if bool(of_joints.any()) or forces:
         own = latents.through(B * of_joints)
@@ -151,7 +150,7 @@ def learned_forces(posterior: Posterior, dynamics: ConstrainedDynamics) -> list[
             contact = dynamics.contacts[which[0]]
             force = whole.through(matrix[..., which, :, :].sum(-3), offset[..., which, :].sum(-2))
             place = contact.position(dynamics.state.kinematics)
-            groups.append(_at_point(f"contact force at {contact.frame}", place, force.mean, force.covariance))
+            groups.append(_at_point(f"contact force at {contact.frame}", place, force))
     return groups
 
 
@@ -179,15 +178,13 @@ def _at_joints(
     return Arrows(title, " or ".join(sorted(kinds)), robot.joint_names, *(x.cpu().numpy() for x in numbers))
 
 
-def _at_point(name: str, place: torch.Tensor, mean: torch.Tensor, covariance: torch.Tensor | None) -> Arrows:
+def _at_point(name: str, place: torch.Tensor, force: Gaussian) -> Arrows:
     """A force in space as one arrow along its mean, with the standard deviation in that direction."""
+    mean = force.mean
     size = torch.linalg.vector_norm(mean, dim=-1, keepdim=True)
     direction = torch.where(size > 0.0, mean / size.clamp_min(torch.finfo(mean.dtype).tiny), torch.eye(3)[2].to(mean))
-    half = torch.zeros_like(size[..., 0])
-    if covariance is not None:
-        variance = (direction[..., None, :] @ covariance @ direction[..., None])[..., 0, 0]
-        half = style.QUANTILE * variance.clamp_min(0.0).sqrt()
-    numbers = (place[:, None], direction[:, None], size, half[:, None])
+    half = style.QUANTILE * force.through(direction[..., None, :]).std
+    numbers = (place[:, None], direction[:, None], size, half)
     return Arrows(name, "N", (name,), *(x.detach().cpu().numpy() for x in numbers))
 
 

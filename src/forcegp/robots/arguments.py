@@ -166,11 +166,9 @@ def locked_positions(locked: Mapping[str, float | int]) -> dict[str, float]:
     """Positions (rad or m) of locked joints as floats."""
     out = {}
     for name, position in locked.items():
-        try:
+        with contextlib.suppress(TypeError, ValueError):
             out[name] = float(position)
-        except (TypeError, ValueError):
-            out[name] = np.nan
-        if not np.isfinite(out[name]):
+        if not math.isfinite(out.get(name, math.nan)):
             raise InvalidInput(f"locked[{name!r}] is {position!r}; give a finite position in rad or m.")
     return out
 

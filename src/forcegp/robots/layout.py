@@ -143,11 +143,6 @@ class Layout:
         return (*names, *(joint.name for joint in self.joints[last:]))
 
     @property
-    def coupled(self) -> bool:
-        """Whether some joint mimics another one."""
-        return len(self.joints) < len(self.bodies)
-
-    @property
     def moving(self) -> tuple[str, ...]:
         """Names of the links that some joint moves."""
         return tuple(name for name, placement in self.links.items() if placement.body != WORLD)

@@ -94,17 +94,14 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
     descendants = moves.copy()
     descendants[:, list(layout.empty)] = 0.0
     twist_basis = np.zeros((6, 3, 4))
-    for k, axis in enumerate(np.eye(3)):
-        twist_basis[k, :, :3] = np.cross(axis, np.eye(3)).T  # [w]x
-        twist_basis[3 + k, :, 3] = axis
+    twist_basis[:3, :, :3] = [np.cross(axis, np.eye(3)).T for axis in np.eye(3)]  # [w]x
+    twist_basis[3:, :, 3] = np.eye(3)
     inertias = np.zeros((n, 4, 4))
     for name in layout.moving:
         placement, inertial = layout.links[name], description.links[name]
         if inertial is not None:
             own_frame = pseudo_inertia(inertial.mass, inertial.center_of_mass, inertial.inertia)
             inertias[placement.body] += placement.offset @ own_frame @ placement.offset.T
-    fall = np.zeros((3, 4))
-    fall[:, 3] = gravity
     coupling = np.zeros((n, len(layout.joints)))
     coupling[range(n), [drive.joint for drive in layout.drives]] = [drive.multiplier for drive in layout.drives]
     armature = np.array([joint.armature for joint in layout.joints])
@@ -118,7 +115,7 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
         "twist_basis": twist_basis.reshape(6, 12).T,
         "inertias": inertias[..., None],
         "gravity": gravity,
-        "fall": fall[..., None],
+        "fall": np.pad(gravity[:, None], ((0, 0), (3, 0)))[..., None],
         "armature": armature,
         "coupling": coupling,
         "shift": [[drive.offset] for drive in layout.drives],
@@ -129,7 +126,7 @@ def compile_tree(description: RobotDescription, layout: Layout, gravity: np.ndar
         parents=layout.parents,
         all_revolute=bool(revolute.all()),
         is_above=torch.tensor(moves[..., None]) > 0,
-        coupled=layout.coupled,
+        coupled=len(layout.joints) < n,
         is_chain=bool(constants["related"].all()),
         has_armature=bool(armature.any()),
         **{name: torch.tensor(array, dtype=torch.float64) for name, array in constants.items()},

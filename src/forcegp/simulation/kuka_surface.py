@@ -20,12 +20,13 @@ from forcegp.robots import Robot
 from forcegp.robots.structure import RigidBodyDynamics
 from forcegp.robots.urdf import numbers
 from forcegp.robots.urdf_file import inertial_element
-from forcegp.simulation.joint_friction import Friction, laws_of_joints
 from forcegp.simulation.scenarios import KukaSurfaceConfig
 from forcegp.simulation.trajectory import (
     ArmState,
+    Friction,
     compiled_plant,
     joint_acceleration,
+    laws_of_joints,
     middle_of,
     over_table,
     random_path,
@@ -55,12 +56,9 @@ def kuka_urdf(config: KukaSurfaceConfig) -> str:
     path = kuka_file()
     text = path.read_text(encoding="utf-8")
     root = ElementTree.fromstring(text)
-    for unused in root.findall("material"):
-        root.remove(unused)
+    root[:] = [part for part in root if part.tag != "material"]
     for link in root.findall("link"):
-        for child in list(link):
-            if child.tag != "inertial":
-                link.remove(child)
+        link[:] = link.findall("inertial")
     for dynamics in root.iter("dynamics"):
         dynamics.set("damping", repr(config.joint_damping))
     tool, base = (root.find(f"link[@name='{name}']/inertial") for name in (TOOL_LINK, BASE_LINK))
@@ -131,9 +129,7 @@ class ContactForces(NamedTuple):
 class IdealContact:
     """The tool point stays on the table from its first touch on: `A a = b` with Baumgarte's b, and friction there.
 
-    Without `friction` it touches nothing.
-
-    `omega` [rad/s] and `zeta` stabilise the constraint.
+    Without `friction` it touches nothing. `omega` [rad/s] and `zeta` stabilise the constraint.
     """
 
     table: Surface

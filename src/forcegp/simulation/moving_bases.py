@@ -21,9 +21,8 @@ from forcegp.mechanics import fixed_point
 from forcegp.model import Model
 from forcegp.progress import tell
 from forcegp.robots import Robot
-from forcegp.simulation.joint_friction import laws_of_joints
 from forcegp.simulation.scenarios import QuadrotorConfig, QuadrupedConfig
-from forcegp.simulation.trajectory import RATE, recorded
+from forcegp.simulation.trajectory import RATE, laws_of_joints, recorded
 
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 STANCE = (0.0, 0.75, -1.5)  # roll, hip pitch and knee in rad
@@ -98,7 +97,6 @@ def _base_motion(
     """Poses (n, 7) of the base, its velocities and accelerations (n, 6) in its axes."""
     size = torch.tensor([*SHIFT, *TURN]) * torch.tensor(rng.uniform(0.3, 0.7, (2, 6)))
     rate, phase = torch.tensor(rng.uniform(*RATES, (2, 6))), torch.tensor(rng.uniform(0.0, 2.0 * np.pi, (2, 6)))
-
     away = torch.tensor([[-LEAN[0], -LEAN[1]], [-LEAN[0], LEAN[1]], [LEAN[0], -LEAN[1]], [LEAN[0], LEAN[1]]])
     lean = away[order].double() if order else torch.zeros(1, 2, dtype=torch.float64)
     turn = torch.clamp((time / PERIOD).long(), max=len(lean) - 1)

@@ -154,19 +154,13 @@ class KukaSurfaceConfig(CommonConfig):
         """Steps before the first recorded row."""
         return math.ceil(self.settle_seconds / self.time_step - 1e-9)
 
-    @property
-    def steps(self) -> int:
-        """Simulated steps of all episodes together."""
-        return self.episodes * (self.settle_steps + self.rows_per_episode)
-
 
 _POSITIVE = ("tool_mass", "breakaway_velocity", "friction_smoothing", "joint_breakaway_velocity", "joint_smoothing")
-_NOT_NEGATIVE = ("viscous_coefficient", "coulomb_coefficient", "static_coefficient")
 _RANGES: dict[str, Range] = {
     "time_step": ("from 1e-5 to 0.01 s", 1e-5, 0.01),
     "settle_seconds": ("from 0.5 to 1000 s", 0.5, 1e3),
     **dict.fromkeys(_POSITIVE, POSITIVE),
-    **dict.fromkeys(_NOT_NEGATIVE, NOT_NEGATIVE),
+    **dict.fromkeys(("viscous_coefficient", "coulomb_coefficient", "static_coefficient"), NOT_NEGATIVE),
 }
 
 
