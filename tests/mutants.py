@@ -21,8 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-ENOUGH = 0.9
-"""Share of killed mutants that is asked for."""
+ENOUGH = 0.9  # share of killed mutants that is asked for
 NOT_COPIED = ".git", ".venv", ".*_cache", "build", "__pycache__"
 LONGEST = 1200.0  # seconds of one run: a guard against a fault that never ends
 GUARD = 1e-9  # the largest number that guards against zero or rounding

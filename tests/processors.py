@@ -24,8 +24,7 @@ from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 FOLDER = REPOSITORY / ".processors"
-BUSY = 6
-"""Processes that compute beside the tests in the variant `loaded`."""
+BUSY = 6  # processes that compute beside the tests in the variant `loaded`
 
 VARIANTS: dict[str, dict[str, str]] = {
     "as-it-is": {}, **{f"openblas-{core}": {"OPENBLAS_CORETYPE": core} for core in ("Haswell", "SkylakeX", "Zen")},

@@ -22,8 +22,6 @@ FIG2B_CONSTRAINT_ERROR = {
 }
 """Mean |A a - b| [m/s^2] of the predicted mean; for S-GP the paper shows about 3e-12 throughout."""
 
-MAE_10000 = {"analytical": 0.57}
-"""The same error with 10,000 points."""
+MAE_10000 = {"analytical": 0.57}  # the same error with 10,000 points
 
-NOISE_STD = 0.1
-"""Of the measured acceleration [rad/s^2]; a perfect model has the MAE 0.1 sqrt(2 / pi) = 0.0798."""
+NOISE_STD = 0.1  # of the measured acceleration [rad/s^2]; a perfect model has the MAE 0.1 sqrt(2 / pi) = 0.0798

@@ -79,7 +79,8 @@ def test_an_environment_that_libraries_do_not_take_is_one_sentence(tmp_path):
     done = subprocess.run(code, env={**os.environ, "MPLBACKEND": "nonsense"}, **how)
     assert (done.returncode, done.stderr) == (0, "")
     stops = "{'__getattr__': lambda *_: signal.raise_signal(signal.SIGINT)}"
-    code[2] = f"import signal, sys; sys.modules['tyro'] = type('', (), {stops})(); {code[2]}"
+    heard = "signal.signal(signal.SIGINT, signal.default_int_handler)"  # which jobs in the background do not
+    code[2] = f"import signal, sys; {heard}; sys.modules['tyro'] = type('', (), {stops})(); {code[2]}"
     done = subprocess.run(code, **how)
     assert (done.returncode, done.stderr) == (130, "forcegp: interrupted; nothing was begun.\n")
     done = subprocess.run(words, env={**os.environ, "PYTHONWARNINGS": "error"}, **how)

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 from tests.durability.commands import COMMANDS, assert_one_line, leftovers, run, snapshot
 
-SIZES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 0.9, 0.97)
-"""Of what a run needs; what is left free on the disk."""
+SIZES = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 0.9, 0.97)  # of what a run needs; what is left free on the disk
 PAGE = 4096
 
 

@@ -7,8 +7,7 @@ import time
 import pytest
 from tests.durability.commands import COMMANDS, KILLED, assert_one_line, leftovers, run, start
 
-KILLS = 10
-"""Of every command: 60 in all."""
+KILLS = 10  # of every command: 60 in all
 
 
 @pytest.mark.nightly

@@ -28,8 +28,7 @@ TRUE_FORCES = (
     Rotor([0.05, 0.04, 0.03]),
 )  # fmt: skip
 LAWS = Viscous(), Coulomb(), Offset()
-WEAK = 1e-3
-"""Strength of the prior on bodies where the log shall decide."""
+WEAK = 1e-3  # strength of the prior on bodies where the log shall decide
 
 
 def identified(data: Dataset, model: Model, *laws, evidence=None, strength: float = 0.1, **options):

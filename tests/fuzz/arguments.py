@@ -110,25 +110,9 @@ def _forces(kind: Any, **arguments: Any) -> None:
     forcegp.Model(model.robot, (), (*model.forces, made)).dynamics(*STATE).acceleration_map()
 
 
-def _with(force: Any) -> Any:
-    return INPUTS.data.model.with_forces(force).dynamics(*STATE).A
-
-
 def _surface(kind: Any, **arguments: Any) -> Any:
     model = arm_model(0).with_contacts((forcegp.Contact("hand", (0.0, 0.0, 0.2), kind(**arguments)),))
     return model.dynamics(*STATE).A
-
-
-def _contact(**arguments: Any) -> Any:
-    return arm_model(0).with_contacts((forcegp.Contact(**arguments),)).dynamics(*STATE).A
-
-
-def _baumgarte(**arguments: Any) -> Any:
-    return arm_model(baumgarte=forcegp.mechanics.Baumgarte(**arguments)).dynamics(*STATE).b
-
-
-def _robot_from(of: Any, **arguments: Any) -> Any:
-    return of(**arguments).forward_dynamics(*STATE)
 
 
 def _drone() -> Any:
@@ -143,24 +127,11 @@ def _link_force(kind: Any, **arguments: Any) -> Any:
     return model.dynamics(POSE, STILL, torch.ones(len(model.inputs)).double()).M
 
 
-def _fitted(noise: Any) -> Any:
-    return fit(INPUTS.data.model.with_forces(JointForces(), noise=noise), INPUTS.data, restarts=1, options=QUICK)
-
-
 def _options(kind: Any, **arguments: Any) -> Any:
     made = kind(**arguments)
     if isinstance(made.iterations, int) and made.iterations > 50:
         return None
     return fit(INPUTS.data.model.with_forces(JointForces()), INPUTS.data, points=6, restarts=1, options=made)
-
-
-def _engine(kind: Any, **arguments: Any) -> Any:
-    how = {"points": 8, "restarts": 1, "options": QUICK, "engine": kind(**arguments)}
-    return fit(INPUTS.data.model.with_forces(JointForces()), INPUTS.data, **how)
-
-
-def _cost(q: torch.Tensor, v: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
-    return q.square().sum((-1, -2))
 
 
 TRACKING = {"stiffness": 10.0, "damping": None, "torque_limits": 50.0}
@@ -207,10 +178,6 @@ def _fit_of(model: Callable[[], Any]) -> Callable[..., Any]:
     return lambda _, **k: fit(model(), **k)
 
 
-def _number(kind: Any, **arguments: Any) -> Any:
-    return _forces(forcegp.Viscous, damping=kind(**arguments))
-
-
 Posterior, Robot = forcegp.Posterior, forcegp.Robot
 POINT = (0.0, 0.0, 0.1)
 CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
@@ -237,7 +204,10 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "predictor()": (lambda **k: INPUTS.predictor(**k), _states),
     "Noise": _call(
-        forcegp.Noise, lambda _, **k: _fitted(forcegp.Noise(**k)), "acceleration learn", lambda: {"force": 0.1}
+        forcegp.Noise,
+        lambda kind, **k: fit(INPUTS.data.model.with_forces(JointForces(), noise=kind(**k)), INPUTS.data, **FIT),
+        "acceleration learn",
+        lambda: {"force": 0.1},
     ),
     "fit": _call(
         fit,
@@ -257,9 +227,17 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         "inputs",
     ),
     "OptimizerOptions": _call(forcegp.inference.OptimizerOptions, _options, "tolerance", lambda: {"iterations": 2}),
-    "Inducing": _call(forcegp.inference.Inducing, _engine, "tolerance", lambda: {"points": 5}),
+    "Inducing": _call(
+        forcegp.inference.Inducing,
+        lambda kind, **k: fit(INPUTS.data.model.with_forces(JointForces()), INPUTS.data, **FIT, engine=kind(**k)),
+        "tolerance",
+        lambda: {"points": 5},
+    ),
     "Robot.from_urdf_text": _call(
-        Robot.from_urdf_text, _robot_from, "gravity armature locked inertias base", lambda: {"text": URDF}
+        Robot.from_urdf_text,
+        lambda of, **k: of(**k).forward_dynamics(*STATE),
+        "gravity armature locked inertias base",
+        lambda: {"text": URDF},
     ),
     "Robot.from_mjcf_text": _call(
         Robot.from_mjcf_text,
@@ -293,9 +271,15 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "KukaSurfaceConfig": _call(KukaSurfaceConfig, names="seconds seed noise surface friction tool_mass"),
     "Model": _call(forcegp.Model, names="contacts forces noise baumgarte", given=lambda: {"robot": _robot()}),
     "dynamics": (lambda **k: INPUTS.data.model.dynamics(**k).A, _states),
-    "Contact": (_contact, lambda: {"frame": "hand", "point": POINT, "surface": forcegp.Plane(**SURFACES)}),
+    "Contact": (
+        lambda **k: arm_model(0).with_contacts((forcegp.Contact(**k),)).dynamics(*STATE).A,
+        lambda: {"frame": "hand", "point": POINT, "surface": forcegp.Plane(**SURFACES)},
+    ),
     "Plane": _call(forcegp.Plane, _surface, given=lambda: dict(SURFACES)),
-    "Baumgarte": (_baumgarte, lambda: {"omega": 5.0, "zeta": 1.0}),
+    "Baumgarte": (
+        lambda **k: arm_model(baumgarte=forcegp.mechanics.Baumgarte(**k)).dynamics(*STATE).b,
+        lambda: {"omega": 5.0, "zeta": 1.0},
+    ),
     "viscous": _call(forcegp.Viscous, _forces, given=lambda: {"damping": 0.1}),
     "stribeck": _call(
         forcegp.Stribeck, _forces, given=lambda: {"level": 0.1, "breakaway": 0.1, "stribeck_velocity": 0.1}
@@ -303,8 +287,16 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     "Payload": _call(
         forcegp.Payload, _forces, "inertia", lambda: {"link": "hand", "mass": 1.0, "center_of_mass": POINT}
     ),
-    "Normal": _call(forcegp.Normal, _number, given=lambda: {"mean": 0.1, "std": 0.1}),
-    "RigidBodies": _call(forcegp.RigidBodies, lambda kind, **k: _with(kind(**k)), given=lambda: {"learn": ("hand",)}),
+    "Normal": _call(
+        forcegp.Normal,
+        lambda kind, **k: _forces(forcegp.Viscous, damping=kind(**k)),
+        given=lambda: {"mean": 0.1, "std": 0.1},
+    ),
+    "RigidBodies": _call(
+        forcegp.RigidBodies,
+        lambda kind, **k: INPUTS.data.model.with_forces(kind(**k)).dynamics(*STATE).A,
+        given=lambda: {"learn": ("hand",)},
+    ),
     "with_forces": (
         lambda **k: INPUTS.data.model.with_forces(k["forces"], noise=k["noise"]),
         lambda: {"forces": forcegp.Viscous(), "noise": 0.1},
@@ -331,7 +323,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
     ),
     "MPPI": _call(
         forcegp.MPPI,
-        lambda kind, **k: kind(INPUTS.predictor, _cost, **k)(*STATE[:2]),
+        lambda kind, **k: kind(INPUTS.predictor, lambda q, v, u: q.square().sum((-1, -2)), **k)(*STATE[:2]),
         "noise seed",
         lambda: {"dt": 0.01, "steps": 2, "torque_limits": 5.0, "samples": 3, "integrator": "rk4"},
     ),

@@ -38,8 +38,7 @@ INPUTS: Any = SimpleNamespace(folder=None)
 """`folder` with the files below, `data`, `posterior`, `predictor`; filled by `make`."""
 LOGS = ("log.csv", "log.npz", "log.mat", "log73.mat", "log.h5", "log.parquet", "log.mcap")
 
-PAIR = model("continuous").robot.urdf_text
-"""The robot of the logs."""
+PAIR = model("continuous").robot.urdf_text  # the robot of the logs
 
 
 def make(folder: Path) -> None:

@@ -30,12 +30,9 @@ import forcegp
 from forcegp.errors import ForceGPError
 
 SEED = int(os.environ.get("FORCEGP_FUZZ_SEED") or datetime.date.today().strftime("%Y%m%d"))
-LONGEST = 60.0
-"""CPU seconds of one case."""
-MOST_MEMORY = 2**30
-"""Bytes by which the memory of this process may grow."""
-CANARY = "canary"
-"""A folder that code hidden in a file would make."""
+LONGEST = 60.0  # CPU seconds of one case
+MOST_MEMORY = 2**30  # bytes by which the memory of this process may grow
+CANARY = "canary"  # a folder that code hidden in a file would make
 PACKAGE = str(Path(forcegp.__file__).parent)
 
 

@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 
 WRITE = os.environ.get("FORCEGP_WRITE_GOLDENS") == "1"
-FEW = 6
-"""Longer arrays are stored as their size and sums of them, which every entry moves."""
+FEW = 6  # longer arrays are stored as their size and sums of them, which every entry moves
 
 
 def assert_unchanged(name: str, values: Any, rtol: float = 1e-6) -> None:

@@ -8,8 +8,7 @@ from tests.inference.problems import normal, problem, rows_of_call
 from forcegp.inference import ExactPosterior, LatentKernels, Terms, prepared_kernels
 from forcegp.inference.prepared_kernels import Sample, compress, kernel_groups, kernel_sums
 
-SHARED = [1, 3, 4]
-"""Latents with the same centres; one of them has one length scale for all features."""
+SHARED = [1, 3, 4]  # latents with the same centres; one of them has one length scale for all features
 
 
 @pytest.fixture(scope="module")

@@ -40,8 +40,7 @@ def given():
     return model, q0, v0, u, tuple(x[:, None].expand(WINDOWS, STEPS, -1) for x in (q0, v0))
 
 
-LEVELS = torch.tensor([0.8, 0.5, 0.3], dtype=torch.float64)
-"""Of friction."""
+LEVELS = torch.tensor([0.8, 0.5, 0.3], dtype=torch.float64)  # of friction
 
 
 @pytest.mark.parametrize("passes", [20, 1])

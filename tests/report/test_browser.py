@@ -17,10 +17,8 @@ GOLDENS = Path(__file__).parent / "goldens"
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next((found for name in BROWSERS if (found := shutil.which(name))), None)
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-COARSE = (60, 50)
-"""Pixels to which pictures are averaged."""
-ALIKE = 8.0
-"""Largest mean difference of two pictures that look alike, of 255."""
+COARSE = (60, 50)  # pixels to which pictures are averaged
+ALIKE = 8.0  # largest mean difference of two pictures that look alike, of 255
 
 
 @pytest.fixture(scope="module")

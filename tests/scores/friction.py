@@ -14,8 +14,7 @@ from forcegp.inference import OptimizerOptions
 from forcegp.model import Model
 from forcegp.posterior import Posterior
 
-VISCOUS = 2.0
-"""N/(m/s) at the tool."""
+VISCOUS = 2.0  # n/(m/s) at the tool
 
 
 def joint_law(v):

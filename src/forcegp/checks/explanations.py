@@ -278,8 +278,9 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
             left, x = best(taus, np.eye(len(every)), every)
         beside = f", and {1.0 / x:.4g} times its torques" if power and x else ""
         what = f"the torques fit positions and velocities of {names[joint]} that are {x:.4g} times the logged ones"
-        do = f"Correct its gear ratio, or the columns, as in forcegp import --q 'COLUMN * {x:.4g}'"
-        do += f" --u 'COLUMN * {1.0 / x:.4g}'." if beside else "."
+        do = f"Correct its gear ratio, or the columns, as in forcegp import --q 'COLUMN * {x:.4g}'."
+        if beside:
+            do = f"{do[:-1]}, and forcegp import --u 'COLUMN * {1.0 / x:.4g}'."
         if x > 0.0 and abs(np.log(x)) > 0.05:
             cause = number("gear ratio", what + beside, joint, x, NUMBER + (0.1 if power else 0.4), do=do)
             found.append((left, cause, lambda joint=joint, x=x, power=power: now.after(geared(joint, x, power))))
