@@ -10,7 +10,7 @@ from forcegp.checks.check_input import CheckInput
 from forcegp.checks.explanations import SIGN, UNITS, candidates, changed
 from forcegp.checks.fits import EXPLAINED, FAR, FEWEST_ROWS, MUCH_MORE, NOISE, RESTS, WORSE, Explanation
 from forcegp.checks.residuals import left_by_positions
-from forcegp.checks.torques import AT_REST, LEAST, WIDTHS, Comparison, in_motion, positive_fit, stretch, torque_noise
+from forcegp.checks.torques import LEAST, WIDTHS, Comparison, in_motion, positive_fit, stretch, torque_noise
 from forcegp.data import Dataset
 from forcegp.data.views import white_noise
 from forcegp.doubts import Doubt, listed, look, wrong
@@ -244,8 +244,7 @@ def _stop(root: Explanation, joint: int) -> float | None:
 def _sticks(root: Explanation, joint: int) -> bool:
     """Whether in motion nothing stays of a torque, and near rest no more than `HELD` times what dry friction holds."""
     rows, tau, friction = root.log.rows, root.log.tau[:, joint], root.log.friction[:, joint]
-    speed, u, ones = np.abs(rows.v[:, joint]), rows.u[:, joint], np.ones(len(tau))
-    moves = speed > AT_REST * np.sqrt(np.square(speed).mean())
+    moves, u, ones = in_motion(rows)[:, joint], rows.u[:, joint], np.ones(len(tau))
     if moves.sum() < FEWEST_ROWS or moves.all():
         return False
     moving = replace(root, log=replace(root.log, rows=rows.rows(np.flatnonzero(moves))))

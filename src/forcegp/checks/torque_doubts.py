@@ -266,9 +266,6 @@ TOUCHES = ok(
 )
 
 
-SLIDES = 0.1  # of the root mean square velocity of a joint, from which on its dry friction is that of motion
-
-
 def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, list[Doubt]]:
     """The log without rests whose torques are not those of this posture, and what is said of them.
 
@@ -284,12 +281,12 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
     compared = inputs.mended if inputs.compared is None else inputs.compared
     rows = replace(inputs, compared=compared, most_rows=1000).rows()
     columns, standing = _needs(inputs.robot, rows), _needs(inputs.robot, at)
-    for k, (u, v, a) in enumerate(zip(rows.u.T, rows.v.T, rows.a.T, strict=True)):
+    each = zip(rows.u.T, rows.v.T, rows.a.T, in_motion(rows).T, strict=True)
+    for k, (u, v, a, moves) in enumerate(each):
         slow = np.sqrt(np.square(v).mean()) + 1e-300
         dry = np.stack([np.tanh(v / (width * slow)) for width in WIDTHS], axis=1)
         both = np.c_[columns[:, k], a, v, dry]
-        slides = np.abs(v) > SLIDES * slow  # elsewhere stiction holds it, while others move, which may be less
-        slides |= slides.sum() < both.shape[1]
+        slides = moves | (moves.sum() < both.shape[1])  # elsewhere stiction holds it, which may be less than friction
         size = np.linalg.norm(both[slides], axis=0) + 1e-300
         basis, sizes, turn = np.linalg.svd(both[slides] / size, full_matrices=False)
         seen, count = sizes > 1e-6 * sizes[0], columns.shape[-1]
