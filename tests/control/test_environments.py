@@ -15,17 +15,11 @@ from forcegp.control.environments import RobotVectorEnv  # noqa: E402
 __all__ = ["predictor"]  # a fixture
 
 
-def near(generator, count):
-    return generator.uniform(-0.5, 0.5, (count, 1)), np.zeros((count, 1))
-
-
-def reached(q, v, u, q_next, v_next):
-    return -np.square(q_next).sum(axis=1)
-
-
 @pytest.fixture
 def settings(predictor):
-    return {"model": predictor, "torque_limits": 5.0, "dt": 0.05, "start": near, "reward": reached}
+    own = {"start": lambda generator, n: (generator.uniform(-0.5, 0.5, (n, 1)), np.zeros((n, 1)))}
+    own["reward"] = lambda q, v, u, q_next, v_next: -np.square(q_next).sum(axis=1)
+    return {"model": predictor, "torque_limits": 5.0, "dt": 0.05, **own}
 
 
 @pytest.mark.filterwarnings("ignore")  # advice on bounds and rendering

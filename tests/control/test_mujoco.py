@@ -15,11 +15,11 @@ mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 rollout = pytest.importorskip("mujoco.rollout")
 
 __all__ = ["posterior"]  # a fixture
+AS_STATED = '<mujoco><compiler balanceinertia="false"/></mujoco></robot>'
 
 
 def model_of(urdf=URDF):
-    as_stated = '<mujoco><compiler balanceinertia="false"/></mujoco></robot>'
-    model = mujoco.MjModel.from_xml_string(urdf.replace("</robot>", as_stated))
+    model = mujoco.MjModel.from_xml_string(urdf.replace("</robot>", AS_STATED))
     model.jnt_limited[:] = 0
     return model
 
@@ -57,9 +57,7 @@ def test_known_friction_and_joints_in_another_order_act_too():
     model = Model(ROBOT, forces=laws)
     rows = Dataset(q=q, v=v, u=u, a=v, time=DT * np.arange(len(q)), model=model, noise_std=np.ones(2))
     fitted = fit(model, rows, points=5, restarts=1)
-    spec = mujoco.MjSpec.from_string(
-        URDF.replace("</robot>", '<mujoco><compiler balanceinertia="false"/></mujoco></robot>')
-    )
+    spec = mujoco.MjSpec.from_string(URDF.replace("</robot>", AS_STATED))
     ball = spec.worldbody.add_body(name="ball", pos=[5.0, 0.0, 0.0])
     ball.add_freejoint()
     ball.add_geom(size=[0.1, 0.0, 0.0])

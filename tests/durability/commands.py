@@ -95,14 +95,10 @@ def assert_one_line(code: int, errors: str) -> None:
 
 def snapshot(path: Path) -> dict[str, str]:
     """Digests of a file, or of every file of a folder."""
-    files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
-    return {file.name if path.is_file() else str(file.relative_to(path)): _digest(file) for file in files}
+    root, files = (path.parent, [path]) if path.is_file() else (path, [x for x in path.rglob("*") if x.is_file()])
+    return {str(file.relative_to(root)): sha256(file.read_bytes()).hexdigest() for file in files}
 
 
 def leftovers(folder: Path) -> list[str]:
     """Hidden files and folders that no run should leave; a store keeps its lock."""
     return [str(entry.relative_to(folder)) for entry in folder.rglob(".*") if entry.name != ".lock"]
-
-
-def _digest(file: Path) -> str:
-    return sha256(file.read_bytes()).hexdigest()

@@ -147,9 +147,8 @@ def test_log_prior_and_its_gradient():
         expected = expected + torch.distributions.Gamma(2.0, 0.5).log_prob(outputscale)
     torch.testing.assert_close(value, expected, rtol=1e-6, atol=0.0)
     leaves = [tensor for name, tensor in parameters.items() if "kernels.1" not in name]
-    for gradient, reference in zip(
-        torch.autograd.grad(value, leaves), torch.autograd.grad(expected, leaves), strict=True
-    ):
+    gradients = (torch.autograd.grad(each, leaves) for each in (value, expected))
+    for gradient, reference in zip(*gradients, strict=True):
         torch.testing.assert_close(gradient, reference, rtol=1e-6, atol=1e-8)
 
 

@@ -165,13 +165,8 @@ def test_kernel_matrices_must_be_finite(where):
 
 # ---------------------------------------------------------------- properties
 
-seeds = st.integers(0, 10_000)
-shapes = st.fixed_dictionaries(
-    {"count": st.integers(1, 6), "outputs": st.integers(1, 4), "latents": st.integers(1, 5), "seed": seeds}
-)
-
 
 @settings(max_examples=40)
-@given(shape=shapes)
-def test_any_problem_has_the_value_and_gradients_of_the_dense_one(shape):
+@given(count=st.integers(1, 6), outputs=st.integers(1, 4), latents=st.integers(1, 5), seed=st.integers(0, 10_000))
+def test_any_problem_has_the_value_and_gradients_of_the_dense_one(**shape):
     assert_same_value_and_gradients(problem(constraints=0, **shape))

@@ -48,8 +48,7 @@ def test_mean_and_covariance(shape, block_bytes, monkeypatch):
 
 def test_noise_covariances_and_force_level_noise():
     given_problem = problem(constraints=1)
-    W = given_problem.W
-    given_problem.noise = torch.diag_embed(given_problem.noise) + 0.02 * W @ W.mT
+    given_problem.noise = torch.diag_embed(given_problem.noise) + 0.02 * given_problem.W @ given_problem.W.mT
     assert_equals_dense(given_problem)
 
 

@@ -23,11 +23,6 @@ def latent() -> ExactPosterior:
     return ExactPosterior.condition(built, Terms(features, *given.data))
 
 
-def points(latent: ExactPosterior, count: int = 6) -> list[torch.Tensor]:
-    one = 5.0 + normal(count, 3, seed=70)
-    return [one if c in SHARED else normal(count, 3, seed=71 + c) for c in range(5)]
-
-
 def close(actual: torch.Tensor, expected: torch.Tensor) -> None:
     torch.testing.assert_close(actual, expected, rtol=1e-10, atol=1e-10)
 
@@ -39,9 +34,10 @@ def test_latents_are_grouped_by_their_centers(latent):
 @pytest.mark.parametrize("lanes", [1, 8])
 def test_the_sums_as_c_have_values_slopes_and_roots(latent, lanes, tmp_path):
     """Every group in a program of its own, whose inputs are the features."""
+    one = 5.0 + normal(11, 3, seed=70)
+    z = [one if c in SHARED else normal(11, 3, seed=71 + c) for c in range(5)]
     for group, part in zip(kernel_groups(latent), kernel_sums(latent), strict=True):
-        function, z = rows_of_call(part, lanes, tmp_path), points(latent, 11)
-        given = z[group[0]]
+        function, given = rows_of_call(part, lanes, tmp_path), z[group[0]]
         outputs = [torch.empty(11, size, dtype=torch.float64) for size in function.outputs]
         assert function.rows([given], outputs) == 0
         leaf = [x.clone().requires_grad_() for x in z]

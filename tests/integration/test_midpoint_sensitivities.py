@@ -11,6 +11,7 @@ from forcegp.model import Model
 
 H = 0.01
 WINDOWS, STEPS = 2, 8
+LEVELS = torch.tensor([0.8, 0.5, 0.3], dtype=torch.float64)  # of friction
 
 
 def accelerations(model: Model, friction: torch.Tensor, width: float) -> Accelerations:
@@ -38,9 +39,6 @@ def given():
     v0 = 0.4 * torch.randn(WINDOWS, nv, generator=generator, dtype=torch.float64)
     u = 3.0 * torch.randn(WINDOWS, STEPS, model.sizes[2], generator=generator, dtype=torch.float64)
     return model, q0, v0, u, tuple(x[:, None].expand(WINDOWS, STEPS, -1) for x in (q0, v0))
-
-
-LEVELS = torch.tensor([0.8, 0.5, 0.3], dtype=torch.float64)  # of friction
 
 
 @pytest.mark.parametrize("passes", [20, 1])

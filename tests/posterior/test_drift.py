@@ -45,8 +45,7 @@ def recording(seed: int, rate: float = 0.0, seconds: float = 60.0, level: float 
 
 
 def fitted(log: Dataset):
-    laws = Viscous(), Coulomb(None, 0.02), Offset()
-    return fit(log.model.with_forces(*laws), replace(log, truth={}), Accelerations())
+    return fit(log.model.with_forces(Viscous(), Coulomb(None, 0.02), Offset()), replace(log, truth={}), Accelerations())
 
 
 def drift_of(posterior) -> Drift:

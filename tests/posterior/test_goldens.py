@@ -11,23 +11,20 @@ from tests.goldens.compare import assert_unchanged
 from tests.posterior.arm import arm_data, arm_model, arm_that_remembers, quick_fit
 from tests.posterior.test_drift import fitted, recording
 
-from forcegp import Accelerations, Posterior, Viscous, fit
+from forcegp import Accelerations, Viscous, fit
 from forcegp.errors import DataWarning, ForceGPError
 from forcegp.forces import ContactFriction, JointAccelerations, JointForces, JointFriction
 from forcegp.posterior.fitted import Estimate, MotionIntervals
-
-
-def with_sensor() -> Posterior:
-    log = replace(measured(held(Viscous(0.7)), held(), rows=30), measured={}, noise_std=[0.05] * 3)
-    return quick_fit(held(JointForces(("v",))), log)
-
 
 POSTERIORS = {
     "friction": lambda: quick_fit(arm_model().with_forces(JointFriction(), ContactFriction(load=True, expected=0.2))),
     "two contacts": lambda: quick_fit(arm_model().with_forces(JointForces())).with_contacts(arm_model(2).contacts),
     "air": lambda: quick_fit(arm_model().with_forces(JointForces(("v",)), Viscous())).with_contacts([]),
     "accelerations": lambda: quick_fit(arm_model().with_forces(JointAccelerations()).without_mean()),
-    "hidden": with_sensor,
+    "hidden": lambda: quick_fit(
+        held(JointForces(("v",))),
+        replace(measured(held(Viscous(0.7)), held(), rows=30), measured={}, noise_std=[0.05] * 3),
+    ),
     "memory": lambda: arm_that_remembers()[0],
     "laws": lambda: fit(arm_model(0).with_forces(Viscous()), arm_data(30, 0, arm_model(0)), Accelerations()),
     "drift": lambda: fitted(recording(1, 0.02, seconds=8.0)),

@@ -174,22 +174,21 @@ def test_forward_mode_derivatives_are_not_lost(posterior, means, states):
 
 
 def test_errors_name_the_remedy(posterior, means, states):
-    predictor = means
     q, v, u = states
     with pytest.raises(InvalidInput, match=r"u \(5, 2\); give q \(\.\.\., 3\)"):
-        predictor.mean(q, v, u[:, :2])
+        means.mean(q, v, u[:, :2])
     with pytest.raises(InvalidInput, match=r"v \(3,\)"):
-        predictor.mean(q, v[0], u)
+        means.mean(q, v[0], u)
     with pytest.raises(InvalidInput, match="not finite"):
-        predictor.mean(q, v * float("nan"), u)
+        means.mean(q, v * float("nan"), u)
     with pytest.raises(InvalidInput, match=r"device .*cpu"):
-        predictor.mean(q.to("meta"), v, u)
+        means.mean(q.to("meta"), v, u)
     with pytest.raises(InvalidInput, match="covariance='compressed' or 'exact'"):
-        predictor(q, v, u)
+        means(q, v, u)
     with pytest.raises(InvalidInput, match=r"'dense'.*'auto', 'compressed', 'exact', 'none'"):
         posterior.predictor(covariance="dense")
     with pytest.raises(NumericalError, match="not finite"):
-        predictor.mean(q, v * 1e200, u)
+        means.mean(q, v * 1e200, u)
 
 
 def test_operations_that_no_tape_holds_are_named(posterior, states):

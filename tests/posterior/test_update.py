@@ -76,9 +76,8 @@ def test_updates_are_conditioning_on_all_rows(make):
     expected = at_once(posterior, data)
     assert_same(grown, expected, test)
     assert grown.negative_log_likelihood == pytest.approx(expected.negative_log_likelihood, rel=1e-9)
-    for mine, theirs in zip(
-        grown.likelihood.standardization.shift, posterior.likelihood.standardization.shift, strict=True
-    ):
+    shifts = (each.likelihood.standardization.shift for each in (grown, posterior))
+    for mine, theirs in zip(*shifts, strict=True):
         assert torch.equal(mine, theirs)
     assert grown.settings["points"] == len(grown.training.q) == 20
     assert grown.settings["rows_added"] == 8

@@ -8,24 +8,14 @@ from tests.posterior.arm import arm_data, arm_model, quick_fit
 
 from forcegp.errors import NumericalWarning
 from forcegp.forces import JointForces, JointFriction
-from forcegp.posterior import Posterior
-
-SLOWER = "predictions are computed by torch, some hundred times slower: "
 
 
-@pytest.fixture(scope="module")
-def posterior() -> Posterior:
-    return quick_fit(arm_model().with_forces(JointFriction(), JointForces()), arm_data(20, 0))
-
-
-@pytest.fixture(autouse=True)
-def empty_cache(tmp_path, monkeypatch):
+def test_everything_is_the_same_after_one_warning(states, tmp_path, monkeypatch):
+    posterior = quick_fit(arm_model().with_forces(JointFriction(), JointForces()), arm_data(20, 0))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-
-
-def test_everything_is_the_same_after_one_warning(posterior, states, monkeypatch):
     monkeypatch.setenv("CC", "no-such-compiler")
-    with pytest.warns(NumericalWarning, match=SLOWER + ".*no-such-compiler.*compile=False") as given:
+    slower = "predictions are computed by torch, some hundred times slower: .*no-such-compiler.*compile=False"
+    with pytest.warns(NumericalWarning, match=slower) as given:
         predictor = posterior.predictor()
     assert len(given) == 1
     assert "\n" not in str(given[0].message)

@@ -7,21 +7,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.data import samples
 from tests.recordings.log_files import EPOCH, write_text
+from tests.recordings.test_moving_bases import flight
 
 from forcegp import Model, Robot
-from forcegp.data import Dataset
 from forcegp.errors import DatasetError
 from forcegp.recordings import ColumnMapping, ImportOptions, import_recordings, open_source
-from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
 typesys = pytest.importorskip("rosbags.typesys")
 ROS2 = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 LATE = 2_000_000  # ns until the recorder has a message
 
-
-@pytest.fixture(scope="module")
-def flight() -> Dataset:
-    return simulate_quadrotor(QuadrotorConfig(seconds=1.0, seed=3, wind=4.0))
+__all__ = ["flight"]  # a fixture
 
 
 def message(kind, **values):

@@ -9,10 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.goldens.compare import assert_unchanged
 from tests.recordings.log_files import JOINTS, motion, table, write_text
+from tests.recordings.test_mapping_file import mapped
 
 from forcegp import Model, Robot
-from forcegp.cli.main import parse_arguments
-from forcegp.cli.terminal import Terminal
 from forcegp.errors import InvalidInput
 from forcegp.recordings import ColumnMapping, by_quantity, listed, open_source
 from forcegp.recordings.mapping import (
@@ -29,6 +28,7 @@ from forcegp.recordings.signal_plan import signal_plan
 
 COLUMNS = ("theta1", "theta2", "theta", "a-b", "a", "b", "/js:position.j1", "x[0]", "1e3")
 VALUES = {name: np.array([1.0 + k, 0.5 * k]) for k, name in enumerate(COLUMNS)}
+WEIGHTS = st.floats(-1e3, 1e3).map(lambda weight: round(weight, 6))
 
 
 @pytest.mark.parametrize(
@@ -74,9 +74,6 @@ def test_any_text_is_a_combination_or_refused(text):
     except InvalidInput:
         return
     assert set(found.weights) <= set(COLUMNS)
-
-
-WEIGHTS = st.floats(-1e3, 1e3).map(lambda weight: round(weight, 6))
 
 
 @given(st.lists(st.tuples(st.sampled_from("abcd"), WEIGHTS), min_size=1), st.data())
@@ -142,28 +139,20 @@ def test_units(quantity, name, given, si):
 @pytest.mark.parametrize(
     "flags",
     [
-        *(
-            "--unit deg", "--unit q=metres", "--unit x=m", "--sign q=2", "--sign q=0", "--sign q=x",
-            "--headerless seven",
-        ),
+        "--unit deg", "--unit q=metres", "--unit x=m", "--sign q=2", "--sign q=0", "--sign q=x", "--headerless seven",
         "--step -1", "--time t --step 1", "--unit q=", "--unit q=deg,q=rad", "--q a,,b",
     ],
 )  # fmt: skip
 def test_flags_that_mean_nothing_are_refused(flags):
     with pytest.raises(InvalidInput):
-        parse_arguments(["import", "log.csv", *flags.split(), "--out", "o.h5"]).columns.mapped([], Terminal(json=True))
+        mapped(*flags.split())
 
 
 def test_short_forms_of_the_command_line():
     assert by_quantity("unit", "q=deg,m,time=ms") == {"q": ("deg", "m"), "time": ("ms",)}
     assert [*by_quantity("force", "imu:l@0,0,1=/imu:acceleration,foot=/w:force")] == ["imu:l@0,0,1", "foot"]
     for flag, signs in (("u=1,-1", {"u": (1.0, -1.0)}), ("1,-1", dict.fromkeys("qvua", (1.0, -1.0)))):
-        assert (
-            parse_arguments(["import", "x.csv", f"--sign={flag}", "--out", "o.h5"])
-            .columns.mapped([], Terminal(json=True))
-            .sign
-            == signs
-        )
+        assert mapped(f"--sign={flag}").sign == signs
 
 
 def test_names_are_guessed_only_where_nothing_else_can_be_meant(tmp_path):

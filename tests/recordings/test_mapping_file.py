@@ -21,10 +21,9 @@ axes:
 """
 
 
-def mapping(path, *words):
-    return parse_arguments(["import", "log.csv", "--mapping", str(path), *words, "--out", "o.h5"]).columns.mapped(
-        [], Terminal(json=True)
-    )
+def mapped(*words):
+    """The mapping of a command line with these words."""
+    return parse_arguments(["import", "log.csv", *words, "--out", "o.h5"]).columns.mapped([], Terminal(json=True))
 
 
 def test_a_file_says_what_options_say_and_flags_come_first(tmp_path):
@@ -32,10 +31,9 @@ def test_a_file_says_what_options_say_and_flags_come_first(tmp_path):
     path.write_text(TEXT)
     words = ["--side-by-side", "--step", "0.0002", "--joints", "one,two", "--u", "32 * a,0", "--headerless", "2,2"]
     words += ["--q", "0.031 * `pos:Joint 1`,0.02 * `pos:Joint 2` - pi/2", "--unit", "time=ms,q=deg", "--sign=u=1,-1"]
-    by_flags = parse_arguments(["import", "log.csv", *words, "--out", "o.h5"]).columns.mapped([], Terminal(json=True))
-    assert mapping(path) == by_flags
-    assert mapping(path, "--u", "b,c").u == ("b", "c")
-    assert mapping(path, "--u", "b,c").q == by_flags.q
+    by_flags, changed = mapped(*words), mapped("--mapping", str(path), "--u", "b,c")
+    assert mapped("--mapping", str(path)) == by_flags
+    assert (changed.u, changed.q) == (("b", "c"), by_flags.q)
 
 
 @pytest.mark.parametrize(
@@ -60,10 +58,11 @@ def test_wrong_values_name_the_file(tmp_path):
     path = tmp_path / "columns.yaml"
     path.write_text("step: -1")
     with pytest.raises(InvalidInput, match=r"columns\.yaml and the flags: step is -1"):
-        mapping(path)
+        mapped("--mapping", str(path))
     for text, step in (("2", 2.0), ("1e-3", 0.001)):
         path.write_text(f"step: {text}\nned: true")
-        assert (mapping(path).step, mapping(path).ned) == (step, True)
+        found = mapped("--mapping", str(path))
+        assert (found.step, found.ned) == (step, True)
 
 
 def test_the_file_beside_a_log_is_found(tmp_path):

@@ -18,7 +18,6 @@ from forcegp.simulation import QuadrotorConfig, QuadrupedConfig, simulate_quadro
 
 FLIP = np.array([1.0, -1.0, -1.0])  # north, east, down -> north, west, up: half a turn about x
 PLAIN = ColumnMapping(time="time", q=("q{0..6}",), v=("v{0..5}",), u=("u{0..3}",), a=("a{0..5}",))
-RPM = 30.0 / np.pi
 
 
 def model_of(dataset: Dataset) -> Model:
@@ -94,15 +93,14 @@ def north_east_down(flight):
     S = np.diag(FLIP)
     R = Rotation.from_matrix(S @ turn(flight).as_matrix() @ S).as_quat()
     q = np.hstack([flight.q[:, :3] * FLIP, np.roll(R, 1, axis=1)])
-    force = classical(flight, pin.LOCAL) - turn(flight).inv().apply([0.0, 0.0, -9.81])
-    v, a = np.tile(FLIP, 2) * flight.v, np.hstack([force, flight.a[:, 3:]]) * np.tile(FLIP, 2)
+    v, a = np.tile(FLIP, 2) * flight.v, accelerometer(flight)[0]["a"] * np.tile(FLIP, 2)
     v[:, :3] = Rotation.from_matrix(S @ turn(flight).as_matrix() @ S).apply(v[:, :3])
     axes = {"v": ("world", "body"), "a": ("imu",)}
     return {"q": q, "v": v, "a": a}, {"orientation": "wxyz", "ned": True, "axes": axes}
 
 
 def rotors_per_minute(flight):
-    return {"u": RPM * flight.u}, {"unit": {"u": ("rpm",)}}
+    return {"u": 30.0 / np.pi * flight.u}, {"unit": {"u": ("rpm",)}}
 
 
 CONVENTIONS = (

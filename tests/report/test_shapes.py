@@ -16,9 +16,8 @@ def drawn(tmp_path, **visuals):
     """The shapes of the arm whose links have these visual elements, and the doubts."""
     text = URDF
     for link, (geometry, xyz, rpy) in visuals.items():
-        text = text.replace(
-            f'<link name="{link}">', f'<link name="{link}">{VISUAL.format(geometry=geometry, xyz=xyz, rpy=rpy)}'
-        )
+        start = f'<link name="{link}">'
+        text = text.replace(start, start + VISUAL.format(geometry=geometry, xyz=xyz, rpy=rpy))
     path = tmp_path / "robots" / "arm.urdf"
     path.parent.mkdir(exist_ok=True)
     path.write_text(text)

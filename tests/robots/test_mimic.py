@@ -16,7 +16,6 @@ TREE_MIMICS = {
     "second_finger": ("left_gripper", -1.0, 0.01), "left_gripper": ("right_wrist", 0.3, -0.05),
 }  # fmt: skip
 CHAIN_MIMICS = {"slide": ("tilt", 0.4, 0.1)}
-COUNT = 5
 
 
 def with_mimics(text: str, mimics: dict[str, tuple[str, float, float]]) -> str:
@@ -79,7 +78,7 @@ CASES = {
 def case(request):
     text, mimics, options = CASES[request.param]
     robot = Robot.from_urdf_text(with_mimics(text, mimics), **options)
-    return robot, Projected(text, mimics, robot), *np.random.default_rng(3).normal(size=(3, COUNT, robot.nv))
+    return robot, Projected(text, mimics, robot), *np.random.default_rng(3).normal(size=(3, 5, robot.nv))
 
 
 def close(ours, theirs):

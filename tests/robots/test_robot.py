@@ -146,8 +146,7 @@ def test_singular_mass_matrix_is_an_error():
     body = """<robot name="r"><link name="a"/><link name="b"><inertial><mass value="1"/>
       <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
       <joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint></robot>"""
-    one, nowhere = torch.ones(2, 1, dtype=torch.float64)
-    nowhere = nowhere * torch.nan
+    one, nowhere = torch.tensor([[1.0], [torch.nan]], dtype=torch.float64)
     with pytest.raises(NumericalError, match=r"mass matrix is not positive definite.*armature"):
         Robot.from_urdf_text(body).forward_dynamics(nowhere, one, one)
 

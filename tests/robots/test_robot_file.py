@@ -117,18 +117,13 @@ URDF = """<robot name="one"><link name="base"/>
 BROKEN = URDF.format(mass=1.0, ixx=0.04)
 
 
-def symmetric(seed: int) -> np.ndarray:
-    root = np.random.default_rng(seed).normal(size=(3, 3))
-    return root + root.T
-
-
 @given(st.integers(0, 10_000))
 def test_the_nearest_is_possible_and_no_possible_one_is_nearer(seed):
-    inertia = symmetric(seed) + np.eye(3)
+    half, root = (np.random.default_rng(each).normal(size=(3, 3)) for each in (seed, seed + 1))
+    inertia = half + half.T + np.eye(3)
     nearest = nearest_inertia(inertia)
     assert physical_objection(1.0, np.zeros(3), nearest) is None
     # the optimality condition of a projection onto a convex set, whatever the axes of the other point
-    root = np.random.default_rng(seed + 1).normal(size=(3, 3))
     before, after = (0.5 * np.trace(x) * np.eye(3) - x for x in (inertia, nearest))
     least = MARGIN * np.maximum(np.linalg.eigvalsh(before), 0.0).sum()
     assert np.linalg.eigvalsh(after)[0] > (1.0 - 1e-9) * least
@@ -179,9 +174,8 @@ def test_written_files_have_the_limits_without_which_others_refuse_them(tmp_path
     again = Robot.from_urdf(tmp_path / "r.urdf")
     assert model.upperPositionLimit.tolist() == [LARGEST, 2.0, LARGEST]
     for one, other in zip(robot.joints, again.joints, strict=True):
-        assert all(
-            getattr(one, name) == getattr(other, name) for name in ("lower", "upper", "velocity_limit", "effort_limit")
-        )
+        limits, written = ((x.lower, x.upper, x.velocity_limit, x.effort_limit) for x in (one, other))
+        assert limits == written
     assert again.joints[0].effort_limit == math.inf
     assert again.joints[2].effort_limit == 5.0
 

@@ -14,7 +14,7 @@ from forcegp.simulation.trajectory import (
     table_of,
 )
 
-START = np.array([0.0, 0.5, 0.1])
+MIDDLE = np.array([0.0, 0.5, 0.055])
 
 
 def one_segment(length: float, duration: float, acceleration: float) -> SegmentPath:
@@ -41,10 +41,6 @@ def test_it_rests_before_after_and_on_a_segment_without_length():
     assert not acceleration.any()
 
 
-KINDS = ("plane", "tilted")
-MIDDLE = np.array([0.0, 0.5, 0.055])
-
-
 def test_the_tilted_plane_falls_towards_positive_x_by_its_angle():
     config = KukaSurfaceConfig(surface="tilted")
     np.testing.assert_allclose(slope_of(config), [-np.tan(np.deg2rad(10)), 0.0])
@@ -53,7 +49,7 @@ def test_the_tilted_plane_falls_towards_positive_x_by_its_angle():
     np.testing.assert_allclose(table_of(config).value(torch.from_numpy(points)), 0.0, atol=1e-13)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["plane", "tilted"])
 def test_velocity_and_acceleration_of_the_bent_path_are_derivatives(kind):
     config, start = KukaSurfaceConfig(surface=kind), np.array([0.1, 0.5, 0.3])
     flat = random_path(config, start, 4.0, np.random.default_rng(3))
