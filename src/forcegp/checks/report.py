@@ -219,7 +219,7 @@ def excitation_doubts(inputs: CheckInput) -> Iterator[Doubt]:
     yield from _held(inputs, still)
     moves, count = in_motion(inputs.prepared), len(inputs.prepared)
     for name, own in zip(inputs.names, map(np.flatnonzero, moves.T), strict=True):
-        if name not in still and own[-1] - own[0] < BRIEF * count:
+        if name not in still and len(own) and own[-1] - own[0] < BRIEF * count:
             begin, end = inputs.prepared.time[own[[0, -1]]].tolist()
             what = (
                 f"{name} moves only from {begin:.1f} to {end:.1f} s: no other time tells whether its friction is right."
