@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from tests.robots.robot_models import with_link
 
 from forcegp.checks import CheckReport, check, quick_check, without_pushes, without_stops
 from forcegp.checks.residuals import pushed_where_they_are
-from forcegp.checks.search import UNKNOWN, moving
+from forcegp.checks.search import UNKNOWN, _stop, moving
 from forcegp.checks.torques import with_gravity
 from forcegp.data import Dataset, Preparation
 from forcegp.doubts import look
@@ -199,6 +200,15 @@ def test_the_seconds_of_a_push_are_named_and_left_out():
     for end, episodes in ((9.0, 2), (10.5, 1)):  # with 3 s and 1.5 s of the log behind it
         found = [look(about="push", what="", numbers={"seconds": [4.0, end]})]
         assert len(without_pushes(touched, found).episodes) == episodes
+
+
+@pytest.mark.parametrize(("wide", "stops"), [(0.009, True), (0.015, False)])
+def test_a_stop_is_a_hundredth_of_the_motion(wide, stops):
+    rng, log = np.random.default_rng(0), clean(4, seconds=12.0)
+    q, tau = rng.uniform(size=log.q.shape), rng.normal(size=log.u.shape)
+    pushed = replace(log, q=q, u=tau + 50.0 * rng.uniform(0.5, 1.0, tau.shape) * (q > 1.0 - wide))
+    held = SimpleNamespace(rows=pushed, tau=tau, friction=np.zeros((*tau.shape, 1)))
+    assert (_stop(SimpleNamespace(log=held), 0) is not None) == stops
 
 
 @pytest.mark.parametrize("stops", [True, False])

@@ -367,7 +367,8 @@ def joint_forces_given(
 
     def given(prior: Gaussian, across: Tensor) -> Gaussian:
         gain = torch.linalg.solve(V, across.mT).mT
-        covariance: Tensor = prior.covariance - gain @ across.mT  # type: ignore[operator]  # `predict` computes it
+        assert prior.covariance is not None, "as above"
+        covariance = prior.covariance - gain @ across.mT
         return Gaussian(prior.mean + (gain @ missed[..., None])[..., 0], 0.5 * (covariance + covariance.mT))
 
     assert learned.covariance is not None, "as above"
