@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from tests.checks.logs import column, exchanged
+from tests.robots.robot_models import loaded
 
 from forcegp.checks import CheckReport, quick_check
 from forcegp.data import Dataset
@@ -202,6 +203,23 @@ def held(x: np.ndarray) -> np.ndarray:
     return np.where((rows > start) & (rows < stop), x[start], x)
 
 
+def mixed(data: Dataset, weights: list[list[float]], signals: str) -> Dataset:
+    """Positions of drives, which are these sums of joints, or torques alone; power is that of the joints."""
+    of = np.array(weights)
+    u = np.linalg.inv(of).T if "q" in signals else of
+    return replace(data, **{name: getattr(data, name) @ (u if name == "u" else of).T for name in signals})
+
+
+def gripped(data: Dataset, begin: float) -> Dataset:
+    """A load of .6 kg on the last link from some time on."""
+    assert data.model is not None
+    needed = [
+        robot.inverse_dynamics(*(torch.tensor(x) for x in (data.q, data.v, data.a))).numpy()
+        for robot in (data.model.robot, loaded(data.model.robot, "link2", mass=0.2))
+    ]
+    return replace(data, u=data.u + np.where(data.time[:, None] >= begin, needed[1] - needed[0], 0.0))
+
+
 def moved(data: Dataset, by: tuple[float, float, float]) -> Dataset:
     """With every contact point elsewhere on its link."""
     assert data.model is not None
@@ -261,6 +279,10 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "time in ms": (lambda d: replace(d, time=1000 * d.time), "velocity|acceleration|sampling"),
     "gear ratio of 1.6": (lambda d: at(d, "qva", [1.0, 0.625]), "gear ratio"),
     "gear ratio of 1.4, of torques too": (lambda d: at(at(d, "qva", [1.0, 1 / 1.4]), "u", [1.0, 1.4]), "gear ratio"),
+    "parallelogram": (lambda d: mixed(d, [[1.0, 0.0], [1.0, 1.0]], "qvau"), "coupled joints"),
+    "a load from 2.6 s on": (lambda d: gripped(d, 2.6), "load"),
+    "parallelogram, turned": (lambda d: mixed(d, [[1.0, 0.0], [-1.0, 1.0]], "qvau"), "coupled joints"),
+    "differential": (lambda d: mixed(d, [[0.5, 0.5], [-0.5, 0.5]], "u"), "coupled joints"),
 }
 
 

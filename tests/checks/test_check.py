@@ -194,9 +194,11 @@ def test_the_seconds_of_a_push_are_named_and_left_out():
     doubts = check(touched).doubts
     [push] = doubts.of("push")
     assert push.joints == ("pan", "lift")
-    assert push.numbers["seconds"] == pytest.approx([4.0, 6.0], abs=0.4)
+    begin, end = push.numbers["seconds"]
+    assert 3.8 < begin < 4.0
+    assert 6.0 < end < 6.2
     kept = without_pushes(touched, doubts)
-    assert (len(kept.episodes), round(len(kept), -2)) == (2, 2000)
+    assert (len(kept.episodes), round(len(kept), -2)) == (2, 1900)
     for end, episodes in ((9.0, 2), (10.5, 1)):  # with 3 s and 1.5 s of the log behind it
         found = [look(about="push", what="", numbers={"seconds": [4.0, end]})]
         assert len(without_pushes(touched, found).episodes) == episodes

@@ -4,7 +4,7 @@ Causes of the torques alone (signs, factors) are found joint by joint in `search
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import combinations, permutations, product
 from typing import Any
 
@@ -13,64 +13,28 @@ import torch
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
+from forcegp.checks.causes import NUMBER, SIGN, Candidate, Cause, changed, number
 from forcegp.checks.check_input import DEGREE, CheckInput
+from forcegp.checks.couplings import coupled_joints
 from forcegp.checks.torques import Change, Comparison, needed_torques, solved, with_gravity
 from forcegp.data import Dataset
-from forcegp.doubts import Level, listed
+from forcegp.doubts import listed
 from forcegp.fit.payloads import with_length
-from forcegp.model import Model
 from forcegp.robots import Robot
 
-SIGN, NUMBER = 0.5, 1.0
-"""What a turned sign, or a free number, must gain at least: it is subtracted from the logarithm of what remains."""
 MOST_ORDERS = 24  # of legs
 SCANNED = 3  # best of the numbers that are scanned, which are looked at in full
 TILTED = np.deg2rad(6.0)  # angle from which a direction of gravity is another
 HEAVIEST = 1.3  # times the assumed gravity, beyond which it is something else
 FACTORS = np.exp(np.linspace(-2.5, 2.5, 251))  # of lengths, its ends left out
 RATIOS = np.exp(np.linspace(-1.2, 1.2, 25))  # of gears: the steps are then divided by ten
+PARTS = 16  # of the log, at whose ends a load is sought that is not held all the time; then as many of a part
 MOST_ENDS = 4  # links that may hold something beside a tilt
 ALL_TRIED = 8  # joints up to which every pair is exchanged; of more, those that fit badly
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Cause:
-    """One cause, as its doubt will say it. `number` tells causes that only fit exactly from mistakes of a kind."""
-
-    about: str
-    what: str
-    do: str = ""
-    joints: tuple[int, ...] = ()
-    numbers: dict[str, Any] = field(default_factory=dict)
-    correction: dict[str, Any] = field(default_factory=dict)
-    cost: float = NUMBER
-    number: bool = False
-    level: Level = "wrong"
-
-
-Candidate = tuple[Cause, Comparison]
-URDF = "Correct the URDF; or let forcegp fit --forces bodies estimate it from this log."
-
-
 ASIDE = np.deg2rad(20.0)  # of gravity: up to which a force is that of a payload
 PULLED = "Take it off, or have it estimated beside masses, by forcegp fit --forces pull, as forcegp auto does."
-
-
-def number(about: str, what: str, joint: int, value: float, cost: float = NUMBER, **more: Any) -> Cause:
-    """A number of the robot that is another."""
-    told = {"do": URDF, "joints": (joint,), "numbers": {"value": value}, "level": "look"} | more
-    return Cause(about=about, what=what, cost=cost, number=True, **told)
-
-
-def changed(signals: str = "", order: np.ndarray | None = None, factor: np.ndarray | float = 1.0) -> Change:
-    """Signals of every joint from another column, times a factor; without forces, truth and metadata."""
-
-    def change(dataset: Dataset) -> Dataset:
-        places = np.arange(dataset.nv) if order is None else order
-        columns = {name: getattr(dataset, name)[:, places] * factor for name in signals}
-        return replace(dataset, **columns, model=Model(dataset.model.robot), noise_std=None, truth={}, metadata={})
-
-    return change
 
 
 def candidates(
@@ -87,6 +51,7 @@ def candidates(
         if first or now.rows.nv <= ALL_TRIED:
             yield from _orders(now, inputs, alive)
             yield from _motions(now, inputs, bad & alive)
+            yield from coupled_joints(now, inputs, bad & alive)
         yield from _scanned(now, inputs)
     yield from _linear(now, inputs)
 
@@ -337,16 +302,20 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         J = robot.tree.inertias[body, :, :, 0]
         size = float(J[3, 3])
         if body in ends:
-            unit, columns = size or 1.0, of_load(body)
-            held = solved(now, columns)
-            if held is not None and held[0] > 0.0:
-                offset = np.linalg.inv(layout.child_frames[body])
+            unit, columns, offset = size or 1.0, of_load(body), np.linalg.inv(layout.child_frames[body])
+            always = ": it holds something", columns, 2.5 * NUMBER, {}
+            for when, part, cost, told in (always, *_parts(now, inputs, columns)):
+                held = solved(now, part)
+                if held is None or held[0] <= 0.0:
+                    continue
                 center = offset[:3, :3] @ held[1:] / held[0] + offset[:3, 3]
                 at = ", ".join(f"{1e3 * x:.3g}" for x in center)
-                text = f"the torques fit {unit * held[0]:.3g} kg more at ({at}) mm of {joint.child}: it holds something"
+                text = f"the torques fit {unit * held[0]:.3g} kg more at ({at}) mm of {joint.child}{when}"
                 numbers = {"mass": unit * float(held[0]), "center_of_mass": center.tolist()}
-                cause = number("payload", text, drive.joint, 0.0, 2.5 * NUMBER, numbers=numbers)
-                yield cause, replace(now, more=now.more + columns @ held)
+                if told:
+                    numbers["seconds"] = list(told.pop("seconds"))
+                cause = number("load" if told else "payload", text, drive.joint, 0.0, cost, numbers=numbers, **told)
+                yield cause, replace(now, more=now.more + part @ held)
         if size <= 0.0:
             continue
         center = J[:, 3] / size
@@ -388,6 +357,32 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
             do = "Describe it as `spring` (forcegp fit --forces spring estimates it)."
             cause = number("spring", text, joint, float(found[0]), NUMBER + 0.2, do=do)
             yield cause, replace(now, more=now.more + found[0] * only)
+
+
+def _parts(
+    now: Comparison, inputs: CheckInput, columns: Float[np.ndarray, "rows nv k"]
+) -> Iterator[tuple[str, Float[np.ndarray, "rows nv k"], float, dict[str, Any]]]:
+    """What a load needs that is held up to a time or from it on, where that leaves least."""
+    share, tried = (now.rows.time - now.rows.time[0]) / np.ptp(now.rows.time), list[tuple[float, float, bool]]()
+    if len(now.rows.episodes) > 1 or not inputs.log.time_ordered:
+        return
+    for middle, width in ((0.5, 1.0), (np.nan, 2.0 / PARTS)):
+        middle = min(tried)[1] if tried else middle
+        for at in middle + width * (np.arange(1, PARTS) / PARTS - 0.5):
+            for later in (False, True):
+                part = ((share >= at) == later)[:, None, None] * columns
+                if (found := solved(now, part)) is not None and found[0] > 0.0:
+                    left = _left_of(now, np.stack([now.rows.u, now.tau + part @ found]), np.ones((1, 1)))
+                    tried.append((float(left[0]), float(at), later))
+        if not tried:
+            return
+    _, at, later = min(tried)
+    begin, end = inputs.log.time[[0, -1]].tolist()
+    time, unsure = begin + at * (end - begin), (end - begin) / PARTS**2
+    short = (time - unsure, end) if at > 0.5 else (begin, time + unsure)
+    do = "Leave the shorter part out by forcegp import --without {:.2f},{:.2f}, as forcegp auto does.".format(*short)
+    when = f" from {time:.4g} s on: it takes up a load" if later else f" until {time:.4g} s: it lets go of a load"
+    yield when, ((share >= at) == later)[:, None, None] * columns, 3.0 * NUMBER, {"do": do, "seconds": short}
 
 
 def _gravities(

@@ -5,9 +5,9 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from forcegp.checks.explanations import NUMBER, SIGN, Cause, changed
+from forcegp.checks.causes import NUMBER, SIGN, Cause, changed
 from forcegp.checks.torques import LEAST, Comparison, in_motion, positive_fit, positive_solution
 
 NOISE = 3.0  # how much of the power of the noise is left to every explanation
@@ -180,8 +180,10 @@ class Explanation:
         """What is left of each torque by a robot with any masses and friction."""
         return self.left_beside(np.ones((*self.log.rows.q.shape, 1)))
 
-    def left_beside(self, more: Float[np.ndarray, "rows nv k"]) -> Float[np.ndarray, "rows nv"]:
-        """The same with these columns of each joint, too."""
+    def left_beside(
+        self, more: Float[np.ndarray, "rows nv k"], told: Bool[np.ndarray, " rows"] | None = None
+    ) -> Float[np.ndarray, "rows nv"]:
+        """The same with these columns of each joint, too, whose numbers the rows `told` tell."""
         rows, robot = self.log.rows, self.log.robot
         q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
         with torch.no_grad():
@@ -190,9 +192,9 @@ class Explanation:
         for k, u in enumerate(rows.u.T):
             columns = np.c_[regressor[:, k], self.log.friction[:, k], np.ones(len(u)), more[:, k]]
             size = np.linalg.norm(columns, axis=0)
-            basis, values, _ = np.linalg.svd(columns[:, size > 0.0] / size[size > 0.0], full_matrices=False)
-            basis = basis[:, values > 1e-8 * values[0]]
-            left.append(u - basis @ (basis.T @ u))
+            columns = columns[:, size > 0.0] / size[size > 0.0]
+            own = slice(None) if told is None else told
+            left.append(u - columns @ np.linalg.lstsq(columns[own], u[own], rcond=1e-8)[0])
         return np.stack(left, axis=1)
 
     @property

@@ -28,7 +28,7 @@ from forcegp.summary import Summary, plain
 
 BEFORE_A_FIT = frozenset(
     ("contact", "velocity", "acceleration", "delay", "torque unit", "torque constant", "masses", "lengths",
-     "joint zero", "gear ratio", "gravity", "stop")
+     "joint zero", "gear ratio", "gravity", "stop", "load")
 )  # fmt: skip
 """Subjects that a fit reports also where a person should judge."""
 

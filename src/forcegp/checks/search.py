@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from forcegp.checks.causes import SIGN, changed
 from forcegp.checks.check_input import CheckInput
-from forcegp.checks.explanations import SIGN, UNITS, candidates, changed
+from forcegp.checks.explanations import UNITS, candidates
 from forcegp.checks.fits import EXPLAINED, FAR, FEWEST_ROWS, MUCH_MORE, NOISE, RESTS, WORSE, Explanation
 from forcegp.checks.residuals import left_by_positions
 from forcegp.checks.torques import LEAST, WIDTHS, Comparison, in_motion, positive_fit, stretch, torque_noise
@@ -28,6 +29,10 @@ DOUBTFUL = 2e-3  # share above which causes are tried
 HELD = 3.0  # of the dry friction and of what remains in motion, from which on no gear holds the joint
 WIDER = 0.0, 0.02, 0.03, 0.05  # of the log: by which its ends are moved, one after the other
 MOSTLY = 0.75  # share of what is left that sits somewhere
+STILL, PASSES = (
+    0.95,
+    "a contact, or a load",
+)  # share of rows from which on a joint stands still; what else comes and goes
 AT_END = 0.01  # of a joint's motion, within which a stop holds it
 
 
@@ -201,8 +206,12 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     numbers: dict[str, object] = {"unexplained": root.rough[bad].tolist(), "rows": len(rows)}
     do = "Look at these joints there: contacts, brakes, cables, another robot, or a channel that is not a torque."
     if left <= EXPLAINED:
-        where += f", and elsewhere at most {100.0 * left:.2g} % stays: a contact, or a load, in these seconds"
-        numbers["seconds"] = [float(x) for x in seconds.split(",")]
+        ends = [float(x) for x in seconds.split(",")]
+        steps = np.diff(inputs.log.q[(inputs.log.time >= ends[0]) & (inputs.log.time <= ends[1])], axis=0)
+        still = inputs.named([k for k in bad if (steps[:, k] == 0.0).mean() > STILL])
+        why = f"the position of {listed(still)} stands still, as of a dead encoder or a brake" if still else PASSES
+        where += f", and elsewhere at most {100.0 * left:.2g} % stays: {why}, in these seconds"
+        numbers |= {"seconds": ends, **({"stands": still} if still else {})}
         do = f"Leave them out by forcegp import --without {seconds}, as forcegp auto does."
     elif stops := {k: end for k in bad.tolist() if (end := _stop(root, k)) is not None}:
         units = inputs.unit_of_each("q")

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
-from forcegp.checks.fits import RARELY
+from forcegp.checks.fits import EXPLAINED, RARELY
 from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, UNKNOWN, Explanation
 from forcegp.checks.torques import WIDTHS, Comparison, in_motion, stretch, with_gravity
 from forcegp.data import Dataset, estimate_delay, with_strokes
@@ -31,12 +31,31 @@ MOST_ROWS = 2000  # on which that is judged
 STIFFNESS = 50.0, 200.0, 800.0  # of what friction remembers, over the reciprocal deviation of positions
 SURE, TELLS = 200.0, 30.0  # nats that a stretch of time in which something is touched explains: in all, and of a joint
 SEEN, WARMER = 1e-3, 0.1  # share of the largest direction of columns; logarithm of a ratio of friction that is told
+ROUNDS = 2  # in which a push is sought anew, by what the other rows tell
 RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
 
 
 def torque_doubts(inputs: CheckInput, found: Explanation) -> list[Doubt]:
     """Friction that drifts, and delay, of a log whose errors were corrected."""
-    return [*_drift(found, inputs), *_delays(inputs, found.log)]
+    return [*_offsets(found, inputs), *_drift(found, inputs), *_delays(inputs, found.log)]
+
+
+def _offsets(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
+    """Sliding joints whose mean force is not that of their weight, beyond dry friction."""
+    rows, tau = found.log.rows, found.log.tau
+    for joint in np.flatnonzero(~inputs.rotates & (np.ptp(rows.u, axis=0) > 0.0) & (found.rough <= EXPLAINED)):
+        weight, missing = float(tau[:, joint].mean()), float((rows.u - tau)[:, joint].mean())
+        spread = float((rows.u - tau)[:, joint].std())  # of dry friction, that of both directions
+        if abs(missing) > max(spread, MUCH * abs(weight)):
+            name = inputs.names[joint]
+            yield look(
+                about="offset",
+                what=f"the force of {name} is {missing:+.3g} N from that of its weight all the time: a gas spring or a "
+                "counterweight carries it, or the sensor is off, or masses are wrong.",
+                do="Give the robot's file the mass that is left, or subtract it from the column of u.",
+                joints=(name,),
+                numbers={"offset": missing, "weight": weight},
+            )
 
 
 def _drift(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
@@ -187,24 +206,30 @@ def _delays(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
 
 def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     """A stretch of time in which several torques are far from any robot of these lengths, unlike before and after."""
-    rows, ones = found.log.rows, np.ones((len(found.log.rows), 1))
+    rows, place = found.log.rows, np.arange(len(found.log.rows))
+    ones, more = np.ones((len(rows), 1)), np.ones((*rows.q.shape, 1))
     if len(rows) < FEWEST_ROWS:
         return
     for again in (False, True):  # beside friction that remembers, which looks like a push where a joint hardly moves
-        left = found.left_beside(_remembered(found, inputs)) if again else found.of_any_masses
+        more = _remembered(found, inputs) if again else more
+        left = found.left_beside(more)
         alive = [np.hstack([ones, -ones, x[:, None]]) for x in left.T if x.any()]
         if not alive:
             return
         _, _, first, last = max(map(stretch, alive))
-        inside = np.isin(np.arange(len(rows)), np.arange(first, last))
+        inside = (place >= first) & (place < last)
         power = [np.square(left[each]).mean(0) + 1e-300 for each in (inside, ~inside, slice(None))]
         told = inside.sum() * np.log(power[2] / power[0]) + (~inside).sum() * np.log(power[2] / power[1])
         gains = told * (power[0] > power[1])
         joints, smeared = np.flatnonzero(gains > TELLS / (1 + again)), 2.0 / inputs.compared_cutoff
-        begin, end = rows.time[first] - smeared, rows.time[last - 1] + smeared
-        lasts = end - begin > 2.5 * smeared  # longer than a period of the cut-off, unlike what a filter makes of a turn
+        lasts = rows.time[last - 1] - rows.time[first] > 0.5 * smeared  # longer than what a filter makes of a turn
         if not (gains.sum() > SURE / (1 + again) and len(joints) > 1 and lasts and first > 0 and last < len(rows)):
             return
+    for _ in range(ROUNDS):  # what is touched tells no masses, and hides behind those that fit it as well
+        left = found.left_beside(more, (place < first) | (place >= last))[:, joints]
+        *_, begin, end = max(stretch(np.hstack([ones, -ones, x[:, None]])) for x in left.T)
+        first, last = min(first, begin), max(last, end)
+    begin, end = rows.time[first] - smeared, rows.time[last - 1] + smeared
     times = np.sqrt(power[0] / power[1])[joints].max()
     yield look(
         about="push",
@@ -316,8 +341,8 @@ SHORT = 2.0  # s, of what stays between pushes: up to which filters and splits h
 
 
 def without_pushes(log: Dataset, doubts: Sequence[Doubt]) -> Dataset:
-    """The log without the seconds in which something is touched; of several episodes, whose times repeat, as it is."""
-    seen = [doubt for doubt in doubts if doubt.about in ("push", UNKNOWN) and "seconds" in doubt.numbers]
+    """The log without the seconds of pushes and loads; of several episodes, whose times repeat, as it is."""
+    seen = [doubt for doubt in doubts if doubt.about in ("push", "load", UNKNOWN) and "seconds" in doubt.numbers]
     spans = [doubt.numbers["seconds"] for doubt in seen if len(log.episodes) == 1]
     touched = [np.flatnonzero((log.time >= begin) & (log.time <= end)) for begin, end in spans]
     if not touched:

@@ -28,7 +28,7 @@ def short_name(name: str) -> str:
 FIRST = {"unknown cause", "joint zero", "gear ratio", "torque constant", "torque unit", "force sensor", "lengths"}
 """Subjects of doubts that change all that follows."""
 TOLD = FIRST | {"stop", "push", "spring", "drift", "elastic joint", "velocity", "sensor delay", "torque sensor", "imu"}
-TOLD |= {"constant channel", "pull"}
+TOLD |= {"constant channel", "pull", "load", "offset"}
 """Those that the answer repeats, and what is wrong but accepted; of what is right only what a force sensor carries."""
 
 
@@ -142,7 +142,8 @@ def seen_in(doubts: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     told = (x for x in doubts if x["about"] in TOLD and (x["level"] != "ok" or x["about"] == "force sensor"))
     for x in (*told, *(x for x in doubts if x["level"] == "wrong" and x["about"] not in {*TOLD, "delay"})):
         passes = "seconds" in x["numbers"] and x["about"] in FIRST
-        about = "push" if passes else "sensor" if x["level"] == "ok" else x["about"]
+        comes = "stop" if "stands" in x["numbers"] else "push"
+        about = comes if passes else "sensor" if x["level"] == "ok" else x["about"]
         seen[about] = f"{seen.get(about, '')} {x['what']} {x['do']}".strip()
     return seen
 

@@ -192,7 +192,8 @@ class ColumnMapping:
         """The mapping after a correction that `forcegp.check` found, whose entries are in the order of `joints`.
 
         Units, orientation and axes replace what was stated, signs multiply it, and an order (joint k has the column of
-        joint order[k]) needs the `columns` of every signal, as `import_recordings` returns them.
+        joint order[k]) or a mix (joint k has the sum of all with the weights mix[k]) needs the `columns` of every
+        signal, as `import_recordings` returns them.
         """
         places = [joints.index(name) for name in self.joints or joints]
 
@@ -215,6 +216,11 @@ class ColumnMapping:
         for signal, order in correction.get("order", {}).items():
             if signal in columns:
                 changes[signal] = tuple(columns[signal][order[place]] for place in places)
+        for signal, mix in correction.get("mix", {}).items():
+            turned = dict(zip(places, (sign.get(signal, (1.0,)) * len(places))[: len(places)], strict=True))
+            if signal in columns:
+                rows = ([turned[k] * turned[m] * w for m, w in enumerate(mix[k])] for k in places)
+                changes[signal] = tuple(_weighted(columns[signal], row) for row in rows)
         return replace(self, **changes)
 
     def flags(self) -> list[str]:
@@ -230,6 +236,17 @@ class ColumnMapping:
         """What is stated, by name."""
         found = {item.name: getattr(self, item.name) for item in fields(self)}
         return {name: value for name, value in found.items() if value not in (None, (), {}, False)}
+
+
+def _weighted(columns: Sequence[str], weights: Sequence[float]) -> str:
+    """Their sum, as an expression."""
+    some = [(x, w) for x, w in zip(columns, weights, strict=True) if w]
+    if len(some) == 1 and some[0][1] == 1.0:
+        return some[0][0]
+    quoted = [x if re.fullmatch(r"[A-Za-z_]\w*", x) else f"`{x}`" for x, _ in some]
+    factors = [f"{abs(w):g}*" if abs(w) != 1.0 else "" for _, w in some]
+    signs = ["-" if w < 0.0 else "+" for _, w in some]
+    return "".join(map("".join, zip(signs, factors, quoted, strict=True))).lstrip("+")
 
 
 def by_quantity(flag: str, text: str) -> dict[str, tuple[str, ...]]:
@@ -375,6 +392,11 @@ class Expression:
     def is_column(self) -> bool:
         """Is this one column as it is?"""
         return isinstance(self.tree, ast.Name)
+
+    @property
+    def has_numbers(self) -> bool:
+        """Is this more than columns that are added and subtracted, which have their unit?"""
+        return any(isinstance(part, ast.Constant) for part in ast.walk(self.tree))
 
     def __str__(self) -> str:
         return self.text

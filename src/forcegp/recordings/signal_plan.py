@@ -337,7 +337,10 @@ def _signals(
         raise InvalidInput(
             f"{signal} has {len(expressions)} columns for {len(names)} {what} ({', '.join(names) or 'none'}); {remedy}"
         )
-    named = [named_unit(signal, *x.weights, stated=source.units) if x.is_column else None for x in expressions]
+    units = [{named_unit(signal, name, source.units) for name in x.weights} for x in expressions]
+    named = [
+        next(iter(u)) if len(u) == 1 and not x.has_numbers else None for u, x in zip(units, expressions, strict=True)
+    ]
     named = [x or columns[name] or "1" for x, name in zip(named, names, strict=True)]
     given = [log_unit(signal, name) for name in mapping.unit.get(signal, named)]
     signs, driven = mapping.sign.get(signal, (1.0,)), sum(signal != "u" or columns[name] != "1" for name in names)

@@ -1,0 +1,73 @@
+"""Joints that drives turn together: a parallelogram, a belt, a differential, whose log is not of single joints."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from forcegp.checks.causes import NUMBER, Candidate, Cause, changed
+from forcegp.checks.check_input import CheckInput
+from forcegp.checks.torques import Comparison
+from forcegp.data import Dataset
+
+LEAST_SHARE = 0.2  # of the larger weight in a torque, from which on the other joint's is part of it
+STEPS = (0.25, 2.5 * NUMBER), (0.01, 4.5 * NUMBER)  # to which weights are rounded, and what these numbers cost
+PARALLEL = 0.99  # cosine of the angle between the axes of a parallelogram
+EASILY = 20.0  # condition of the weights up to which torques can be told apart again
+
+
+def coupled_joints(now: Comparison, inputs: CheckInput, bad: np.ndarray) -> Iterator[Candidate]:
+    """A joint logged as its own and the one before it, or two torques that drives share; `bad` (nv,) fit badly.
+
+    With p = L q of a log, power is the same where the joints' torques are L' times those logged.
+    """
+    layout, names = now.robot.layout, inputs.names
+    kinematics = now.robot.kinematics(torch.tensor(now.rows.q[:1], device=now.robot.device))
+    for body, parent in ((body, parent) for body, parent in enumerate(layout.parents) if parent >= 0):
+        one, other = layout.drives[parent].joint, layout.drives[body].joint
+        if one == other or not bad[[one, other]].any():
+            continue
+        axes = kinematics.frame_jacobian(layout.bodies[body].child)[0, 3:, [one, other]].cpu().numpy()
+        for sign in (1.0, -1.0) if abs(axes[:, 0] @ axes[:, 1]) > PARALLEL else ():
+            L = np.eye(now.rows.nv)
+            L[other, one] = sign
+            how = "the sum of its own and that" if sign > 0.0 else "its own less that"
+            what = f"the position of {names[other]} is logged as {how} of {names[one]}, as of a parallelogram, or of a "
+            mix = {"q": np.linalg.inv(L), "v": np.linalg.inv(L), "u": L.T}
+            yield _apart(now, f"{what}motor at the base", (one, other), mix, 1.5 * NUMBER)
+        for cost, weights in _weights(now, one, other) if bad[[one, other]].all() else ():
+            each = [f"{x[0]:+.3g} of {names[one]} {x[1]:+.3g} of {names[other]}" for x in weights]
+            what = f"the torques of {names[one]} and {names[other]} are those of drives that turn both joints, "
+            what += f"{each[0]} and {each[1]} of what these need: a differential"
+            U = np.eye(now.rows.nv)
+            U[np.ix_((one, other), (one, other))] = np.linalg.inv(weights)
+            yield _apart(now, what, (one, other), {"u": U}, cost)
+
+
+def _apart(now: Comparison, what: str, joints: tuple[int, int], mix: dict[str, np.ndarray], cost: float) -> Candidate:
+    """The log whose signals are these sums of those of all joints."""
+
+    def change(rows: Dataset) -> Dataset:
+        every = {**mix, "a": mix["v"]} if "v" in mix else mix
+        return replace(changed()(rows), **{name: getattr(rows, name) @ weights.T for name, weights in every.items()})
+
+    do = "Take them apart, as in forcegp import --u 'COLUMN_A + COLUMN_B'."
+    told = {"joints": joints, "correction": {"mix": {name: tuple(x.tolist()) for name, x in mix.items()}}}
+    cause = Cause(about="coupled joints", what=what, do=do, cost=cost, number="q" not in mix, **told)
+    return cause, now.after(change) if "q" in mix else now.with_torques(change)
+
+
+def _weights(now: Comparison, first: int, second: int) -> Iterator[tuple[float, Float[np.ndarray, "2 2"]]]:
+    """Weights of what two joints need in each of their torques, and their cost; none where each has its own."""
+    pair = [first, second]
+    friction = np.concatenate([now.friction[:, k] for k in pair], axis=-1)
+    columns = np.c_[now.tau[:, pair], friction, np.ones(len(friction))]
+    size = np.linalg.norm(columns, axis=0) + 1e-300
+    found = np.linalg.lstsq(columns / size, now.rows.u[:, pair], rcond=1e-9)[0][:2].T / size[:2]
+    for step, cost in STEPS:
+        rounded = step * np.round(found / step)
+        size = np.abs(rounded)
+        if (size.min(axis=1) >= LEAST_SHARE * size.max(axis=1)).any() and np.linalg.cond(rounded) < EASILY:
+            yield cost, rounded
