@@ -283,6 +283,7 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "a load from 2.6 s on": (lambda d: gripped(d, 2.6), "load"),
     "parallelogram, turned": (lambda d: mixed(d, [[1.0, 0.0], [-1.0, 1.0]], "qvau"), "coupled joints"),
     "differential": (lambda d: mixed(d, [[0.5, 0.5], [-0.5, 0.5]], "u"), "coupled joints"),
+    "differential of other gears": (lambda d: mixed(d, [[0.8, 0.3], [-0.3, 0.8]], "u"), "coupled joints"),
 }
 
 

@@ -204,6 +204,15 @@ def test_the_seconds_of_a_push_are_named_and_left_out():
         assert len(without_pushes(touched, found).episodes) == episodes
 
 
+def test_a_joint_that_stands_still_while_its_torque_goes_on_has_a_dead_encoder():
+    log = clean(4, seconds=12.0)
+    q, v, a = (x.copy() for x in (log.q, log.v, log.a))
+    q[1600:, 1], v[1600:, 1], a[1600:, 1] = q[1600, 1], 0.0, 0.0
+    [found] = check(replace(log, q=q, v=v, a=a)).doubts.of("unknown cause")
+    assert "dead encoder" in found.what
+    assert found.numbers["stands"] == ("lift",)
+
+
 @pytest.mark.parametrize(("wide", "stops"), [(0.009, True), (0.015, False)])
 def test_a_stop_is_a_hundredth_of_the_motion(wide, stops):
     rng, log = np.random.default_rng(0), clean(4, seconds=12.0)
