@@ -53,7 +53,14 @@ def _apart(now: Comparison, what: str, joints: tuple[int, int], mix: dict[str, n
         every = {**mix, "a": mix["v"]} if "v" in mix else mix
         return replace(changed()(rows), **{name: getattr(rows, name) @ weights.T for name, weights in every.items()})
 
-    do = "Take them apart, as in forcegp import --u 'COLUMN_A + COLUMN_B'."
+    names = now.robot.joint_names
+    sums = (
+        f"{signal} of {names[k]} is {' '.join(f'{w:+.3g} {names[m]}' for m, w in enumerate(row) if w)}"
+        for signal, weights in mix.items()
+        for k, row in enumerate(weights)
+        if np.count_nonzero(row) > 1
+    )
+    do = f"Import sums of columns, as in forcegp import --u 'COLUMN_A + COLUMN_B', so that {'; '.join(sums)}."
     told = {"joints": joints, "correction": {"mix": {name: tuple(x.tolist()) for name, x in mix.items()}}}
     cause = Cause(about="coupled joints", what=what, do=do, cost=cost, number="q" not in mix, **told)
     return cause, now.after(change) if "q" in mix else now.with_torques(change)

@@ -233,7 +233,8 @@ def _instead(
     explained = 0.5 * change**2 * size  # nats
     k = int(np.argmax(explained))
     more = explained[k] + 0.5 * (r @ r - left @ left + slope @ inner[:, 0])
-    if not none.any() or explained[k] < least or more < max(-CLEARLY_MORE, most - least):
+    enough = max(least, MOSTLY * 0.5 * float(left @ left))  # of what is left without the payload
+    if not none.any() or explained[k] < enough or more < max(-CLEARLY_MORE, most - least):
         return None
     none[free] -= inner[:, 0] + inner[:, 1 + k] * change[k]
     return np.where(np.arange(len(change)) == k, change, 0.0), none
