@@ -13,9 +13,7 @@ from typing_extensions import override
 
 from forcegp.control.tracking import per_joint, usual_integrator
 from forcegp.errors import InvalidInput, require_number, require_type
-from forcegp.posterior import load_posterior
-from forcegp.posterior.posterior import Posterior
-from forcegp.posterior.predictor import Predictor
+from forcegp.posterior import Posterior, Predictor, load_posterior
 from forcegp.robots.arguments import whole_number
 
 LONGEST = 1.0  # s, of a step

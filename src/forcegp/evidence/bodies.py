@@ -18,12 +18,7 @@ from forcegp.errors import NonPhysicalInertia
 from forcegp.forces import Body
 from forcegp.inference import require_memory
 from forcegp.robots import Robot
-from forcegp.robots.inertia import (
-    physical_of_pseudo_inertia,
-    pseudo_inertia,
-    standard_basis,
-    standard_of_pseudo_inertia,
-)
+from forcegp.robots.inertia import physical_of_pseudo_inertia, standard_basis, standard_of_pseudo_inertia
 from forcegp.robots.urdf_file import replace_inertial
 
 
@@ -279,7 +274,7 @@ def with_bodies(robot: Robot, wanted: Mapping[int, Float[np.ndarray, "4 4"]]) ->
         offset = np.linalg.inv(robot.layout.child_frames[body]) @ placement.offset
         there = np.linalg.inv(offset) @ change[body] @ offset
         # a congruence by [[A, t], [0, s]] moves the moments about the centre of mass by A alone: no cancellation
-        own_moments = pseudo_inertia(link.mass, np.zeros(3), link.inertia)[:3, :3]
+        own_moments = 0.5 * np.trace(link.inertia) * np.eye(3) - link.inertia
         A, shift, scale = there[:3, :3], there[:3, 3], there[3, 3]
         center = (A @ link.center_of_mass + shift) / scale
         second = A @ own_moments @ A.T

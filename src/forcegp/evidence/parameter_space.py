@@ -16,8 +16,7 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput
 from forcegp.evidence.bodies import QUANTITIES, Bodies, body_names, body_pseudo_inertias, carrying, with_bodies
-from forcegp.forces import Actuation, Law, LogNormal, Normal, Parameter, Payload, RigidBodies
-from forcegp.forces.force import Body
+from forcegp.forces import Actuation, Body, Law, LogNormal, Normal, Parameter, Payload, RigidBodies
 from forcegp.forces.joint_law import PerJointLaw
 from forcegp.forces.registry import force_name
 from forcegp.mechanics import State

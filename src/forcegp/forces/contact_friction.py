@@ -14,14 +14,7 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput, NumericalWarning, require_type, usable_arguments
 from forcegp.forces.joint_forces import JointFriction, joint_indices
 from forcegp.forces.kernels import checked_kernel
-from forcegp.forces.link_forces import (
-    SMALLEST_SPEED,
-    ToolPoint,
-    contact_axes,
-    nominal_normal_force,
-    require_contact,
-    require_contact_number,
-)
+from forcegp.forces.link_forces import SMALLEST_SPEED, ToolPoint, contact_axes, require_contact, require_contact_number
 from forcegp.forces.unknown import ExpressedKernels, Scaling, UnknownForces
 from forcegp.mechanics import ConstrainedDynamics, Contact
 from forcegp.robots import Robot
@@ -127,6 +120,12 @@ class ExpectedFriction:
                 stacklevel=2,
             )
         return size * free.abs() / growth.clamp_min(SMALLEST_SHARE)
+
+
+def nominal_normal_force(dynamics: ConstrainedDynamics, contact: int) -> Float[Tensor, "*batch"]:
+    """|normal force| in N that the contact would have if the known forces were all: |s_p| |lambda(Q_U = 0)|."""
+    size = torch.linalg.vector_norm(dynamics.normals[..., contact, :], dim=-1)
+    return size * dynamics.multiplier_map().offset[..., contact].abs()
 
 
 @dataclass(frozen=True)

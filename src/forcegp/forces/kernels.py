@@ -8,16 +8,7 @@ from typing import Any
 import torch
 from gpytorch import Module
 from gpytorch.constraints import Interval, Positive
-from gpytorch.kernels import (
-    AdditiveKernel,
-    ConstantKernel,
-    Kernel,
-    LinearKernel,
-    MaternKernel,
-    ProductKernel,
-    RBFKernel,
-    ScaleKernel,
-)
+from gpytorch.kernels import AdditiveKernel, ConstantKernel, Kernel, LinearKernel, MaternKernel, RBFKernel, ScaleKernel
 from gpytorch.priors import NormalPrior
 from torch import Tensor
 from typing_extensions import override
@@ -132,7 +123,7 @@ def friction(dimension: int, variance: float | Tensor) -> AdditiveKernel:
     register_log_normal_prior(change, "outputscale", share, LOG_VARIANCE_SPREAD)
     level = AdditiveKernel(constant(1, share), change)
     viscous = linear(1, share)
-    return AdditiveKernel(ProductKernel(SmoothSignKernel(), level), viscous, BeyondVisitedKernel(level, viscous))
+    return AdditiveKernel(SmoothSignKernel() * level, viscous, BeyondVisitedKernel(level, viscous))
 
 
 class _WidthKernel(Kernel):

@@ -50,12 +50,6 @@ def contact_axes(dynamics: ConstrainedDynamics, contact: int) -> Float[Tensor, "
     return surface_axes(dynamics.normals[..., contact, :])
 
 
-def nominal_normal_force(dynamics: ConstrainedDynamics, contact: int) -> Float[Tensor, "*batch"]:
-    """|normal force| in N that the contact would have if the known forces were all: |s_p| |lambda(Q_U = 0)|."""
-    size = torch.linalg.vector_norm(dynamics.normals[..., contact, :], dim=-1)
-    return size * dynamics.multiplier_map().offset[..., contact].abs()
-
-
 def require_contact_number(force: str, contact: object) -> None:
     """Raise InvalidInput for what cannot be the number of a contact, counted from 0."""
     if isinstance(contact, bool) or not isinstance(contact, int) or contact < 0:

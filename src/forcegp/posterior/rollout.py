@@ -13,17 +13,8 @@ from torch import Tensor
 from forcegp.codegen.library import RowFunction
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
 from forcegp.inference.pathwise import draw_functions
-from forcegp.integration.integrators import (
-    NO_ROOT,
-    Feedback,
-    Integrator,
-    Trajectory,
-    check_start,
-    integrate,
-    rows_jacobian,
-    steps_by,
-    warn_of_divergence,
-)
+from forcegp.integration import Feedback, Integrator, Trajectory, integrate
+from forcegp.integration.integrators import NO_ROOT, check_start, rows_jacobian, steps_by, warn_of_divergence
 from forcegp.model import Model
 from forcegp.posterior.fitted import MotionIntervals
 from forcegp.posterior.prediction import state_tensor
@@ -304,18 +295,11 @@ def stepped(
     return torch.cat([step.q, step.v], dim=-1)
 
 
-def linearized_step(
-    step: Callable[[Tensor, float, str], Tensor],
-    linearize: Callable[[Tensor, Tensor, Tensor], Sequence[Tensor]],
-    model: Model,
-    x: Float[Tensor, "n rows"],
-    dt: Any,
-    integrator: Any,
-) -> StepLinearization:
-    """The same with its derivatives, by the chain rule; of an implicit step by the implicit function theorem.
-
-    `step` gives [q, v] after it from the rows x, `linearize` gives a (n, nv), da/dq, da/dv and da/du (n, nv, nv).
-    """
+def linearized_step(predictor: Any, x: Float[Tensor, "n rows"], dt: Any, integrator: Any) -> StepLinearization:
+    """The step of a `Predictor` with its derivatives, by the chain rule; of an implicit one by implicit functions."""
+    model = predictor.posterior.model
+    if not model.robot.space.is_vector_space:
+        return _on_manifold(predictor.mean, model, x, dt, integrator)
     method, (q, v, u) = steps_by(integrator, model, dt), x.detach().split(model.sizes, dim=-1)
     nv, unit = q.shape[-1], torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
 
@@ -325,13 +309,13 @@ def linearized_step(
 
     def acceleration(at_q: Tensor, at_v: Tensor) -> Tensor:
         at_q, at_v = (part.unflatten(1, (nv, -1)) for part in (at_q, at_v))
-        a, da_dq, da_dv, da_du = linearize(at_q[..., 0], at_v[..., 0], u)
+        a, da_dq, da_dv, da_du = predictor.linearize(at_q[..., 0], at_v[..., 0], u)
         return joined(a, da_dq @ at_q[..., 1:] + da_dv @ at_v[..., 1:] + da_du @ unit[2 * nv :])
 
     start_q, start_v = joined(q, unit[:nv]), joined(v, unit[nv : 2 * nv])
     if integrator == "implicit-midpoint":
-        middle = 0.5 * (v + step(x.detach(), dt, integrator)[:, nv:])
-        _, da_dq, da_dv, da_du = linearize(q + 0.5 * dt * middle, middle, u)
+        middle = 0.5 * (v + predictor.stepped(x.detach(), dt, integrator)[:, nv:])
+        _, da_dq, da_dv, da_du = predictor.linearize(q + 0.5 * dt * middle, middle, u)
         J = unit[:nv, :nv] - 0.5 * dt * (da_dv + 0.5 * dt * da_dq)
         right = torch.cat([0.5 * dt * da_dq, unit[:nv, :nv].expand_as(J), 0.5 * dt * da_du], dim=-1)
         at_middle = joined(middle, torch.linalg.solve(J, right))
@@ -345,7 +329,7 @@ def linearized_step(
     return StepLinearization(q, v, A, B, c)
 
 
-def linearized_on_manifold(
+def _on_manifold(
     mean: AccelerationFunction, model: Model, x: Float[Tensor, "n rows"], dt: Any, integrator: Any
 ) -> StepLinearization:
     """The same where positions do not add up, in steps from q and from the q after it; by backward passes of `mean`."""

@@ -333,11 +333,7 @@ def parquet_arrays(path: Path) -> Arrays:
 ARRAYS: dict[str, Callable[[Path], Arrays]] = {
     ".npz": numpy_arrays,
     ".mat": matlab_arrays,
-    ".h5": hdf5_arrays,
-    ".hdf5": hdf5_arrays,
-    ".parquet": parquet_arrays,
-    ".pq": parquet_arrays,
-    ".json": json_arrays,
-    ".jsonl": json_arrays,
-    ".ndjson": json_arrays,
+    **dict.fromkeys((".h5", ".hdf5"), hdf5_arrays),
+    **dict.fromkeys((".parquet", ".pq"), parquet_arrays),
+    **dict.fromkeys((".json", ".jsonl", ".ndjson"), json_arrays),
 }

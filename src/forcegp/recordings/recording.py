@@ -19,7 +19,7 @@ from forcegp.errors import DatasetError, FileFormatError, MistakenUnit
 from forcegp.recordings.mapping import in_short, log_unit
 from forcegp.recordings.ros_bag import Read, read_on_one_clock
 from forcegp.recordings.signal_plan import Layout, SignalPlan, spans
-from forcegp.recordings.source import MOST_LOST, Columns, Source
+from forcegp.recordings.source import Columns, Source
 from forcegp.robots.manifold import POSITIONS, TURN, ConfigurationSpace
 
 Jumps = tuple[Int[np.ndarray, " jumps"], str, str]
@@ -151,13 +151,13 @@ def _lost(
         lost = np.array(missing[:, there].any(axis=1))
         for name in (*(plan.time.weights if plan.time else ()), *([plan.episode] if plan.episode else ())):
             lost |= ~np.isfinite(columns[name])
-    count, rows = int(lost.sum()), len(values)
-    if skip and count > MOST_LOST * rows:
+    count, rows, most = int(lost.sum()), len(values), Source.MOST_LOST
+    if skip and count > most * rows:
         raise DatasetError(
-            f"{label}: {count} of {rows} rows lack a value, and `bad_rows` skip leaves out {MOST_LOST:.0%} at most. "
+            f"{label}: {count} of {rows} rows lack a value, and `bad_rows` skip leaves out {most:.0%} at most. "
             "Map other columns, or repair the log."
         )
-    return lost if count <= MOST_LOST * rows else np.zeros(rows, bool)  # then the first value that is missing is named
+    return lost if count <= most * rows else np.zeros(rows, bool)  # then the first value that is missing is named
 
 
 def _at_ends(plan: SignalPlan, values: np.ndarray, lost: Bool[np.ndarray, " rows"]) -> list[str]:

@@ -17,7 +17,6 @@ Columns = dict[str, np.ndarray]
 """Columns of equal length by name: float64 (rows,), or int64 where the file holds integers (stamps in nanoseconds)."""
 
 LONGEST_VECTOR = 4096  # columns of a table in one array; wider ones are pictures and the like, not signals of joints
-MOST_LOST = 0.05  # of the rows: a driver loses single messages; what lacks more is another topic, sensor or log
 ELEMENT = re.compile(r"(?P<vector>.*)\[\d+\]$", re.DOTALL)
 LARGEST_EXPANSION = 200
 """Logs of sensors shrink by a factor of 2 to 20, numbers written as text with all digits by 50 at most."""
@@ -35,6 +34,8 @@ class Source(ABC):
     Raises FileFormatError, with the path and what to do, from the constructor or from any method.
     """
 
+    MOST_LOST: ClassVar[float] = 0.05
+    """Of the rows: a driver loses single messages; what lacks more is another topic, sensor or log."""
     lenient = False
     """Whether rows that cannot be read, up to MOST_LOST of them, are left out."""
     units: Mapping[str, str] = MappingProxyType({})

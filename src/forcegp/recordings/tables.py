@@ -21,15 +21,7 @@ from typing_extensions import override
 
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput
 from forcegp.recordings.mapping import UNITS, named_unit
-from forcegp.recordings.source import (
-    MOST_LOST,
-    Columns,
-    Source,
-    arrow_numbers,
-    reading,
-    require_distinct,
-    require_plausible_size,
-)
+from forcegp.recordings.source import Columns, Source, arrow_numbers, reading, require_distinct, require_plausible_size
 
 FIRST_BYTES = 2**16  # what is looked at to detect the header, the delimiter and whether there are comments
 BLOCK = 2**22  # bytes that pyarrow parses at a time; no line may be longer
@@ -243,7 +235,7 @@ class DelimitedText(Source):
                     self._no_numbers.append(found[3])
                     return self._parsed(stored, wanted, kinds, again=True)
                 raise self._told_by_pyarrow(error) from error
-            if len(ragged) > MOST_LOST * (len(table) + len(ragged)):
+            if len(ragged) > self.MOST_LOST * (len(table) + len(ragged)):
                 raise FileFormatError(
                     f"{self.path}: {len(ragged)} lines have other than {len(stored)} fields; repair it."
                 )

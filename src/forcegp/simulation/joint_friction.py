@@ -9,10 +9,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from forcegp.forces.joint_law import JointLaw
-from forcegp.forces.joint_laws import Viscous
-from forcegp.forces.registry import parse_forces
-from forcegp.mechanics.gauss_principle import State
+from forcegp.forces import JointLaw, Viscous, parse_forces
+from forcegp.mechanics import State
 from forcegp.robots import Robot
 
 Numbers = Mapping[str, Any]
