@@ -179,9 +179,7 @@ def write_entry(program: Program, function: str, finish: Mapping[str, tuple[str,
     ]
     place = 0
     for k, size in enumerate(program.inputs.values()):
-        text.append(
-            f"    if (s{k} || i == first) found |= rows_read(a{k} + i * s{k}, s{k}, {size}, live, x + {place});"
-        )
+        text += [f"    if (s{k} || i == first) found |= rows_read(a{k} + i * s{k}, s{k}, {size}, live, x + {place});"]
         place += size
     text.append(f"    {function}(t, live, x, y);")
     place = 0

@@ -33,7 +33,7 @@ PACKAGES = (
 LONGEST = 600.0  # seconds after which a compiler hangs: our longest program takes it a fiftieth of that
 WITHOUT = "or do without it: a robot itself, predictor(compile=False), export_c(unchecked=True)"
 ELSEWHERE = "choose another folder (the environment variable XDG_CACHE_HOME, robot.compile(folder=...))"
-MOST_LANES, STATES_PER_THREAD = 8, 2048  # fewer states are done before another thread has started
+MOST_LANES, PER_THREAD = 8, 2048  # fewer states are done before another thread has started
 NOT_FINITE, NOT_POSITIVE, RESULT_NOT_FINITE = 1, 2, 4  # what a program reports of its states: bits of its return value
 # Lanes and compiler options by the vector unit that torch found.
 VECTOR_UNITS = {"AVX512": (8, ("-mavx512f", "-mavx512dq", "-mavx512vl", "-mfma")), "AVX2": (4, ("-mavx2", "-mfma"))}
@@ -186,9 +186,7 @@ Tensors = Sequence[Tensor]
 class RowFunction:
     """`evaluate` of a library, on flat `tables`: rows of numbers of length `outputs` from rows of so many `inputs`."""
 
-    def __init__(
-        self, library: ctypes.CDLL, inputs: int, outputs: Sequence[int], tables: Sequence[Tensor] = ()
-    ) -> None:
+    def __init__(self, library: ctypes.CDLL, inputs: int, outputs: Sequence[int], tables: Tensors = ()) -> None:
         self.library, self.inputs, self.outputs, self.tables = library, inputs, tuple(outputs), tuple(tables)
         self._tables = (ctypes.c_void_p * max(len(tables), 1))(*(x.data_ptr() for x in tables))
         self._evaluate = library.evaluate
@@ -201,9 +199,7 @@ class RowFunction:
         given = [argument for x in (*inputs, *made) for argument in (x.data_ptr(), 1)]
         return self._evaluate(0, 1, self._tables, *given), made
 
-    def rows(
-        self, inputs: Tensors, outputs: Tensors, threads: int | None = None, least: int = STATES_PER_THREAD
-    ) -> int:
+    def rows(self, inputs: Tensors, outputs: Tensors, threads: int | None = None, least: int = PER_THREAD) -> int:
         """Fill contiguous `outputs` (count, size); what is to be reported. An input (1, size) serves all states.
 
         Batches of `least` states for each take as many threads as torch has, or `threads`.

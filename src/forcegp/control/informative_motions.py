@@ -328,9 +328,7 @@ def excitation(
             best, least = (motion, score) if score < least else (best, least)
             tell(k + 1, motions)
     if not np.isfinite(least):
-        raise InvalidInput(
-            f"none of {motions} motions shows all base parameters; give more seconds, limits or motions."
-        )
+        raise InvalidInput(f"no motion of {motions} shows all base parameters; give more seconds, limits or motions.")
     if isinstance(teaches, BaseParameters):
         R = teaches.triangle(best)
         return replace(draft, motion=best, condition=float(np.linalg.cond(R / np.linalg.norm(R, axis=0))))

@@ -244,9 +244,7 @@ class ContactMonitor:
     def _residuals(self, q: Any, v: Any, u: Any, settle: int = 0) -> Residuals:
         q, v, u = self._motion(q, v, u)
         if q.dim() != 2 or len(q) < 2:
-            raise InvalidInput(
-                f"a recording has shape {tuple(q.shape)}; give (T, {self.robot.nv}) of two rows or more."
-            )
+            raise InvalidInput(f"a recording has shape {tuple(q.shape)}; give (T, {self.robot.nv}), two rows or more.")
         self.past = Past(self.known)
         middle = 0.5 * (q[1:] + q[:-1]), 0.5 * (v[1:] + v[:-1])
         a = (v[1:] - v[:-1]) / self.dt

@@ -48,9 +48,7 @@ class MujocoForces:
         code, nv = predictor.code, predictor.nv
         program = code.program("passive")
         if set(program.graph.inputs[2 * nv :]) & set(program.graph.needed(program.nodes)):
-            raise InvalidInput(
-                "the forces depend on u, which MuJoCo computes after passive forces; learn forces of q and v only."
-            )
+            raise InvalidInput("forces depend on u, which MuJoCo computes after passive ones; learn forces of q and v.")
         positions, velocities = (", ".join(map(str, numbers)) for numbers in zip(*places, strict=True))
         words = {"JOINTS": nv, "POSITIONS": positions, "VELOCITIES": velocities}
         source = code.c_source("passive", 1, filled(c_text(__name__, "passive_force.c"), words))

@@ -18,6 +18,7 @@ from forcegp.robots.manifold import ConfigurationSpace
 
 Signal = Literal["q", "v", "u", "a"]
 Values = Float[np.ndarray, "rows *columns"]
+Times = Float[np.ndarray, " rows"]
 
 TRANSIENT = 1e-3  # what is left of a filter's transient at the ends of a recording; sets the length of the padding
 PASSED = 3.0  # rows in a period of a cut-off, of which more repeat their neighbours (`LowPass.memory`)
@@ -37,7 +38,7 @@ class LowPass:
     cutoff: float
     order: ClassVar[int] = 4
 
-    def __call__(self, values: Values, time: Float[np.ndarray, " rows"]) -> Values:
+    def __call__(self, values: Values, time: Times) -> Values:
         """Filtered, for rows at even times. Raises as `uniform_step`."""
         rate = 1.0 / uniform_step(time)
         if not 0 < self.cutoff < rate / 2:
@@ -69,7 +70,7 @@ class LowPass:
         return HALF / self.cutoff
 
 
-def lagged(values: Values, time: Float[np.ndarray, " rows"], seconds: float) -> Values:
+def lagged(values: Values, time: Times, seconds: float) -> Values:
     """What an actuator of first order makes of values, at rest with the first of them: T x' + x = values, T in s.
 
     By Tustin's rule (trapezoids), for equal steps of time.
@@ -128,7 +129,7 @@ def shifted(dataset: Dataset, delay: float, lag: float = 0.0, lagging: Sequence[
 
 
 def differentiate(
-    values: Float[np.ndarray, "rows columns"], time: Float[np.ndarray, " rows"], space: ConfigurationSpace | None = None
+    values: Float[np.ndarray, "rows columns"], time: Times, space: ConfigurationSpace | None = None
 ) -> np.ndarray:
     """Central differences, second order also at both ends and for unequal steps (three-point Lagrange formulas).
 
@@ -144,7 +145,7 @@ def differentiate(
     return np.gradient(values, time, axis=0, edge_order=2)
 
 
-def uniform_step(time: Float[np.ndarray, " rows"], name: str = "this recording") -> float:
+def uniform_step(time: Times, name: str = "this recording") -> float:
     """The sampling interval [s]. Raises DatasetError if steps differ by more than `JITTER` (1 %) from their median."""
     if len(time) < 2:
         raise DatasetError(f"{name} has {len(time)} row; at least 2 are needed.")
@@ -215,15 +216,11 @@ def resample(dataset: Dataset, step: float) -> Dataset:
 def episodes_in_order(dataset: Dataset) -> list[tuple[int, Dataset, str]]:
     """Number, rows and name for messages of every episode. Raises DatasetError for rows not in order of time."""
     if not dataset.time_ordered:
-        raise DatasetError(
-            "the rows are not in order of time (a sample of rows?); filter the whole recording, then sample."
-        )
+        raise DatasetError("the rows are not in order of time (a sample?); filter the whole recording, then sample.")
     return [(number, dataset.select_episodes([number]), f"episode {number}") for number in dataset.episodes]
 
 
-def sums_before(
-    values: Float[np.ndarray, "rows k"], time: Float[np.ndarray, " rows"], seconds: float
-) -> Float[np.ndarray, "rows k"]:
+def sums_before(values: Float[np.ndarray, "rows k"], time: Times, seconds: float) -> Float[np.ndarray, "rows k"]:
     """Sums of the rows before each, with weights exp(-age / seconds); zero for the first."""
     sums, keep = np.zeros_like(values), np.exp(-np.diff(time) / seconds)
     for row in range(1, len(values)):

@@ -38,6 +38,7 @@ LIFTED, USUAL = 0.004, 0.75
 quantile of what the rows ask of feet that are lifted, above which one that is not may bear."""
 FEW = 10
 MANY_OPEN = 0.25  # share of open rows that more than changes of stance leave
+OfSwitches = Float[np.ndarray, "rows switches"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,10 +50,10 @@ class Stance:
     """
 
     names: tuple[str, ...]
-    flags: Float[np.ndarray, "rows switches"]
-    speed: Float[np.ndarray, "rows switches"]
+    flags: OfSwitches
+    speed: OfSwitches
     slow: Float[np.ndarray, " switches"]
-    force: Float[np.ndarray, "rows switches"]
+    force: OfSwitches
     bearing: Float[np.ndarray, " 2"]
 
     @property
@@ -165,7 +166,7 @@ def _mean(values: Float[np.ndarray, "rows k"], width: int) -> Float[np.ndarray, 
 
 def _motion_and_force(
     dataset: Dataset, model: forcegp.Model, names: tuple[str, ...]
-) -> tuple[list[Float[np.ndarray, "rows m"]], list[Float[np.ndarray, "rows 3"]], Float[np.ndarray, "rows switches"]]:
+) -> tuple[list[Float[np.ndarray, "rows m"]], list[Float[np.ndarray, "rows 3"]], OfSwitches]:
     """A v of the contacts of every switch, the force that the rows ask of them, and how high they are."""
     of = [[k for k, contact in enumerate(model.contacts) if contact.switch == name] for name in names]
     places = [model.inputs.index(name) for name in names]
@@ -236,9 +237,7 @@ def _beside(places: Int[np.ndarray, " k"], rows: Int[np.ndarray, " rows"]) -> tu
     return before, places[np.minimum(np.searchsorted(places, rows), len(places) - 1)]
 
 
-def _as_low(
-    flags: Float[np.ndarray, "rows switches"], height: Float[np.ndarray, "rows switches"], least: np.ndarray
-) -> Bool[np.ndarray, "rows switches"]:
+def _as_low(flags: OfSwitches, height: OfSwitches, least: np.ndarray) -> Bool[np.ndarray, "rows switches"]:
     """Where a contact is hardly above or below where it acted last, or acts next."""
     rows, low = np.arange(len(flags)), np.zeros(flags.shape, bool)
     for own, z, out, lift in zip(flags.T, height.T, low.T, least, strict=True):

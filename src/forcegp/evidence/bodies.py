@@ -95,6 +95,7 @@ QUANTITIES = (
 )
 """What people read of a body: inertia about its centre of mass."""
 _INERTIA = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+Coordinates = Float[np.ndarray, " k"]
 
 
 class Bodies:
@@ -116,28 +117,26 @@ class Bodies:
         """Which coordinates belong to each body."""
         return tuple(slice(10 * k, 10 * k + 10) for k in range(len(self.priors)))
 
-    def pseudo_inertias(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 4 4"]:
+    def pseudo_inertias(self, x: Coordinates) -> Float[np.ndarray, "n 4 4"]:
         """P of every body."""
         return self._congruent(_log_cholesky(x)[0])
 
-    def parameters(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 10"]:
+    def parameters(self, x: Coordinates) -> Float[np.ndarray, "n 10"]:
         """Standard parameters."""
         return self._standard(self.pseudo_inertias(x))
 
-    def chained(
-        self, x: Float[np.ndarray, " k"], regressor: Float[np.ndarray, "rows nv n 10"]
-    ) -> Float[np.ndarray, "rows nv k"]:
+    def chained(self, x: Coordinates, regressor: Float[np.ndarray, "rows nv n 10"]) -> Float[np.ndarray, "rows nv k"]:
         """Derivatives in the coordinates of what has these derivatives in the standard parameters of every body."""
         out, slopes = np.empty((*regressor.shape[:2], self.size)), self.slopes(x)
         for body, columns in enumerate(self.slices):  # matrix products, where `einsum` would loop by itself
             out[..., columns] = regressor[:, :, body] @ slopes[10 * body : 10 * body + 10, columns]
         return out
 
-    def slopes(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "standard k"]:
+    def slopes(self, x: Coordinates) -> Float[np.ndarray, "standard k"]:
         """Derivatives of the standard parameters of all bodies, one after the other, in the coordinates."""
         return block_diag(np.zeros((0, 0)), *self._standard(self._congruent(_log_cholesky(x)[1])).swapaxes(-1, -2))
 
-    def moved(self, x: Float[np.ndarray, " k"], step: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    def moved(self, x: Coordinates, step: Coordinates) -> Coordinates:
         """x + step to first order: parameters change by exactly their derivatives times the step, if a body can.
 
         Torque is linear in them: with many rows of little noise, straight lines in x leave its narrow valley.
@@ -152,7 +151,7 @@ class Bodies:
         there[possible] = np.concatenate([np.log(scale), np.log(inside[:, :3]), inside[:, 3:]], axis=1)
         return there.ravel()
 
-    def distance(self, x: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
+    def distance(self, x: Coordinates) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
         """A vector whose norm is the distance from the references times the root of its weight, and its Jacobian."""
         inner, change = _log_cholesky(x)
         values, vectors = np.linalg.eigh(inner)
@@ -170,12 +169,12 @@ class Bodies:
         distance = np.einsum("kab,nab->nk", _SYMMETRIC, logarithm).ravel()
         return self._weights * distance, self._weights[:, None] * jacobian
 
-    def numbers(self, x: Float[np.ndarray, " k"], frames: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " m"]:
+    def numbers(self, x: Coordinates, frames: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " m"]:
         """`QUANTITIES` of every body, in axes with these poses in its frame."""
         told = [physical_of_pseudo_inertia(pseudo) for pseudo in _in_frames(self.pseudo_inertias(x), frames)]
         return np.array([[mass, *center, *(inertia[at] for at in _INERTIA)] for mass, center, inertia in told]).ravel()
 
-    def number_slopes(self, x: Float[np.ndarray, " k"], frames: Float[np.ndarray, "n 4 4"]) -> np.ndarray:
+    def number_slopes(self, x: Coordinates, frames: Float[np.ndarray, "n 4 4"]) -> np.ndarray:
         """Derivatives of `numbers` in the coordinates."""
         changes = _in_frames(self._congruent(_log_cholesky(x)[1]), frames[:, None])
         blocks = [np.zeros((0, 0))]

@@ -22,9 +22,7 @@ class Evidence(ABC):
     def check(self, dataset: Dataset) -> None:
         """Raise InvalidInput where a log lacks what this needs."""
         if self.in_order and not dataset.time_ordered:
-            raise InvalidInput(
-                f"{self.name} need rows in order of time, and these are a sample; give the whole recording."
-            )
+            raise InvalidInput(f"{self.name} need rows in order of time, not a sample; give the whole recording.")
 
     def __str__(self) -> str:
         given = [f"{f.name} {getattr(self, f.name)}" for f in fields(self) if getattr(self, f.name) != f.default]  # type: ignore[arg-type]  # every evidence is a dataclass

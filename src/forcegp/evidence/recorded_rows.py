@@ -33,10 +33,12 @@ from forcegp.model import Model
 from forcegp.robots import Kinematics
 from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_of_pseudo_inertia
 
+Positions = Float[np.ndarray, "rows nq"]
+Rows = Float[np.ndarray, "rows nv"]
+Inputs = Float[np.ndarray, "rows nu"]
 
-def motion_residuals(
-    dataset: Dataset, model: Model
-) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv"]]:
+
+def motion_residuals(dataset: Dataset, model: Model) -> tuple[Rows, Rows]:
     """Residuals of joint forces, Q_K - M a (Nm or N), and of accelerations, measured less predicted.
 
     Forces of feet that stand are left out, where no sensor measured them; those of contacts that slide are
@@ -103,9 +105,6 @@ def _under_load(state: State, load: Tensor) -> State:
 
 
 FIRST = 1e-2  # of the root mean square of the residual forces, what rough searches take for noise of forces
-Positions = Float[np.ndarray, "rows nq"]
-Rows = Float[np.ndarray, "rows nv"]
-Inputs = Float[np.ndarray, "rows nu"]
 
 
 @dataclass(frozen=True, eq=False)

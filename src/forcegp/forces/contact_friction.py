@@ -23,6 +23,7 @@ from forcegp.robots.arguments import finite_vector, is_sequence
 SMALLEST_SHARE = 0.1
 """Smallest 1 + mu g: where it nears 0, friction and normal force lift each other without end (jamming)."""
 JAMMING = "the expected friction nearly jams"  # how the warning of it begins
+Numbers = Float[Tensor, "*batch"]
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class TabulatedCurve:
                 "places increasing"
             )
 
-    def __call__(self, x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def __call__(self, x: Numbers) -> Numbers:
         """The value at x; differentiable in x, with steps in the derivative at the places."""
         at, values = (torch.tensor(part, dtype=x.dtype, device=x.device) for part in (self.at, self.values))
         # counted, since torch.searchsorted warns of its copies under vmap
@@ -87,12 +88,8 @@ class ExpectedFriction:
         return cls(TabulatedCurve((0.0, 1.0), (coefficient, coefficient)))
 
     def normal_force(
-        self,
-        dynamics: ConstrainedDynamics,
-        contact: int,
-        direction: Float[Tensor, "*batch 3"],
-        speed: Float[Tensor, "*batch"],
-    ) -> Float[Tensor, "*batch"]:
+        self, dynamics: ConstrainedDynamics, contact: int, direction: Float[Tensor, "*batch 3"], speed: Numbers
+    ) -> Numbers:
         """|normal force| in N under the known forces and the expected friction.
 
         |lambda| = |lambda_0| / (1 + sign(lambda_0) mu |s_p| g), g = (d lambda / d Q_U) J_p^T d, for sliding along d
@@ -122,7 +119,7 @@ class ExpectedFriction:
         return size * free.abs() / growth.clamp_min(SMALLEST_SHARE)
 
 
-def nominal_normal_force(dynamics: ConstrainedDynamics, contact: int) -> Float[Tensor, "*batch"]:
+def nominal_normal_force(dynamics: ConstrainedDynamics, contact: int) -> Numbers:
     """|normal force| in N that the contact would have if the known forces were all: |s_p| |lambda(Q_U = 0)|."""
     size = torch.linalg.vector_norm(dynamics.normals[..., contact, :], dim=-1)
     return size * dynamics.multiplier_map().offset[..., contact].abs()

@@ -121,9 +121,7 @@ class PerJoint(ExpressedKernels):
         names, prior = as_names(self.joints), type(self).__name__
         if self.joints is not None:
             if not names or any(not isinstance(name, str) for name in names) or len(set(names)) < len(names):
-                raise InvalidInput(
-                    f"{prior} joints are {self.joints!r}; give names of joints, each once, or None for all."
-                )
+                raise InvalidInput(f"{prior} joints are {self.joints!r}; give names, each once, or None for all.")
             object.__setattr__(self, "joints", names)
         checked_kernel(self.kernel)
 

@@ -199,10 +199,8 @@ class Predictor(Summary):
         else:
             states, single = self._states(q, v, u)
             Q, around = (_single(x, single) for x in self.run("forces", states))
-        slope, M, A, b, off = around.split([nv * nu, nv**2, m * nv, m, m], dim=-1)
-        return JointForces(
-            Q, slope.unflatten(-1, (nv, nu)), M.unflatten(-1, (nv, nv)), A.unflatten(-1, (m, nv)), b, off
-        )
+        dQ, M, A, b, off = around.split([nv * nu, nv**2, m * nv, m, m], dim=-1)
+        return JointForces(Q, dQ.unflatten(-1, (nv, nu)), M.unflatten(-1, (nv, nv)), A.unflatten(-1, (m, nv)), b, off)
 
     def inverse_dynamics(self, q: Any, v: Any, a: Any, normal_force: Any = None, memory: Any = None) -> Gaussian:
         """The actuator forces u (nv,) or (n, nv) in Nm or N that make the acceleration a (rad/s^2 or m/s^2).
@@ -367,9 +365,7 @@ class MeanWithGradient(torch.autograd.Function):
     @override
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():  # create_graph=True: the gradients would pass for constants
-            raise InvalidInput(
-                "a compiled predictor has first derivatives only; for second ones make it with compile=False."
-            )
+            raise InvalidInput("a compiled predictor has first derivatives only; for more make it with compile=False.")
         (_, nv, nu), space = ctx.predictor.sizes, ctx.predictor.space
         jacobian = ctx.predictor.run("linearize", ctx.saved_tensors)[1].view(-1, nv, 2 * nv + nu)
         in_q, in_v, in_u = (grad_outputs[0][:, None] @ jacobian)[:, 0].split([nv, nv, nu], dim=-1)

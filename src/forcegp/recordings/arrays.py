@@ -145,9 +145,7 @@ def numpy_arrays(path: Path) -> Arrays:
                     "it as an array of numbers."
                 )
             if math.prod(shape) * dtype.itemsize > member.file_size:
-                raise FileFormatError(
-                    f"{path}: {name!r} claims the shape {shape}, but the file does not hold that much."
-                )
+                raise FileFormatError(f"{path}: {name!r} claims the shape {shape}, but the file holds less than that.")
             if dtype.kind in "fiu":
                 if len(shape) < 3:
                     require_plausible_size(path, repr(name), 8 * math.prod(shape), member.compress_size)

@@ -93,16 +93,14 @@ def import_recordings(
     plan = plans[0]
     for (label, _), other in zip(sources, plans, strict=True):
         if (other.joints, other.logged) != (plan.joints, plan.logged):
-            raise InvalidInput(
-                f"{label} has the signals {other.logged} and {sources[0][0]} {plan.logged}; import alike."
-            )
+            raise InvalidInput(f"{label} has signals {other.logged} and {sources[0][0]} {plan.logged}; import alike.")
     recordings = []
     for index, ((label, source), own) in enumerate(zip(sources, plans, strict=True)):
         tell(index, len(sources), f"reading {label}")
         believed = own.joints if "q" in mapping.unit else ()
         recordings.append(read_recording(source, own, label, options, model.robot, believed))
     step = _even_step(recordings, options)
-    done = _what_was_done(mapping, plan, recordings, step, sources)
+    done = _what_was_done(mapping, plan, recordings, step)
     pieces: list[dict[str, np.ndarray]] = []
     for recording in recordings:
         for number, rows in recording.stretches:
@@ -172,13 +170,9 @@ def _even_step(recordings: Sequence[Recording], options: ImportOptions) -> float
 
 
 def _what_was_done(
-    mapping: ColumnMapping,
-    plan: SignalPlan,
-    recordings: Sequence[Recording],
-    step: float | None,
-    sources: Sequence[tuple[str, Source]],
+    mapping: ColumnMapping, plan: SignalPlan, recordings: Sequence[Recording], step: float | None
 ) -> dict[str, Any]:
-    files = dict.fromkeys(file for _, source in sources for file in source.files())
+    files = dict.fromkeys(file for recording in recordings for file in recording.source.files())
     made = {"u": "none", "v": "central differences of q", "a": "central differences of v"}
     lacking = {name: max(len(own.layout.derived.get(name, ())) for own in recordings) for name in SIGNALS}
     entries = Counter(item.signal for item in plan.signals)
@@ -213,9 +207,7 @@ class SideBySide(Source):
 
     @cached_property
     def _owners(self) -> Mapping[str, tuple[Source, str]]:
-        return {
-            f"{name}:{column}": (source, column) for name, source in self.sources.items() for column in source.columns()
-        }
+        return {f"{stem}:{own}": (source, own) for stem, source in self.sources.items() for own in source.columns()}
 
     @override
     def columns(self) -> tuple[str, ...]:

@@ -22,6 +22,8 @@ from forcegp.recordings.signal_plan import Layout, SignalPlan, spans
 from forcegp.recordings.source import Columns, Source
 from forcegp.robots.manifold import POSITIONS, TURN, ConfigurationSpace
 
+Values = Float[np.ndarray, "rows signals"]
+Marked = Bool[np.ndarray, " rows"]
 Jumps = tuple[Int[np.ndarray, " jumps"], str, str]
 """Rows before which something moves too far, what was seen, and what to do."""
 LARGEST_ERROR = 0.01  # of the length of a quaternion: more is no rounding
@@ -125,7 +127,7 @@ def read_recording(
     return Recording(about, source, signals, time, begin, (*jumps, *turned), layout, stretches, step, worst)
 
 
-def _unlogged(plan: SignalPlan, values: Float[np.ndarray, "rows signals"]) -> tuple[dict[str, list[int]], list[str]]:
+def _unlogged(plan: SignalPlan, values: Values) -> tuple[dict[str, list[int]], list[str]]:
     """Entries of v and a to be derived, those that hold no number at all among them, which become 0; and remarks."""
     derived, notes = {name: list(rows) for name, rows in plan.layout.derived.items()}, list[str]()
     for name in ("v", "a"):
@@ -139,9 +141,7 @@ def _unlogged(plan: SignalPlan, values: Float[np.ndarray, "rows signals"]) -> tu
     return derived, notes
 
 
-def _lost(
-    label: str, plan: SignalPlan, columns: Columns, values: Float[np.ndarray, "rows signals"], *, skip: bool
-) -> Bool[np.ndarray, " rows"]:
+def _lost(label: str, plan: SignalPlan, columns: Columns, values: Values, *, skip: bool) -> Marked:
     """Rows to leave out: those without any value, and with `skip` those without one of them or without a stamp."""
     missing = np.logical_not(np.isfinite(values))
     there = ~missing.all(axis=0)  # what the log lacks throughout is no loss of rows
@@ -160,7 +160,7 @@ def _lost(
     return lost if count <= most * rows else np.zeros(rows, bool)  # then the first value that is missing is named
 
 
-def _at_ends(plan: SignalPlan, values: np.ndarray, lost: Bool[np.ndarray, " rows"]) -> list[str]:
+def _at_ends(plan: SignalPlan, values: np.ndarray, lost: Marked) -> list[str]:
     """Marks rows in which a sensor stays at an end of its range as lost, and says so."""
     sensors, notes = np.array([item.signal.startswith(SENSORS) for item in plan.signals]), list[str]()
     changes = np.r_[False, (np.diff(values[:, ~sensors], axis=0) != 0.0).any(1)] & ~lost
@@ -291,11 +291,7 @@ def _episodes(column: np.ndarray, source: Source) -> Int[np.ndarray, "n 2"]:
 
 
 def _require_plausible_positions(
-    label: str,
-    values: Float[np.ndarray, "rows signals"],
-    plan: SignalPlan,
-    robot: forcegp.robots.Robot,
-    believed: Collection[str],
+    label: str, values: Values, plan: SignalPlan, robot: forcegp.robots.Robot, believed: Collection[str]
 ) -> None:
     """Refuse positions far beyond the limits of the URDF; without limits, those that look like degrees."""
     limits = {joint.name: (joint.lower, joint.upper) for joint in robot.joints}

@@ -436,9 +436,7 @@ def layout_of(mapping: ColumnMapping, model: forcegp.Model, lacking: Mapping[str
     derived = {name: [row for row, lacks in enumerate(own) if lacks] for name, own in lacking.items()}
     axes = {name: (own[0], own[-1] if own[-1] != "imu" else "body") for name, own in mapping.axes.items()}
     for name in axes.keys() - lacking.keys() - ({"force"} if mapping.force else set()):
-        raise InvalidInput(
-            f"axes of {name} are stated, but the log has no {name}; name its columns, or leave axes out."
-        )
+        raise InvalidInput(f"axes of {name} are stated, but the log has none; name its columns, or leave axes out.")
     for name, group in ((name, group) for name in axes if name != "force" for group in groups):
         for part, words in (((0, 1, 2), "linear"), ((3, 4, 5), "angular")):
             rows = {group.row + k for k in part}

@@ -168,9 +168,7 @@ def lay_out(
         if by_name[name].type == "fixed":
             raise InvalidInput(f"{description.source}: joint {name!r} is fixed already; remove it from `locked`.")
         if by_name[name].type == "floating" and position != 0.0:
-            raise InvalidInput(
-                f"{description.source}: joint {name!r} is {by_name[name].type}, so it can be locked at 0 alone."
-            )
+            raise InvalidInput(f"{description.source}: joint {name!r} is floating, so it can be locked at 0 alone.")
     held, drives = followed(description, locked, problems)
     root, children = _tree_of(description)
     bodies: list[Joint] = []

@@ -231,9 +231,7 @@ class _Part:
             return np.array(default, dtype=np.float64)
         words, what = text.split(), f"<{self.element.tag}> {attribute}"
         if len(words) != len(default):
-            raise RobotModelError(
-                f"{self}: {what} holds {len(words)} numbers ({' '.join(words)!r}), not {len(default)}."
-            )
+            raise RobotModelError(f"{self}: {what} holds {len(words)} numbers ({text!r}), not {len(default)}.")
         return np.array([self.parsed(word, what) for word in words])
 
     def origin(self) -> np.ndarray:

@@ -19,9 +19,7 @@ from forcegp.sandbox import read_apart
 
 HEAVIEST = 1e9  # kg and kg m^2, of one link: far from where products of inertias overflow
 LARGEST_FILE = 16 << 20  # bytes; robot files have some hundred thousand
-IN_THE_FILE = (
-    ". Correct its <inertial> element (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>)"
-)
+IN_THE_FILE = ". Correct its <inertial> (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>)"
 InertiaChoice = Literal["strict", "nearest"]
 """What to do about a link with an inertia that no body has: refuse it, or replace it by the nearest possible."""
 
@@ -43,9 +41,7 @@ def read_text(path: str | Path) -> str:
         hint = f" It holds {', '.join(inside)}." if inside else ""
         raise RobotModelError(f"{path}: is a directory; give the path of the URDF file itself.{hint}") from None
     except OSError as error:
-        raise RobotModelError(
-            f"{path}: cannot be read ({error.strerror}); check the path and its permissions."
-        ) from None
+        raise RobotModelError(f"{path}: cannot be read ({error.strerror}); check path and permissions.") from None
     try:
         return data.decode()
     except UnicodeDecodeError:
