@@ -117,6 +117,10 @@ def per_joint(name: str, joints: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{name}.{joint}" for joint in joints)
 
 
+Joints = Float[Tensor, "*batch nv"]
+Remembered = Float[Tensor, "*batch m"]
+
+
 def _times(T: Float[Tensor, "nv nv"], x: Joints) -> Joints:
     return (T @ x[..., None])[..., 0]
 
@@ -124,8 +128,6 @@ def _times(T: Float[Tensor, "nv nv"], x: Joints) -> Joints:
 PerJoint = float | Sequence[float] | Mapping[str, float] | np.ndarray | Tensor
 Number = PerJoint | Normal | LogNormal | None
 """A number of a law: given (one, one per joint, or by joint name), or estimated under a prior; None: a weak one."""
-Joints = Float[Tensor, "*batch nv"]
-Remembered = Float[Tensor, "*batch m"]
 AnyForce = TypeVar("AnyForce", bound="Force")
 AnyLaw = TypeVar("AnyLaw", bound="Law")
 
