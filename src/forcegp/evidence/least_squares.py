@@ -33,11 +33,7 @@ class NoiseLevels:
 
     @classmethod
     def of(
-        cls,
-        residual: Rows,
-        M: Matrices,
-        H: Matrices | None = None,
-        near: "NoiseLevels | None" = None,
+        cls, residual: Rows, M: Matrices, H: Matrices | None = None, near: "NoiseLevels | None" = None
     ) -> "NoiseLevels":
         """Those of largest likelihood, each between `LEAST` and `MOST` times the whole: Fisher scoring of logarithms.
 

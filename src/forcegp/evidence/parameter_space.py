@@ -295,9 +295,7 @@ def _derivatives(
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """The force (rows, nv), and slopes of minus that by entry: (rows, nv, k), or (rows, nv) for joints alone."""
     rows, wanted = features[0].shape[:-1], {term.name for term in terms}
-    numbers = {
-        name: value.expand(*rows, *value.shape).clone().requires_grad_(name in wanted) for name, value in values.items()
-    }
+    numbers = {name: x.expand(*rows, *x.shape).clone().requires_grad_(name in wanted) for name, x in values.items()}
     with torch.enable_grad():
         # a number that all directions share has no last dimension to broadcast along
         given = {name: value[..., None] if value.dim() == len(rows) else value for name, value in numbers.items()}

@@ -95,9 +95,7 @@ class _AtRoot(torch.autograd.Function):
     @override
     def backward(ctx: Any, *grads: Tensor) -> tuple[None, None, Tensor]:  # type: ignore[override]  # as in torch's guide
         if torch.is_grad_enabled():
-            raise InvalidInput(
-                "an implicit step is differentiable once; leave out create_graph, or take explicit steps."
-            )
+            raise InvalidInput("an implicit step is differentiable once; leave out create_graph, or step explicitly.")
         return None, None, -_solve(ctx.saved_tensors[0].mT, grads[0])
 
 

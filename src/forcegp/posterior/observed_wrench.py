@@ -125,9 +125,7 @@ def _with_past(dataset: Dataset, seconds: float) -> Int[np.ndarray, " late"]:
     first = {number: rows.time[0] for number, rows, _ in episodes_in_order(dataset)}
     late = np.flatnonzero(dataset.time - np.array([first[number] for number in dataset.episode]) >= seconds)
     if not len(late):
-        raise InvalidInput(
-            f"the rows hold less than {seconds:g} s of flight, which does not show their wind; give longer pieces."
-        )
+        raise InvalidInput(f"rows hold less than {seconds:g} s of flight, which shows no wind; give longer pieces.")
     return late
 
 

@@ -288,9 +288,7 @@ def inverse_dynamics(
     shape = (len(q), len(posterior.model.contacts))
     wanted = q.new_zeros(shape) if normal_force is None else real_tensor("normal_force", normal_force, q.device)
     if wanted.shape not in (shape, shape[1:]):
-        raise InvalidInput(
-            f"normal_force has shape {tuple(wanted.shape)}; give {shape[1:]} or {shape}, one per contact."
-        )
+        raise InvalidInput(f"normal_force has shape {tuple(wanted.shape)}; give {shape[1:]} or {shape}, by contact.")
     require_finite("normal_force", wanted)
     names, first = posterior.model.memory.names, posterior.model.memory_column
     if names and memory is None:

@@ -38,7 +38,7 @@ from forcegp.sandbox import MEMORY, SECONDS, read_apart
 from forcegp.summary import listed
 
 SEPARATOR = "/"
-MOST_NAMES = 12  # of arrays in a message
+SHOWN = 12  # names of arrays in a message
 NUMPY, HDF5, MATLAB, PARQUET = "a NumPy archive", "an HDF5 file", "a MATLAB file", "a Parquet file"
 INTERNAL = "#"  # begins names under which MATLAB keeps the contents of cells
 REFERENCE = np.dtype(object)
@@ -71,9 +71,7 @@ class ArrayFile(Source):
         names = dict.fromkeys(SEPARATOR.join(name.split(SEPARATOR)[:depth]) for name in self.arrays)
         found = [name for name in names if fnmatch.fnmatchcase(name, pattern)]
         if not found:
-            raise InvalidInput(
-                f"no array or group of {self.path} matches {pattern!r}; it has {listed(names, MOST_NAMES)}."
-            )
+            raise InvalidInput(f"no array or group of {self.path} matches {pattern!r}; it has {listed(names, SHOWN)}.")
         # demo_10 after demo_9
         return sorted(found, key=lambda name: [x.zfill(20) for x in re.findall(r"\d+|\D", name)])
 
@@ -97,7 +95,7 @@ class ArrayFile(Source):
             inside = f" under {self.within!r}" if self.within else ""
             raise FileFormatError(
                 f"{self.path} has no array of numbers with one or two dimensions and more than one row{inside}; "
-                f"it has {listed(self.arrays, MOST_NAMES)}."
+                f"it has {listed(self.arrays, SHOWN)}."
             )
         return places
 
@@ -110,9 +108,7 @@ class ArrayFile(Source):
         chosen = {self._places[name][0]: self.arrays[self._places[name][0]] for name in names}
         if len({shape[0] for shape, _ in chosen.values()}) > 1:
             counts = ", ".join(f"{array} {shape[0]}" for array, (shape, _) in chosen.items())
-            raise FileFormatError(
-                f"{self.path}: its arrays have different numbers of rows ({counts}); map those of one."
-            )
+            raise FileFormatError(f"{self.path}: arrays have different numbers of rows ({counts}); map those of one.")
         tables = {name: content() for name, (_, content) in chosen.items()}
         places = {name: self._places[name] for name in names}
         return {name: tables[own] if at is None else tables[own][:, at] for name, (own, at) in places.items()}

@@ -88,8 +88,7 @@ def import_recordings(
     if not paths:
         raise InvalidInput("no logs are given.")
     sources = _sources([Path(path) for path in paths], mapping)
-    lacks = {"may_lack_switches": options.stance == "auto"}
-    plans = [signal_plan(mapping, source, model, **lacks) for _, source in sources]
+    plans = [signal_plan(mapping, source, model, options.stance == "auto") for _, source in sources]
     plan = plans[0]
     for (label, _), other in zip(sources, plans, strict=True):
         if (other.joints, other.logged) != (plan.joints, plan.logged):

@@ -146,13 +146,11 @@ class SignalPlan:
         return tuple(dict.fromkeys([*needed, *([] if self.episode is None else [self.episode])]))
 
 
-def signal_plan(
-    mapping: ColumnMapping, source: Source, model: forcegp.Model, *, may_lack_switches: bool = False
-) -> SignalPlan:
+def signal_plan(mapping: ColumnMapping, source: Source, model: forcegp.Model, open_u: bool = False) -> SignalPlan:
     """What a mapping means for this table, with joints in the order of the robot.
 
     Signals that the mapping does not name are looked for by the names of the joints (`guessed` lists what was found).
-    With `may_lack_switches`, u may end with the actuators.
+    With `open_u` it may end with the actuators, without switches of contacts.
     Raises InvalidInput for columns, joints and numbers of them that do not fit, FileFormatError for missing columns.
     """
     robot = model.robot
@@ -171,7 +169,7 @@ def signal_plan(
                 rest = guessed_columns(signal, joints, source) if joints else ()
                 found_by = {**dict(zip(own, pose or (), strict=False)), **dict(zip(joints, rest or (), strict=False))}
                 patterns = tuple(found_by[name] for name in names) if len(found_by) == len(names) else None
-            if patterns is None and signal == "u" and may_lack_switches and model.actuators:
+            if patterns is None and signal == "u" and open_u and model.actuators:
                 patterns = guessed_columns(signal, names[: len(model.actuators)], source)
             if patterns is None and signal in by_number and {*names} <= {*joints}:
                 patterns = counted_columns(signal, len(names), source)
@@ -181,7 +179,7 @@ def signal_plan(
                 found[signal] = [parse_expression(name, [name], str(source.path)) for name in patterns]
         elif patterns is not None:
             found[signal] = _expressions(patterns, joints, source, may_lack=signal in ("v", "a"))
-    switches = len({x.switch for x in (model.contacts if may_lack_switches else ())} - {None})
+    switches = len({x.switch for x in (model.contacts if open_u else ())} - {None})
     if switches and len(found.get("u", ())) == len(model.inputs) - switches:
         found["u"] = [*found.get("u", ()), *[LACKING] * switches]
     for signal, why in (("q", "positions"), ("u", "forces or efforts of the actuators; 0 for a passive robot")):
@@ -436,7 +434,7 @@ def layout_of(mapping: ColumnMapping, model: forcegp.Model, lacking: Mapping[str
     derived = {name: [row for row, lacks in enumerate(own) if lacks] for name, own in lacking.items()}
     axes = {name: (own[0], own[-1] if own[-1] != "imu" else "body") for name, own in mapping.axes.items()}
     for name in axes.keys() - lacking.keys() - ({"force"} if mapping.force else set()):
-        raise InvalidInput(f"axes of {name} are stated, but the log has none; name its columns, or leave axes out.")
+        raise InvalidInput(f"axes of {name} are stated, and the log has no {name}; name its columns, or leave it out.")
     for name, group in ((name, group) for name in axes if name != "force" for group in groups):
         for part, words in (((0, 1, 2), "linear"), ((3, 4, 5), "angular")):
             rows = {group.row + k for k in part}

@@ -38,9 +38,7 @@ _TIME = re.compile(
 _UNITS = {unit.lower() for units in UNITS.values() for unit in units} | {"%", "sec", "°", "°/s", "-", "", "degrees"}
 _REMEDY = "Repair or remove it, or leave such rows out by `bad_rows` skip."
 LAST_LINES = 20  # of those that are looked at: they are rows, whatever stands above
-_CONVERSION = re.compile(
-    r"In CSV column #(\d+): Row #(\d+): CSV conversion error to \w+: invalid value '(.*)'", re.DOTALL
-)
+_REFUSED = re.compile(r"In CSV column #(\d+): Row #(\d+): CSV conversion error to \w+: invalid value '(.*)'", re.DOTALL)
 _RAGGED = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+)")
 
 
@@ -230,7 +228,7 @@ class DelimitedText(Source):
             except pa.ArrowInvalid as error:
                 if not again:
                     return self._parsed(stored, wanted, kinds, again=True)
-                found = _CONVERSION.search(str(error))
+                found = _REFUSED.search(str(error))
                 if self.lenient and found and len(self._no_numbers) < LAST_LINES:
                     self._no_numbers.append(found[3])
                     return self._parsed(stored, wanted, kinds, again=True)
@@ -252,7 +250,7 @@ class DelimitedText(Source):
         def line(number: str) -> str:
             return self.place((int(number) - 1) // self._lines_per_row)  # pyarrow counts from 1
 
-        if found := _CONVERSION.search(text):
+        if found := _REFUSED.search(text):
             name = "c1" if self._lines_per_row > 1 else self._columns[int(found[1])]
             text = f"column {name!r} holds {found[3]!r} at {line(found[2])}, which is no number. {_REMEDY}"
         elif found := _RAGGED.search(text):
