@@ -45,18 +45,14 @@ def compiler() -> list[str]:
     try:
         chosen = shlex.split(os.environ.get(VARIABLE, ""))
     except ValueError as error:
-        raise CompilerError(
-            f"the environment variable {VARIABLE} is {os.environ[VARIABLE]!r}, which is no command ({error}); correct "
-            f"it, {WITHOUT}."
-        ) from None
+        seen = f"the environment variable {VARIABLE} is {os.environ[VARIABLE]!r}, which is no command ({error})"
+        raise CompilerError(f"{seen}; correct it, {WITHOUT}.") from None
     for command in [chosen] if chosen else [[command] for command in COMMANDS]:
         if shutil.which(command[0]):
             return command
     looked_for = f"{chosen[0]!r}, which {VARIABLE} names" if chosen else ", ".join(COMMANDS)
-    raise CompilerError(
-        f"compiled code needs a C compiler, and there is none here (looked for {looked_for}); install one "
-        f"({PACKAGES}), name it by the environment variable {VARIABLE}, {WITHOUT}."
-    )
+    seen = f"compiled code needs a C compiler, and there is none here (looked for {looked_for})"
+    raise CompilerError(f"{seen}; install one ({PACKAGES}), name it by the environment variable {VARIABLE}, {WITHOUT}.")
 
 
 def compile_library(source: str, options: Iterable[str], library: Path, function: str) -> ctypes.CDLL:
@@ -174,10 +170,8 @@ def own_file(path: Path, *, parent: bool = False) -> None:
     if status.st_uid not in (os.getuid(), 0):
         raise CompilerError(f"{path} belongs to another user, {danger}; {ELSEWHERE}, in folders of your own.")
     if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not (parent and status.st_mode & stat.S_ISVTX):
-        raise CompilerError(
-            f"{path} can be written to by others than you, {danger}; take that away (chmod go-w "
-            f"{shlex.quote(str(path))}), or {ELSEWHERE}."
-        )
+        seen = f"{path} can be written to by others than you, {danger}"
+        raise CompilerError(f"{seen}; take that away (chmod go-w {shlex.quote(str(path))}), or {ELSEWHERE}.")
 
 
 Tensors = Sequence[Tensor]

@@ -113,10 +113,8 @@ class RobotVectorEnv(VectorEnv):
             q, v = (np.asarray(x) for x in self.start(self.np_random, count))
             fits = q.shape == v.shape == (count, nv) and {q.dtype.kind, v.dtype.kind} <= {"f", "i"}
             if not fits or not np.isfinite(q + v).all() or self._beyond(q, v).any():
-                raise InvalidInput(
-                    f"start returned q of shape {q.shape} and v of shape {v.shape}; return finite ones ({count}, {nv}) "
-                    "within the limits of the joints."
-                )
+                seen = f"start returned q of shape {q.shape} and v of shape {v.shape}"
+                raise InvalidInput(f"{seen}; return finite ones ({count}, {nv}) within the limits of the joints.")
         self.q, self.v, self.age = self.q.copy(), self.v.copy(), np.where(which, 0, self.age)
         self.q[which], self.v[which], self._ended = q, v, np.zeros(self.num_envs, bool)
 

@@ -79,10 +79,8 @@ class ContactMonitor:
         self.model, self.known = model, model_of(model)
         self.known.robot.require_vectors("monitors of contacts")
         if self.known.contacts:
-            raise InvalidInput(
-                "ContactMonitor looks for contacts that are not modelled, and this model has one; fit a log of free "
-                "motion, or give posterior.with_contacts([])."
-            )
+            seen = "ContactMonitor looks for contacts that are not modelled, and this model has one"
+            raise InvalidInput(f"{seen}; fit a log of free motion, or give posterior.with_contacts([]).")
         self.open = isinstance(model, Predictor) and model.kind != "none"
         check_time_step(dt)
         require_number("bandwidth", bandwidth, f"give Hz above 0 and below {0.5 / dt:g}, half the rate", below=0.5 / dt)
@@ -119,10 +117,8 @@ class ContactMonitor:
         found = [self._residuals(*motion, settle) for motion in free]
         if sum(len(tau) // block for tau, *_ in found) < LEAST_BLOCKS:
             seconds = sum(len(tau) for tau, *_ in found) * self.dt
-            raise DatasetError(
-                f"free motion of {seconds:.3g} s is too short for a threshold; give at least "
-                f"{LEAST_BLOCKS * BLOCK:g} s in stretches of {BLOCK:g} s or more."
-            )
+            seen = f"free motion of {seconds:.3g} s is too short for a threshold"
+            raise DatasetError(f"{seen}; give at least {LEAST_BLOCKS * BLOCK:g} s in stretches of {BLOCK:g} s or more.")
         tau, M = torch.cat([each[0] for each in found]), torch.cat([each[1] for each in found])
         v, inertial = torch.cat([each[3] for each in found]), torch.cat([each[4] for each in found])
         self.largest = inertial.abs().amax(0).clamp_min(1e-9)  # of a joint that rested, any motion is beyond

@@ -109,7 +109,5 @@ def _require_alike(predictor: Predictor, model: Any, places: list[tuple[int, int
         for what, own, other in pairs:
             apart = float(np.abs(own - other).max() / np.abs(own).max())
             if not apart <= ALIKE:
-                raise InvalidInput(
-                    f"the {what} of the MjModel differs by {apart:.2g} (relative) from that of "
-                    f"{known.robot.name}; load the same URDF, with the same gravity and armature (dof_armature)."
-                )
+                seen = f"the {what} of the MjModel differs by {apart:.2g} (relative) from that of {known.robot.name}"
+                raise InvalidInput(f"{seen}; load the same URDF, with the same gravity and armature (dof_armature).")

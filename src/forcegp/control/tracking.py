@@ -141,10 +141,8 @@ class ComputedTorque(TrackingController):
         known = model_of(model)
         require_number("position_noise", position_noise, "give rad (m) of at least 0", 0.0)
         if known.contacts:
-            raise InvalidInput(
-                "ComputedTorque moves a robot without contacts, and this model has one; use HybridForce, or "
-                "posterior.with_contacts([])."
-            )
+            seen = "ComputedTorque moves a robot without contacts, and this model has one"
+            raise InvalidInput(f"{seen}; use HybridForce, or posterior.with_contacts([]).")
         self.model, self.past = model, Past(known, position_noise)
         super().__init__(known.robot, **settings)
 
@@ -251,10 +249,8 @@ class HybridForce(TrackingController):
         self.predictor = require_type("predictor", predictor, Predictor, " : posterior.predictor()")
         self.model = predictor.posterior.model
         if not self.model.contacts:
-            raise InvalidInput(
-                "HybridForce wants a force against a contact, and this model has none; name it in "
-                "posterior.with_contacts([...]), or use ComputedTorque."
-            )
+            seen = "HybridForce wants a force against a contact, and this model has none"
+            raise InvalidInput(f"{seen}; name it in posterior.with_contacts([...]), or use ComputedTorque.")
         require_actuated(predictor.posterior)
         require_number("tolerance", tolerance, "give m, more than 0")
         require_known("off_surface", off_surface, "HybridForce", ("raise", "release"))
@@ -403,17 +399,13 @@ class MPPI(Controller):
             motions = self.predictor.rollouts(q, v, torques, self.dt, integrator=self.integrator, threads=1)
             costs = torch.as_tensor(self.cost(motions.q, motions.v, torques.expand_as(motions.a)))
         if costs.shape != motions.diverged_at.shape:
-            raise InvalidInput(
-                f"cost returned shape {tuple(costs.shape)} for motions {tuple(motions.q.shape)}; return one number per "
-                f"motion, {tuple(motions.diverged_at.shape)}."
-            )
+            seen = f"cost returned shape {tuple(costs.shape)} for motions {tuple(motions.q.shape)}"
+            raise InvalidInput(f"{seen}; return one number per motion, {tuple(motions.diverged_at.shape)}.")
         costs = costs.double().masked_fill((motions.diverged_at >= 0) | costs.isnan(), math.inf)
         best = float(costs.min())
         if not math.isfinite(best):
-            raise NumericalError(
-                f"none of {self.samples} sequences of torques has a finite cost from here; check cost(q, v, u), give a "
-                "smaller dt, less noise or fewer steps."
-            )
+            seen = f"none of {self.samples} sequences of torques has a finite cost from here"
+            raise NumericalError(f"{seen}; check cost(q, v, u), give a smaller dt, less noise or fewer steps.")
         self._best = torques[costs.argmin()]
         temperature = max(SHARE_OF_MEDIAN * float(costs[costs.isfinite()].median() - best), 1e-12)
         return torch.einsum("s,stj->tj", torch.softmax((best - costs) / temperature, dim=0), torques)

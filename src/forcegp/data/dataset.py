@@ -113,10 +113,8 @@ class Dataset(Summary):
         if self.noise_std is not None:
             put("noise_std", finite_columns("noise_std", self.noise_std, None, len(names), what="joints"))
             for column in np.flatnonzero(self.noise_std <= 0)[:1]:
-                raise DatasetError(
-                    f"noise_std of joint {names[column]!r} is {self.noise_std[column]}; it must be > 0. Give None if "
-                    "it is not known or if there is no noise."
-                )
+                seen = f"noise_std of joint {names[column]!r} is {self.noise_std[column]}; it must be > 0"
+                raise DatasetError(f"{seen}. Give None if it is not known or if there is no noise.")
         if self.strokes is not None:
             past = real_array("strokes", self.strokes, "fiu", DatasetError).astype(np.float64)
             if past.ndim != 3 or past.shape[:2] != self.v.shape or not (np.abs(past) <= LARGEST_MEASURED).all():
@@ -312,7 +310,5 @@ def require_rows(name: str, rows: object, joint_names: Sequence[str], whose: str
     """Raise InvalidInput unless `rows` is a Dataset with these joints, which are those of `whose`."""
     own = require_type(name, rows, Dataset, example).joint_names
     if tuple(own) != tuple(joint_names):
-        raise InvalidInput(
-            f"the joints of {name} are {', '.join(own)}, those of {whose} {', '.join(joint_names)}; give data of the "
-            "same robot, with its joints in the same order"
-        )
+        seen = f"the joints of {name} are {', '.join(own)}, those of {whose} {', '.join(joint_names)}"
+        raise InvalidInput(f"{seen}; give data of the same robot, with its joints in the same order")

@@ -251,7 +251,5 @@ def require_no_turns(rows: Dataset, label: str) -> None:
     if jumps.any():
         row, column = np.argwhere(jumps)[0]
         joint = rows.joint_names[np.asarray(space.single_rows)[angular][column]]
-        raise DatasetError(
-            f"{label}: q of joint {joint!r} jumps by more than pi after row {row}; the angle wraps. "
-            "Unwrap it first (np.unwrap(q, axis=0))."
-        )
+        seen = f"{label}: q of joint {joint!r} jumps by more than pi after row {row}; the angle wraps"
+        raise DatasetError(f"{seen}. Unwrap it first (np.unwrap(q, axis=0)).")

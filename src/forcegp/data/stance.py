@@ -113,10 +113,8 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
     """
     model = dataset.model if model is None else model
     if not (names := model.switches):
-        raise ContactError(
-            "no contact of the model has a switch, so there is no stance to find; give one, for example "
-            "fixed_point('foot', switch='foot_stands')."
-        )
+        seen = "no contact of the model has a switch, so there is no stance to find"
+        raise ContactError(f"{seen}; give one, for example fixed_point('foot', switch='foot_stands').")
     order = np.argsort(dataset.time, kind="stable")
     episodes = [order[dataset.episode[order] == number] for number in dataset.episodes]
     motion, asked, height = _motion_and_force(dataset, model, names)

@@ -267,17 +267,13 @@ def recorded_motions(dataset: Dataset, starts: int | Sequence[int], seconds: flo
     else:
         chosen = np.asarray(starts, dtype=int)
         for row in chosen[~np.isin(chosen, possible)][:1]:
-            raise InvalidInput(
-                f"no motion of {steps * dt:.4g} s begins at row {row} of the {len(dataset)} rows within its episode; "
-                "start earlier, or ask for fewer seconds."
-            )
+            seen = f"no motion of {steps * dt:.4g} s begins at row {row} of the {len(dataset)} rows within its episode"
+            raise InvalidInput(f"{seen}; start earlier, or ask for fewer seconds.")
     for row in chosen[before[chosen + steps] != before[chosen]][:1]:
         pauses = np.diff(dataset.time[row : row + steps + 1])
         worst = int(np.abs(pauses - dt).argmax())
-        raise InvalidInput(
-            f"the time steps are uneven: {pauses[worst]:.6g} s after row {row + worst}, {dt:.6g} s elsewhere; resample "
-            "the recording to equal steps, or start where there is no gap."
-        )
+        seen = f"the time steps are uneven: {pauses[worst]:.6g} s after row {row + worst}, {dt:.6g} s elsewhere"
+        raise InvalidInput(f"{seen}; resample the recording to equal steps, or start where there is no gap.")
     index = chosen[:, None] + np.arange(steps + 1)
     return RecordedMotions(tuple(chosen.tolist()), dt, dataset.q[index], dataset.v[index], dataset.u[index[:, :-1]])
 
@@ -309,10 +305,8 @@ def all_motions(dataset: Dataset, seconds: float, longest_step: float) -> tuple[
         firsts = rows[: len(rows) - steps : steps]
         starts += firsts[before[firsts + steps] == before[firsts]].tolist()
     if not starts:
-        raise InvalidInput(
-            f"no stretch of {steps * dt:.4g} s has equal steps of {dt:.4g} s; give fewer seconds, or resample the "
-            "recording (forcegp import does)."
-        )
+        seen = f"no stretch of {steps * dt:.4g} s has equal steps of {dt:.4g} s"
+        raise InvalidInput(f"{seen}; give fewer seconds, or resample the recording (forcegp import does).")
     return recorded_motions(dataset, starts, steps * dt), stride
 
 

@@ -259,10 +259,8 @@ def with_bodies(robot: Robot, wanted: Mapping[int, Float[np.ndarray, "4 4"]]) ->
     own, names = carrying(robot), body_names(robot)
     indefinite = [body for body, pseudo in wanted.items() if torch.linalg.cholesky_ex(torch.as_tensor(pseudo)).info]
     if impossible := [names[own.index(body)] for body in indefinite]:
-        raise NonPhysicalInertia(
-            f"no body has the inertia that was found for {', '.join(impossible)}, so there is no such robot; give the "
-            "log more motion, or a prior."
-        )
+        seen = f"no body has the inertia that was found for {', '.join(impossible)}, so there is no such robot"
+        raise NonPhysicalInertia(f"{seen}; give the log more motion, or a prior.")
     now = body_pseudo_inertias(robot).cpu().numpy()
     change = {k: upper_cholesky(P) @ np.linalg.inv(upper_cholesky(now[own.index(k)])) for k, P in wanted.items()}
     text = robot.urdf_text

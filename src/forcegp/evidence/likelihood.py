@@ -249,10 +249,8 @@ class MarginalLikelihood:
         variances = (torch.linalg.pinv(self.mixing, rtol=1e-8) @ self.residual[..., None])[..., 0].square().mean(0)
         largest = float(variances.max()) if variances.numel() else 0.0
         if variances.numel() and not largest > 0.0:
-            raise InvalidInput(
-                "the accelerations equal the mean exactly, so no unknown force can be learned; check that a was "
-                "measured and not computed from the model itself"
-            )
+            seen = "the accelerations equal the mean exactly, so no unknown force can be learned"
+            raise InvalidInput(f"{seen}; check that a was measured and not computed from the model itself")
         variances = variances.clamp_min(RESIDUAL_FLOOR * largest)
         kernels = self.model.unknown.kernels(self.model.robot, tuple(z.shape[-1] for z in features), variances)
         for kernel, z in zip(kernels, features, strict=True):

@@ -82,10 +82,8 @@ def arm(kinematics: Kinematics, model: Model, frame: str) -> Float[Tensor, "rows
     """Joint forces of a force on the robot at a frame, or at the point of its contacts. Raises InvalidInput."""
     points = {contact.point for contact in model.contacts if contact.frame == frame}
     if len(points) > 1:
-        raise InvalidInput(
-            f"a force at {frame!r} was measured, which is held at {len(points)} points: only a torque tells how they "
-            "share it; hold one point."
-        )
+        seen = f"a force at {frame!r} was measured, which is held at {len(points)} points"
+        raise InvalidInput(f"{seen}: only a torque tells how they share it; hold one point.")
     [point] = points or {(0.0, 0.0, 0.0)}
     return kinematics.frame_jacobian(frame, point)[..., :3, :].mT
 

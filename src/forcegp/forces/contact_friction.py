@@ -43,10 +43,8 @@ class TabulatedCurve:
             found = finite_vector(f"{name} of a tabulated curve", values, len(values))
             object.__setattr__(self, name, tuple(found.tolist()))
         if len(self.at) < 2 or len(self.at) != len(self.values) or any(b <= a for a, b in pairwise(self.at)):
-            raise InvalidInput(
-                f"a tabulated curve has {len(self.at)} places and {len(self.values)} values; give two or more of each, "
-                "places increasing"
-            )
+            seen = f"a tabulated curve has {len(self.at)} places and {len(self.values)} values"
+            raise InvalidInput(f"{seen}; give two or more of each, places increasing")
 
     def __call__(self, x: Numbers) -> Numbers:
         """The value at x; differentiable in x, with steps in the derivative at the places."""

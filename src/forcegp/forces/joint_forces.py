@@ -132,10 +132,8 @@ class PerJoint(ExpressedKernels):
     @override
     def check(self, robot: Robot, contacts: Sequence[Contact]) -> None:
         if not joint_indices(self.joints, robot):
-            raise InvalidInput(
-                f"{type(self).__name__} acts in joints, and {robot.name} has none but its base; leave it out, "
-                "or use aerodynamic."
-            )
+            seen = f"{type(self).__name__} acts in joints, and {robot.name} has none but its base"
+            raise InvalidInput(f"{seen}; leave it out, or use aerodynamic.")
 
     @override
     def direction(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:

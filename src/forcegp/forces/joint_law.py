@@ -50,10 +50,8 @@ class PerJointLaw(Law):
             values = values * torch.tensor(driven, dtype=values.dtype, device=values.device)
         values = values.clone()  # which keeps the graph
         if values.shape != (robot.nv,):
-            raise InvalidInput(
-                f"{what} has {tuple(values.shape)} values; {robot.name} has {robot.nv} joints: "
-                f"{', '.join(robot.joint_names)}"
-            )
+            seen = f"{what} has {tuple(values.shape)} values"
+            raise InvalidInput(f"{seen}; {robot.name} has {robot.nv} joints: {', '.join(robot.joint_names)}")
         least = "a finite number"
         checked = torch.where(values.isnan(), 1.0, values) if weak else values
         good = torch.isfinite(checked)

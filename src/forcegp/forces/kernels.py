@@ -113,10 +113,8 @@ def friction(dimension: int, variance: float | Tensor) -> AdditiveKernel:
     where a law bends slowly, and fail where it bends within a few cm/s (docs/how-to/forces.md).
     """
     if dimension != 1:
-        raise InvalidInput(
-            f"the kernel 'friction' is a function of one velocity and was given {dimension} features; give it a latent "
-            "with one feature"
-        )
+        seen = f"the kernel 'friction' is a function of one velocity and was given {dimension} features"
+        raise InvalidInput(f"{seen}; give it a latent with one feature")
     share = float64(variance) / 3.0
     change = ScaleKernel(LogVelocityKernel(), outputscale_constraint=log_scale()).double()
     change.outputscale = share

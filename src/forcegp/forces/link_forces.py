@@ -197,20 +197,16 @@ class AerodynamicForce(SharedInputs):
         frame = self.link(robot)
         if robot.frame(frame)[0] < 0:
             moving = ", ".join(name for name in robot.link_names if robot.frame(name)[0] >= 0)
-            raise InvalidInput(
-                f"AerodynamicForce acts on frame {frame!r}, which is fixed in the world and never moves, so its forces "
-                f"move nothing; give a frame of a moving link: {moving}."
-            )
+            seen = f"AerodynamicForce acts on frame {frame!r}, which is fixed in the world and never moves"
+            raise InvalidInput(f"{seen}, so its forces move nothing; give a frame of a moving link: {moving}.")
 
     def link(self, robot: Robot) -> str:
         """The link that the force acts on. Raises InvalidInput where none is named and none moves freely."""
         if self.frame is not None:
             return self.frame
         if not robot.layout.groups:
-            raise InvalidInput(
-                f"AerodynamicForce acts on a base that moves, and {robot.name} is fixed to the world; read it "
-                "with base='floating', or name a link: frame=..."
-            )
+            seen = f"AerodynamicForce acts on a base that moves, and {robot.name} is fixed to the world"
+            raise InvalidInput(f"{seen}; read it with base='floating', or name a link: frame=...")
         body = robot.layout.groups[0].bodies.stop - 1
         return next(name for name in robot.link_names if robot.frame(name)[0] == body)
 

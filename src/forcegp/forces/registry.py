@@ -75,10 +75,8 @@ def force_name(force: Force) -> str:
     for name, entry in FORCES.items():
         if entry is kind or f"{kind.__module__}.{kind.__name__}" == f"forcegp.forces.{entry}":
             return name
-    raise InvalidInput(
-        f"a {kind.__name__} cannot be stored: register it first, FORCES['my-force'] = {kind.__name__}; registered: "
-        f"{', '.join(FORCES)}"
-    )
+    seen = f"a {kind.__name__} cannot be stored: register it first, FORCES['my-force'] = {kind.__name__}"
+    raise InvalidInput(f"{seen}; registered: {', '.join(FORCES)}")
 
 
 def force_to_dict(force: Force) -> dict[str, Any]:

@@ -87,10 +87,8 @@ class Contact:
     def check(self, robot: Robot) -> None:
         """Raise UnknownName for a frame that is not there, ContactError where the contact constrains nothing."""
         if robot.frame(self.frame)[0] < 0:
-            raise ContactError(
-                f"frame {self.frame!r} of {robot.name} is fixed in the world, so a contact there constrains nothing; "
-                "name a frame that moves."
-            )
+            seen = f"frame {self.frame!r} of {robot.name} is fixed in the world, so a contact there constrains nothing"
+            raise ContactError(f"{seen}; name a frame that moves.")
 
     def position(self, kinematics: Kinematics) -> Float[Tensor, "*batch 3"]:
         """World position p(q) of the contact point (..., 3) in m."""

@@ -71,10 +71,8 @@ def export_c(
     if steps is not None:
         require_step(steps, integrator, posterior.model)
         if jacobian and len({*posterior.model.sizes}) > 1:
-            raise InvalidInput(
-                "derivatives of exported steps need a base that is fixed and one input per joint; export `jacobian` "
-                "without `steps`, or take `predictor.linearize_step`."
-            )
+            seen = "derivatives of exported steps need a base that is fixed and one input per joint"
+            raise InvalidInput(f"{seen}; export `jacobian` without `steps`, or take `predictor.linearize_step`.")
     if covariance and not (isinstance(posterior.latent, ExactPosterior) and posterior.latent_names):
         raise InvalidInput(
             "this model has no covariance that could be exported: it has no unknown forces, or its engine does not "

@@ -107,10 +107,8 @@ def export_casadi(
         apart = made[:, : expected[file].shape[1]] - expected[file].numpy()
         worst = float(np.abs(apart).max() / expected[file].abs().max())
         if not worst <= max(STEP_TOLERANCE if file != called else TOLERANCE, lost):
-            raise NumericalError(
-                f"{file}.casadi and forcegp differ by {worst:.2g} of the largest value, so nothing is written; export "
-                "to C, or fit with fewer points, which cancel less."
-            )
+            seen = f"{file}.casadi and forcegp differ by {worst:.2g} of the largest value, so nothing is written"
+            raise NumericalError(f"{seen}; export to C, or fit with fewer points, which cancel less.")
         found[f"{file}.casadi"] = worst
     for file, function in functions.items():
         text = casadi.StringSerializer()

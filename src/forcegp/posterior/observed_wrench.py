@@ -93,10 +93,8 @@ def unobserved(model: Model) -> Model:
 def require_unobserved(posterior: Posterior, what: str) -> None:
     """Raise InvalidInput for what `observing` gave, where `what` observes by itself."""
     if len(posterior.model.inputs) > len(posterior.trained.inputs):
-        raise InvalidInput(
-            f"{what} include the observers of the model: give the posterior and the recording as they were before "
-            "`observing`."
-        )
+        seen = f"{what} include the observers of the model"
+        raise InvalidInput(f"{seen}: give the posterior and the recording as they were before `observing`.")
 
 
 def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
@@ -105,10 +103,8 @@ def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
     if target is None or not own.unknown_forces:  # laws alone learn nothing from rows but their level
         return rows
     if "air" not in posterior.settings or target.known.to_dict() != unobserved(own).known.to_dict():
-        raise InvalidInput(
-            "the posterior was carried to another system than the one that its rows were measured on; update it "
-            "before it is carried there: posterior.update(rows).with_model(model)."
-        )
+        seen = "the posterior was carried to another system than the one that its rows were measured on"
+        raise InvalidInput(f"{seen}; update it before it is carried there: posterior.update(rows).with_model(model).")
     return in_own_air(posterior, rows)
 
 

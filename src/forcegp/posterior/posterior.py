@@ -323,10 +323,8 @@ class Posterior(Fitted):
         require_type("model", model, Model)
         trained = self.trained
         if self.is_black_box:
-            raise InvalidInput(
-                f"a {self.description} learned the accelerations of one robot, so it cannot move to another model; fit "
-                "it to data from there, or learn forces."
-            )
+            seen = f"a {self.description} learned the accelerations of one robot, so it cannot move to another model"
+            raise InvalidInput(f"{seen}; fit it to data from there, or learn forces.")
         if model.robot.joint_names != trained.robot.joint_names:
             raise InvalidInput(
                 f"the model was trained on joints {', '.join(trained.robot.joint_names)}; the other robot has "

@@ -152,10 +152,8 @@ class Programs:
         self.space: ConfigurationSpace = self.physics.model.robot.space
         self.sizes: tuple[int, int, int] = self.physics.model.sizes
         if self.example[0].device.type != "cpu":
-            raise InvalidInput(
-                f"compiled code runs on the CPU, and the model is on {self.example[0].device}; give compile=False, or "
-                "a model on the CPU."
-            )
+            seen = f"compiled code runs on the CPU, and the model is on {self.example[0].device}"
+            raise InvalidInput(f"{seen}; give compile=False, or a model on the CPU.")
 
     @cached_property
     def sums(self) -> tuple[KernelSum, ...]:

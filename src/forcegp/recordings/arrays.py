@@ -93,10 +93,8 @@ class ArrayFile(Source):
                 places |= {element: (full, index) for index, element in enumerate(element_names(name, shape[1]))}
         if not places:
             inside = f" under {self.within!r}" if self.within else ""
-            raise FileFormatError(
-                f"{self.path} has no array of numbers with one or two dimensions and more than one row{inside}; "
-                f"it has {listed(self.arrays, SHOWN)}."
-            )
+            seen = f"{self.path} has no array of numbers with one or two dimensions and more than one row{inside}"
+            raise FileFormatError(f"{seen}; it has {listed(self.arrays, SHOWN)}.")
         return places
 
     @override
@@ -136,10 +134,8 @@ def numpy_arrays(path: Path) -> Arrays:
                 read = npy.read_array_header_1_0 if npy.read_magic(stream) == (1, 0) else npy.read_array_header_2_0
                 shape, _, dtype = read(stream)
             if dtype.hasobject:
-                raise FileFormatError(
-                    f"{path}: {name!r} holds Python objects, which are never read because reading them runs code; save "
-                    "it as an array of numbers."
-                )
+                seen = f"{path}: {name!r} holds Python objects, which are never read because reading them runs code"
+                raise FileFormatError(f"{seen}; save it as an array of numbers.")
             if math.prod(shape) * dtype.itemsize > member.file_size:
                 raise FileFormatError(f"{path}: {name!r} claims the shape {shape}, but the file holds less than that.")
             if dtype.kind in "fiu":
@@ -173,10 +169,8 @@ def _stored(path: Path, group: h5py.Group, prefix: str, seen: set[Any]) -> Itera
         item = group[name] if isinstance(link, h5py.HardLink) else None  # a soft link is another name
         outside = isinstance(item, h5py.Dataset) and (item.external or item.is_virtual)
         if isinstance(link, h5py.ExternalLink) or outside:
-            raise FileFormatError(
-                f"{path}: {full!r} is in another file, and links to other files are not followed; give that file, or "
-                "copy the data into one."
-            )
+            outer = f"{path}: {full!r} is in another file, and links to other files are not followed"
+            raise FileFormatError(f"{outer}; give that file, or copy the data into one.")
         if isinstance(item, h5py.Group) and item not in seen:
             if prefix.count("/") > 32:
                 raise FileFormatError(f"{path}: its groups are nested more than 32 deep.")
@@ -294,10 +288,8 @@ def parquet_arrays(path: Path) -> Arrays:
                 return arrow_numbers(column)
             lengths = pc.call_function("list_value_length", [column]).fill_null(0).to_numpy(zero_copy_only=False)
             for row in np.flatnonzero(lengths != width)[:1]:
-                raise FileFormatError(
-                    f"{path}: column {name!r} has {lengths[row]} elements at row {row}, {width} before; lists must be "
-                    "of one length."
-                )
+                seen = f"{path}: column {name!r} has {lengths[row]} elements at row {row}, {width} before"
+                raise FileFormatError(f"{seen}; lists must be of one length.")
             return arrow_numbers(column.flatten()).reshape(len(column), width)
 
     widths: dict[str, int | None] = {}

@@ -411,10 +411,8 @@ def parse_expression(text: str, columns: Collection[str], owner: str) -> Express
         at_zero = _value(tree, [0.0] * len(words))
         slopes = {name: _value(tree, [float(word == name) for word in words]) - at_zero for name in words}
     except (SyntaxError, ValueError, ArithmeticError, RecursionError, MemoryError) as error:
-        raise InvalidInput(
-            f"{text!r:.200} is no combination of columns: {getattr(error, 'msg', error)}. For example: "
-            "theta2 - theta1, 0.5*`a-b` + pi/2."
-        ) from None
+        seen = f"{text!r:.200} is no combination of columns: {getattr(error, 'msg', error)}"
+        raise InvalidInput(f"{seen}. For example: theta2 - theta1, 0.5*`a-b` + pi/2.") from None
     if not all(map(math.isfinite, (at_zero, *slopes.values()))):
         raise InvalidInput(f"{text!r:.200} has a number that is not finite.")
     for word in words:

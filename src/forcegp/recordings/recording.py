@@ -153,10 +153,8 @@ def _lost(label: str, plan: SignalPlan, columns: Columns, values: Values, *, ski
             lost |= ~np.isfinite(columns[name])
     count, rows, most = int(lost.sum()), len(values), Source.MOST_LOST
     if skip and count > most * rows:
-        raise DatasetError(
-            f"{label}: {count} of {rows} rows lack a value, and `bad_rows` skip leaves out {most:.0%} at most. "
-            "Map other columns, or repair the log."
-        )
+        seen = f"{label}: {count} of {rows} rows lack a value, and `bad_rows` skip leaves out {most:.0%} at most"
+        raise DatasetError(f"{seen}. Map other columns, or repair the log.")
     return lost if count <= most * rows else np.zeros(rows, bool)  # then the first value that is missing is named
 
 
@@ -183,10 +181,8 @@ def _seconds(plan: SignalPlan, source: Source, columns: Columns, rows: int) -> t
     raw = columns[name] if whole else plan.time.value(columns, rows)
     if not whole and not np.isfinite(raw).all():
         row = int(np.argmin(np.isfinite(raw)))
-        raise DatasetError(
-            f"{source.path}: column {name!r}, the time, is {_shown(raw[row])} at {source.place(row)}. Repair or remove "
-            "that row."
-        )
+        seen = f"{source.path}: column {name!r}, the time, is {_shown(raw[row])} at {source.place(row)}"
+        raise DatasetError(f"{seen}. Repair or remove that row.")
     begin = float(plan.time_unit.in_si(raw[:1].astype(np.float64))[0])
     return plan.time_unit.in_si((raw - raw[0]).astype(np.float64)), begin
 
@@ -283,10 +279,8 @@ def _episodes(column: np.ndarray, source: Source) -> Int[np.ndarray, "n 2"]:
     own = numbers[starts].astype(np.int64)
     again = np.setdiff1d(np.arange(len(own)), np.unique(own, return_index=True)[1])
     if len(again):
-        raise DatasetError(
-            f"{source.path}: episode {own[again[0]]} begins again at {source.place(int(starts[again[0]]))}; rows of an "
-            "episode must lie together. Sort the log by episode and time."
-        )
+        seen = f"{source.path}: episode {own[again[0]]} begins again at {source.place(int(starts[again[0]]))}"
+        raise DatasetError(f"{seen}; rows of an episode must lie together. Sort the log by episode and time.")
     return np.stack([own, starts], axis=1)
 
 
@@ -368,10 +362,8 @@ def _stretches(
     pieces = np.split(np.arange(len(used)), np.flatnonzero(~inside) + 1)
     stretches = [(int(episodes[number[own[0]], 0]), used[own]) for own in pieces if len(own) >= FEWEST_ROWS]
     if not stretches:
-        raise DatasetError(
-            f"{label}: no {FEWEST_ROWS} rows lie together without a gap of more than {limit:.6g} s; "
-            "a longer `gap` may be right."
-        )
+        seen = f"{label}: no {FEWEST_ROWS} rows lie together without a gap of more than {limit:.6g} s"
+        raise DatasetError(f"{seen}; a longer `gap` may be right.")
     worst = float(np.abs(between[inside] / step - 1.0).max())
     left_out = {"repeated_stamps_dropped": repeated, "gaps": between[same & ~inside].tolist()}
     left_out["rows_in_stretches_too_short"] = len(used) - sum(len(rows) for _, rows in stretches)

@@ -322,10 +322,8 @@ def read_on_one_clock(source: Source, plan: Any) -> Read:
         tracks.append((float(np.median(steps)) if len(steps) else np.inf, ages * seconds))
         found |= {name: values[:, column] for column, name in enumerate(own[topic])}
     if not kept.any():
-        raise DatasetError(
-            f"{source.path}: the stamps of {', '.join(own)} do not overlap; compare their clocks, or name `time` "
-            f"{clock}:{LOG_TIME}."
-        )
+        seen = f"{source.path}: the stamps of {', '.join(own)} do not overlap"
+        raise DatasetError(f"{seen}; compare their clocks, or name `time` {clock}:{LOG_TIME}.")
     outside = int((~kept).sum())
     lost = f"; {outside} rows before the first or behind the last message of a topic left out" * bool(outside)
     notes.append(f"rows are those of {clock}: {', '.join(ways)}{lost}")

@@ -266,10 +266,8 @@ def _joints(mapping: ColumnMapping, robot: Robot) -> tuple[str, ...]:
         raise InvalidInput(f"{stated[0]} is about a base that moves; give a robot with one, by base='floating'.")
     own = robot.single_joint_names
     if mapping.joints and sorted(mapping.joints) != sorted(own):
-        raise InvalidInput(
-            f"the mapping names the joints {', '.join(mapping.joints)}; {robot.name!r} has {', '.join(own)}. "
-            "Give the columns of exactly these, or another `model`."
-        )
+        seen = f"the mapping names the joints {', '.join(mapping.joints)}; {robot.name!r} has {', '.join(own)}"
+        raise InvalidInput(f"{seen}. Give the columns of exactly these, or another `model`.")
     return mapping.joints or own
 
 

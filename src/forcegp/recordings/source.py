@@ -97,10 +97,8 @@ def require_distinct(path: Path, names: Sequence[str]) -> None:
     repeated = sorted(name for name, count in Counter(names).items() if count > 1)
     if repeated:
         places = [str(index + 1) for index, name in enumerate(names) if name == repeated[0]]
-        raise FileFormatError(
-            f"{path}: column name {repeated[0]!r} stands over columns {', '.join(places)}; "
-            "rename all but one in the header."
-        )
+        seen = f"{path}: column name {repeated[0]!r} stands over columns {', '.join(places)}"
+        raise FileFormatError(f"{seen}; rename all but one in the header.")
 
 
 def element_names(name: str, width: int) -> list[str]:
@@ -123,10 +121,8 @@ def reading(path: Path, what: str) -> Iterator[None]:
         raise
     except Exception as error:  # parsers raise what their authors did not think of: a TokenError for a header of NumPy
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise FileFormatError(
-            f"{path} cannot be read as {what}: {reason.rstrip('.')}. It may be truncated or of another format; "
-            "copy or write it again."
-        ) from error
+        seen = f"{path} cannot be read as {what}: {reason.rstrip('.')}. It may be truncated or of another format"
+        raise FileFormatError(f"{seen}; copy or write it again.") from error
 
 
 def require_plausible_size(path: Path, what: str, declared: int, stored: int) -> None:

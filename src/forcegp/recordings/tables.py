@@ -193,10 +193,8 @@ class DelimitedText(Source):
             return columns
         values, width = columns["c1"], self._lines_per_row
         if len(values) % width:
-            raise FileFormatError(
-                f"{self.path} has {len(values)} numbers, which is no multiple of {width}; another `headerless` may be "
-                "right, or the file is truncated."
-            )
+            seen = f"{self.path} has {len(values)} numbers, which is no multiple of {width}"
+            raise FileFormatError(f"{seen}; another `headerless` may be right, or the file is truncated.")
         return {name: values[self._columns.index(name) :: width] for name in names}
 
     def _parsed(self, stored: list[str], wanted: list[str], kinds: dict[str, Any], again: bool = False) -> Any:

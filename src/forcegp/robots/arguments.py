@@ -29,10 +29,8 @@ def real_array(name: str, given: Any, kinds: str = "fiu", error: type[ForceGPErr
     kind = "real numbers" if "f" in kinds else "integers"
     if np.ma.is_masked(given):
         where = np.argwhere(np.ma.getmaskarray(given))
-        raise error(
-            f"{name} has {len(where)} masked values, the first at {tuple(where[0].tolist())}; a mask would be lost: "
-            "drop these rows, or fill them with numbers that were measured."
-        )
+        seen = f"{name} has {len(where)} masked values, the first at {tuple(where[0].tolist())}"
+        raise error(f"{seen}; a mask would be lost: drop these rows, or fill them with numbers that were measured.")
     try:
         values = np.asarray(given)
     except (TypeError, ValueError, RuntimeError) as cause:  # ragged lists, tensors that require a gradient
@@ -111,10 +109,8 @@ def checked_tensor(name: str, value: object, size: int, meaning: str, device: to
     if value.dim() == 0 or value.shape[-1] != size:
         raise InvalidInput(f"{name} has shape {tuple(value.shape)}; its last dimension must be {size} ({meaning}).")
     if value.device != device:
-        raise InvalidInput(
-            f"{name} is on {value.device} but the robot on {device}; use robot.to({str(value.device)!r}) "
-            f"or {name}.to({str(device)!r})."
-        )
+        seen = f"{name} is on {value.device} but the robot on {device}"
+        raise InvalidInput(f"{seen}; use robot.to({str(value.device)!r}) or {name}.to({str(device)!r}).")
     return real_tensor(name, value, device)
 
 

@@ -268,10 +268,8 @@ def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]
         children[joint.parent].append(joint)
     roots = [link for link in description.links if link not in above]
     if len(roots) > 1:
-        raise RobotModelError(
-            f"{source}: the links form {len(roots)} separate parts, with base links {', '.join(map(repr, roots))}; "
-            "connect them by (fixed) joints so that one base link remains."
-        )
+        seen = f"{source}: the links form {len(roots)} separate parts, with base links {', '.join(map(repr, roots))}"
+        raise RobotModelError(f"{seen}; connect them by (fixed) joints so that one base link remains.")
     below = list(roots)
     for link in below:
         below += [joint.child for joint in children[link]]
@@ -282,10 +280,8 @@ def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]
             loop.append(link)
             link = above[link].parent
         loop = [*loop[loop.index(link) :], link]
-        raise RobotModelError(
-            f"{source}: the links {' <- '.join(map(repr, loop))} form a loop, and a robot is a tree here; "
-            "remove one of its joints, and lock those that it leaves without a hold."
-        )
+        seen = f"{source}: the links {' <- '.join(map(repr, loop))} form a loop, and a robot is a tree here"
+        raise RobotModelError(f"{seen}; remove one of its joints, and lock those that it leaves without a hold.")
     return roots[0], children
 
 

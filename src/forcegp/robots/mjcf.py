@@ -183,10 +183,8 @@ class MjcfWriter:
             joints = [*((each, inverse(step) @ at) for each, at in joints), (joint, np.eye(4))]
             pose = pose @ step
         if joint.type == "floating" and (depth != 2 or not np.array_equal(pose, np.eye(4))):
-            raise RobotModelError(
-                f"{self.robot.source}: joint {joint.name!r} floats beside the origin of the world, which MuJoCo does "
-                "not take; move its origin there."
-            )
+            seen = f"{self.robot.source}: joint {joint.name!r} floats beside the origin of the world"
+            raise RobotModelError(f"{seen}, which MuJoCo does not take; move its origin there.")
         self._body(joint.child, pose, joints, depth)
 
     def _rigid(self, link: str) -> dict[str, np.ndarray]:

@@ -237,10 +237,8 @@ def simulate_episode(config: KukaSurfaceConfig, robot: Robot, plant: RigidBodyDy
 
     columns = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
     if config.surface != "none" and not columns["in_contact"][: settle + 1].any():
-        raise SimulationError(
-            f"episode {episode}: no contact within settle_seconds = {config.settle_seconds:.3g} s. "
-            "Give it more time, or a start posture nearer to the surface."
-        )
+        seen = f"episode {episode}: no contact within settle_seconds = {config.settle_seconds:.3g} s"
+        raise SimulationError(f"{seen}. Give it more time, or a start posture nearer to the surface.")
     columns["time"] = config.time_step * np.arange(steps)
     return {name: values[settle:] for name, values in columns.items()}
 
