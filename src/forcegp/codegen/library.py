@@ -76,10 +76,9 @@ def compile_library(source: str, options: Iterable[str], library: Path, function
             return loaded
         except (OSError, AttributeError) as error:
             why = f"what it wrote cannot be loaded ({error}): its linker is broken, or no program may be run there"
-    raise CompilerError(
-        f"the C compiler failed: {shlex.join(command)}: {why}; name another (GCC or Clang) by the environment variable "
-        f"{VARIABLE}, {ELSEWHERE}, {WITHOUT}."
-    )
+    seen = f"the C compiler failed: {shlex.join(command)}: {why}"
+    advice = f"name another (GCC or Clang) by the environment variable {VARIABLE}, {ELSEWHERE}, {WITHOUT}."
+    raise CompilerError(f"{seen}; {advice}")
 
 
 def require_plain(tensors: Iterable[Tensor], what: str, remedy: str) -> None:
@@ -132,10 +131,9 @@ def opened_library(path: Path) -> ctypes.CDLL:
         library = ctypes.CDLL(str(path))
         library.evaluate.restype = ctypes.c_int
     except (OSError, AttributeError) as error:
-        raise CompilerError(
-            f"{path} cannot be loaded ({error}); delete it, and it is compiled anew. If that does not help, no program "
-            f"may be run from its folder: {ELSEWHERE}."
-        ) from error
+        seen = f"{path} cannot be loaded ({error}); delete it, and it is compiled anew"
+        advice = f"If that does not help, no program may be run from its folder: {ELSEWHERE}."
+        raise CompilerError(f"{seen}. {advice}") from error
     return library
 
 

@@ -241,10 +241,8 @@ def _apply(graph: Graph, target: Any, args: tuple, kwargs: dict[str, Any]) -> An
 
 
 def _refused(what: str) -> InvalidInput:
-    return InvalidInput(
-        f"compiled code cannot hold {what}, which the model's surface, known force or prior uses; write it with other "
-        "operations, or give compile=False, whose results are the same."
-    )
+    seen = f"compiled code cannot hold {what}, which the model's surface, known force or prior uses"
+    return InvalidInput(f"{seen}; write it with other operations, or give compile=False, whose results are the same.")
 
 
 def _moved(graph: Graph, target: Any, args: tuple, kwargs: dict[str, Any], indexed: bool) -> Any:

@@ -271,10 +271,9 @@ class HybridForce(TrackingController):
         count = len(self.model.contacts)
         wanted = real_tensor("normal_force", 0.0 if normal_force is None else normal_force, torch.device("cpu"))
         if normal_force is None or wanted.shape not in ((), (count,)) or not bool((wanted >= 0.0).all()):
-            raise InvalidInput(
-                f"normal_force is {normal_force!r}; give the force in N with which the surface pushes, at least 0, one "
-                f"per contact ({count})."
-            )
+            seen = f"normal_force is {normal_force!r}"
+            advice = f"give the force in N with which the surface pushes, at least 0, one per contact ({count})."
+            raise InvalidInput(f"{seen}; {advice}")
         self.wanted = wanted.expand(count)
         return super().__call__(q, v, q_d, v_d, a_d)
 

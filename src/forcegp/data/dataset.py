@@ -203,9 +203,8 @@ class Dataset(Summary):
         wanted = tuple(ids)
         missing = [number for number in wanted if number not in self.episodes]
         if missing or not wanted:
-            raise InvalidInput(
-                f"no episodes {missing if wanted else '(none asked for)'}; this Dataset has {list(self.episodes)}."
-            )
+            seen = f"no episodes {missing if wanted else '(none asked for)'}"
+            raise InvalidInput(f"{seen}; this Dataset has {list(self.episodes)}.")
         return self.rows(np.isin(self.episode, wanted))
 
     def save(self, path: str | Path) -> None:
@@ -233,9 +232,8 @@ def imu_place(name: str) -> tuple[str, list[float], Float[np.ndarray, "3 3"]]:
         if len(pose) not in (3, 6) or not np.isfinite(pose).all():
             raise ValueError
     except ValueError:
-        raise InvalidInput(
-            f"{name!r} has no place in its frame; give FRAME@x,y,z [m] or FRAME@x,y,z,roll,pitch,yaw [m, rad]."
-        ) from None
+        seen = f"{name!r} has no place in its frame"
+        raise InvalidInput(f"{seen}; give FRAME@x,y,z [m] or FRAME@x,y,z,roll,pitch,yaw [m, rad].") from None
     return frame, pose[:3], rotation_from_rpy(pose[3:] or [0.0] * 3)
 
 
@@ -263,9 +261,8 @@ def _truth(
         columns = () if name == "lambda" else joint_names if name.startswith(("a", "Q_U")) else ("x", "y", "z")
         checked[name] = values = finite_columns(f"truth[{name!r}]", given[name], columns, rows)
         if name == "lambda" and values.shape[1] != len(model.contacts):
-            raise DatasetError(
-                f"truth[{name!r}] has {values.shape[1]} columns; the model has {len(model.contacts)} contacts."
-            )
+            seen = f"truth[{name!r}] has {values.shape[1]} columns"
+            raise DatasetError(f"{seen}; the model has {len(model.contacts)} contacts.")
     return checked
 
 

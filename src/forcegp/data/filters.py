@@ -42,9 +42,8 @@ class LowPass:
         """Filtered, for rows at even times. Raises as `uniform_step`."""
         rate = 1.0 / uniform_step(time)
         if not 0 < self.cutoff < rate / 2:
-            raise InvalidInput(
-                f"cutoff is {self.cutoff} Hz; it must be > 0 and below {rate / 2:.6g} Hz, half the sample rate."
-            )
+            seen = f"cutoff is {self.cutoff} Hz"
+            raise InvalidInput(f"{seen}; it must be > 0 and below {rate / 2:.6g} Hz, half the sample rate.")
         from scipy.signal import butter, sosfiltfilt  # half a second, which only filtering should cost
 
         slowest = np.abs(butter(self.order, self.cutoff, fs=rate, output="zpk")[1]).max()

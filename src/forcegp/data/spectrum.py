@@ -104,9 +104,8 @@ def power_density(
     steps = [uniform_step(rows.time, label) for _, rows, label in episodes if len(rows) > 1]
     longest = max(len(rows) for _, rows, _ in episodes)
     if longest < FEWEST_ROWS:
-        raise DatasetError(
-            f"the longest episode has {longest} rows; a spectrum needs {FEWEST_ROWS}. Give the cut-off in Hz."
-        )
+        seen = f"the longest episode has {longest} rows; a spectrum needs {FEWEST_ROWS}"
+        raise DatasetError(f"{seen}. Give the cut-off in Hz.")
     step = float(np.median(steps))
     window = min(max(FEWEST_ROWS // 2, round(SEGMENT / step)), longest - differences)
     frequency, total, weight, segments = np.zeros(0), np.zeros((0, 0)), 0, 0.0

@@ -95,10 +95,9 @@ class Stance:
         return rows
 
     def _open(self, rows: int) -> DatasetError:
-        return DatasetError(
-            f"motion and forces leave the stance open in all {rows} rows; give the flags {', '.join(self.names)} in "
-            "the last columns of u, or filter the velocities first."
-        )
+        seen = f"motion and forces leave the stance open in all {rows} rows"
+        advice = f"give the flags {', '.join(self.names)} in the last columns of u, or filter the velocities first."
+        return DatasetError(f"{seen}; {advice}")
 
 
 def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Stance:

@@ -196,9 +196,8 @@ def with_memory(dataset: Dataset, model: Model) -> Dataset:
     if not memory.names or (own == memory.names and dataset.strokes is None):
         return dataset
     if not (dataset := with_strokes(dataset, memory.transmission)).knows_strokes(memory.transmission):
-        raise InvalidInput(
-            f"{', '.join(memory.titles)} remembers, and the rows are not in order of time; give the whole log."
-        )
+        seen = f"{', '.join(memory.titles)} remembers, and the rows are not in order of time"
+        raise InvalidInput(f"{seen}; give the whole log.")
     bare = dataset.u[:, ~np.isin(dataset.model.inputs, own)]
     columns = memory.past_of(torch.as_tensor(np.array(dataset.strokes), device=model.robot.device)).cpu().numpy()
     first = model.memory_column

@@ -115,10 +115,9 @@ class Sensor(Evidence):
     def check(self, dataset: Dataset) -> None:
         """Raise InvalidInput where the log has no such sensor."""
         if not self.names(dataset):
-            raise InvalidInput(
-                f"{self.name} need the sensor {self.kind}{self.frame or 'FRAME'}; the log has {[*dataset.measured]}: "
-                "name its columns, as in `forcegp import --force foot=fx,fy,fz,imu:hand=ax,ay,az`."
-            )
+            seen = f"{self.name} need the sensor {self.kind}{self.frame or 'FRAME'}; the log has {[*dataset.measured]}"
+            advice = "name its columns, as in `forcegp import --force foot=fx,fy,fz,imu:hand=ax,ay,az`."
+            raise InvalidInput(f"{seen}: {advice}")
 
 
 @dataclass(frozen=True)

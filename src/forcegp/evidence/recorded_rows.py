@@ -382,10 +382,9 @@ def kept_laws(space: ParameterSpace, any_contact: bool = False, sensed: Iterable
     frames = (contact.frame for contact in model.contacts if slides(contact) and contact.frame not in sensed)
     sliding = ", ".join(dict.fromkeys(frames))
     if sliding and not any_contact:
-        raise InvalidInput(
-            f"the robot touches something with {sliding} and slides on it, with friction that is not measured; "
-            "learn from a motion in the air (model.with_contacts([])), or give the model an unknown force there."
-        )
+        seen = f"the robot touches something with {sliding} and slides on it, with friction that is not measured"
+        advice = "learn from a motion in the air (model.with_contacts([])), or give the model an unknown force there."
+        raise InvalidInput(f"{seen}; {advice}")
     if model.carries_known_forces:
         raise InvalidInput("the forces lack RigidBodies(); list it, since without gravity no number can be estimated.")
     skipped: Sequence[type[Law]] = (RigidBodies, *OBSERVED)

@@ -263,9 +263,8 @@ def _fitting(name: str, given: object, shape: tuple[int, ...], robot: Robot) -> 
     try:
         return values.expand(shape).clone()
     except RuntimeError:
-        raise InvalidInput(
-            f"Thrusters {name} has shape {tuple(values.shape)}; give one for all, or {shape[0]}, one for each thruster."
-        ) from None
+        seen = f"Thrusters {name} has shape {tuple(values.shape)}"
+        raise InvalidInput(f"{seen}; give one for all, or {shape[0]}, one for each thruster.") from None
 
 
 def forces_of_file(robot: Robot) -> tuple[Force, ...]:

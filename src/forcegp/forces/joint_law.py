@@ -120,10 +120,9 @@ def bound_transmission(owner: str, given: Transmission, robot: Robot) -> Tensor 
         matrix = as_numbers(what, given, robot, f"{nv} rows of numbers")
     free = [j for j, name in enumerate(robot.joint_names) if name not in robot.single_joint_names]
     if matrix.shape != (nv, nv) or not bool(torch.isfinite(matrix).all() and torch.linalg.matrix_rank(matrix) == nv):
-        raise InvalidInput(
-            f"{what} has shape {tuple(matrix.shape)}; {robot.name} needs a finite regular matrix ({nv}, {nv}): a row "
-            f"per motor, a column per joint {', '.join(robot.joint_names)}."
-        )
+        seen = f"{what} has shape {tuple(matrix.shape)}; {robot.name} needs a finite regular matrix ({nv}, {nv})"
+        advice = f"a row per motor, a column per joint {', '.join(robot.joint_names)}."
+        raise InvalidInput(f"{seen}: {advice}")
     one = torch.eye(nv).to(matrix)
     if bool((matrix != one)[free].any() | (matrix != one)[:, free].any()):
         raise InvalidInput(f"{what} has other numbers than the identity at a base that moves, which has no motor.")

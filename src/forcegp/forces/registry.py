@@ -160,9 +160,8 @@ def _refuse(name: str, unknown: bool, expression: Any) -> None:
 
     whole = repr(expression if isinstance(expression, str) else ",".join(expression))
     if name in KERNELS and name not in FORCES:
-        raise InvalidInput(
-            f"{name!r} in {whole} is a kernel, not a force; write it as an option, gp:tool-friction:kernel={name}"
-        )
+        seen = f"{name!r} in {whole} is a kernel, not a force"
+        raise InvalidInput(f"{seen}; write it as an option, gp:tool-friction:kernel={name}")
     if name in FORCES or name in SHORT:
         other = name if unknown else f"{UNKNOWN}{name}"
         kind = "a law with coefficients" if unknown else "an unknown force"

@@ -269,10 +269,9 @@ def check_start(v0: Tensor, dt: float) -> None:
     """Raise InvalidInput where `dt` is no positive number or a start is faster than the limit."""
     check_time_step(dt)
     if bool((v0.abs() > SPEED_LIMIT).any()):
-        raise InvalidInput(
-            f"v0 has a joint velocity of {float(v0.abs().max()):.3g}; a motion faster than {SPEED_LIMIT:g} rad/s or "
-            "m/s counts as diverged, check its units."
-        )
+        seen = f"v0 has a joint velocity of {float(v0.abs().max()):.3g}"
+        advice = f"a motion faster than {SPEED_LIMIT:g} rad/s or m/s counts as diverged, check its units."
+        raise InvalidInput(f"{seen}; {advice}")
 
 
 def warn_of_divergence(diverged_at: Tensor, not_found: Tensor, dt: float, what: str) -> None:

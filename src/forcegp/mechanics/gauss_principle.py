@@ -248,18 +248,16 @@ class ConstrainedDynamics:
         try:
             lower = torch.linalg.cholesky(self.M)
         except torch.linalg.LinAlgError:
-            raise NumericalError(
-                "the mass matrix is not positive definite; check the inertias, masses and armature of the robot"
-            ) from None
+            seen = "the mass matrix is not positive definite"
+            raise NumericalError(f"{seen}; check the inertias, masses and armature of the robot") from None
         inverse_lower = torch.linalg.solve_triangular(lower, identity.expand_as(self.M), upper=False)
         A_white = self.A @ inverse_lower.mT
         if self.A.shape[-2]:
             try:
                 pseudo_inverse = torch.linalg.pinv(A_white, rtol=REDUNDANCY_TOLERANCE)
             except torch.linalg.LinAlgError:
-                raise NumericalError(
-                    "the constraint matrix A is not finite; Model.check_states names the row and the contact"
-                ) from None
+                seen = "the constraint matrix A is not finite"
+                raise NumericalError(f"{seen}; Model.check_states names the row and the contact") from None
         else:
             pseudo_inverse = A_white.mT
         H = inverse_lower.mT @ (identity - pseudo_inverse @ A_white) @ inverse_lower

@@ -270,9 +270,8 @@ def require_actuated(posterior: Any) -> None:
         )
     if posterior.carries_known_forces or not actuated:
         lacks = "RigidBodies()" if posterior.carries_known_forces else "Actuation()"
-        raise InvalidInput(
-            f"this model has no {lacks} among its laws, so no u can be solved for; call `predict`, or fit one that has."
-        )
+        seen = f"this model has no {lacks} among its laws, so no u can be solved for"
+        raise InvalidInput(f"{seen}; call `predict`, or fit one that has.")
 
 
 def inverse_dynamics(

@@ -76,9 +76,8 @@ def rows_for(training: TrainingData, trained: Model, model: Model) -> TrainingDa
         return training
     reported = [name for force in model.forces if isinstance(force, ObservedWrench) for name in force.names]
     if new := [name for name in model.inputs if name not in (*had, *reported)]:
-        raise InvalidInput(
-            f"the training rows lack inputs ({', '.join(new)}), so no predictor can be checked; call predict."
-        )
+        seen = f"the training rows lack inputs ({', '.join(new)}), so no predictor can be checked"
+        raise InvalidInput(f"{seen}; call predict.")
     with_zero = torch.nn.functional.pad(training.u, (0, 1))
     return replace(training, u=with_zero[..., [had.index(name) if name in had else -1 for name in model.inputs]])
 

@@ -45,9 +45,8 @@ def require_step(seconds: object, integrator: str, model: Model) -> None:
     steps_by(integrator, model, seconds)
     there = steps_of(model.robot.space)
     if integrator not in there:
-        raise InvalidInput(
-            f"an exported step is not {integrator!r}; give one of {', '.join(map(repr, there))} as `integrator`."
-        )
+        seen = f"an exported step is not {integrator!r}"
+        raise InvalidInput(f"{seen}; give one of {', '.join(map(repr, there))} as `integrator`.")
 
 
 @dataclass(frozen=True, eq=False)

@@ -166,9 +166,8 @@ class Rollout:
     def _sampled(self, quantity: Literal["q", "v"], least: int) -> Tensor:
         count = 0 if self.samples is None else self.samples.q.shape[0]
         if count < least:
-            raise InvalidInput(
-                f"this rollout has {count} samples, {least} are needed; ask for rollout(..., samples=20)."
-            )
+            seen = f"this rollout has {count} samples, {least} are needed"
+            raise InvalidInput(f"{seen}; ask for rollout(..., samples=20).")
         values: Tensor = getattr(self.samples, quantity)
         return values if quantity != "q" or self.space.is_vector_space else self.steps_to(values)
 
@@ -252,10 +251,9 @@ def checked_start(
     for size, (name, values) in zip(sizes, (("q0", q0), ("v0", v0), ("u", u)), strict=True):
         tensor = given[name] = state_tensor(name, values, size, device).to(device)
         if tensor.requires_grad and torch.is_grad_enabled():
-            raise InvalidInput(
-                f"{name} requires a gradient, which a rollout drops; multiply the A and B of steps, "
-                f"predictor.linearize_step, and give {name}.detach()."
-            )
+            seen = f"{name} requires a gradient, which a rollout drops"
+            advice = f"multiply the A and B of steps, predictor.linearize_step, and give {name}.detach()."
+            raise InvalidInput(f"{seen}; {advice}")
         if name == "u" and tensor.dim() < 2:
             raise InvalidInput(f"u has shape {tuple(tensor.shape)}; it must be (..., T, {size}), one row per step.")
     q, v, forces = given.values()

@@ -308,10 +308,9 @@ def read_on_one_clock(source: Source, plan: Any) -> Read:
         notes += source.notes()
         steps = np.diff(track[stamp]) * seconds
         if len(steps) and steps.min() < 0.0:
-            raise DatasetError(
-                f"{source.path}: the stamps of {topic} run backwards by {-steps.min():.6g} s; topics are joined in the "
-                f"order of time. Name `time` {clock}:{LOG_TIME}, or mend the bag."
-            )
+            seen = f"{source.path}: the stamps of {topic} run backwards by {-steps.min():.6g} s"
+            advice = f"topics are joined in the order of time. Name `time` {clock}:{LOG_TIME}, or mend the bag."
+            raise DatasetError(f"{seen}; {advice}")
         largest = np.array([most.get(name, np.inf) for name in own[topic]])
         places = [[own[topic].index(name) for name in turn] for turn in turns.values() if {*turn} <= {*own[topic]}]
         table = np.stack([track[name] for name in own[topic]], axis=1).astype(np.float64)

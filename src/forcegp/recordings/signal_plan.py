@@ -197,10 +197,8 @@ def signal_plan(mapping: ColumnMapping, source: Source, model: forcegp.Model, op
         used = [name for expressions in found.values() for item in expressions for name in item.weights]
         name = guessed_time(source, used)
         if name is None:
-            raise InvalidInput(
-                "no column for the time; name it with `time`, or `step` for the time between rows. "
-                f"{source.path} has {listed(source.columns(), MOST_NAMES)}."
-            )
+            seen = "no column for the time; name it with `time`, or `step` for the time between rows"
+            raise InvalidInput(f"{seen}. {source.path} has {listed(source.columns(), MOST_NAMES)}.")
         guessed.append(f"time = {name}")
         time = parse_expression(name, [name], str(source.path))
     else:
@@ -330,9 +328,8 @@ def _signals(
         elif signal in "qu":
             more = {"q": "angles of a base have `orientation` angles", "u": "0 for a joint that nothing drives"}
             remedy = f"{remedy}; {more[signal]}." if names else "leave u out, or give actuators (`identified`)."
-        raise InvalidInput(
-            f"{signal} has {len(expressions)} columns for {len(names)} {what} ({', '.join(names) or 'none'}); {remedy}"
-        )
+        seen = f"{signal} has {len(expressions)} columns for {len(names)} {what} ({', '.join(names) or 'none'})"
+        raise InvalidInput(f"{seen}; {remedy}")
     named = [named_unit(signal, *x.weights, stated=source.units) if x.is_column else None for x in expressions]
     named = [x or columns[name] or "1" for x, name in zip(named, names, strict=True)]
     given = [log_unit(signal, name) for name in mapping.unit.get(signal, named)]
@@ -344,10 +341,9 @@ def _signals(
         unit = _unit(signal, given, index, columns)
         if si not in (None, unit.si):
             kind = "is part of a turn" if si == "1" else "turns" if si in ROTATION.values() else "slides"
-            raise InvalidInput(
-                f"unit of {signal} of joint {name!r} is {unit.name}, but the joint {kind}: give a unit of {si}, or one "
-                "per joint."
-            )
+            seen = f"unit of {signal} of joint {name!r} is {unit.name}, but the joint {kind}"
+            advice = f"give a unit of {si}, or one per joint."
+            raise InvalidInput(f"{seen}: {advice}")
         if len(signs) not in (1, len(names)):
             raise InvalidInput(f"sign of {signal} has {len(signs)} entries; give one, or {len(names)}, one per joint.")
         sign = signs[index if len(signs) > 1 else 0]
@@ -363,10 +359,9 @@ def _unit(signal: str, given: Sequence[LogUnit], index: int, columns: Mapping[st
     idle = [unit.name for unit in given if not any(unit in own for own in fitting)]
     if idle or any(len(own) > 1 for own in fitting):
         needed = ", ".join(dict.fromkeys(kind or "the actuators" for kind in kinds))
-        raise InvalidInput(
-            f"unit of {signal} is {', '.join(unit.name for unit in given)}; give at most one of each kind ({needed}), "
-            f"or one for each of the {len(kinds)} columns."
-        )
+        seen = f"unit of {signal} is {', '.join(unit.name for unit in given)}"
+        advice = f"give at most one of each kind ({needed}), or one for each of the {len(kinds)} columns."
+        raise InvalidInput(f"{seen}; {advice}")
     return fitting[index][0] if fitting[index] else log_unit(signal, kinds[index] or "1")
 
 

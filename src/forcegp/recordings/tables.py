@@ -81,9 +81,8 @@ class DelimitedText(Source):
                 stream = io.BufferedReader(io.BytesIO(text.encode()), 2**20)
                 first = stream.peek(FIRST_BYTES)[:FIRST_BYTES]
             if b"\0" in first:
-                raise FileFormatError(
-                    f"{path} holds binary data, not text; if it is another format, give it that format's extension."
-                )
+                seen = f"{path} holds binary data, not text"
+                raise FileFormatError(f"{seen}; if it is another format, give it that format's extension.")
         except BaseException:
             stream.close()
             raise
@@ -232,9 +231,8 @@ class DelimitedText(Source):
                     return self._parsed(stored, wanted, kinds, again=True)
                 raise self._told_by_pyarrow(error) from error
             if len(ragged) > self.MOST_LOST * (len(table) + len(ragged)):
-                raise FileFormatError(
-                    f"{self.path}: {len(ragged)} lines have other than {len(stored)} fields; repair it."
-                )
+                seen = f"{self.path}: {len(ragged)} lines have other than {len(stored)} fields"
+                raise FileFormatError(f"{seen}; repair it.")
             if ragged:
                 self._notes += [f"lines left out because they have other than {len(stored)} fields: {len(ragged)}"]
             if cut:

@@ -57,10 +57,9 @@ def require_finite(name: str, values: Tensor) -> None:
         # the sum takes half as long, and is finite where all numbers are, unless they are very large
         finite = math.isfinite(float(values.detach().sum())) or bool(torch.isfinite(values.detach()).all())
     except RuntimeError:
-        raise InvalidInput(
-            f"{name} comes from torch.func.vmap, inside which numbers cannot be checked; batch dimensions lead, so "
-            "call this once without vmap, with all states as rows (n, nv)."
-        ) from None
+        seen = f"{name} comes from torch.func.vmap, inside which numbers cannot be checked"
+        advice = "batch dimensions lead, so call this once without vmap, with all states as rows (n, nv)."
+        raise InvalidInput(f"{seen}; {advice}") from None
     if not finite:
         raise InvalidInput(f"{name} has values that are not finite; drop or repair those rows.")
 
@@ -103,9 +102,8 @@ Positions = Float[Tensor, "*#batch nq"]
 def checked_tensor(name: str, value: object, size: int, meaning: str, device: torch.device) -> Tensor:
     """The tensor in float64; :class:`~forcegp.errors.InvalidInput` unless it is real (..., size) on ``device``."""
     if not isinstance(value, Tensor):
-        raise InvalidInput(
-            f"{name} is a {type(value).__name__}; give a tensor: torch.as_tensor({name}, dtype=torch.float64)."
-        )
+        seen = f"{name} is a {type(value).__name__}"
+        raise InvalidInput(f"{seen}; give a tensor: torch.as_tensor({name}, dtype=torch.float64).")
     if value.dim() == 0 or value.shape[-1] != size:
         raise InvalidInput(f"{name} has shape {tuple(value.shape)}; its last dimension must be {size} ({meaning}).")
     if value.device != device:
@@ -123,9 +121,8 @@ def broadcast_batch(shapes: Mapping[str, torch.Size]) -> torch.Size:
         return torch.broadcast_shapes(*shapes.values())
     except RuntimeError:
         listed = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items())
-        raise InvalidInput(
-            f"batch shapes do not broadcast: {listed}; make them equal, or 1 where one value serves all."
-        ) from None
+        seen = f"batch shapes do not broadcast: {listed}"
+        raise InvalidInput(f"{seen}; make them equal, or 1 where one value serves all.") from None
 
 
 def finite_vector(name: str, values: Any, size: int, meaning: str = "") -> np.ndarray:

@@ -214,9 +214,8 @@ def lay_out(
             "`base='floating'` for a body that moves freely."
         )
     if len(bodies) > MOST_BODIES:
-        raise RobotModelError(
-            f"{description.source}: {len(bodies)} joints move; forcegp takes up to {MOST_BODIES}, lock the others."
-        )
+        seen = f"{description.source}: {len(bodies)} joints move"
+        raise RobotModelError(f"{seen}; forcegp takes up to {MOST_BODIES}, lock the others.")
     joints = {body.name: body for body in bodies if body.name not in drives}
     for body in (body for body in bodies if body.name in drives):  # rotors and friction of those that follow count, too
         name, multiplier, _ = drives[body.name]

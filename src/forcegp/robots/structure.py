@@ -320,10 +320,9 @@ class RobotStructure(Summary):
         """Raise InvalidInput where positions do not add up; `what` needs that, in the plural: "filters"."""
         if self.layout.groups:
             group = self.layout.groups[0]
-            raise InvalidInput(
-                f"{what} need a base that is fixed; {self.name} has the floating joint {group.name!r}. Fitting, "
-                "prediction, identification, predictors and `posterior.rollout` work without."
-            )
+            seen = f"{what} need a base that is fixed; {self.name} has the floating joint {group.name!r}"
+            advice = "Fitting, prediction, identification, predictors and `posterior.rollout` work without."
+            raise InvalidInput(f"{seen}. {advice}")
 
 
 def bodies_without_inertia(

@@ -213,8 +213,7 @@ def read_robot_file(path: str | Path) -> str:
     required_extra("xacro", "xacro", f"{path}: a file that is not expanded elsewhere")
     answer = read_apart("xacro", str(path), {"path": str(Path(path).absolute())})
     if "refused" in answer:
-        raise RobotModelError(
-            f"{path}: xacro could not expand it ({answer['refused']}); correct it, or "
-            "expand it where its packages are: xacro robot.xacro > robot.urdf."
-        )
+        seen = f"{path}: xacro could not expand it ({answer['refused']})"
+        advice = "correct it, or expand it where its packages are: xacro robot.xacro > robot.urdf."
+        raise RobotModelError(f"{seen}; {advice}")
     return answer["text"]

@@ -63,9 +63,8 @@ def kuka_urdf(config: KukaSurfaceConfig) -> str:
         dynamics.set("damping", repr(config.joint_damping))
     tool, base = (root.find(f"link[@name='{name}']/inertial") for name in (TOOL_LINK, BASE_LINK))
     if tool is None or base is None:
-        raise RobotModelError(
-            f"{path} lacks {TOOL_LINK!r} or {BASE_LINK!r} with inertia; install pybullet 3.2.6 or 3.2.7."
-        )
+        seen = f"{path} lacks {TOOL_LINK!r} or {BASE_LINK!r} with inertia"
+        raise RobotModelError(f"{seen}; install pybullet 3.2.6 or 3.2.7.")
     loaded = inertial_element(config.tool_mass, config.tool_center_of_mass, np.diag(config.tool_inertia))
     for link, element in ((tool, loaded), (base, inertial_element(0.0, np.zeros(3), np.zeros((3, 3))))):
         link[:] = ElementTree.fromstring(element)
@@ -212,10 +211,9 @@ def simulate_episode(config: KukaSurfaceConfig, robot: Robot, plant: RigidBodyDy
         try:
             wanted = joint_acceleration(config, state, aim)
         except np.linalg.LinAlgError as error:
-            raise SimulationError(
-                f"episode {episode}: the arm is in a singular posture at {step * config.time_step:.3g} s. "
-                "Start from another posture (start_degrees) or keep the way-points nearer."
-            ) from error
+            seen = f"episode {episode}: the arm is in a singular posture at {step * config.time_step:.3g} s"
+            advice = "Start from another posture (start_degrees) or keep the way-points nearer."
+            raise SimulationError(f"{seen}. {advice}") from error
         asked = state.mass @ wanted + state.bias + config.joint_damping * v
         if config.pressing_force:
             normal = table.gradient(torch.from_numpy(state.position)).numpy()
