@@ -237,13 +237,10 @@ def _kept(chosen: Preparation, dataset: Dataset) -> np.ndarray:
             )
         kept.append(own)
         if chosen.cutoff is not None and 0.5 / (chosen.every * step) < float(chosen.cutoff):
-            warn(
-                f"every {chosen.every}. row is {1.0 / (chosen.every * step):.4g} Hz, of which only half can carry "
-                f"motion; the filter passes {chosen.cutoff:g} Hz. Rows stay true, but spectra, derivatives and filters "
-                "of them do not: keep more rows or filter lower.",
-                DataWarning,
-                stacklevel=3,
-            )
+            kept_rate = f"every {chosen.every}. row is {1.0 / (chosen.every * step):.4g} Hz"
+            seen = f"{kept_rate}, of which only half can carry motion; the filter passes {chosen.cutoff:g} Hz"
+            effect = "Rows stay true, but spectra, derivatives and filters of them do not"
+            warn(f"{seen}. {effect}: keep more rows or filter lower.", DataWarning, stacklevel=3)
     return np.sort(np.concatenate(kept))
 
 

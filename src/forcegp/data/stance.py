@@ -85,13 +85,10 @@ class Stance:
         if not decided.any():
             raise self._open(len(rows))
         if decided.mean() < 1.0 - MANY_OPEN:
-            warn(
-                f"motion and forces leave the stance open in {1.0 - decided.mean():.0%} of the rows, of which torques "
-                "alone are used: velocities are noisy (filter them: `cutoff='auto'`), stance is as short as what a "
-                "filter smears, feet slip or lean, or touch at other points than those given.",
-                DataWarning,
-                stacklevel=3,
-            )
+            seen = f"motion and forces leave the stance open in {1.0 - decided.mean():.0%} of the rows"
+            why = "velocities are noisy (filter them: `cutoff='auto'`), stance is as short as what a filter smears"
+            why = f"{why}, feet slip or lean, or touch at other points than those given"
+            warn(f"{seen}, of which torques alone are used: {why}.", DataWarning, stacklevel=3)
         return rows
 
     def _open(self, rows: int) -> DatasetError:

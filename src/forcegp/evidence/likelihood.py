@@ -134,12 +134,9 @@ def check_distance(model: Model, training: TrainingData) -> None:
                 f"more than {distance:.3g} m; {remedy}"
             )
         if distance > FAR_FROM_SURFACE:
-            warnings.warn(
-                f"half of the training points lie more than {distance:.3g} m from {what}; {remedy}, or train on the "
-                "rows in contact only (forcegp.data.rows_in_contact)",
-                DataWarning,
-                stacklevel=5,
-            )
+            seen = f"half of the training points lie more than {distance:.3g} m from {what}"
+            advice = f"{remedy}, or train on the rows in contact only (forcegp.data.rows_in_contact)"
+            warnings.warn(f"{seen}; {advice}", DataWarning, stacklevel=5)
 
 
 def checked_values(forces: UnknownForces, dynamics: ConstrainedDynamics) -> tuple[Tensor, tuple[Tensor, ...]]:

@@ -283,10 +283,7 @@ def warn_of_divergence(diverged_at: Tensor, not_found: Tensor, dt: float, what: 
     cause = f"a joint faster than {SPEED_LIMIT:g} rad/s or m/s, or a state that is not finite"
     if lost:
         cause = NO_ROOT + (f" ({lost} of them), or {cause}" if lost < int(ended.sum()) else "")
-    warnings.warn(
-        f"{int(ended.sum())} of {len(diverged_at)} {what} diverged, the first at step {first} ({first * dt:.4g} s): "
-        f"{cause}. They are NaN from there on; a smaller dt, a shorter motion or a model with more physics "
-        "avoids this.",
-        NumericalWarning,
-        stacklevel=3,
-    )
+    first_at = f"the first at step {first} ({first * dt:.4g} s)"
+    seen = f"{int(ended.sum())} of {len(diverged_at)} {what} diverged, {first_at}: {cause}"
+    advice = "a smaller dt, a shorter motion or a model with more physics avoids this."
+    warnings.warn(f"{seen}. They are NaN from there on; {advice}", NumericalWarning, stacklevel=3)

@@ -57,12 +57,9 @@ def prepared_predictor(posterior: Any, covariance: str, compile: bool) -> Predic
         compressed = compress(latent, chosen, check, tolerance=TOLERANCE, largest=LARGEST_RANK)
         reached = float(compressed.inflation.max()) if len(compressed.inflation) else 0.0
         if reached > TOLERANCE:
-            warnings.warn(
-                f"rank {compressed.rank} makes standard deviations up to {reached:.2g} (relative) too large, more "
-                f"than {TOLERANCE:.2g}; give covariance='exact' where that matters.",
-                NumericalWarning,
-                stacklevel=3,
-            )
+            seen = f"rank {compressed.rank} makes standard deviations up to {reached:.2g} (relative) too large"
+            advice = f"more than {TOLERANCE:.2g}; give covariance='exact' where that matters."
+            warnings.warn(f"{seen}, {advice}", NumericalWarning, stacklevel=3)
     code = posterior.programs(compressed=compressed) if compile else None
     made = Predictor(posterior, model.robot.space, model.sizes, training.q.device, code, covariance, compressed)
     made.compiled("mean" if compressed is None else "covariance")

@@ -154,12 +154,10 @@ def _even_step(recordings: Sequence[Recording], options: ImportOptions) -> float
     median = float(np.median([own.step for own in recordings]))
     if not isinstance(options.rate, str):
         if options.rate < 0.9 / median:
-            warnings.warn(
-                f"`rate` {options.rate:g} Hz is below the {1 / median:.6g} Hz of the log; what moves faster than half "
-                "of that appears as slow motion. Filter first: forcegp import --cutoff --every.",
-                DataWarning,
-                stacklevel=3,
-            )
+            seen = f"`rate` {options.rate:g} Hz is below the {1 / median:.6g} Hz of the log"
+            effect = "what moves faster than half of that appears as slow motion"
+            advice = "Filter first: forcegp import --cutoff --every."
+            warnings.warn(f"{seen}; {effect}. {advice}", DataWarning, stacklevel=3)
         return 1.0 / options.rate
     alike = all(abs(own.step / median - 1.0) <= ROUND_RATE for own in recordings)
     if options.rate == "log" or (alike and all(own.worst <= JITTER for own in recordings)):

@@ -240,9 +240,8 @@ def read_poses(
         turn, jumped = following(turn, turn[0])
         jumped[begins] = False
         seen = f"{group.name!r} turns by more than a quarter of a turn"
-        remedy = (
-            "give the order of its columns (`orientation`), the unit of its angles (`unit` q=deg), or leave it out."
-        )
+        unit = "the unit of its angles (`unit` q=deg)"
+        remedy = f"give the order of its columns (`orientation`), {unit}, or leave it out."
         jumps.append((np.flatnonzero(jumped), seen, remedy))
         q = np.hstack([q[:, : group.place], given[:, :first], turn, q[:, group.place :]])
     return q, jumps, notes

@@ -108,10 +108,9 @@ class CompiledModel:
 
     def _joint(self, name: str, kind: str, parent: str, child: str, origin: np.ndarray, more: str) -> None:
         xyz, rpy = numbers(origin[:3, 3]), numbers(rpy_from_rotation(origin[:3, :3]))
-        self.elements.append(
-            f'  <joint name={quoteattr(name)} type="{kind}"><parent link={quoteattr(parent)}/>'
-            f'<child link={quoteattr(child)}/><origin xyz="{xyz}" rpy="{rpy}"/>{more}</joint>'
-        )
+        links = f"<parent link={quoteattr(parent)}/><child link={quoteattr(child)}/>"
+        inside = f'{links}<origin xyz="{xyz}" rpy="{rpy}"/>{more}'
+        self.elements.append(f'  <joint name={quoteattr(name)} type="{kind}">{inside}</joint>')
 
     def _body(self, body: int) -> None:
         """The chain of joints of one body, and its link."""

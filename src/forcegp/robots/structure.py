@@ -356,9 +356,7 @@ def bodies_without_inertia(
             found.append((drive.joint, NonPhysicalInertia(seen, "; correct its <inertial> element.", remedy)))
         elif body not in whole and joint.type != "prismatic" and moments[:2].sum() <= SINGULAR * moments.sum():
             seen = f"{link} turns with joint {name!r} but has no rotational inertia about its axis"
-            advice = (
-                ": any force would accelerate it infinitely. Correct its <inertial> element, give the joint the "
-                "inertia of its rotor (`armature`, in kg m^2), or lock it."
-            )
+            rotor = "give the joint the inertia of its rotor (`armature`, in kg m^2)"
+            advice = f": any force would accelerate it infinitely. Correct its <inertial> element, {rotor}, or lock it."
             found.append((drive.joint, NonPhysicalInertia(seen, advice, remedy)))
     return found

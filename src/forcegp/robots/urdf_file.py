@@ -194,10 +194,8 @@ def with_chosen_inertias(
             problems.note("a mass without <inertia> is taken as a point", f"link {name!r}")
             continue
         relative = 100.0 * np.linalg.norm(nearest - given) / np.linalg.norm(given)
-        problems.note(
-            "an inertia that no body has is replaced by the nearest one that a body has",
-            f"link {name!r}: {objection}; changed by {relative:.2g} %",
-        )
+        where = f"link {name!r}: {objection}; changed by {relative:.2g} %"
+        problems.note("an inertia that no body has is replaced by the nearest one that a body has", where)
     links = dict(parse_urdf(text, Problems(source)).links) if changed else links
     for name, inertial in links.items():
         if inertial is not None and name not in layout.moving and np.isnan(inertial.inertia).all():
