@@ -21,6 +21,7 @@ from forcegp.posterior.predictor import Predictor
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, real_array
 
+Torques = Float[np.ndarray, " rows"]
 Motion = tuple[Any, Any, Any]
 """q, v and u (T, nv) of one recording; u[k] acts from row k to row k + 1."""
 
@@ -271,9 +272,7 @@ class ContactMonitor:
         return ContactState(tau.clone(), distance, probability, distance > self.threshold)
 
 
-def errors_near_rest(
-    tau: Float[np.ndarray, " rows"], known: Float[np.ndarray, " rows"], slow: Float[np.ndarray, " rows"]
-) -> tuple[float, float, float]:
+def errors_near_rest(tau: Torques, known: Torques, slow: Torques) -> tuple[float, float, float]:
     """Standard deviations f and s by which tau ~ N(0, known + f^2 + (s slow)^2) is most likely.
 
     The first number is minus the mean logarithm of the likelihood, less a constant.

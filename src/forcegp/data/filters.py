@@ -21,7 +21,6 @@ Values = Float[np.ndarray, "rows *columns"]
 Times = Float[np.ndarray, " rows"]
 
 TRANSIENT = 1e-3  # what is left of a filter's transient at the ends of a recording; sets the length of the padding
-PASSED = 3.0  # rows in a period of a cut-off, of which more repeat their neighbours (`LowPass.memory`)
 HALF = 0.32434  # periods of a cut-off in which the autocorrelation of white noise behind it falls to one half
 JITTER = 0.01
 """Largest deviation of a time step from the median step, relative to it, that still counts as uniform sampling."""

@@ -10,16 +10,7 @@ import numpy as np
 
 from forcegp.data.dataset import Dataset
 from forcegp.data.delay import estimate_delay, torques_of_joints
-from forcegp.data.filters import (
-    PASSED,
-    LowPass,
-    Signal,
-    differentiated,
-    episodes_in_order,
-    low_pass,
-    shifted,
-    uniform_step,
-)
+from forcegp.data.filters import LowPass, Signal, differentiated, episodes_in_order, low_pass, shifted, uniform_step
 from forcegp.data.spectrum import FEWEST_ROWS, held_out_cutoff, motion_spectrum
 from forcegp.data.stance import estimate_stance
 from forcegp.data.strokes import with_strokes
@@ -29,6 +20,7 @@ from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_argum
 from forcegp.robots.arguments import whole_number
 from forcegp.summary import plain
 
+PASSED = 3.0  # rows in a period of a cut-off, of which more repeat their neighbours (`LowPass.memory`)
 FEW = 2_000  # rows of a whole log
 SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
 EXPLAINED, SLOW = 1.1, 0.25

@@ -19,6 +19,7 @@ Posterior = Any
 """A `Posterior`, whose module imports this one."""
 
 OBSERVERS = ObservedWind | ObservedWrench
+Wrenches = Float[np.ndarray, "rows 6"]
 TRIED = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s
 MEMORY, LEAST = 1.0, 0.1  # s, of how much each time missed, and of the past that the first row needs
 
@@ -135,9 +136,7 @@ def _in_observed_wind(posterior: Posterior, dataset: Dataset) -> tuple[Posterior
     return posterior.with_model(seen.model), seen
 
 
-def _observed(
-    wrench: Float[np.ndarray, "rows 6"], dataset: Dataset, times: Sequence[float]
-) -> Float[np.ndarray, "rows 6"]:
+def _observed(wrench: Wrenches, dataset: Dataset, times: Sequence[float]) -> Wrenches:
     """The wrench that the rows before each show, none at the first of an episode."""
     observed = np.zeros_like(wrench)
     for number, rows, _ in episodes_in_order(dataset):

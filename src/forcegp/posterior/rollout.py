@@ -27,6 +27,7 @@ STEPS_TO_COMPILE = 2000
 TOGETHER, FUNCTIONS = 10, 3  # motions, and unknown functions, that cost as much as one step again
 ROWS_PER_BLOCK = 4096  # states whose constraint is evaluated at once
 
+Inputs, States = Float[Tensor, "T n nu"], Float[Tensor, "n rows"]
 AccelerationFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(q, v, u) -> a, all of one shape."""
 
@@ -60,7 +61,7 @@ def moved(
     model: Model,
     q: Float[Tensor, "n nq"],
     v: Float[Tensor, "n nv"],
-    u: Float[Tensor, "T n nu"],
+    u: Inputs,
     dt: float,
     *,
     feedback: Feedback | None = None,
@@ -186,9 +187,7 @@ class Rollout:
         return torch.where(torch.isnan(high - low), torch.nan, ((low <= off) & (off <= high)).to(off))
 
 
-def remembering(
-    model: Model, u: Float[Tensor, "T n nu"], dt: float, feedback: Feedback | None
-) -> tuple[Float[Tensor, "T n nu"], Feedback | None]:
+def remembering(model: Model, u: Inputs, dt: float, feedback: Feedback | None) -> tuple[Inputs, Feedback | None]:
     """u without memory but in its first row, and feedback that adds what laws remember of the motion since then."""
     memory, first = model.memory, model.memory_column
     if not memory.names:
@@ -281,9 +280,7 @@ class StepLinearization(NamedTuple):
     c: Tensor
 
 
-def stepped(
-    mean: AccelerationFunction, model: Model, x: Float[Tensor, "n rows"], dt: Any, integrator: Any
-) -> Float[Tensor, "n state"]:
+def stepped(mean: AccelerationFunction, model: Model, x: States, dt: Any, integrator: Any) -> Float[Tensor, "n state"]:
     """[q, v] one step after the rows x = [q, v, u], as `Predictor.step` documents it."""
     q, v, u = x.split(model.sizes, dim=-1)
     step = steps_by(integrator, model, dt)(lambda q, v: mean(q, v, u), q, v, dt)
@@ -293,7 +290,7 @@ def stepped(
     return torch.cat([step.q, step.v], dim=-1)
 
 
-def linearized_step(predictor: Any, x: Float[Tensor, "n rows"], dt: Any, integrator: Any) -> StepLinearization:
+def linearized_step(predictor: Any, x: States, dt: Any, integrator: Any) -> StepLinearization:
     """The step of a `Predictor` with its derivatives, by the chain rule; of an implicit one by implicit functions."""
     model = predictor.posterior.model
     if not model.robot.space.is_vector_space:
@@ -327,9 +324,7 @@ def linearized_step(predictor: Any, x: Float[Tensor, "n rows"], dt: Any, integra
     return StepLinearization(q, v, A, B, c)
 
 
-def _on_manifold(
-    mean: AccelerationFunction, model: Model, x: Float[Tensor, "n rows"], dt: Any, integrator: Any
-) -> StepLinearization:
+def _on_manifold(mean: AccelerationFunction, model: Model, x: States, dt: Any, integrator: Any) -> StepLinearization:
     """The same where positions do not add up, in steps from q and from the q after it; by backward passes of `mean`."""
     space, (nq, nv, _) = model.robot.space, model.sizes
     q, rest = x.detach().split([nq, x.shape[-1] - nq], dim=-1)

@@ -23,6 +23,7 @@ from forcegp.recordings.source import Columns, Source
 from forcegp.robots.manifold import POSITIONS, TURN, ConfigurationSpace
 
 Values = Float[np.ndarray, "rows signals"]
+Times = Float[np.ndarray, " rows"]
 Marked = Bool[np.ndarray, " rows"]
 Jumps = tuple[Int[np.ndarray, " jumps"], str, str]
 """Rows before which something moves too far, what was seen, and what to do."""
@@ -59,7 +60,7 @@ class Recording:
     told: dict[str, Any]
     source: Source
     signals: Mapping[str, Float[np.ndarray, "rows _"]]
-    time: Float[np.ndarray, " rows"]
+    time: Times
     begin: float
     jumps: tuple[Jumps, ...]
     layout: Layout
@@ -205,11 +206,7 @@ def _continued(plan: SignalPlan, values: np.ndarray, begins: np.ndarray, unwrap:
 
 
 def read_poses(
-    space: ConfigurationSpace,
-    orientation: str,
-    source: Source,
-    table: Float[np.ndarray, "rows columns"],
-    begins: Int[np.ndarray, " episodes"],
+    space: ConfigurationSpace, orientation: str, source: Source, table: Values, begins: Int[np.ndarray, " episodes"]
 ) -> tuple[Float[np.ndarray, "rows nq"], list[Jumps], list[str]]:
     """Positions as the log writes them, as q: turns of length 1, quaternions whose sign never jumps.
 
@@ -247,9 +244,7 @@ def read_poses(
     return q, jumps, notes
 
 
-def _require_finite(
-    values: np.ndarray, columns: Columns, plan: SignalPlan, source: Source, time: Float[np.ndarray, " rows"]
-) -> None:
+def _require_finite(values: np.ndarray, columns: Columns, plan: SignalPlan, source: Source, time: Times) -> None:
     if np.isfinite(values).all():
         return
     row, index = (int(position) for position in np.argwhere(~np.isfinite(values))[0])
@@ -319,7 +314,7 @@ def _require_plausible_positions(
 
 
 def _stretches(
-    label: str, source: Source, time: Float[np.ndarray, " rows"], episodes: np.ndarray, read: Read, options: Any
+    label: str, source: Source, time: Times, episodes: np.ndarray, read: Read, options: Any
 ) -> tuple[tuple[tuple[int, np.ndarray], ...], float, float, dict[str, Any]]:
     """Rows between gaps, their median step, the worst relative deviation from it, and what was left out.
 

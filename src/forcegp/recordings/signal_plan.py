@@ -15,8 +15,6 @@ from forcegp.data.configurations import in_base
 from forcegp.data.dataset import FORCE, IMU, ROTATION, TORQUE, TRANSLATION, imu_place
 from forcegp.errors import FileFormatError, InvalidInput, require_known
 from forcegp.recordings.mapping import (
-    OF_IMU,
-    OF_LINKS,
     ORIENTATIONS,
     SIGNALS,
     UNITS,
@@ -44,6 +42,7 @@ TURNED = ("y", "z", "qy", "qz", "sin", "ry", "rz", "pitch", "yaw")
 """What changes sign by half a turn of world and base about x: north, east, down becomes north, west, up."""
 LACKING = Expression("derive", {}, ast.Constant(0.0), ())
 """This very object: an entry of v or a that the log lacks, which is differentiated, or a switch of a contact."""
+OF_IMU, OF_LINKS = "imu", "torque"  # before the frame of an IMU, and the joint of a torque, in `force`
 LACKS = re.compile(r"derive\d*")
 EPISODE = "episode_index"  # numbers the episodes where nothing else is stated, as in datasets of LeRobot
 MOST_NAMES = 40  # of columns in a message

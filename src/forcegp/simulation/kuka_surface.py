@@ -24,6 +24,7 @@ from forcegp.simulation.scenarios import KukaSurfaceConfig
 from forcegp.simulation.trajectory import (
     ArmState,
     Friction,
+    Vector,
     compiled_plant,
     joint_acceleration,
     laws_of_joints,
@@ -102,9 +103,7 @@ class PointFriction:
         """`|F| / |N|` of dry friction at tangential speeds [m/s]."""
         return np.asarray(self._per_velocity(speed) * speed)
 
-    def forces(
-        self, velocity: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"]
-    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    def forces(self, velocity: Vector, normal: Vector) -> tuple[Vector, Vector]:
         """Viscous friction [N], and dry friction per newton of normal force; `normal` is a unit vector."""
         tangential = velocity - (normal @ velocity) * normal
         return -self.viscous * velocity, -self._per_velocity(np.sqrt(tangential @ tangential)) * tangential
@@ -118,7 +117,7 @@ class ContactForces(NamedTuple):
     """What acts at the tool: normal force [N], friction (3,) [N, world axes] and joint torques, `push` all of these."""
 
     multiplier: float
-    tool_force: Float[np.ndarray, "3"]
+    tool_force: Vector
     tool_torques: Float[np.ndarray, " nv"]
     in_contact: bool
     push: Float[np.ndarray, " nv"]

@@ -24,6 +24,8 @@ from forcegp.robots import Robot
 from forcegp.robots.structure import RigidBodyDynamics
 from forcegp.simulation.scenarios import KukaSurfaceConfig
 
+Vector = Float[np.ndarray, "3"]
+
 
 @dataclass(frozen=True, eq=False)
 class ArmState:
@@ -33,7 +35,7 @@ class ArmState:
     v: Float[np.ndarray, " nv"]
     mass: Float[np.ndarray, "nv nv"]
     bias: Float[np.ndarray, " nv"]
-    position: Float[np.ndarray, "3"]
+    position: Vector
     rotation: Float[np.ndarray, "3 3"]
     jacobian: Float[np.ndarray, "6 nv"]
     bias_acceleration: Float[np.ndarray, "6"]
@@ -58,11 +60,10 @@ def compiled_plant(robot: Robot) -> RigidBodyDynamics:
     return plant
 
 
-Aim = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 Motions = tuple[Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"]]
 
 
-def middle_of(config: KukaSurfaceConfig) -> Float[np.ndarray, "3"]:
+def middle_of(config: KukaSurfaceConfig) -> Vector:
     """Of the region of way-points, on the table [m]."""
     return np.array([np.mean(config.waypoint_x), np.mean(config.waypoint_y), config.surface_height])
 
@@ -120,9 +121,7 @@ def over_table(config: KukaSurfaceConfig, motions: Motions) -> Motions:
     return motions
 
 
-def random_path(
-    config: KukaSurfaceConfig, start: Float[np.ndarray, "3"], seconds: float, rng: np.random.Generator
-) -> SegmentPath:
+def random_path(config: KukaSurfaceConfig, start: Vector, seconds: float, rng: np.random.Generator) -> SegmentPath:
     """Random way-points at `config.waypoint_height`, from `start` [m], for at least `seconds` [s]."""
     points, durations = [np.asarray(start, dtype=np.float64)], []
     while sum(durations) < seconds:
@@ -137,7 +136,9 @@ def random_path(
 TOOL_ORIENTATION = np.diag([-1.0, 1.0, -1.0])  # the tool points straight down
 
 
-def joint_acceleration(config: KukaSurfaceConfig, state: ArmState, reference: Aim) -> Float[np.ndarray, " nv"]:
+def joint_acceleration(
+    config: KukaSurfaceConfig, state: ArmState, reference: tuple[Vector, Vector, Vector]
+) -> Float[np.ndarray, " nv"]:
     """Commanded joint acceleration [rad/s^2] under which the tool follows an aimed position, velocity and acceleration.
 
     Resolved-acceleration control (Siciliano et al., Robotics, section 8.6.2) with a null-space posture: with `e` the
