@@ -171,7 +171,8 @@ def _tensor(what: str, given: Any, shape: tuple[int | None, ...], wanted: str) -
     if not isinstance(given, Tensor) or not fits or given.dtype != torch.float64 or given.requires_grad:
         kind = f"a {getattr(given, 'dtype', type(given).__name__)} of shape {found}"
         sizes = ", ".join("any" if size is None else str(size) for size in shape)
-        raise InvalidInput(f"{what} is {kind}; give a float64 tensor ({sizes}) without gradients, that is {wanted}")
+        seen = f"{what} is {kind}"
+        raise InvalidInput(f"{seen}; it must be a float64 tensor ({sizes}) without gradients, that is {wanted}")
     lost = ~torch.isfinite(given).flatten(1).all(1)
     if bool(lost.any()):
         raise InvalidInput(f"{what} is not finite at training row {int(lost.nonzero()[0])}; mend it there")

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from forcegp.errors import ContactError, InvalidInput, NumericalError, require_number, require_type
+from forcegp.errors import ContactError, InvalidInput, NumericalError, require_number
 from forcegp.mechanics.surfaces import Held, Surface, surface_from_dict, surface_to_dict
 from forcegp.robots import Kinematics, Robot
 from forcegp.robots.arguments import finite_vector
@@ -65,7 +65,9 @@ class Contact:
     def __post_init__(self) -> None:
         if not isinstance(self.frame, str):
             raise InvalidInput(f"Contact frame is {self.frame!r}; give the name of a link.")
-        require_type("Contact surface", self.surface, Surface, ": Plane, Sphere, ImplicitSurface ...")
+        if not isinstance(self.surface, Surface):
+            seen = f"Contact surface is a {type(self.surface).__name__}"
+            raise InvalidInput(f"{seen}; give a Plane, Sphere, ImplicitSurface ...")
         if self.switch is not None and not (isinstance(self.switch, str) and self.switch):
             raise InvalidInput(f"Contact switch is {self.switch!r}; give the name of an input, or None.")
         point = finite_vector("Contact point", self.point, 3, f" x, y, z in m, in frame {self.frame!r}")

@@ -27,7 +27,8 @@ STEPS_TO_COMPILE = 2000
 TOGETHER, FUNCTIONS = 10, 3  # motions, and unknown functions, that cost as much as one step again
 ROWS_PER_BLOCK = 4096  # states whose constraint is evaluated at once
 
-Inputs, States = Float[Tensor, "T n nu"], Float[Tensor, "n rows"]
+Inputs = Float[Tensor, "T n nu"]
+States = Float[Tensor, "n rows"]
 AccelerationFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(q, v, u) -> a, all of one shape."""
 
