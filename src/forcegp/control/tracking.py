@@ -46,10 +46,9 @@ class Controller:
         stated = [joint.effort_limit for joint in robot.joints]
         self.torque_limits = per_joint("torque_limits", stated if torque_limits is None else torque_limits, robot.nv)
         if not bool(self.torque_limits.any()):
-            raise InvalidInput(
-                "torque_limits are zero in every joint, so nothing can be controlled; give Nm or N"
-                + (": the URDF states an effort of 0." if torque_limits is None else ".")
-            )
+            seen = "torque_limits are zero in every joint, so nothing can be controlled"
+            why = ": the URDF states an effort of 0." if torque_limits is None else "."
+            raise InvalidInput(f"{seen}; give Nm or N{why}")
         self.restart()
 
     def restart(self) -> None:
@@ -284,10 +283,9 @@ class HybridForce(TrackingController):
         far = float(at.off.abs().max())
         self.released = far > self.tolerance
         if self.released and self._free is None:
-            raise ContactError(
-                f"a contact's point is {far:.3g} m off its surface, and at most {self.tolerance:g} m are allowed: a "
-                'force there would push nothing; move it there by ComputedTorque first, or give off_surface="release".'
-            )
+            seen = f"a contact's point is {far:.3g} m off its surface, and at most {self.tolerance:g} m are allowed"
+            advice = 'move it there by ComputedTorque first, or give off_surface="release".'
+            raise ContactError(f"{seen}: a force there would push nothing; {advice}")
         if self.released and self._free is not None:
             return self._free._torques(q, v, v_d, a_d, e, e_v)
         free = a_d + self.feedback(e, e_v)

@@ -64,9 +64,9 @@ NUMBERS = {
 SIGN = ("velocity_scale", "sigma")
 
 
-def of_dry_friction(*level: str) -> dict[str, Coefficient]:
-    """The coefficients of a law whose level has these numbers."""
-    return {name: NUMBERS[name] for name in (*level, *SIGN)}
+def of_friction(*more: str) -> dict[str, Coefficient]:
+    """The coefficients of a law of dry friction whose level has these numbers, too."""
+    return {name: NUMBERS[name] for name in ("level", *more, *SIGN)}
 
 
 Memory = bool | tuple[str, ...] | tuple[bool, ...]
@@ -82,6 +82,7 @@ class DryFriction(JointLaw):
 
     sigma: Number = field(default=None, kw_only=True)
     memory: Memory = field(default=False, kw_only=True)
+    level: Number = None
     part: ClassVar[str] = DRY
 
     def level_at(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Float[Tensor, "*batch nv"]:
@@ -175,9 +176,8 @@ class DryFriction(JointLaw):
 class Coulomb(DryFriction):
     """-c s: dry friction of `level` c in Nm or N."""
 
-    level: Number = None
     velocity_scale: Number = None
-    coefficients: ClassVar[Mapping[str, Coefficient]] = of_dry_friction("level")
+    coefficients: ClassVar[Mapping[str, Coefficient]] = of_friction()
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,11 +187,10 @@ class Stribeck(DryFriction):
     `level` c, `breakaway` b in Nm or N, `stribeck_velocity` v_s in rad/s or m/s (Olsson et al. 1998, eq. 4).
     """
 
-    level: Number = None
     breakaway: Number = None
     stribeck_velocity: Number = None
     velocity_scale: Number = None
-    coefficients: ClassVar[Mapping[str, Coefficient]] = of_dry_friction("level", "breakaway", "stribeck_velocity")
+    coefficients: ClassVar[Mapping[str, Coefficient]] = of_friction("breakaway", "stribeck_velocity")
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,10 +200,9 @@ class LoadFriction(DryFriction):
     `level` c in Nm or N, `factor` mu without unit (Hamon, Gautier & Garrec, IROS 2010, with the output torque).
     """
 
-    level: Number = None
     factor: Number = None
     velocity_scale: Number = None
-    coefficients: ClassVar[Mapping[str, Coefficient]] = of_dry_friction("level", "factor")
+    coefficients: ClassVar[Mapping[str, Coefficient]] = of_friction("factor")
     under_load: ClassVar[bool] = True
 
 
@@ -221,9 +219,7 @@ class GearFriction(LoadFriction):
     breakaway: Number = None
     stribeck_velocity: Number = None
     memory: Memory | None = field(default=None, kw_only=True)  # type: ignore[assignment]  # open until a fit decides
-    coefficients: ClassVar[Mapping[str, Coefficient]] = of_dry_friction(
-        "level", "factor", "root", "breakaway", "stribeck_velocity"
-    )
+    coefficients: ClassVar[Mapping[str, Coefficient]] = of_friction("factor", "root", "breakaway", "stribeck_velocity")
 
 
 @dataclass(frozen=True, eq=False)
