@@ -223,10 +223,9 @@ class ContactMonitor:
         found = [torch.tensor(real_array(name, x), dtype=torch.float64) for name, x in named]
         shapes = [tuple(x.shape) for x in found]
         if len({*shapes}) > 1 or shapes[0][-1:] != (self.robot.nv,) or not all(bool(x.isfinite().all()) for x in found):
-            raise InvalidInput(
-                f"q, v and u have shapes {', '.join(map(str, shapes))}; give finite numbers, all ({self.robot.nv},) "
-                f"for one sample or (T, {self.robot.nv}) for a recording."
-            )
+            seen = f"q, v and u have shapes {', '.join(map(str, shapes))}"
+            advice = f"all ({self.robot.nv},) for one sample or (T, {self.robot.nv}) for a recording."
+            raise InvalidInput(f"{seen}; give finite numbers, {advice}")
         return found[0], found[1], found[2]
 
     def _near_rest(self, v: Tensor, fade: np.ndarray) -> np.ndarray:

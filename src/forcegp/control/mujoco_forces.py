@@ -85,10 +85,9 @@ def _joints(model: Any, names: tuple[str, ...]) -> list[tuple[int, int]]:
         stated = {"damping": model.dof_damping[at], "frictionloss": model.dof_frictionloss[at]}
         for what, value in (stated | {"stiffness": model.jnt_stiffness[number]}).items():
             if np.any(value):
-                raise InvalidInput(
-                    f"joint {name} has {what} in the MjModel, which would act beside the learned forces; set it to 0 "
-                    f"(model.dof_damping, dof_frictionloss, jnt_stiffness), or learn with it as a known force."
-                )
+                seen = f"joint {name} has {what} in the MjModel, which would act beside the learned forces"
+                numbers = "model.dof_damping, dof_frictionloss, jnt_stiffness"
+                raise InvalidInput(f"{seen}; set it to 0 ({numbers}), or learn with it as a known force.")
         places.append((int(model.jnt_qposadr[number]), at))
     return places
 

@@ -112,10 +112,9 @@ class TrackingController(Controller):
         low, high = self._range
         if beyond := torch.nonzero((q_d < low) | (q_d > high))[:, 0].tolist():
             j = beyond[0]
-            raise InvalidInput(
-                f"the reference asks {self.robot.joint_names[j]} to be at {float(q_d[j]):.4g}, and it moves "
-                f"between {float(low[j]):.4g} and {float(high[j]):.4g}; change q_d, or the limits in the URDF."
-            )
+            seen = f"the reference asks {self.robot.joint_names[j]} to be at {float(q_d[j]):.4g}"
+            ends = f"it moves between {float(low[j]):.4g} and {float(high[j]):.4g}"
+            raise InvalidInput(f"{seen}, and {ends}; change q_d, or the limits in the URDF.")
         return self.limited(self._torques(q, v, v_d, a_d, q_d - q, v_d - v))
 
     def feedback(self, e: Tensor, e_v: Tensor) -> Tensor:

@@ -93,10 +93,8 @@ def estimate_delay(dataset: Dataset, cutoff: float | None = None) -> Delay:
         seen = "the forces of contacts are not known, so a delay cannot be found in this log"
         raise InvalidInput(f"{seen}. Give the delay in s, or use a log without contact.")
     if not torques_of_joints(dataset):
-        raise InvalidInput(
-            "a delay is found from the torque of every joint, which u does not hold for a base that moves or actuators "
-            "of another kind; give the delay in s."
-        )
+        why = "which u does not hold for a base that moves or actuators of another kind"
+        raise InvalidInput(f"a delay is found from the torque of every joint, {why}; give the delay in s.")
     near = _told_apart(dataset, USUAL_DELAY, cutoff)
     open_ones = np.isnan(near.seconds) & np.array([bool(np.ptp(u)) for u in dataset.u.T])
     at_end = np.isnan(near.common + near.common_std)  # that of a part of the log lies beyond

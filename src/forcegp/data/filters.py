@@ -50,10 +50,9 @@ class LowPass:
             dies = np.ceil(np.log(TRANSIENT) / np.log(slowest)) if slowest < 1.0 else np.inf
         padding = int(max(min(dies, 1e15), self.order + 1))
         if len(values) <= padding:
-            raise DatasetError(
-                f"{len(values)} rows are too few for a filter of order {self.order} with a cut-off at {self.cutoff} Hz;"
-                f" more than {padding:g} are needed. Use a higher cut-off, or leave the episode out."
-            )
+            which = f"a filter of order {self.order} with a cut-off at {self.cutoff} Hz"
+            seen = f"{len(values)} rows are too few for {which}; more than {padding:g} are needed"
+            raise DatasetError(f"{seen}. Use a higher cut-off, or leave the episode out.")
         return sosfiltfilt(butter(self.order, self.cutoff, fs=rate, output="sos"), values, axis=0, padlen=padding)
 
     def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Float[np.ndarray, " k"]:
@@ -151,10 +150,8 @@ def uniform_step(time: Times, name: str = "this recording") -> float:
     median = float(np.median(steps))
     worst = int(np.argmax(np.abs(steps - median)))
     if median <= 0 or abs(steps[worst] - median) > JITTER * median:
-        raise DatasetError(
-            f"{name} is not sampled uniformly: the step after row {worst} is {steps[worst]:.6g} s, the median "
-            f"{median:.6g} s. Resample it first (forcegp.data.resample)."
-        )
+        seen = f"the step after row {worst} is {steps[worst]:.6g} s, the median {median:.6g} s"
+        raise DatasetError(f"{name} is not sampled uniformly: {seen}. Resample it first (forcegp.data.resample).")
     return float((time[-1] - time[0]) / (len(time) - 1))
 
 

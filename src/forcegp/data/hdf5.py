@@ -134,9 +134,8 @@ class _Reader:
         """The HDF5 dataset of that name, which must lie inside this very file."""
         found = self.file[name] if isinstance(self.file.get(name, getlink=True), h5py.HardLink) else None
         if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
-            raise FileFormatError(
-                f"{self.path}: {name!r} must be a dataset stored in this file, not a group or a link elsewhere."
-            )
+            seen = f"{self.path}: {name!r} must be a dataset stored in this file"
+            raise FileFormatError(f"{seen}, not a group or a link elsewhere.")
         return found
 
     def array(self, name: str) -> np.ndarray:

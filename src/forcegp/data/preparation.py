@@ -223,10 +223,9 @@ def _kept(chosen: Preparation, dataset: Dataset) -> np.ndarray:
         inside = (rows.time >= rows.time[0] + early - slack) & (rows.time <= rows.time[-1] - late + slack)
         own = np.flatnonzero(dataset.episode == number)[inside][:: chosen.every]
         if not len(own):
-            raise DatasetError(
-                f"{label} lasts {rows.time[-1] - rows.time[0]:.6g} s; nothing is left of it after "
-                f"{chosen.trim:g} s are trimmed at both ends. Trim less, or leave the episode out."
-            )
+            seen = f"{label} lasts {rows.time[-1] - rows.time[0]:.6g} s"
+            why = f"nothing is left of it after {chosen.trim:g} s are trimmed at both ends"
+            raise DatasetError(f"{seen}; {why}. Trim less, or leave the episode out.")
         kept.append(own)
         if chosen.cutoff is not None and 0.5 / (chosen.every * step) < float(chosen.cutoff):
             kept_rate = f"every {chosen.every}. row is {1.0 / (chosen.every * step):.4g} Hz"

@@ -85,10 +85,9 @@ class Motions(Evidence):
     def refuse(unknown_forces: Sequence[object]) -> None:
         """Raise InvalidInput where there are unknown forces: these learn from accelerations."""
         if unknown_forces:
-            raise InvalidInput(
-                "motions refine numbers of laws and bodies, and the model has unknown forces, which learn from "
-                "accelerations; refine the laws first, and learn the forces beside them without motions."
-            )
+            why = "the model has unknown forces, which learn from accelerations"
+            advice = "refine the laws first, and learn the forces beside them without motions."
+            raise InvalidInput(f"motions refine numbers of laws and bodies, and {why}; {advice}")
 
 
 @dataclass(frozen=True)

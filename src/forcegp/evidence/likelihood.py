@@ -129,10 +129,8 @@ def check_distance(model: Model, training: TrainingData) -> None:
         what = f"the surface of contact {index} (frame {contact.frame!r})"
         remedy = "check its surface, point and units (m), or leave the contact out"
         if float(distances.min()) > FAR_FROM_SURFACE:
-            raise ContactError(
-                f"no training point touches {what}: the nearest is {float(distances.min()):.3g} m away, half of them "
-                f"more than {distance:.3g} m; {remedy}"
-            )
+            seen = f"no training point touches {what}: the nearest is {float(distances.min()):.3g} m away"
+            raise ContactError(f"{seen}, half of them more than {distance:.3g} m; {remedy}")
         if distance > FAR_FROM_SURFACE:
             seen = f"half of the training points lie more than {distance:.3g} m from {what}"
             advice = f"{remedy}, or train on the rows in contact only (forcegp.data.rows_in_contact)"

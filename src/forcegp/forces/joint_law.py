@@ -109,10 +109,9 @@ def bound_transmission(owner: str, given: Transmission, robot: Robot) -> Tensor 
         matrix = torch.eye(nv, dtype=torch.float64, device=robot.device)
         for row in given.replace(" ", "").split("/"):
             if not re.fullmatch(f"({term})+", row):
-                raise InvalidInput(
-                    f"{what} is {given!r}; write the joints that a motor turns with, its own first, as in "
-                    f"{robot.joint_names[-1]}+{robot.joint_names[-2 % nv]}, with / between motors."
-                )
+                example = f"{robot.joint_names[-1]}+{robot.joint_names[-2 % nv]}, with / between motors"
+                advice = f"write the joints that a motor turns with, its own first, as in {example}."
+                raise InvalidInput(f"{what} is {given!r}; {advice}")
             terms = [(sign, size, robot.joint_names.index(name)) for sign, size, name in re.findall(term, row)]
             for sign, size, j in terms:
                 matrix[terms[0][2], j] = float(f"{sign}{size or 1.0}")

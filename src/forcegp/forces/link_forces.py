@@ -61,10 +61,9 @@ def require_contact(force: str, contact: int, contacts: Sequence[Contact]) -> No
     numbers = range(len(contacts))
     if contact not in numbers:
         have = f"only contact {', '.join(map(str, numbers))}" if numbers else "no contact with a surface to slide on"
-        raise InvalidInput(
-            f"{force} acts at contact {contact}, but the model has {have}; give the contact (`contacts`), or use a "
-            "force that needs none, such as JointFriction or AerodynamicForce(frame=...)."
-        )
+        seen = f"{force} acts at contact {contact}, but the model has {have}"
+        other = "a force that needs none, such as JointFriction or AerodynamicForce(frame=...)"
+        raise InvalidInput(f"{seen}; give the contact (`contacts`), or use {other}.")
 
 
 TANGENTS = ("tangent-1", "tangent-2")

@@ -264,10 +264,9 @@ def require_actuated(posterior: Any) -> None:
     actuated = any(isinstance(force, Actuation) and force.known for force in posterior.model.laws)
     nv, nu = posterior.model.sizes[1], posterior.model.sizes[2] - len(posterior.model.memory.names)
     if nv != nu:
-        raise InvalidInput(
-            f"no u makes every acceleration: {posterior.model.robot.name} has {nv} degrees of freedom and u has {nu} "
-            "entries; search for u with `predictor.linearize` or `predictor.rollouts`."
-        )
+        seen = f"{posterior.model.robot.name} has {nv} degrees of freedom and u has {nu} entries"
+        advice = "search for u with `predictor.linearize` or `predictor.rollouts`."
+        raise InvalidInput(f"no u makes every acceleration: {seen}; {advice}")
     if posterior.carries_known_forces or not actuated:
         lacks = "RigidBodies()" if posterior.carries_known_forces else "Actuation()"
         seen = f"this model has no {lacks} among its laws, so no u can be solved for"
@@ -307,10 +306,9 @@ def inverse_dynamics(
         # from the u without what was learned: from u = 0 the load, and friction under it, would be those of free fall
         u, found = find_roots(surplus, -surplus(torch.zeros_like(a), learned=False))
         if not bool(found.all()):
-            raise NumericalError(
-                f"no u was found that gives row {int((~found).nonzero()[0])} its acceleration: friction takes as much "
-                "as u adds, or a number is too large; check q, v, a and normal_force of that row."
-            )
+            seen = f"no u was found that gives row {int((~found).nonzero()[0])} its acceleration"
+            why = "friction takes as much as u adds, or a number is too large"
+            raise NumericalError(f"{seen}: {why}; check q, v, a and normal_force of that row.")
         if not covariance:
             return Gaussian(u, None)
         at = posterior.dynamics(q, v, whole(u))

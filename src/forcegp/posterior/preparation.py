@@ -38,11 +38,10 @@ def prepared_predictor(posterior: Any, covariance: str, compile: bool) -> Predic
     compressed = None
     if covariance == "compressed" and len(latent.kernels.dense):
         if not isinstance(latent, ExactPosterior):
-            raise InvalidInput(
-                "covariance='compressed' needs the factorised covariance of all rows, which a model with a "
-                f"{type(latent).__name__} does not have; give covariance='exact', which is the one that it has, "
-                f"'none', or {latent.remedy}."
-            )
+            seen = "covariance='compressed' needs the factorised covariance of all rows"
+            why = f"which a model with a {type(latent).__name__} does not have"
+            advice = f"give covariance='exact', which is the one that it has, 'none', or {latent.remedy}."
+            raise InvalidInput(f"{seen}, {why}; {advice}")
         # functions of one input are rough: between two training values, what is uncertain hangs on these two alone
         rough = any(z.shape[-1] == 1 for z in latent.features)
 

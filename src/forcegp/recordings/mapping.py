@@ -167,10 +167,9 @@ class ColumnMapping:
             raise InvalidInput(f"orientation is {self.orientation!r}; give {', '.join(ORIENTATIONS)}.")
         for signal, names in self.axes.items():
             if not 1 <= len(names) <= 2 or not set(names) <= set(AXES.get(signal, ())) or names[1:] == ("imu",):
-                raise InvalidInput(
-                    f"axes of {signal} are {','.join(names)}; give v body or world, a body, world or imu, or two of "
-                    "them: of the linear and of the angular part, which no `imu` measures as an acceleration."
-                )
+                seen = f"axes of {signal} are {','.join(names)}"
+                kinds = "v body or world, a body, world or imu, or two of them: of the linear and of the angular part"
+                raise InvalidInput(f"{seen}; give {kinds}, which no `imu` measures as an acceleration.")
         for quantity, names in self.unit.items():
             if quantity not in UNITS:
                 raise InvalidInput(f"unit names {quantity!r}; it has {', '.join(UNITS)}.")

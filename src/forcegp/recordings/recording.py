@@ -226,11 +226,10 @@ def read_poses(
             row = int(error.argmax())
             if error[row] > LARGEST_ERROR:
                 names = ", ".join(POSITIONS[TURN])
-                raise DatasetError(
-                    f"{source.path}: the orientation of {group.name!r} ({names}) has the length {length[row, 0]:.4g} "
-                    f"at {source.place(row)}; a turn has length 1. Map its columns, give `orientation` angles if they "
-                    "are roll, pitch and yaw, or repair or remove these rows."
-                )
+                where = f"({names}) has the length {length[row, 0]:.4g} at {source.place(row)}"
+                angles = "give `orientation` angles if they are roll, pitch and yaw"
+                advice = f"a turn has length 1. Map its columns, {angles}, or repair or remove these rows."
+                raise DatasetError(f"{source.path}: the orientation of {group.name!r} {where}; {advice}")
             if error[row] > ROUNDED:
                 notes.append(f"orientations divided by their length, which differs from 1 by up to {error[row]:.2g}")
             turn = given[:, first:] / length
@@ -251,11 +250,10 @@ def _require_finite(values: np.ndarray, columns: Columns, plan: SignalPlan, sour
     item = plan.signals[index]
     wrong = [name for name in item.expression.weights if not np.isfinite(columns[name][row])]
     name, value = (wrong[0], columns[wrong[0]][row]) if wrong else (item.expression.text, values[row, index])
-    raise DatasetError(
-        f"{source.path}: column {name!r} ({item.signal} of joint {item.joint!r}) is {_shown(value)} at "
-        f"{source.place(row)}, {time[row]:.6g} s from the start; {int((~np.isfinite(values)).sum())} such values. "
-        "Repair these rows, map another column, or leave such rows out by `bad_rows` skip."
-    )
+    seen = f"{source.path}: column {name!r} ({item.signal} of joint {item.joint!r}) is {_shown(value)}"
+    where = f"{source.place(row)}, {time[row]:.6g} s from the start; {int((~np.isfinite(values)).sum())} such values"
+    advice = "Repair these rows, map another column, or leave such rows out by `bad_rows` skip."
+    raise DatasetError(f"{seen} at {where}. {advice}")
 
 
 def _shown(value: float) -> str:
@@ -325,11 +323,10 @@ def _stretches(
     backwards = np.flatnonzero(steps < 0)
     if backwards.size:
         row = int(backwards[0]) + 1
-        raise DatasetError(
-            f"{label}: time runs backwards by {-steps[row - 1]:.6g} s at {source.place(row)} ({time[row]:.6g} s from "
-            f"the start), {backwards.size} times in all. Sort the log, map another column as the time, or name the "
-            "column that numbers its episodes (`episode`)."
-        )
+        where = f"{source.place(row)} ({time[row]:.6g} s from the start), {backwards.size} times in all"
+        seen = f"{label}: time runs backwards by {-steps[row - 1]:.6g} s at {where}"
+        advice = "map another column as the time, or name the column that numbers its episodes (`episode`)."
+        raise DatasetError(f"{seen}. Sort the log, {advice}")
     positive = steps[steps > 0]
     if len(time) < FEWEST_ROWS:
         raise DatasetError(f"{label} has {len(time)} rows; an episode has at least {FEWEST_ROWS}.")

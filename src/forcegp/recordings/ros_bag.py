@@ -134,10 +134,8 @@ class RosBag(Source):
     def table(self, names: Sequence[str]) -> Columns:
         topics = sorted({self.topic_of(name) for name in names})
         if len(topics) != 1:
-            raise InvalidInput(
-                f"{self.path}: the columns come from the topics {', '.join(topics)}, whose messages have times of "
-                "their own; read them one by one."
-            )
+            seen = f"{self.path}: the columns come from the topics {', '.join(topics)}"
+            raise InvalidInput(f"{seen}, whose messages have times of their own; read them one by one.")
         answer, columns = self._answer({"topic": topics[0], "wanted": [name[len(topics[0]) + 1 :] for name in names]})
         self._left_out = answer["left_out"]
         return dict(zip(names, columns, strict=True))

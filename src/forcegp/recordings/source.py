@@ -128,8 +128,6 @@ def reading(path: Path, what: str) -> Iterator[None]:
 def require_plausible_size(path: Path, what: str, declared: int, stored: int) -> None:
     """Refuse what claims to hold far more than it stores. Sizes in bytes. Raises FileFormatError."""
     if declared > HARMLESS and declared > LARGEST_EXPANSION * max(stored, 1):
-        raise FileFormatError(
-            f"{path}: {what} claims {declared / 2**20:.0f} MiB in {stored / 2**10:.0f} KiB of the file, more than "
-            f"{LARGEST_EXPANSION} times as much, and no log of sensors shrinks so far: it is truncated or no log. "
-            "Copy or write it again."
-        )
+        seen = f"{path}: {what} claims {declared / 2**20:.0f} MiB in {stored / 2**10:.0f} KiB of the file"
+        why = f"more than {LARGEST_EXPANSION} times as much, and no log of sensors shrinks so far"
+        raise FileFormatError(f"{seen}, {why}: it is truncated or no log. Copy or write it again.")

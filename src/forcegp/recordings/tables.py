@@ -119,10 +119,9 @@ class DelimitedText(Source):
         fields = table[begin] if begin < len(table) else []
         self._lines_per_row = 1
         if headerless is not None and (begin or len(fields) not in (1, headerless)):
-            raise FileFormatError(
-                f"{self.path} begins with {len(table[0])} fields, the first of them {table[0][0]!r}; `headerless` is "
-                f"{headerless}: so many numbers on every line, or one. Give another, or leave it out."
-            )
+            seen = f"{self.path} begins with {len(table[0])} fields, the first of them {table[0][0]!r}"
+            asked = f"`headerless` is {headerless}: so many numbers on every line, or one"
+            raise FileFormatError(f"{seen}; {asked}. Give another, or leave it out.")
         if not begin:
             self._lines_per_row = (headerless or 1) // len(fields) or 1
             named = self._fields(comments[-1]) if comments and headerless is None else []

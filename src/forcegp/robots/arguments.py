@@ -83,10 +83,8 @@ def usable_device(device: torch.device | str) -> torch.device:
         torch.zeros(1, dtype=torch.float64, device=asked)
     except (RuntimeError, AssertionError, TypeError, NotImplementedError):  # as torch's backends happen to raise
         there = ["cpu", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))]
-        raise InvalidInput(
-            f"device {str(device)!r} cannot be used here; there is {', '.join(there)} for torch {torch.__version__} "
-            "(docs/how-to/gpu.md names builds for GPUs)."
-        ) from None
+        seen = f"device {str(device)!r} cannot be used here; there is {', '.join(there)} for torch {torch.__version__}"
+        raise InvalidInput(f"{seen} (docs/how-to/gpu.md names builds for GPUs).") from None
     return asked
 
 

@@ -208,11 +208,9 @@ def lay_out(
             origins += [offset @ turn] * len(rows)
         stack.extend(reversed(children[joint.child]))
     if not bodies:
-        raise RobotModelError(
-            f"{description.source}: robot {description.name!r} has no movable joint, so it has no dynamics; "
-            f"use a URDF with at least one joint of type {', '.join(MOVABLE)} that is not locked, or "
-            "`base='floating'` for a body that moves freely."
-        )
+        seen = f"{description.source}: robot {description.name!r} has no movable joint, so it has no dynamics"
+        needed = f"at least one joint of type {', '.join(MOVABLE)} that is not locked"
+        raise RobotModelError(f"{seen}; use a URDF with {needed}, or `base='floating'` for a body that moves freely.")
     if len(bodies) > MOST_BODIES:
         seen = f"{description.source}: {len(bodies)} joints move"
         raise RobotModelError(f"{seen}; forcegp takes up to {MOST_BODIES}, lock the others.")
@@ -259,10 +257,9 @@ def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]
     children: dict[str, list[Joint]] = {link: [] for link in description.links}
     for joint in description.joints:
         if joint.child in above:
-            raise RobotModelError(
-                f"{source}: link {joint.child!r} has two parents, through joints {above[joint.child].name!r} and "
-                f"{joint.name!r}; a link can be the child of one joint only, remove one of them."
-            )
+            both = f"joints {above[joint.child].name!r} and {joint.name!r}"
+            seen = f"{source}: link {joint.child!r} has two parents, through {both}"
+            raise RobotModelError(f"{seen}; a link can be the child of one joint only, remove one of them.")
         above[joint.child] = joint
         children[joint.parent].append(joint)
     roots = [link for link in description.links if link not in above]

@@ -148,10 +148,9 @@ class ConfigurationSpace:
                 return
             if not worst <= LARGEST_NORM_ERROR:
                 names = ", ".join(f"{group.name}.{name}" for name in POSITIONS[TURN])
-                raise InvalidInput(
-                    f"q has ({names}) of length {float(length[(length - 1.0).abs().argmax()]):.4g}; a turn has length "
-                    "1: check the order of the columns, or divide by the length with robot.normalized(q)."
-                )
+                seen = f"q has ({names}) of length {float(length[(length - 1.0).abs().argmax()]):.4g}"
+                advice = "check the order of the columns, or divide by the length with robot.normalized(q)."
+                raise InvalidInput(f"{seen}; a turn has length 1: {advice}")
 
     def singles(self, q: Float[Tensor, "*batch nq"]) -> Float[Tensor, "*batch singles"]:
         """The positions of all joints of one degree of freedom."""

@@ -174,10 +174,9 @@ class MjcfWriter:
             below = [(at @ each.origin, each) for name, at in rigid.items() for each in self.children[name]]
             below = [(step, each) for step, each in below if each.name in self.moving]
             if len(below) != 1 or joint.type == "floating":
-                raise RobotModelError(
-                    f"{self.robot.source}: link {joint.child!r} moves and has no mass, which MuJoCo takes only between "
-                    "two joints of one degree of freedom; give it a mass."
-                )
+                seen = f"{self.robot.source}: link {joint.child!r} moves and has no mass"
+                why = "which MuJoCo takes only between two joints of one degree of freedom"
+                raise RobotModelError(f"{seen}, {why}; give it a mass.")
             self.left_out += rigid
             step, joint = below[0]
             joints = [*((each, inverse(step) @ at) for each, at in joints), (joint, np.eye(4))]

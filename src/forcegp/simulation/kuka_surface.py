@@ -172,11 +172,10 @@ def multiplier_with_friction(
     free, per_newton, per_friction = np.linalg.solve(mass, np.stack([force, row, per_load], axis=1)).T
     alpha, gamma, needed = float(row @ per_newton), float(row @ per_friction), b - float(row @ free)
     if not abs(gamma) < alpha:
-        raise SimulationError(
-            f"friction changes the normal acceleration by {abs(gamma):.3g} 1/kg per newton of normal force, the normal "
-            f"force itself by {alpha:.3g} 1/kg: the normal force is not determined (Painleve's paradox). Use smaller "
-            "friction coefficients or another posture (start_degrees)."
-        )
+        by = f"{abs(gamma):.3g} 1/kg per newton of normal force, the normal force itself by {alpha:.3g} 1/kg"
+        seen = f"friction changes the normal acceleration by {by}: the normal force is not determined"
+        advice = "Use smaller friction coefficients or another posture (start_degrees)."
+        raise SimulationError(f"{seen} (Painleve's paradox). {advice}")
     return needed / (alpha + gamma) if needed > 0 else needed / (alpha - gamma)
 
 
@@ -225,10 +224,9 @@ def simulate_episode(config: KukaSurfaceConfig, robot: Robot, plant: RigidBodyDy
         v = v + config.time_step * a
         q = q + config.time_step * v
         if not np.abs(v).max() < DIVERGED:  # also NaN
-            raise SimulationError(
-                f"episode {episode} diverged after {(step + 1) * config.time_step:.3g} s (joint velocity "
-                f"{np.abs(v).max():.3g} rad/s). Use the published constants, a shorter time_step or another controller."
-            )
+            after = f"{(step + 1) * config.time_step:.3g} s (joint velocity {np.abs(v).max():.3g} rad/s)"
+            advice = "Use the published constants, a shorter time_step or another controller."
+            raise SimulationError(f"episode {episode} diverged after {after}. {advice}")
         if (step + 1) % STEPS_PER_REPORT == 0 or step + 1 == steps:
             tell(step + 1, steps)
 
