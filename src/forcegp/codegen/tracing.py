@@ -23,9 +23,8 @@ MOVING = frozenset(
     {
         *("view", "_unsafe_view", "reshape", "expand", "permute", "transpose", "t", "unsqueeze", "squeeze", "flip"),
         *("select", "slice", "diagonal", "as_strided", "split", "split_with_sizes", "unbind", "cat", "stack", "repeat"),
-        *("clone", "alias", "detach", "lift_fresh_copy", "index", "index_select", "gather"),
+        *("clone", "alias", "detach", "lift_fresh_copy", "index", "index_select", "gather", "new_zeros", "new_ones"),
         *("select_scatter", "slice_scatter", "diag_embed", "tril", "triu", "zeros_like", "ones_like"),
-        *("new_zeros", "new_ones"),
     }
 )
 """Operations that are the same on node numbers: nodes 0 and 1 hold 0.0 and 1.0."""

@@ -133,10 +133,9 @@ class Dataset(Summary):
             at, number = self.time[order][row], self.episode[order][row]
             if not self.time_ordered:
                 raise DatasetError(f"time {at} s occurs twice in episode {number}; drop the repeated rows.")
-            raise DatasetError(
-                f"time does not increase at row {row} (episode {number}, time {at} s). "
-                "Sort the rows, drop stamps less than a nanosecond apart, or number a new recording as a new episode."
-            )
+            seen = f"time does not increase at row {row} (episode {number}, time {at} s)"
+            advice = "drop stamps less than a nanosecond apart, or number a new recording as a new episode."
+            raise DatasetError(f"{seen}. Sort the rows, {advice}")
 
     def __len__(self) -> int:
         return len(self.q)

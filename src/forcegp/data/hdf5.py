@@ -112,8 +112,7 @@ class _Reader:
         values: dict[str, Any] = {name: self.array(name) for name in COLUMNS}
         values["metadata"] = json.loads(self.text("metadata"))
         self.require(isinstance(values["metadata"], dict), ": 'metadata' must be a JSON object.")
-        values["noise_std"] = self.array("noise_std") if "noise_std" in file else None
-        values["strokes"] = self.array("strokes") if "strokes" in file else None
+        values |= {name: self.array(name) if name in file else None for name in ("noise_std", "strokes")}
         truth = file["truth"] if isinstance(file.get("truth", getlink=True), h5py.HardLink) else None
         self.require("truth" not in file or isinstance(truth, h5py.Group), ": 'truth' must be a group in this file.")
         names = list(truth) if isinstance(truth, h5py.Group) else []

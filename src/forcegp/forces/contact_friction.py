@@ -106,14 +106,12 @@ class ExpectedFriction:
         # no value may decide anything while torch transforms or records the function
         traced = torch._C._are_functorch_transforms_active() or _get_current_dispatch_mode() is not None
         if not traced and bool(jammed.any()):
-            warnings.warn(
-                f"{JAMMING} contact {contact} in {int(jammed.sum())} of {jammed.numel()} states: "
-                "friction and normal force lift each other almost without end, and the normal force is taken as "
-                f"{1.0 / SMALLEST_SHARE:g} times that without sliding friction. Check the contact's frame, point and "
-                "surface, leave such states out, or give a smaller coefficient, expected=COEFFICIENT (0 for none).",
-                NumericalWarning,
-                stacklevel=2,
-            )
+            seen = f"{JAMMING} contact {contact} in {int(jammed.sum())} of {jammed.numel()} states"
+            why = "friction and normal force lift each other almost without end"
+            taken = f"the normal force is taken as {1.0 / SMALLEST_SHARE:g} times that without sliding friction"
+            advice = "leave such states out, or give a smaller coefficient, expected=COEFFICIENT (0 for none)."
+            text = f"{seen}: {why}, and {taken}. Check the contact's frame, point and surface, {advice}"
+            warnings.warn(text, NumericalWarning, stacklevel=2)
         return size * free.abs() / growth.clamp_min(SMALLEST_SHARE)
 
 

@@ -184,14 +184,10 @@ def signal_plan(mapping: ColumnMapping, source: Source, model: forcegp.Model, op
     for signal, why in (("q", "positions"), ("u", "forces or efforts of the actuators; 0 for a passive robot")):
         if signal not in found and log[signal]:
             lacking = [name for name in joints if not any(map(named_after(name).search, source.columns()))]
-            raise InvalidInput(
-                f"no columns for {signal} ({why}); name them with --{signal}"
-                + (f", in the order {', '.join(log[signal])} (angles: `orientation`)" if robot.space.groups else "")
-                + f". {source.path} has {listed(source.columns(), MOST_NAMES)}"
-                + f"; no column is named after {listed(lacking)} (`locked` holds what was not recorded)"
-                * (0 < len(lacking) < len(joints))
-                + "."
-            )
+            in_order = f", in the order {', '.join(log[signal])} (angles: `orientation`)" * bool(robot.space.groups)
+            few = f"; no column is named after {listed(lacking)} (`locked` holds what was not recorded)"
+            there = f"{source.path} has {listed(source.columns(), MOST_NAMES)}{few * (0 < len(lacking) < len(joints))}"
+            raise InvalidInput(f"no columns for {signal} ({why}); name them with --{signal}{in_order}. {there}.")
     if mapping.time is None and mapping.step is None:
         used = [name for expressions in found.values() for item in expressions for name in item.weights]
         name = guessed_time(source, used)
@@ -320,10 +316,9 @@ def _signals(
         what = "joints" if plain and names else {"q": "positions", "u": "inputs"}.get(signal, "velocities")
         remedy = "name one column for each"
         if signal == "q" and not plain and len(expressions) == len(set(names) & set(joints)):
-            remedy = (
-                "the base was not measured: record its pose by motion capture or a state estimator (position and "
-                "quaternion). Without, learn joint friction on a stand: a robot with `base` fixed."
-            )
+            pose = "its pose by motion capture or a state estimator (position and quaternion)"
+            stand = "Without, learn joint friction on a stand: a robot with `base` fixed."
+            remedy = f"the base was not measured: record {pose}. {stand}"
         elif signal in "qu":
             more = {"q": "angles of a base have `orientation` angles", "u": "0 for a joint that nothing drives"}
             remedy = f"{remedy}; {more[signal]}." if names else "leave u out, or give actuators (`identified`)."

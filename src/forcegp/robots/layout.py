@@ -241,13 +241,12 @@ def check_tree(layout: Layout, loops: Loops, problems: Problems) -> None:
 
     for name, *links in loops:
         if between := sorted(set(moving(links[0])) ^ set(moving(links[1]))):
-            advice = (
-                "; a robot is a tree here, which would move in another way. Lock the joints between these links "
-                f"({', '.join(layout.bodies[body].name for body in between)}) by `locked`, or take the "
-                "equality out of the file where nothing holds them together."
-            )
+            joints = ", ".join(layout.bodies[body].name for body in between)
+            lock = f"Lock the joints between these links ({joints}) by `locked`"
+            advice = f"{lock}, or take the equality out of the file where nothing holds them together."
             seen = f"{problems.source}: {name} closes a loop, from link {links[0]!r} to {links[1]!r}"
-            problems.errors.append(RobotModelError(seen, advice))
+            why = "; a robot is a tree here, which would move in another way. "
+            problems.errors.append(RobotModelError(seen, why + advice))
 
 
 def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]]:

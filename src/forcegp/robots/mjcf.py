@@ -134,19 +134,15 @@ class MjcfWriter:
             for joint in robot.description.joints
             if joint.mimics is not None and joint.name in self.moving
         ]
-        return "\n".join(
-            [
-                f"<mujoco model={quoteattr(robot.name)}>",
-                '  <compiler angle="radian" autolimits="true" inertiafromgeom="false"/>',
-                f'  <option gravity="{numbers(robot.gravity.tolist())}"/>',
-                "  <worldbody>",
-                *self.lines,
-                "  </worldbody>",
-                *_block("equality", couplings),
-                *_block("actuator", motors),
-                "</mujoco>\n",
-            ]
-        )
+        text = [
+            f"<mujoco model={quoteattr(robot.name)}>",
+            '  <compiler angle="radian" autolimits="true" inertiafromgeom="false"/>',
+            f'  <option gravity="{numbers(robot.gravity.tolist())}"/>',
+            *("  <worldbody>", *self.lines, "  </worldbody>"),
+            *_block("equality", couplings),
+            *_block("actuator", motors),
+        ]
+        return "\n".join([*text, "</mujoco>\n"])
 
     def _body(self, link: str, pose: np.ndarray, joints: Sequence[tuple[Joint, np.ndarray]], depth: int) -> None:
         """One body with its joints, which have poses in its frame, and what hangs on it."""

@@ -69,10 +69,9 @@ def kuka_urdf(config: KukaSurfaceConfig) -> str:
     loaded = inertial_element(config.tool_mass, config.tool_center_of_mass, np.diag(config.tool_inertia))
     for link, element in ((tool, loaded), (base, inertial_element(0.0, np.zeros(3), np.zeros((3, 3))))):
         link[:] = ElementTree.fromstring(element)
-    joint = (
-        f'<joint name="world_joint" type="fixed"><parent link="world"/><child link="{BASE_LINK}"/>'
-        f'<origin rpy="0 0 0" xyz="{numbers((0.0, 0.0, BASE_HEIGHT))}"/></joint>'
-    )
+    inside = f'<parent link="world"/><child link="{BASE_LINK}"/>'
+    origin = f'<origin rpy="0 0 0" xyz="{numbers((0.0, 0.0, BASE_HEIGHT))}"/>'
+    joint = f'<joint name="world_joint" type="fixed">{inside}{origin}</joint>'
     root[:0] = [ElementTree.Element("link", name="world"), ElementTree.fromstring(joint)]
     ElementTree.indent(root)
     changes = "<!-- Changed by forcegp: base mounted on `world`, tool inertia and damping set, meshes left out. -->\n"
