@@ -155,8 +155,4 @@ class RobotEnv(gymnasium.Env):
         return seen[0], float(rewards[0]), bool(over[0]), bool(late[0]), {"diverged": bool(info["diverged"][0])}
 
 
-gymnasium.register(
-    "forcegp/Robot-v0",
-    entry_point="forcegp.control.environments:RobotEnv",
-    vector_entry_point="forcegp.control.environments:RobotVectorEnv",
-)
+gymnasium.register("forcegp/Robot-v0", f"{__name__}:RobotEnv", vector_entry_point=f"{__name__}:RobotVectorEnv")

@@ -143,12 +143,9 @@ class ParameterSpace:
     def parameters(self) -> tuple[Parameter, ...]:
         """Name, unit, start and prior of each of `numbers`: ten of a body, and every entry of a coefficient."""
         stated = np.concatenate([np.zeros(self.bodies.size), *(term.center for term in self.terms)])
-        robot, starts = self.model.robot, self.numbers(stated)
-        out, place = [], 0
+        robot, starts, out = self.model.robot, iter(self.numbers(stated).tolist()), list[Parameter]()
         for each in self.carried:
-            for name, unit in QUANTITIES:
-                out.append(Parameter(f"{each.name}.{name}", unit, float(starts[place]), each.prior))
-                place += 1
+            out += [Parameter(f"{each.name}.{name}", unit, next(starts), each.prior) for name, unit in QUANTITIES]
         for term in self.terms:
             law = self.model.laws[term.law]
             own = force_title(law)
@@ -159,8 +156,7 @@ class ParameterSpace:
                 center = term.values(term.center)[k]
                 spread = term.spread[k] if term.logarithm else term.spread[k] * term.size[k]
                 name = label if joint is None else f"{label}.{joint}"
-                out.append(Parameter(name, unit, float(starts[place]), kind(float(center), float(spread))))
-                place += 1
+                out.append(Parameter(name, unit, next(starts), kind(float(center), float(spread))))
         return tuple(out)
 
     def numbers(self, x: Coordinates) -> Float[np.ndarray, " n"]:
