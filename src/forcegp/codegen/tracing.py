@@ -394,7 +394,6 @@ HANDLERS: dict[str, Callable[..., Any]] = {
     "where": lambda graph, m, x, y: _elementwise(graph, lambda *nodes: graph.apply("choose", *nodes), m, x, y),
     "reciprocal": lambda graph, x: _binary("divide")(graph, 1.0, x),
     "rsqrt": lambda graph, x: _power(graph, x, -0.5),
-    "square": lambda graph, x: _power(graph, x, 2.0),
     "sign": lambda graph, x: _binary("subtract")(graph, HANDLERS["gt"](graph, x, 0.0), HANDLERS["lt"](graph, x, 0.0)),
     "pow": _power,
     **dict.fromkeys(("clamp", "clamp_min", "maximum"), _clamp),
