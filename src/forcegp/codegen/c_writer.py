@@ -196,8 +196,8 @@ def write_entry(program: Program, function: str, finish: Mapping[str, tuple[str,
             text.append(f"    found |= rows_write(y + {place}, {size}, live, o{k} + i * r{k}, r{k}) << 2;")
         place += size
     if program.positive:
-        all_of_them = f"for (int j = {place}; j < {place + len(program.positive)}; j++) for (int k = 0; k < live; k++)"
-        text.append(f"    {all_of_them} found |= !(AT(y[j], k) > 0.0) << 1;")
+        every = f"for (int j = {place}; j < {place + len(program.positive)}; j++) for (int k = 0; k < live; k++)"
+        text.append(f"    {every} found |= !(AT(y[j], k) > 0.0) << 1;")
     text.append("  }")
     text.append("  return found;\n}")
     return "\n".join(text)

@@ -104,9 +104,9 @@ class _Reader:
         kind, version = _attribute(file, "format"), _attribute(file, "format_version")
         ours = f"is an HDF5 file, but not a forcegp dataset (its 'format' is {kind!r}, not {FORMAT!r})."
         self.require(isinstance(kind, str) and kind == FORMAT, f" {ours}")
-        ours = f" has format version {version!r}; this forcegp ({__version__}) reads {VERSION}"
+        seen = f" has format version {version!r}; this forcegp ({__version__}) reads {VERSION}"
         advice = f"Use what wrote it ({_attribute(file, 'written_by')!r}), or convert the log again."
-        self.require(isinstance(version, int | np.integer) and version == VERSION, f"{ours}. {advice}")
+        self.require(isinstance(version, int | np.integer) and version == VERSION, f"{seen}. {advice}")
         missing = [name for name in required if name not in file]
         self.require(not missing, f" has no {', '.join(missing)}; a dataset needs {', '.join(required)}.")
         values: dict[str, Any] = {name: self.array(name) for name in COLUMNS}

@@ -57,8 +57,8 @@ def prepared_predictor(posterior: Any, covariance: str, compile: bool) -> Predic
         reached = float(compressed.inflation.max()) if len(compressed.inflation) else 0.0
         if reached > TOLERANCE:
             seen = f"rank {compressed.rank} makes standard deviations up to {reached:.2g} (relative) too large"
-            advice = f"more than {TOLERANCE:.2g}; give covariance='exact' where that matters."
-            warnings.warn(f"{seen}, {advice}", NumericalWarning, stacklevel=3)
+            advice = "give covariance='exact' where that matters."
+            warnings.warn(f"{seen}, more than {TOLERANCE:.2g}; {advice}", NumericalWarning, stacklevel=3)
     code = posterior.programs(compressed=compressed) if compile else None
     made = Predictor(posterior, model.robot.space, model.sizes, training.q.device, code, covariance, compressed)
     made.compiled("mean" if compressed is None else "covariance")
