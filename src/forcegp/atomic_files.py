@@ -105,10 +105,8 @@ def require_replaceable(
         listed |= {line[66:] for line in (folder / SUMS).read_text(encoding="utf-8").splitlines()}
     entries = (entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
     if others := sorted({entry.relative_to(folder).as_posix() for entry in entries} - listed):
-        raise FileFormatError(
-            f"{folder} holds files that {writer} did not write ({', '.join(others[:3])}), so it is not overwritten; "
-            "move them away, or choose another name."
-        )
+        seen = f"{folder} holds files that {writer} did not write ({', '.join(others[:3])}), so it is not overwritten"
+        raise FileFormatError(f"{seen}; move them away, or choose another name.")
 
 
 def write_text(path: str | Path, text: str, *, overwrite: bool = True) -> None:

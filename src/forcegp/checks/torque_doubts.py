@@ -306,6 +306,11 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
     compared = inputs.mended if inputs.compared is None else inputs.compared
     rows = replace(inputs, compared=compared, most_rows=1000).rows()
     columns, standing = _needs(inputs.robot, rows), _needs(inputs.robot, at)
+    ends = [np.flatnonzero(log.episode == log.episode[rest[0]])[[0, -1]] for rest in found]
+    outer = [np.abs(rest[[0, -1]] - both).min() < FEWEST_ROWS for rest, both in zip(found, ends, strict=True)]
+    idle = np.isin(
+        still, np.concatenate([still[:0], *(rest for rest, at_end in zip(found, outer, strict=True) if at_end)])
+    )
     each = zip(rows.u.T, rows.v.T, rows.a.T, in_motion(rows).T, strict=True)
     for k, (u, v, a, moves) in enumerate(each):
         slow = np.sqrt(np.square(v).mean()) + 1e-300
@@ -319,7 +324,8 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
         number = inverse @ (basis[:, seen].T @ u[slides]) / size
         far = np.square(standing[:, k] / size[:count] @ inverse[:count]).sum(axis=1)  # a posture unlike those of motion
         most = np.abs(dry @ number[-len(WIDTHS) :]).max() + np.std((u - both @ number)[slides])
-        held |= np.abs(at.u[:, k] - standing[:, k] @ number[:count]) > HELD * most * np.sqrt(1.0 + far)
+        unsure = np.where(idle, 1.0, np.sqrt(1.0 + far))  # but before and behind all motion, of which none is lost
+        held |= np.abs(at.u[:, k] - standing[:, k] @ number[:count]) > HELD * most * unsure
     stops = [each for each in found if held[np.isin(still, each)].mean() > 0.5]
     if not stops:
         return log, []
@@ -330,7 +336,8 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
     doubt = look(
         about="stop",
         what=f"all joints stand still from {', '.join(f'{x:.4g} to {y:.4g}' for x, y in spans)} s, and their torques "
-        "are not those that this posture needs: brakes hold the robot, or its drives are off.",
+        "are not those that this posture needs by what the motion tells: brakes hold the robot, its drives are off, or "
+        "they bear what stiction holds.",
         do="These rows are left out of all checks, and of forcegp auto; of other fits leave them out yourself.",
         numbers={"seconds": spans},
     )

@@ -179,9 +179,7 @@ def write_entry(program: Program, function: str, finish: Mapping[str, tuple[str,
     ]
     place = 0
     for k, size in enumerate(program.inputs.values()):
-        text.append(
-            f"    if (s{k} || i == first) found |= rows_read(a{k} + i * s{k}, s{k}, {size}, live, x + {place});"
-        )
+        text += [f"    if (s{k} || i == first) found |= rows_read(a{k} + i * s{k}, s{k}, {size}, live, x + {place});"]
         place += size
     text.append(f"    {function}(t, live, x, y);")
     place = 0
@@ -198,10 +196,8 @@ def write_entry(program: Program, function: str, finish: Mapping[str, tuple[str,
             text.append(f"    found |= rows_write(y + {place}, {size}, live, o{k} + i * r{k}, r{k}) << 2;")
         place += size
     if program.positive:
-        text.append(
-            f"    for (int j = {place}; j < {place + len(program.positive)}; j++) for (int k = 0; k < live; k++) "
-            "found |= !(AT(y[j], k) > 0.0) << 1;"
-        )
+        every = f"for (int j = {place}; j < {place + len(program.positive)}; j++) for (int k = 0; k < live; k++)"
+        text.append(f"    {every} found |= !(AT(y[j], k) > 0.0) << 1;")
     text.append("  }")
     text.append("  return found;\n}")
     return "\n".join(text)

@@ -290,7 +290,4 @@ def partials(graph: Graph, node: int) -> list[tuple[int, Callable[[], int]]]:
             lower = apply("power", x, apply("subtract", y, ONE))
             log = apply("choose", apply("equal", x, ZERO), ZERO, apply("log", x))
             return [(x, lambda: apply("multiply", y, lower)), (y, lambda: apply("multiply", node, log))]
-        case "choose":
-            _, y, z = operands
-            return [(y, lambda: apply("choose", x, ONE, ZERO)), (z, lambda: apply("choose", x, ZERO, ONE))]
     raise AssertionError(operation)

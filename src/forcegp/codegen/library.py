@@ -33,7 +33,7 @@ PACKAGES = (
 LONGEST = 600.0  # seconds after which a compiler hangs: our longest program takes it a fiftieth of that
 WITHOUT = "or do without it: a robot itself, predictor(compile=False), export_c(unchecked=True)"
 ELSEWHERE = "choose another folder (the environment variable XDG_CACHE_HOME, robot.compile(folder=...))"
-MOST_LANES, STATES_PER_THREAD = 8, 2048  # fewer states are done before another thread has started
+MOST_LANES, PER_THREAD = 8, 2048  # fewer states are done before another thread has started
 NOT_FINITE, NOT_POSITIVE, RESULT_NOT_FINITE = 1, 2, 4  # what a program reports of its states: bits of its return value
 # Lanes and compiler options by the vector unit that torch found.
 VECTOR_UNITS = {"AVX512": (8, ("-mavx512f", "-mavx512dq", "-mavx512vl", "-mfma")), "AVX2": (4, ("-mavx2", "-mfma"))}
@@ -45,18 +45,14 @@ def compiler() -> list[str]:
     try:
         chosen = shlex.split(os.environ.get(VARIABLE, ""))
     except ValueError as error:
-        raise CompilerError(
-            f"the environment variable {VARIABLE} is {os.environ[VARIABLE]!r}, which is no command ({error}); correct "
-            f"it, {WITHOUT}."
-        ) from None
+        seen = f"the environment variable {VARIABLE} is {os.environ[VARIABLE]!r}, which is no command ({error})"
+        raise CompilerError(f"{seen}; correct it, {WITHOUT}.") from None
     for command in [chosen] if chosen else [[command] for command in COMMANDS]:
         if shutil.which(command[0]):
             return command
     looked_for = f"{chosen[0]!r}, which {VARIABLE} names" if chosen else ", ".join(COMMANDS)
-    raise CompilerError(
-        f"compiled code needs a C compiler, and there is none here (looked for {looked_for}); install one "
-        f"({PACKAGES}), name it by the environment variable {VARIABLE}, {WITHOUT}."
-    )
+    seen = f"compiled code needs a C compiler, and there is none here (looked for {looked_for})"
+    raise CompilerError(f"{seen}; install one ({PACKAGES}), name it by the environment variable {VARIABLE}, {WITHOUT}.")
 
 
 def compile_library(source: str, options: Iterable[str], library: Path, function: str) -> ctypes.CDLL:
@@ -80,10 +76,9 @@ def compile_library(source: str, options: Iterable[str], library: Path, function
             return loaded
         except (OSError, AttributeError) as error:
             why = f"what it wrote cannot be loaded ({error}): its linker is broken, or no program may be run there"
-    raise CompilerError(
-        f"the C compiler failed: {shlex.join(command)}: {why}; name another (GCC or Clang) by the environment variable "
-        f"{VARIABLE}, {ELSEWHERE}, {WITHOUT}."
-    )
+    seen = f"the C compiler failed: {shlex.join(command)}: {why}"
+    advice = f"name another (GCC or Clang) by the environment variable {VARIABLE}, {ELSEWHERE}, {WITHOUT}."
+    raise CompilerError(f"{seen}; {advice}")
 
 
 def require_plain(tensors: Iterable[Tensor], what: str, remedy: str) -> None:
@@ -136,10 +131,9 @@ def opened_library(path: Path) -> ctypes.CDLL:
         library = ctypes.CDLL(str(path))
         library.evaluate.restype = ctypes.c_int
     except (OSError, AttributeError) as error:
-        raise CompilerError(
-            f"{path} cannot be loaded ({error}); delete it, and it is compiled anew. If that does not help, no program "
-            f"may be run from its folder: {ELSEWHERE}."
-        ) from error
+        seen = f"{path} cannot be loaded ({error}); delete it, and it is compiled anew"
+        advice = f"If that does not help, no program may be run from its folder: {ELSEWHERE}."
+        raise CompilerError(f"{seen}. {advice}") from error
     return library
 
 
@@ -174,10 +168,8 @@ def own_file(path: Path, *, parent: bool = False) -> None:
     if status.st_uid not in (os.getuid(), 0):
         raise CompilerError(f"{path} belongs to another user, {danger}; {ELSEWHERE}, in folders of your own.")
     if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not (parent and status.st_mode & stat.S_ISVTX):
-        raise CompilerError(
-            f"{path} can be written to by others than you, {danger}; take that away (chmod go-w "
-            f"{shlex.quote(str(path))}), or {ELSEWHERE}."
-        )
+        seen = f"{path} can be written to by others than you, {danger}"
+        raise CompilerError(f"{seen}; take that away (chmod go-w {shlex.quote(str(path))}), or {ELSEWHERE}.")
 
 
 Tensors = Sequence[Tensor]
@@ -186,9 +178,7 @@ Tensors = Sequence[Tensor]
 class RowFunction:
     """`evaluate` of a library, on flat `tables`: rows of numbers of length `outputs` from rows of so many `inputs`."""
 
-    def __init__(
-        self, library: ctypes.CDLL, inputs: int, outputs: Sequence[int], tables: Sequence[Tensor] = ()
-    ) -> None:
+    def __init__(self, library: ctypes.CDLL, inputs: int, outputs: Sequence[int], tables: Tensors = ()) -> None:
         self.library, self.inputs, self.outputs, self.tables = library, inputs, tuple(outputs), tuple(tables)
         self._tables = (ctypes.c_void_p * max(len(tables), 1))(*(x.data_ptr() for x in tables))
         self._evaluate = library.evaluate
@@ -201,9 +191,7 @@ class RowFunction:
         given = [argument for x in (*inputs, *made) for argument in (x.data_ptr(), 1)]
         return self._evaluate(0, 1, self._tables, *given), made
 
-    def rows(
-        self, inputs: Tensors, outputs: Tensors, threads: int | None = None, least: int = STATES_PER_THREAD
-    ) -> int:
+    def rows(self, inputs: Tensors, outputs: Tensors, threads: int | None = None, least: int = PER_THREAD) -> int:
         """Fill contiguous `outputs` (count, size); what is to be reported. An input (1, size) serves all states.
 
         Batches of `least` states for each take as many threads as torch has, or `threads`.

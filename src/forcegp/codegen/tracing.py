@@ -23,9 +23,8 @@ MOVING = frozenset(
     {
         *("view", "_unsafe_view", "reshape", "expand", "permute", "transpose", "t", "unsqueeze", "squeeze", "flip"),
         *("select", "slice", "diagonal", "as_strided", "split", "split_with_sizes", "unbind", "cat", "stack", "repeat"),
-        *("clone", "alias", "detach", "lift_fresh_copy", "index", "index_select", "gather"),
+        *("clone", "alias", "detach", "lift_fresh_copy", "index", "index_select", "gather", "new_zeros", "new_ones"),
         *("select_scatter", "slice_scatter", "diag_embed", "tril", "triu", "zeros_like", "ones_like"),
-        *("new_zeros", "new_ones"),
     }
 )
 """Operations that are the same on node numbers: nodes 0 and 1 hold 0.0 and 1.0."""
@@ -241,10 +240,8 @@ def _apply(graph: Graph, target: Any, args: tuple, kwargs: dict[str, Any]) -> An
 
 
 def _refused(what: str) -> InvalidInput:
-    return InvalidInput(
-        f"compiled code cannot hold {what}, which the model's surface, known force or prior uses; write it with other "
-        "operations, or give compile=False, whose results are the same."
-    )
+    seen = f"compiled code cannot hold {what}, which the model's surface, known force or prior uses"
+    return InvalidInput(f"{seen}; write it with other operations, or give compile=False, whose results are the same.")
 
 
 def _moved(graph: Graph, target: Any, args: tuple, kwargs: dict[str, Any], indexed: bool) -> Any:
@@ -397,7 +394,6 @@ HANDLERS: dict[str, Callable[..., Any]] = {
     "where": lambda graph, m, x, y: _elementwise(graph, lambda *nodes: graph.apply("choose", *nodes), m, x, y),
     "reciprocal": lambda graph, x: _binary("divide")(graph, 1.0, x),
     "rsqrt": lambda graph, x: _power(graph, x, -0.5),
-    "square": lambda graph, x: _power(graph, x, 2.0),
     "sign": lambda graph, x: _binary("subtract")(graph, HANDLERS["gt"](graph, x, 0.0), HANDLERS["lt"](graph, x, 0.0)),
     "pow": _power,
     **dict.fromkeys(("clamp", "clamp_min", "maximum"), _clamp),

@@ -13,9 +13,7 @@ from typing_extensions import override
 
 from forcegp.control.tracking import per_joint, usual_integrator
 from forcegp.errors import InvalidInput, require_number, require_type
-from forcegp.posterior import load_posterior
-from forcegp.posterior.posterior import Posterior
-from forcegp.posterior.predictor import Predictor
+from forcegp.posterior import Posterior, Predictor, load_posterior
 from forcegp.robots.arguments import whole_number
 
 LONGEST = 1.0  # s, of a step
@@ -115,10 +113,8 @@ class RobotVectorEnv(VectorEnv):
             q, v = (np.asarray(x) for x in self.start(self.np_random, count))
             fits = q.shape == v.shape == (count, nv) and {q.dtype.kind, v.dtype.kind} <= {"f", "i"}
             if not fits or not np.isfinite(q + v).all() or self._beyond(q, v).any():
-                raise InvalidInput(
-                    f"start returned q of shape {q.shape} and v of shape {v.shape}; return finite ones ({count}, {nv}) "
-                    "within the limits of the joints."
-                )
+                seen = f"start returned q of shape {q.shape} and v of shape {v.shape}"
+                raise InvalidInput(f"{seen}; return finite ones ({count}, {nv}) within the limits of the joints.")
         self.q, self.v, self.age = self.q.copy(), self.v.copy(), np.where(which, 0, self.age)
         self.q[which], self.v[which], self._ended = q, v, np.zeros(self.num_envs, bool)
 
@@ -159,8 +155,4 @@ class RobotEnv(gymnasium.Env):
         return seen[0], float(rewards[0]), bool(over[0]), bool(late[0]), {"diverged": bool(info["diverged"][0])}
 
 
-gymnasium.register(
-    "forcegp/Robot-v0",
-    entry_point="forcegp.control.environments:RobotEnv",
-    vector_entry_point="forcegp.control.environments:RobotVectorEnv",
-)
+gymnasium.register("forcegp/Robot-v0", f"{__name__}:RobotEnv", vector_entry_point=f"{__name__}:RobotVectorEnv")

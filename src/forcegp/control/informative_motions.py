@@ -251,11 +251,9 @@ def motion_limits(robot: Robot, start: np.ndarray, given: Mapping[str, Any]) -> 
         wrong = (low > 0.0) | (high < 0.0) | (low == high) | (np.isinf(high) & (name == "velocity"))
         if wrong.any():
             j = int(wrong.argmax())
-            raise InvalidInput(
-                f"joint {robot.joint_names[j]}: no motion from {start[j]:.4g} can be chosen within {name} limits of "
-                f"{low[j]:.4g} and {high[j]:.4g}{' from there' * (name == 'position')}; give limits={{{name!r}: ...}}, "
-                "or another start."
-            )
+            ends = f"{name} limits of {low[j]:.4g} and {high[j]:.4g}{' from there' * (name == 'position')}"
+            seen = f"joint {robot.joint_names[j]}: no motion from {start[j]:.4g} can be chosen within {ends}"
+            raise InvalidInput(f"{seen}; give limits={{{name!r}: ...}}, or another start.")
     limits["position"] = np.where(np.isinf(limits["position"]), limits["velocity"], limits["position"])
     return limits
 
@@ -328,9 +326,7 @@ def excitation(
             best, least = (motion, score) if score < least else (best, least)
             tell(k + 1, motions)
     if not np.isfinite(least):
-        raise InvalidInput(
-            f"none of {motions} motions shows all base parameters; give more seconds, limits or motions."
-        )
+        raise InvalidInput(f"no motion of {motions} shows all base parameters; give more seconds, limits or motions.")
     if isinstance(teaches, BaseParameters):
         R = teaches.triangle(best)
         return replace(draft, motion=best, condition=float(np.linalg.cond(R / np.linalg.norm(R, axis=0))))

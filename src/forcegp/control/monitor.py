@@ -21,6 +21,7 @@ from forcegp.posterior.predictor import Predictor
 from forcegp.robots import Robot
 from forcegp.robots.arguments import finite_vector, real_array
 
+Torques = Float[np.ndarray, " rows"]
 Motion = tuple[Any, Any, Any]
 """q, v and u (T, nv) of one recording; u[k] acts from row k to row k + 1."""
 
@@ -79,10 +80,8 @@ class ContactMonitor:
         self.model, self.known = model, model_of(model)
         self.known.robot.require_vectors("monitors of contacts")
         if self.known.contacts:
-            raise InvalidInput(
-                "ContactMonitor looks for contacts that are not modelled, and this model has one; fit a log of free "
-                "motion, or give posterior.with_contacts([])."
-            )
+            seen = "ContactMonitor looks for contacts that are not modelled, and this model has one"
+            raise InvalidInput(f"{seen}; fit a log of free motion, or give posterior.with_contacts([]).")
         self.open = isinstance(model, Predictor) and model.kind != "none"
         check_time_step(dt)
         require_number("bandwidth", bandwidth, f"give Hz above 0 and below {0.5 / dt:g}, half the rate", below=0.5 / dt)
@@ -119,10 +118,8 @@ class ContactMonitor:
         found = [self._residuals(*motion, settle) for motion in free]
         if sum(len(tau) // block for tau, *_ in found) < LEAST_BLOCKS:
             seconds = sum(len(tau) for tau, *_ in found) * self.dt
-            raise DatasetError(
-                f"free motion of {seconds:.3g} s is too short for a threshold; give at least "
-                f"{LEAST_BLOCKS * BLOCK:g} s in stretches of {BLOCK:g} s or more."
-            )
+            seen = f"free motion of {seconds:.3g} s is too short for a threshold"
+            raise DatasetError(f"{seen}; give at least {LEAST_BLOCKS * BLOCK:g} s in stretches of {BLOCK:g} s or more.")
         tau, M = torch.cat([each[0] for each in found]), torch.cat([each[1] for each in found])
         v, inertial = torch.cat([each[3] for each in found]), torch.cat([each[4] for each in found])
         self.largest = inertial.abs().amax(0).clamp_min(1e-9)  # of a joint that rested, any motion is beyond
@@ -226,10 +223,9 @@ class ContactMonitor:
         found = [torch.tensor(real_array(name, x), dtype=torch.float64) for name, x in named]
         shapes = [tuple(x.shape) for x in found]
         if len({*shapes}) > 1 or shapes[0][-1:] != (self.robot.nv,) or not all(bool(x.isfinite().all()) for x in found):
-            raise InvalidInput(
-                f"q, v and u have shapes {', '.join(map(str, shapes))}; give finite numbers, all ({self.robot.nv},) "
-                f"for one sample or (T, {self.robot.nv}) for a recording."
-            )
+            seen = f"q, v and u have shapes {', '.join(map(str, shapes))}"
+            advice = f"all ({self.robot.nv},) for one sample or (T, {self.robot.nv}) for a recording."
+            raise InvalidInput(f"{seen}; give finite numbers, {advice}")
         return found[0], found[1], found[2]
 
     def _near_rest(self, v: Tensor, fade: np.ndarray) -> np.ndarray:
@@ -244,9 +240,7 @@ class ContactMonitor:
     def _residuals(self, q: Any, v: Any, u: Any, settle: int = 0) -> Residuals:
         q, v, u = self._motion(q, v, u)
         if q.dim() != 2 or len(q) < 2:
-            raise InvalidInput(
-                f"a recording has shape {tuple(q.shape)}; give (T, {self.robot.nv}) of two rows or more."
-            )
+            raise InvalidInput(f"a recording has shape {tuple(q.shape)}; give (T, {self.robot.nv}), two rows or more.")
         self.past = Past(self.known)
         middle = 0.5 * (q[1:] + q[:-1]), 0.5 * (v[1:] + v[:-1])
         a = (v[1:] - v[:-1]) / self.dt
@@ -277,9 +271,7 @@ class ContactMonitor:
         return ContactState(tau.clone(), distance, probability, distance > self.threshold)
 
 
-def errors_near_rest(
-    tau: Float[np.ndarray, " rows"], known: Float[np.ndarray, " rows"], slow: Float[np.ndarray, " rows"]
-) -> tuple[float, float, float]:
+def errors_near_rest(tau: Torques, known: Torques, slow: Torques) -> tuple[float, float, float]:
     """Standard deviations f and s by which tau ~ N(0, known + f^2 + (s slow)^2) is most likely.
 
     The first number is minus the mean logarithm of the likelihood, less a constant.

@@ -48,9 +48,7 @@ class MujocoForces:
         code, nv = predictor.code, predictor.nv
         program = code.program("passive")
         if set(program.graph.inputs[2 * nv :]) & set(program.graph.needed(program.nodes)):
-            raise InvalidInput(
-                "the forces depend on u, which MuJoCo computes after passive forces; learn forces of q and v only."
-            )
+            raise InvalidInput("forces depend on u, which MuJoCo computes after passive ones; learn forces of q and v.")
         positions, velocities = (", ".join(map(str, numbers)) for numbers in zip(*places, strict=True))
         words = {"JOINTS": nv, "POSITIONS": positions, "VELOCITIES": velocities}
         source = code.c_source("passive", 1, filled(c_text(__name__, "passive_force.c"), words))
@@ -87,10 +85,9 @@ def _joints(model: Any, names: tuple[str, ...]) -> list[tuple[int, int]]:
         stated = {"damping": model.dof_damping[at], "frictionloss": model.dof_frictionloss[at]}
         for what, value in (stated | {"stiffness": model.jnt_stiffness[number]}).items():
             if np.any(value):
-                raise InvalidInput(
-                    f"joint {name} has {what} in the MjModel, which would act beside the learned forces; set it to 0 "
-                    f"(model.dof_damping, dof_frictionloss, jnt_stiffness), or learn with it as a known force."
-                )
+                seen = f"joint {name} has {what} in the MjModel, which would act beside the learned forces"
+                numbers = "model.dof_damping, dof_frictionloss, jnt_stiffness"
+                raise InvalidInput(f"{seen}; set it to 0 ({numbers}), or learn with it as a known force.")
         places.append((int(model.jnt_qposadr[number]), at))
     return places
 
@@ -111,7 +108,5 @@ def _require_alike(predictor: Predictor, model: Any, places: list[tuple[int, int
         for what, own, other in pairs:
             apart = float(np.abs(own - other).max() / np.abs(own).max())
             if not apart <= ALIKE:
-                raise InvalidInput(
-                    f"the {what} of the MjModel differs by {apart:.2g} (relative) from that of "
-                    f"{known.robot.name}; load the same URDF, with the same gravity and armature (dof_armature)."
-                )
+                seen = f"the {what} of the MjModel differs by {apart:.2g} (relative) from that of {known.robot.name}"
+                raise InvalidInput(f"{seen}; load the same URDF, with the same gravity and armature (dof_armature).")

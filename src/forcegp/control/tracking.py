@@ -46,10 +46,9 @@ class Controller:
         stated = [joint.effort_limit for joint in robot.joints]
         self.torque_limits = per_joint("torque_limits", stated if torque_limits is None else torque_limits, robot.nv)
         if not bool(self.torque_limits.any()):
-            raise InvalidInput(
-                "torque_limits are zero in every joint, so nothing can be controlled; give Nm or N"
-                + (": the URDF states an effort of 0." if torque_limits is None else ".")
-            )
+            seen = "torque_limits are zero in every joint, so nothing can be controlled"
+            why = ": the URDF states an effort of 0." if torque_limits is None else "."
+            raise InvalidInput(f"{seen}; give Nm or N{why}")
         self.restart()
 
     def restart(self) -> None:
@@ -113,10 +112,9 @@ class TrackingController(Controller):
         low, high = self._range
         if beyond := torch.nonzero((q_d < low) | (q_d > high))[:, 0].tolist():
             j = beyond[0]
-            raise InvalidInput(
-                f"the reference asks {self.robot.joint_names[j]} to be at {float(q_d[j]):.4g}, and it moves "
-                f"between {float(low[j]):.4g} and {float(high[j]):.4g}; change q_d, or the limits in the URDF."
-            )
+            seen = f"the reference asks {self.robot.joint_names[j]} to be at {float(q_d[j]):.4g}"
+            ends = f"it moves between {float(low[j]):.4g} and {float(high[j]):.4g}"
+            raise InvalidInput(f"{seen}, and {ends}; change q_d, or the limits in the URDF.")
         return self.limited(self._torques(q, v, v_d, a_d, q_d - q, v_d - v))
 
     def feedback(self, e: Tensor, e_v: Tensor) -> Tensor:
@@ -141,10 +139,8 @@ class ComputedTorque(TrackingController):
         known = model_of(model)
         require_number("position_noise", position_noise, "give rad (m) of at least 0", 0.0)
         if known.contacts:
-            raise InvalidInput(
-                "ComputedTorque moves a robot without contacts, and this model has one; use HybridForce, or "
-                "posterior.with_contacts([])."
-            )
+            seen = "ComputedTorque moves a robot without contacts, and this model has one"
+            raise InvalidInput(f"{seen}; use HybridForce, or posterior.with_contacts([]).")
         self.model, self.past = model, Past(known, position_noise)
         super().__init__(known.robot, **settings)
 
@@ -251,10 +247,8 @@ class HybridForce(TrackingController):
         self.predictor = require_type("predictor", predictor, Predictor, " : posterior.predictor()")
         self.model = predictor.posterior.model
         if not self.model.contacts:
-            raise InvalidInput(
-                "HybridForce wants a force against a contact, and this model has none; name it in "
-                "posterior.with_contacts([...]), or use ComputedTorque."
-            )
+            seen = "HybridForce wants a force against a contact, and this model has none"
+            raise InvalidInput(f"{seen}; name it in posterior.with_contacts([...]), or use ComputedTorque.")
         require_actuated(predictor.posterior)
         require_number("tolerance", tolerance, "give m, more than 0")
         require_known("off_surface", off_surface, "HybridForce", ("raise", "release"))
@@ -275,10 +269,9 @@ class HybridForce(TrackingController):
         count = len(self.model.contacts)
         wanted = real_tensor("normal_force", 0.0 if normal_force is None else normal_force, torch.device("cpu"))
         if normal_force is None or wanted.shape not in ((), (count,)) or not bool((wanted >= 0.0).all()):
-            raise InvalidInput(
-                f"normal_force is {normal_force!r}; give the force in N with which the surface pushes, at least 0, one "
-                f"per contact ({count})."
-            )
+            seen = f"normal_force is {normal_force!r}"
+            advice = f"give the force in N with which the surface pushes, at least 0, one per contact ({count})."
+            raise InvalidInput(f"{seen}; {advice}")
         self.wanted = wanted.expand(count)
         return super().__call__(q, v, q_d, v_d, a_d)
 
@@ -289,10 +282,9 @@ class HybridForce(TrackingController):
         far = float(at.off.abs().max())
         self.released = far > self.tolerance
         if self.released and self._free is None:
-            raise ContactError(
-                f"a contact's point is {far:.3g} m off its surface, and at most {self.tolerance:g} m are allowed: a "
-                'force there would push nothing; move it there by ComputedTorque first, or give off_surface="release".'
-            )
+            seen = f"a contact's point is {far:.3g} m off its surface, and at most {self.tolerance:g} m are allowed"
+            advice = 'move it there by ComputedTorque first, or give off_surface="release".'
+            raise ContactError(f"{seen}: a force there would push nothing; {advice}")
         if self.released and self._free is not None:
             return self._free._torques(q, v, v_d, a_d, e, e_v)
         free = a_d + self.feedback(e, e_v)
@@ -403,17 +395,13 @@ class MPPI(Controller):
             motions = self.predictor.rollouts(q, v, torques, self.dt, integrator=self.integrator, threads=1)
             costs = torch.as_tensor(self.cost(motions.q, motions.v, torques.expand_as(motions.a)))
         if costs.shape != motions.diverged_at.shape:
-            raise InvalidInput(
-                f"cost returned shape {tuple(costs.shape)} for motions {tuple(motions.q.shape)}; return one number per "
-                f"motion, {tuple(motions.diverged_at.shape)}."
-            )
+            seen = f"cost returned shape {tuple(costs.shape)} for motions {tuple(motions.q.shape)}"
+            raise InvalidInput(f"{seen}; return one number per motion, {tuple(motions.diverged_at.shape)}.")
         costs = costs.double().masked_fill((motions.diverged_at >= 0) | costs.isnan(), math.inf)
         best = float(costs.min())
         if not math.isfinite(best):
-            raise NumericalError(
-                f"none of {self.samples} sequences of torques has a finite cost from here; check cost(q, v, u), give a "
-                "smaller dt, less noise or fewer steps."
-            )
+            seen = f"none of {self.samples} sequences of torques has a finite cost from here"
+            raise NumericalError(f"{seen}; check cost(q, v, u), give a smaller dt, less noise or fewer steps.")
         self._best = torques[costs.argmin()]
         temperature = max(SHARE_OF_MEDIAN * float(costs[costs.isfinite()].median() - best), 1e-12)
         return torch.einsum("s,stj->tj", torch.softmax((best - costs) / temperature, dim=0), torques)

@@ -26,10 +26,9 @@ def continuous(space: ConfigurationSpace, q: Positions) -> Positions:
         turn = slice(group.place + TURN.start, group.place + TURN.stop)
         followed, jumped = following(q[:, turn], q[0, turn])
         if jumped.any():
-            raise DatasetError(
-                f"{group.name!r} turns by more than {np.degrees(LARGEST_TURN):.0f} degrees after row "
-                f"{np.argmax(jumped) - 1}; check the order of the quaternion's columns, or leave these rows out."
-            )
+            row = np.argmax(jumped) - 1
+            seen = f"{group.name!r} turns by more than {np.degrees(LARGEST_TURN):.0f} degrees after row {row}"
+            raise DatasetError(f"{seen}; check the order of the quaternion's columns, or leave these rows out.")
         q = q.copy()
         q[:, turn] = followed
     return q

@@ -95,10 +95,9 @@ def _on_surfaces(
             if residual <= max(BROKEN * acceleration, NOISE * noise):  # accelerations obey it: drawn, not recorded
                 return np.zeros(len(rows), dtype=bool), []
             far = float(np.median(distance))
-            seen = (
-                f"only {100.0 * share:.0f} % of the rows move along its surface; the others move through it with "
-                f"{np.median(rate):.2g} m/s, and |A a - b| is {residual:.2g} m/s² (medians)."
-            )
+            few = f"only {100.0 * share:.0f} % of the rows move along its surface"
+            speeds = f"{np.median(rate):.2g} m/s, and |A a - b| is {residual:.2g} m/s² (medians)"
+            seen = f"{few}; the others move through it with {speeds}."
         elif (far := float(np.median(distance[along] if along.any() else distance))) > FAR:
             seen = f"its point moves along the surface, but {far:.3g} m away from it."
         else:

@@ -113,10 +113,8 @@ class Dataset(Summary):
         if self.noise_std is not None:
             put("noise_std", finite_columns("noise_std", self.noise_std, None, len(names), what="joints"))
             for column in np.flatnonzero(self.noise_std <= 0)[:1]:
-                raise DatasetError(
-                    f"noise_std of joint {names[column]!r} is {self.noise_std[column]}; it must be > 0. Give None if "
-                    "it is not known or if there is no noise."
-                )
+                seen = f"noise_std of joint {names[column]!r} is {self.noise_std[column]}; it must be > 0"
+                raise DatasetError(f"{seen}. Give None if it is not known or if there is no noise.")
         if self.strokes is not None:
             past = real_array("strokes", self.strokes, "fiu", DatasetError).astype(np.float64)
             if past.ndim != 3 or past.shape[:2] != self.v.shape or not (np.abs(past) <= LARGEST_MEASURED).all():
@@ -135,10 +133,9 @@ class Dataset(Summary):
             at, number = self.time[order][row], self.episode[order][row]
             if not self.time_ordered:
                 raise DatasetError(f"time {at} s occurs twice in episode {number}; drop the repeated rows.")
-            raise DatasetError(
-                f"time does not increase at row {row} (episode {number}, time {at} s). "
-                "Sort the rows, drop stamps less than a nanosecond apart, or number a new recording as a new episode."
-            )
+            seen = f"time does not increase at row {row} (episode {number}, time {at} s)"
+            advice = "drop stamps less than a nanosecond apart, or number a new recording as a new episode."
+            raise DatasetError(f"{seen}. Sort the rows, {advice}")
 
     def __len__(self) -> int:
         return len(self.q)
@@ -205,9 +202,8 @@ class Dataset(Summary):
         wanted = tuple(ids)
         missing = [number for number in wanted if number not in self.episodes]
         if missing or not wanted:
-            raise InvalidInput(
-                f"no episodes {missing if wanted else '(none asked for)'}; this Dataset has {list(self.episodes)}."
-            )
+            seen = f"no episodes {missing if wanted else '(none asked for)'}"
+            raise InvalidInput(f"{seen}; this Dataset has {list(self.episodes)}.")
         return self.rows(np.isin(self.episode, wanted))
 
     def save(self, path: str | Path) -> None:
@@ -235,9 +231,8 @@ def imu_place(name: str) -> tuple[str, list[float], Float[np.ndarray, "3 3"]]:
         if len(pose) not in (3, 6) or not np.isfinite(pose).all():
             raise ValueError
     except ValueError:
-        raise InvalidInput(
-            f"{name!r} has no place in its frame; give FRAME@x,y,z [m] or FRAME@x,y,z,roll,pitch,yaw [m, rad]."
-        ) from None
+        seen = f"{name!r} has no place in its frame"
+        raise InvalidInput(f"{seen}; give FRAME@x,y,z [m] or FRAME@x,y,z,roll,pitch,yaw [m, rad].") from None
     return frame, pose[:3], rotation_from_rpy(pose[3:] or [0.0] * 3)
 
 
@@ -265,9 +260,8 @@ def _truth(
         columns = () if name == "lambda" else joint_names if name.startswith(("a", "Q_U")) else ("x", "y", "z")
         checked[name] = values = finite_columns(f"truth[{name!r}]", given[name], columns, rows)
         if name == "lambda" and values.shape[1] != len(model.contacts):
-            raise DatasetError(
-                f"truth[{name!r}] has {values.shape[1]} columns; the model has {len(model.contacts)} contacts."
-            )
+            seen = f"truth[{name!r}] has {values.shape[1]} columns"
+            raise DatasetError(f"{seen}; the model has {len(model.contacts)} contacts.")
     return checked
 
 
@@ -312,7 +306,5 @@ def require_rows(name: str, rows: object, joint_names: Sequence[str], whose: str
     """Raise InvalidInput unless `rows` is a Dataset with these joints, which are those of `whose`."""
     own = require_type(name, rows, Dataset, example).joint_names
     if tuple(own) != tuple(joint_names):
-        raise InvalidInput(
-            f"the joints of {name} are {', '.join(own)}, those of {whose} {', '.join(joint_names)}; give data of the "
-            "same robot, with its joints in the same order"
-        )
+        seen = f"the joints of {name} are {', '.join(own)}, those of {whose} {', '.join(joint_names)}"
+        raise InvalidInput(f"{seen}; give data of the same robot, with its joints in the same order")

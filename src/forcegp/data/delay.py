@@ -90,15 +90,11 @@ def estimate_delay(dataset: Dataset, cutoff: float | None = None) -> Delay:
     DatasetError for a log shorter than .4 s.
     """
     if dataset.model.contacts:
-        raise InvalidInput(
-            "the forces of contacts are not known, so a delay cannot be found in this log. Give the delay in s, or use "
-            "a log without contact."
-        )
+        seen = "the forces of contacts are not known, so a delay cannot be found in this log"
+        raise InvalidInput(f"{seen}. Give the delay in s, or use a log without contact.")
     if not torques_of_joints(dataset):
-        raise InvalidInput(
-            "a delay is found from the torque of every joint, which u does not hold for a base that moves or actuators "
-            "of another kind; give the delay in s."
-        )
+        why = "which u does not hold for a base that moves or actuators of another kind"
+        raise InvalidInput(f"a delay is found from the torque of every joint, {why}; give the delay in s.")
     near = _told_apart(dataset, USUAL_DELAY, cutoff)
     open_ones = np.isnan(near.seconds) & np.array([bool(np.ptp(u)) for u in dataset.u.T])
     at_end = np.isnan(near.common + near.common_std)  # that of a part of the log lies beyond
@@ -134,10 +130,8 @@ def _estimated(dataset: Dataset, largest: float, cutoff: float | None) -> list[t
         episodes.append((own, own[inner][::thin]))
     compared = np.concatenate([inner for _, inner in episodes])
     if len(compared) < 10 * BLOCKS:
-        raise DatasetError(
-            f"{len(compared)} rows lie more than {largest} s from the ends of their episodes; a delay needs at "
-            f"least {10 * BLOCKS}. Record longer, or give the delay in s."
-        )
+        seen = f"{len(compared)} rows lie more than {largest} s from the ends of their episodes"
+        raise DatasetError(f"{seen}; a delay needs at least {10 * BLOCKS}. Record longer, or give the delay in s.")
     features = torque_columns(dataset, compared, cutoff)
     profiles = np.full((2, dataset.nv, BLOCKS + 1, len(shifts)), np.nan)  # of all rows, and of all but one block
     for joint in range(dataset.nv):

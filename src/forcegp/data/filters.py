@@ -18,9 +18,9 @@ from forcegp.robots.manifold import ConfigurationSpace
 
 Signal = Literal["q", "v", "u", "a"]
 Values = Float[np.ndarray, "rows *columns"]
+Times = Float[np.ndarray, " rows"]
 
 TRANSIENT = 1e-3  # what is left of a filter's transient at the ends of a recording; sets the length of the padding
-PASSED = 3.0  # rows in a period of a cut-off, of which more repeat their neighbours (`LowPass.memory`)
 HALF = 0.32434  # periods of a cut-off in which the autocorrelation of white noise behind it falls to one half
 JITTER = 0.01
 """Largest deviation of a time step from the median step, relative to it, that still counts as uniform sampling."""
@@ -37,13 +37,12 @@ class LowPass:
     cutoff: float
     order: ClassVar[int] = 4
 
-    def __call__(self, values: Values, time: Float[np.ndarray, " rows"]) -> Values:
+    def __call__(self, values: Values, time: Times) -> Values:
         """Filtered, for rows at even times. Raises as `uniform_step`."""
         rate = 1.0 / uniform_step(time)
         if not 0 < self.cutoff < rate / 2:
-            raise InvalidInput(
-                f"cutoff is {self.cutoff} Hz; it must be > 0 and below {rate / 2:.6g} Hz, half the sample rate."
-            )
+            seen = f"cutoff is {self.cutoff} Hz"
+            raise InvalidInput(f"{seen}; it must be > 0 and below {rate / 2:.6g} Hz, half the sample rate.")
         from scipy.signal import butter, sosfiltfilt  # half a second, which only filtering should cost
 
         slowest = np.abs(butter(self.order, self.cutoff, fs=rate, output="zpk")[1]).max()
@@ -51,10 +50,9 @@ class LowPass:
             dies = np.ceil(np.log(TRANSIENT) / np.log(slowest)) if slowest < 1.0 else np.inf
         padding = int(max(min(dies, 1e15), self.order + 1))
         if len(values) <= padding:
-            raise DatasetError(
-                f"{len(values)} rows are too few for a filter of order {self.order} with a cut-off at {self.cutoff} Hz;"
-                f" more than {padding:g} are needed. Use a higher cut-off, or leave the episode out."
-            )
+            which = f"a filter of order {self.order} with a cut-off at {self.cutoff} Hz"
+            seen = f"{len(values)} rows are too few for {which}; more than {padding:g} are needed"
+            raise DatasetError(f"{seen}. Use a higher cut-off, or leave the episode out.")
         return sosfiltfilt(butter(self.order, self.cutoff, fs=rate, output="sos"), values, axis=0, padlen=padding)
 
     def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Float[np.ndarray, " k"]:
@@ -69,7 +67,7 @@ class LowPass:
         return HALF / self.cutoff
 
 
-def lagged(values: Values, time: Float[np.ndarray, " rows"], seconds: float) -> Values:
+def lagged(values: Values, time: Times, seconds: float) -> Values:
     """What an actuator of first order makes of values, at rest with the first of them: T x' + x = values, T in s.
 
     By Tustin's rule (trapezoids), for equal steps of time.
@@ -128,7 +126,7 @@ def shifted(dataset: Dataset, delay: float, lag: float = 0.0, lagging: Sequence[
 
 
 def differentiate(
-    values: Float[np.ndarray, "rows columns"], time: Float[np.ndarray, " rows"], space: ConfigurationSpace | None = None
+    values: Float[np.ndarray, "rows columns"], time: Times, space: ConfigurationSpace | None = None
 ) -> np.ndarray:
     """Central differences, second order also at both ends and for unequal steps (three-point Lagrange formulas).
 
@@ -144,7 +142,7 @@ def differentiate(
     return np.gradient(values, time, axis=0, edge_order=2)
 
 
-def uniform_step(time: Float[np.ndarray, " rows"], name: str = "this recording") -> float:
+def uniform_step(time: Times, name: str = "this recording") -> float:
     """The sampling interval [s]. Raises DatasetError if steps differ by more than `JITTER` (1 %) from their median."""
     if len(time) < 2:
         raise DatasetError(f"{name} has {len(time)} row; at least 2 are needed.")
@@ -152,10 +150,8 @@ def uniform_step(time: Float[np.ndarray, " rows"], name: str = "this recording")
     median = float(np.median(steps))
     worst = int(np.argmax(np.abs(steps - median)))
     if median <= 0 or abs(steps[worst] - median) > JITTER * median:
-        raise DatasetError(
-            f"{name} is not sampled uniformly: the step after row {worst} is {steps[worst]:.6g} s, the median "
-            f"{median:.6g} s. Resample it first (forcegp.data.resample)."
-        )
+        seen = f"the step after row {worst} is {steps[worst]:.6g} s, the median {median:.6g} s"
+        raise DatasetError(f"{name} is not sampled uniformly: {seen}. Resample it first (forcegp.data.resample).")
     return float((time[-1] - time[0]) / (len(time) - 1))
 
 
@@ -215,15 +211,11 @@ def resample(dataset: Dataset, step: float) -> Dataset:
 def episodes_in_order(dataset: Dataset) -> list[tuple[int, Dataset, str]]:
     """Number, rows and name for messages of every episode. Raises DatasetError for rows not in order of time."""
     if not dataset.time_ordered:
-        raise DatasetError(
-            "the rows are not in order of time (a sample of rows?); filter the whole recording, then sample."
-        )
+        raise DatasetError("the rows are not in order of time (a sample?); filter the whole recording, then sample.")
     return [(number, dataset.select_episodes([number]), f"episode {number}") for number in dataset.episodes]
 
 
-def sums_before(
-    values: Float[np.ndarray, "rows k"], time: Float[np.ndarray, " rows"], seconds: float
-) -> Float[np.ndarray, "rows k"]:
+def sums_before(values: Float[np.ndarray, "rows k"], time: Times, seconds: float) -> Float[np.ndarray, "rows k"]:
     """Sums of the rows before each, with weights exp(-age / seconds); zero for the first."""
     sums, keep = np.zeros_like(values), np.exp(-np.diff(time) / seconds)
     for row in range(1, len(values)):
@@ -254,7 +246,5 @@ def require_no_turns(rows: Dataset, label: str) -> None:
     if jumps.any():
         row, column = np.argwhere(jumps)[0]
         joint = rows.joint_names[np.asarray(space.single_rows)[angular][column]]
-        raise DatasetError(
-            f"{label}: q of joint {joint!r} jumps by more than pi after row {row}; the angle wraps. "
-            "Unwrap it first (np.unwrap(q, axis=0))."
-        )
+        seen = f"{label}: q of joint {joint!r} jumps by more than pi after row {row}; the angle wraps"
+        raise DatasetError(f"{seen}. Unwrap it first (np.unwrap(q, axis=0)).")

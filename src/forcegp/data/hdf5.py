@@ -104,18 +104,15 @@ class _Reader:
         kind, version = _attribute(file, "format"), _attribute(file, "format_version")
         ours = f"is an HDF5 file, but not a forcegp dataset (its 'format' is {kind!r}, not {FORMAT!r})."
         self.require(isinstance(kind, str) and kind == FORMAT, f" {ours}")
-        self.require(
-            isinstance(version, int | np.integer) and version == VERSION,
-            f" has format version {version!r}; this forcegp ({__version__}) reads {VERSION}. Use what wrote it "
-            f"({_attribute(file, 'written_by')!r}), or convert the log again.",
-        )
+        seen = f" has format version {version!r}; this forcegp ({__version__}) reads {VERSION}"
+        advice = f"Use what wrote it ({_attribute(file, 'written_by')!r}), or convert the log again."
+        self.require(isinstance(version, int | np.integer) and version == VERSION, f"{seen}. {advice}")
         missing = [name for name in required if name not in file]
         self.require(not missing, f" has no {', '.join(missing)}; a dataset needs {', '.join(required)}.")
         values: dict[str, Any] = {name: self.array(name) for name in COLUMNS}
         values["metadata"] = json.loads(self.text("metadata"))
         self.require(isinstance(values["metadata"], dict), ": 'metadata' must be a JSON object.")
-        values["noise_std"] = self.array("noise_std") if "noise_std" in file else None
-        values["strokes"] = self.array("strokes") if "strokes" in file else None
+        values |= {name: self.array(name) if name in file else None for name in ("noise_std", "strokes")}
         truth = file["truth"] if isinstance(file.get("truth", getlink=True), h5py.HardLink) else None
         self.require("truth" not in file or isinstance(truth, h5py.Group), ": 'truth' must be a group in this file.")
         names = list(truth) if isinstance(truth, h5py.Group) else []
@@ -136,9 +133,8 @@ class _Reader:
         """The HDF5 dataset of that name, which must lie inside this very file."""
         found = self.file[name] if isinstance(self.file.get(name, getlink=True), h5py.HardLink) else None
         if not isinstance(found, h5py.Dataset) or found.external or found.is_virtual:
-            raise FileFormatError(
-                f"{self.path}: {name!r} must be a dataset stored in this file, not a group or a link elsewhere."
-            )
+            seen = f"{self.path}: {name!r} must be a dataset stored in this file"
+            raise FileFormatError(f"{seen}, not a group or a link elsewhere.")
         return found
 
     def array(self, name: str) -> np.ndarray:

@@ -22,6 +22,7 @@ from forcegp.mechanics import AffineMap
 from forcegp.robots import Kinematics
 from forcegp.robots.inertia import rpy_from_rotation
 
+Measured = Float[np.ndarray, "rows k"]
 STANDARD = 9.80665  # m/s^2 in a g
 AGREES, WRONG = 0.02, 0.05
 """Of what an IMU measures: the disagreement with the log that is none, and from which on it is wrong."""
@@ -48,16 +49,14 @@ def expected(dataset: Dataset, model: forcegp.model.Model, name: str) -> Float[n
         return specific_force(model.robot.kinematics(q, v), name)(a).cpu().numpy()
 
 
-def short_means(dataset: Dataset, *values: Float[np.ndarray, "rows k"]) -> list[Float[np.ndarray, "windows k"]]:
+def short_means(dataset: Dataset, *values: Measured) -> list[Float[np.ndarray, "windows k"]]:
     """Over a tenth of a second each."""
     width = int(max(1.0, SECONDS / median_step(dataset))) if dataset.time_ordered else 1
     first = whole_windows(dataset, width)
     return [window_means(x, first, width) for x in values]
 
 
-def delay_doubts(
-    dataset: Dataset, which: str, f: Float[np.ndarray, "rows k"], p: Float[np.ndarray, "rows k"]
-) -> Iterator[Doubt]:
+def delay_doubts(dataset: Dataset, which: str, f: Measured, p: Measured) -> Iterator[Doubt]:
     """A sensor whose values f, those of the first episode, fit what was expected, p, far better at other times."""
     first = dataset.episode == dataset.episodes[0]
     time, f, p = dataset.time[first], f[first], p[first]
@@ -77,7 +76,7 @@ def late_doubts(which: str, left: Sequence[float], step: float) -> Iterator[Doub
         yield look(about="sensor delay", what=what, do="Shift its columns before an import.", numbers={"delay": late})
 
 
-def _rms(values: Float[np.ndarray, "rows k"]) -> float:
+def _rms(values: Measured) -> float:
     return float(np.sqrt(np.square(values).sum(1).mean()))
 
 

@@ -10,16 +10,7 @@ import numpy as np
 
 from forcegp.data.dataset import Dataset
 from forcegp.data.delay import estimate_delay, torques_of_joints
-from forcegp.data.filters import (
-    PASSED,
-    LowPass,
-    Signal,
-    differentiated,
-    episodes_in_order,
-    low_pass,
-    shifted,
-    uniform_step,
-)
+from forcegp.data.filters import LowPass, Signal, differentiated, episodes_in_order, low_pass, shifted, uniform_step
 from forcegp.data.spectrum import FEWEST_ROWS, held_out_cutoff, motion_spectrum
 from forcegp.data.stance import estimate_stance
 from forcegp.data.strokes import with_strokes
@@ -29,6 +20,7 @@ from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_argum
 from forcegp.robots.arguments import whole_number
 from forcegp.summary import plain
 
+PASSED = 3.0  # rows in a period of a cut-off, of which more repeat their neighbours (`LowPass.memory`)
 FEW = 2_000  # rows of a whole log
 SETTLED = 5.0  # time constants of an actuator after which what it did before the log is forgotten
 EXPLAINED, SLOW = 1.1, 0.25
@@ -231,19 +223,15 @@ def _kept(chosen: Preparation, dataset: Dataset) -> np.ndarray:
         inside = (rows.time >= rows.time[0] + early - slack) & (rows.time <= rows.time[-1] - late + slack)
         own = np.flatnonzero(dataset.episode == number)[inside][:: chosen.every]
         if not len(own):
-            raise DatasetError(
-                f"{label} lasts {rows.time[-1] - rows.time[0]:.6g} s; nothing is left of it after "
-                f"{chosen.trim:g} s are trimmed at both ends. Trim less, or leave the episode out."
-            )
+            seen = f"{label} lasts {rows.time[-1] - rows.time[0]:.6g} s"
+            why = f"nothing is left of it after {chosen.trim:g} s are trimmed at both ends"
+            raise DatasetError(f"{seen}; {why}. Trim less, or leave the episode out.")
         kept.append(own)
         if chosen.cutoff is not None and 0.5 / (chosen.every * step) < float(chosen.cutoff):
-            warn(
-                f"every {chosen.every}. row is {1.0 / (chosen.every * step):.4g} Hz, of which only half can carry "
-                f"motion; the filter passes {chosen.cutoff:g} Hz. Rows stay true, but spectra, derivatives and filters "
-                "of them do not: keep more rows or filter lower.",
-                DataWarning,
-                stacklevel=3,
-            )
+            kept_rate = f"every {chosen.every}. row is {1.0 / (chosen.every * step):.4g} Hz"
+            seen = f"{kept_rate}, of which only half can carry motion; the filter passes {chosen.cutoff:g} Hz"
+            effect = "Rows stay true, but spectra, derivatives and filters of them do not"
+            warn(f"{seen}. {effect}: keep more rows or filter lower.", DataWarning, stacklevel=3)
     return np.sort(np.concatenate(kept))
 
 

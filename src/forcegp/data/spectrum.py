@@ -32,6 +32,8 @@ FACTORS = 0.5, 0.7, 1.0, 1.4, 2.0  # of the cut-off that the spectrum shows
 MOST_ROWS, MOST_NUMBERS = 20_000, 2.5e7
 FOLDS = 8  # stretches of time: the odd ones judge what the even ones teach, and the other way round
 SETTLED = 2.0  # periods of the lowest cut-off at the ends of an episode that filters spoil
+Source = Literal["q", "v"]
+Frequencies = Float[np.ndarray, " frequencies"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,9 +45,9 @@ class MotionSpectrum:
     it does not move, was filtered already, or has hardly any noise.
     """
 
-    source: Literal["q", "v"]
+    source: Source
     step: float
-    frequency: Float[np.ndarray, " frequencies"]
+    frequency: Frequencies
     density: Float[np.ndarray, "frequencies nv"]
     knee: Float[np.ndarray, " nv"]
     floor: Float[np.ndarray, " nv"]
@@ -69,7 +71,7 @@ class MotionSpectrum:
         return np.sqrt((self.noise_density * response[:, None]).sum(axis=0) * (self.frequency[1] - self.frequency[0]))
 
 
-def motion_spectrum(dataset: Dataset, source: Literal["q", "v"] = "q") -> MotionSpectrum:
+def motion_spectrum(dataset: Dataset, source: Source = "q") -> MotionSpectrum:
     """The spectrum of `source` over all episodes, with knee, floor and cut-off of every joint.
 
     Raises DatasetError for fewer than 64 rows in the longest episode, rows out of order or sampled unevenly.
@@ -91,7 +93,7 @@ def motion_spectrum(dataset: Dataset, source: Literal["q", "v"] = "q") -> Motion
 
 def power_density(
     dataset: Dataset, values: Float[np.ndarray, "rows nv"], differences: int = 0
-) -> tuple[Float[np.ndarray, " frequencies"], Float[np.ndarray, "frequencies nv"], float, float]:
+) -> tuple[Frequencies, Float[np.ndarray, "frequencies nv"], float, float]:
     """Frequencies > 0 [Hz], one-sided power density of `values` [unit^2/Hz], number of segments that count, time step.
 
     Hann windows of up to 4 s (Welch 1967); shorter episodes are left out. Values are differenced so often before.
@@ -102,9 +104,8 @@ def power_density(
     steps = [uniform_step(rows.time, label) for _, rows, label in episodes if len(rows) > 1]
     longest = max(len(rows) for _, rows, _ in episodes)
     if longest < FEWEST_ROWS:
-        raise DatasetError(
-            f"the longest episode has {longest} rows; a spectrum needs {FEWEST_ROWS}. Give the cut-off in Hz."
-        )
+        seen = f"the longest episode has {longest} rows; a spectrum needs {FEWEST_ROWS}"
+        raise DatasetError(f"{seen}. Give the cut-off in Hz.")
     step = float(np.median(steps))
     window = min(max(FEWEST_ROWS // 2, round(SEGMENT / step)), longest - differences)
     frequency, total, weight, segments = np.zeros(0), np.zeros((0, 0)), 0, 0.0
@@ -121,10 +122,7 @@ def power_density(
 
 
 def _knee_and_floor(
-    frequency: Float[np.ndarray, " frequencies"],
-    density: Float[np.ndarray, " frequencies"],
-    segments: float,
-    derivatives: int,
+    frequency: Frequencies, density: Frequencies, segments: float, derivatives: int
 ) -> tuple[float, float, float]:
     """Knee [Hz], floor [unit^2/Hz] and cut-off [Hz] of one joint; NaN where there are none."""
     nothing = (np.nan, np.nan, np.nan)
@@ -159,9 +157,7 @@ def _knee_and_floor(
     return float(knee), floor, cutoff if cutoff <= HIGHEST * frequency[-1] else np.nan
 
 
-def held_out_cutoff(
-    dataset: Dataset, cutoff: float, source: Literal["q", "v"] = "q"
-) -> tuple[float, dict[float, float]]:
+def held_out_cutoff(dataset: Dataset, cutoff: float, source: Source = "q") -> tuple[float, dict[float, float]]:
     """The best of `FACTORS` times `cutoff` [Hz], and of each the share of the torques that it leaves unexplained.
 
     A low cut-off smears dry friction, a high one leaves noise. So a linear model is learned behind each, and all are
@@ -175,7 +171,7 @@ def held_out_cutoff(
     return best, dict(sorted(shares.items()))
 
 
-def _judged(dataset: Dataset, cutoff: float, source: Literal["q", "v"]) -> tuple[float, dict[float, float]]:
+def _judged(dataset: Dataset, cutoff: float, source: Source) -> tuple[float, dict[float, float]]:
     nv, columns = dataset.nv, 10 * dataset.nv + 10
     rows = int(min(MOST_ROWS, MOST_NUMBERS / (nv * columns)))
     log = dataset.rows(slice(0, rows))

@@ -38,6 +38,7 @@ LIFTED, USUAL = 0.004, 0.75
 quantile of what the rows ask of feet that are lifted, above which one that is not may bear."""
 FEW = 10
 MANY_OPEN = 0.25  # share of open rows that more than changes of stance leave
+OfSwitches = Float[np.ndarray, "rows switches"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,10 +50,10 @@ class Stance:
     """
 
     names: tuple[str, ...]
-    flags: Float[np.ndarray, "rows switches"]
-    speed: Float[np.ndarray, "rows switches"]
+    flags: OfSwitches
+    speed: OfSwitches
     slow: Float[np.ndarray, " switches"]
-    force: Float[np.ndarray, "rows switches"]
+    force: OfSwitches
     bearing: Float[np.ndarray, " 2"]
 
     @property
@@ -84,20 +85,16 @@ class Stance:
         if not decided.any():
             raise self._open(len(rows))
         if decided.mean() < 1.0 - MANY_OPEN:
-            warn(
-                f"motion and forces leave the stance open in {1.0 - decided.mean():.0%} of the rows, of which torques "
-                "alone are used: velocities are noisy (filter them: `cutoff='auto'`), stance is as short as what a "
-                "filter smears, feet slip or lean, or touch at other points than those given.",
-                DataWarning,
-                stacklevel=3,
-            )
+            seen = f"motion and forces leave the stance open in {1.0 - decided.mean():.0%} of the rows"
+            why = "velocities are noisy (filter them: `cutoff='auto'`), stance is as short as what a filter smears"
+            why = f"{why}, feet slip or lean, or touch at other points than those given"
+            warn(f"{seen}, of which torques alone are used: {why}.", DataWarning, stacklevel=3)
         return rows
 
     def _open(self, rows: int) -> DatasetError:
-        return DatasetError(
-            f"motion and forces leave the stance open in all {rows} rows; give the flags {', '.join(self.names)} in "
-            "the last columns of u, or filter the velocities first."
-        )
+        seen = f"motion and forces leave the stance open in all {rows} rows"
+        advice = f"give the flags {', '.join(self.names)} in the last columns of u, or filter the velocities first."
+        return DatasetError(f"{seen}; {advice}")
 
 
 def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Stance:
@@ -112,10 +109,8 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
     """
     model = dataset.model if model is None else model
     if not (names := model.switches):
-        raise ContactError(
-            "no contact of the model has a switch, so there is no stance to find; give one, for example "
-            "fixed_point('foot', switch='foot_stands')."
-        )
+        seen = "no contact of the model has a switch, so there is no stance to find"
+        raise ContactError(f"{seen}; give one, for example fixed_point('foot', switch='foot_stands').")
     order = np.argsort(dataset.time, kind="stable")
     episodes = [order[dataset.episode[order] == number] for number in dataset.episodes]
     motion, asked, height = _motion_and_force(dataset, model, names)
@@ -165,7 +160,7 @@ def _mean(values: Float[np.ndarray, "rows k"], width: int) -> Float[np.ndarray, 
 
 def _motion_and_force(
     dataset: Dataset, model: forcegp.Model, names: tuple[str, ...]
-) -> tuple[list[Float[np.ndarray, "rows m"]], list[Float[np.ndarray, "rows 3"]], Float[np.ndarray, "rows switches"]]:
+) -> tuple[list[Float[np.ndarray, "rows m"]], list[Float[np.ndarray, "rows 3"]], OfSwitches]:
     """A v of the contacts of every switch, the force that the rows ask of them, and how high they are."""
     of = [[k for k, contact in enumerate(model.contacts) if contact.switch == name] for name in names]
     places = [model.inputs.index(name) for name in names]
@@ -236,9 +231,7 @@ def _beside(places: Int[np.ndarray, " k"], rows: Int[np.ndarray, " rows"]) -> tu
     return before, places[np.minimum(np.searchsorted(places, rows), len(places) - 1)]
 
 
-def _as_low(
-    flags: Float[np.ndarray, "rows switches"], height: Float[np.ndarray, "rows switches"], least: np.ndarray
-) -> Bool[np.ndarray, "rows switches"]:
+def _as_low(flags: OfSwitches, height: OfSwitches, least: np.ndarray) -> Bool[np.ndarray, "rows switches"]:
     """Where a contact is hardly above or below where it acted last, or acts next."""
     rows, low = np.arange(len(flags)), np.zeros(flags.shape, bool)
     for own, z, out, lift in zip(flags.T, height.T, low.T, least, strict=True):

@@ -17,6 +17,8 @@ STEPS = 2.0  # steps of an encoder within which a reversal counts as none
 NOISES = 8.0  # standard deviations of white noise in positions within which a reversal counts as none
 ORDERS, AGREE = (5, 6), 1.25
 """Differences of both orders find the same noise up to this factor; where motion or rounding dominates they do not."""
+Positions = Float[np.ndarray, "rows nv"]
+Gears = Float[np.ndarray, "nv nv"] | None  # a `transmission`, or None for joints
 NORMAL = 0.6745  # median of absolute values of a standard normal variable
 ON_GRID, MOSTLY = 0.1, 0.9
 """Positions lie on a grid where so many of their differences are within this share of a whole number of steps."""
@@ -33,9 +35,7 @@ def with_strokes(dataset: Dataset, transmission: Float[np.ndarray, "nv nv"] | Te
     return replace(dataset, strokes=strokes(dataset, transmission=T), transmission=T)
 
 
-def strokes(
-    dataset: Dataset, count: int = COUNT, transmission: Float[np.ndarray, "nv nv"] | None = None
-) -> Float[np.ndarray, "rows nv count"]:
+def strokes(dataset: Dataset, count: int = COUNT, transmission: Gears = None) -> Float[np.ndarray, "rows nv count"]:
     """Displacements (rad or m) of each joint up to every row: since the last reversal, of the stroke before, and so on.
 
     They alternate in sign; those before the first row of an episode are 0. Of joints of several degrees of freedom all
@@ -60,16 +60,14 @@ def strokes(
     return out
 
 
-def motor_positions(
-    dataset: Dataset, transmission: Float[np.ndarray, "nv nv"] | None = None
-) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, " nv"]]:
+def motor_positions(dataset: Dataset, transmission: Gears = None) -> tuple[Positions, Float[np.ndarray, " nv"]]:
     """Positions of motors with this transmission, None: of joints; and the steps of their encoders."""
     positions = joint_positions(dataset)
     steps = np.array([encoder_step(dataset, q) for q in positions.T])
     return (positions, steps) if transmission is None else (positions @ transmission.T, abs(transmission) @ steps)
 
 
-def joint_positions(dataset: Dataset) -> Float[np.ndarray, "rows nv"]:
+def joint_positions(dataset: Dataset) -> Positions:
     """Positions of joints of one degree of freedom; 0 for the others."""
     q, v = torch.tensor(dataset.q), torch.tensor(dataset.v)
     return State(q, v, v, dataset.model.robot).positions.numpy()

@@ -17,6 +17,8 @@ from forcegp.robots.arguments import whole_number
 
 Select = Callable[[Dataset, int], Int[np.ndarray, " chosen"]]
 """Which rows: numbers of at most so many of a log, such as `evenly` gives."""
+Marked = Bool[np.ndarray, " rows"]
+Numbered = Int[np.ndarray, " rows"]
 
 BLOCK = 4096  # rows
 EVEN_STEPS = 1e-3  # of a duration: rounding
@@ -61,7 +63,7 @@ def decided(dataset: Dataset) -> Dataset:
     return dataset if known.all() else dataset.rows(np.flatnonzero(known))
 
 
-def consecutive(dataset: Dataset) -> Bool[np.ndarray, " rows"]:
+def consecutive(dataset: Dataset) -> Marked:
     """Whether the next row belongs to the same episode and follows; False for the last row."""
     return np.append(dataset.episode[1:] == dataset.episode[:-1], False)
 
@@ -75,7 +77,7 @@ def move_on(dataset: Dataset) -> bool:
     return bool((np.median(steps, axis=0)[moving] < LEAP * spread[moving]).any())
 
 
-def postures(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
+def postures(dataset: Dataset) -> Numbered | None:
     """The rest that each row belongs to or comes after; None for a log of other motions.
 
     A log of postures rests three times or more, in a quarter of its rows, with all joints at once.
@@ -83,7 +85,7 @@ def postures(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
     return _numbered(dataset, OFTEN)
 
 
-def rests_alone(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
+def rests_alone(dataset: Dataset) -> Numbered | None:
     """The rest of each row of a log of postures alone, three or more: an episode each, or one after the other."""
     of_episode = np.unique(dataset.episode, return_inverse=True)[1]
     within = [np.ptp(dataset.q[of_episode == each], axis=0) for each in range(of_episode.max() + 1)]
@@ -92,7 +94,7 @@ def rests_alone(dataset: Dataset) -> Int[np.ndarray, " rows"] | None:
     return _numbered(dataset, ALONE)
 
 
-def _numbered(dataset: Dataset, share: float) -> Int[np.ndarray, " rows"] | None:
+def _numbered(dataset: Dataset, share: float) -> Numbered | None:
     """The rest that each row belongs to or comes after; None for fewer than three, or less than a share of the rows."""
     if not dataset.time_ordered:
         return None
@@ -146,7 +148,7 @@ def _within(dataset: Dataset) -> Float[np.ndarray, " nq"]:
     return RESTS * np.maximum(span, IDLE * span.max())
 
 
-def runs(marked: Bool[np.ndarray, " rows"]) -> Int[np.ndarray, "runs 2"]:
+def runs(marked: Marked) -> Int[np.ndarray, "runs 2"]:
     """First rows of all runs of True, and the rows after them."""
     return np.flatnonzero(np.diff(marked, prepend=False, append=False)).reshape(-1, 2)
 
@@ -156,9 +158,7 @@ def resolution(values: Float[np.ndarray, " rows"]) -> float:
     return float(np.diff(np.unique(np.round(values / np.ptp(values), 9))).min() * np.ptp(values))
 
 
-def ends_of_range(
-    values: Float[np.ndarray, " rows"], moves: Bool[np.ndarray, " rows"]
-) -> Iterator[tuple[float, Bool[np.ndarray, " rows"]]]:
+def ends_of_range(values: Float[np.ndarray, " rows"], moves: Marked) -> Iterator[tuple[float, Marked]]:
     """Extremes at which a channel stays while something `moves`, and where: far more rows there than just below."""
     if moves.sum() < CLIPPED_ROWS or not np.ptp(values[moves]) > 0.0:
         return
@@ -196,9 +196,8 @@ def with_memory(dataset: Dataset, model: Model) -> Dataset:
     if not memory.names or (own == memory.names and dataset.strokes is None):
         return dataset
     if not (dataset := with_strokes(dataset, memory.transmission)).knows_strokes(memory.transmission):
-        raise InvalidInput(
-            f"{', '.join(memory.titles)} remembers, and the rows are not in order of time; give the whole log."
-        )
+        seen = f"{', '.join(memory.titles)} remembers, and the rows are not in order of time"
+        raise InvalidInput(f"{seen}; give the whole log.")
     bare = dataset.u[:, ~np.isin(dataset.model.inputs, own)]
     columns = memory.past_of(torch.as_tensor(np.array(dataset.strokes), device=model.robot.device)).cpu().numpy()
     first = model.memory_column
@@ -206,7 +205,7 @@ def with_memory(dataset: Dataset, model: Model) -> Dataset:
     return replace(dataset, u=u, model=replace(dataset.model, forces=model.laws))
 
 
-def past_known(dataset: Dataset, model: Model) -> Bool[np.ndarray, " rows"]:
+def past_known(dataset: Dataset, model: Model) -> Marked:
     """Rows in which what joints remember does not depend on what was before their episode.
 
     A joint that never goes so far in an episode does not count: what sticks there is in its offset.
@@ -257,9 +256,7 @@ def recorded_motions(dataset: Dataset, starts: int | Sequence[int], seconds: flo
     possible = whole_windows(dataset, steps + 1)
     if not possible.size:
         longest = np.unique(dataset.episode, return_counts=True)[1].max() - 1
-        raise InvalidInput(
-            f"no episode lasts {steps * dt:.4g} s: the longest has {dt * longest:.4g} s; ask for fewer seconds."
-        )
+        raise InvalidInput(f"no episode lasts {steps * dt:.4g} s: the longest has {dt * longest:.4g} s; ask for less.")
     if isinstance(starts, int):
         if starts < 1:
             raise InvalidInput(f"the number of starts is {starts}; it must be at least 1.")
@@ -269,17 +266,13 @@ def recorded_motions(dataset: Dataset, starts: int | Sequence[int], seconds: flo
     else:
         chosen = np.asarray(starts, dtype=int)
         for row in chosen[~np.isin(chosen, possible)][:1]:
-            raise InvalidInput(
-                f"no motion of {steps * dt:.4g} s begins at row {row} of the {len(dataset)} rows within its episode; "
-                "start earlier, or ask for fewer seconds."
-            )
+            seen = f"no motion of {steps * dt:.4g} s begins at row {row} of the {len(dataset)} rows within its episode"
+            raise InvalidInput(f"{seen}; start earlier, or ask for fewer seconds.")
     for row in chosen[before[chosen + steps] != before[chosen]][:1]:
         pauses = np.diff(dataset.time[row : row + steps + 1])
         worst = int(np.abs(pauses - dt).argmax())
-        raise InvalidInput(
-            f"the time steps are uneven: {pauses[worst]:.6g} s after row {row + worst}, {dt:.6g} s elsewhere; resample "
-            "the recording to equal steps, or start where there is no gap."
-        )
+        seen = f"the time steps are uneven: {pauses[worst]:.6g} s after row {row + worst}, {dt:.6g} s elsewhere"
+        raise InvalidInput(f"{seen}; resample the recording to equal steps, or start where there is no gap.")
     index = chosen[:, None] + np.arange(steps + 1)
     return RecordedMotions(tuple(chosen.tolist()), dt, dataset.q[index], dataset.v[index], dataset.u[index[:, :-1]])
 
@@ -290,7 +283,7 @@ def median_step(recording: Dataset) -> float:
     return float(np.median(pauses)) if pauses.size else float("inf")
 
 
-def stretches_without_gap(recording: Dataset, part: Bool[np.ndarray, " rows"]) -> list[Int[np.ndarray, " rows"]]:
+def stretches_without_gap(recording: Dataset, part: Marked) -> list[Numbered]:
     """Numbers of rows of a part that follow each other in one episode without a gap."""
     rows = np.flatnonzero(part)
     apart = (np.diff(rows) > 1) | (np.diff(recording.episode[rows]) != 0)
@@ -311,14 +304,12 @@ def all_motions(dataset: Dataset, seconds: float, longest_step: float) -> tuple[
         firsts = rows[: len(rows) - steps : steps]
         starts += firsts[before[firsts + steps] == before[firsts]].tolist()
     if not starts:
-        raise InvalidInput(
-            f"no stretch of {steps * dt:.4g} s has equal steps of {dt:.4g} s; give fewer seconds, or resample the "
-            "recording (forcegp import does)."
-        )
+        seen = f"no stretch of {steps * dt:.4g} s has equal steps of {dt:.4g} s"
+        raise InvalidInput(f"{seen}; give fewer seconds, or resample the recording (forcegp import does).")
     return recorded_motions(dataset, starts, steps * dt), stride
 
 
-def _even_steps(dataset: Dataset) -> tuple[float, Int[np.ndarray, " rows"]]:
+def _even_steps(dataset: Dataset) -> tuple[float, Numbered]:
     """The median step of time [s], and how many steps before each row are not of that length."""
     if not np.isfinite(dt := median_step(dataset)):
         raise InvalidInput("every episode has one row only; a rollout is compared with a motion of several rows.")

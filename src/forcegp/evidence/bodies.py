@@ -18,12 +18,7 @@ from forcegp.errors import NonPhysicalInertia
 from forcegp.forces import Body
 from forcegp.inference import require_memory
 from forcegp.robots import Robot
-from forcegp.robots.inertia import (
-    physical_of_pseudo_inertia,
-    pseudo_inertia,
-    standard_basis,
-    standard_of_pseudo_inertia,
-)
+from forcegp.robots.inertia import physical_of_pseudo_inertia, standard_basis, standard_of_pseudo_inertia
 from forcegp.robots.urdf_file import replace_inertial
 
 
@@ -100,6 +95,7 @@ QUANTITIES = (
 )
 """What people read of a body: inertia about its centre of mass."""
 _INERTIA = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+Coordinates = Float[np.ndarray, " k"]
 
 
 class Bodies:
@@ -121,28 +117,26 @@ class Bodies:
         """Which coordinates belong to each body."""
         return tuple(slice(10 * k, 10 * k + 10) for k in range(len(self.priors)))
 
-    def pseudo_inertias(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 4 4"]:
+    def pseudo_inertias(self, x: Coordinates) -> Float[np.ndarray, "n 4 4"]:
         """P of every body."""
         return self._congruent(_log_cholesky(x)[0])
 
-    def parameters(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 10"]:
+    def parameters(self, x: Coordinates) -> Float[np.ndarray, "n 10"]:
         """Standard parameters."""
         return self._standard(self.pseudo_inertias(x))
 
-    def chained(
-        self, x: Float[np.ndarray, " k"], regressor: Float[np.ndarray, "rows nv n 10"]
-    ) -> Float[np.ndarray, "rows nv k"]:
+    def chained(self, x: Coordinates, regressor: Float[np.ndarray, "rows nv n 10"]) -> Float[np.ndarray, "rows nv k"]:
         """Derivatives in the coordinates of what has these derivatives in the standard parameters of every body."""
         out, slopes = np.empty((*regressor.shape[:2], self.size)), self.slopes(x)
         for body, columns in enumerate(self.slices):  # matrix products, where `einsum` would loop by itself
             out[..., columns] = regressor[:, :, body] @ slopes[10 * body : 10 * body + 10, columns]
         return out
 
-    def slopes(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "standard k"]:
+    def slopes(self, x: Coordinates) -> Float[np.ndarray, "standard k"]:
         """Derivatives of the standard parameters of all bodies, one after the other, in the coordinates."""
         return block_diag(np.zeros((0, 0)), *self._standard(self._congruent(_log_cholesky(x)[1])).swapaxes(-1, -2))
 
-    def moved(self, x: Float[np.ndarray, " k"], step: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    def moved(self, x: Coordinates, step: Coordinates) -> Coordinates:
         """x + step to first order: parameters change by exactly their derivatives times the step, if a body can.
 
         Torque is linear in them: with many rows of little noise, straight lines in x leave its narrow valley.
@@ -157,7 +151,7 @@ class Bodies:
         there[possible] = np.concatenate([np.log(scale), np.log(inside[:, :3]), inside[:, 3:]], axis=1)
         return there.ravel()
 
-    def distance(self, x: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
+    def distance(self, x: Coordinates) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
         """A vector whose norm is the distance from the references times the root of its weight, and its Jacobian."""
         inner, change = _log_cholesky(x)
         values, vectors = np.linalg.eigh(inner)
@@ -175,12 +169,12 @@ class Bodies:
         distance = np.einsum("kab,nab->nk", _SYMMETRIC, logarithm).ravel()
         return self._weights * distance, self._weights[:, None] * jacobian
 
-    def numbers(self, x: Float[np.ndarray, " k"], frames: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " m"]:
+    def numbers(self, x: Coordinates, frames: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, " m"]:
         """`QUANTITIES` of every body, in axes with these poses in its frame."""
         told = [physical_of_pseudo_inertia(pseudo) for pseudo in _in_frames(self.pseudo_inertias(x), frames)]
         return np.array([[mass, *center, *(inertia[at] for at in _INERTIA)] for mass, center, inertia in told]).ravel()
 
-    def number_slopes(self, x: Float[np.ndarray, " k"], frames: Float[np.ndarray, "n 4 4"]) -> np.ndarray:
+    def number_slopes(self, x: Coordinates, frames: Float[np.ndarray, "n 4 4"]) -> np.ndarray:
         """Derivatives of `numbers` in the coordinates."""
         changes = _in_frames(self._congruent(_log_cholesky(x)[1]), frames[:, None])
         blocks = [np.zeros((0, 0))]
@@ -265,10 +259,8 @@ def with_bodies(robot: Robot, wanted: Mapping[int, Float[np.ndarray, "4 4"]]) ->
     own, names = carrying(robot), body_names(robot)
     indefinite = [body for body, pseudo in wanted.items() if torch.linalg.cholesky_ex(torch.as_tensor(pseudo)).info]
     if impossible := [names[own.index(body)] for body in indefinite]:
-        raise NonPhysicalInertia(
-            f"no body has the inertia that was found for {', '.join(impossible)}, so there is no such robot; give the "
-            "log more motion, or a prior."
-        )
+        seen = f"no body has the inertia that was found for {', '.join(impossible)}, so there is no such robot"
+        raise NonPhysicalInertia(f"{seen}; give the log more motion, or a prior.")
     now = body_pseudo_inertias(robot).cpu().numpy()
     change = {k: upper_cholesky(P) @ np.linalg.inv(upper_cholesky(now[own.index(k)])) for k, P in wanted.items()}
     text = robot.urdf_text
@@ -279,7 +271,7 @@ def with_bodies(robot: Robot, wanted: Mapping[int, Float[np.ndarray, "4 4"]]) ->
         offset = np.linalg.inv(robot.layout.child_frames[body]) @ placement.offset
         there = np.linalg.inv(offset) @ change[body] @ offset
         # a congruence by [[A, t], [0, s]] moves the moments about the centre of mass by A alone: no cancellation
-        own_moments = pseudo_inertia(link.mass, np.zeros(3), link.inertia)[:3, :3]
+        own_moments = 0.5 * np.trace(link.inertia) * np.eye(3) - link.inertia
         A, shift, scale = there[:3, :3], there[:3, 3], there[3, 3]
         center = (A @ link.center_of_mass + shift) / scale
         second = A @ own_moments @ A.T

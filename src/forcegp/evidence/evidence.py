@@ -22,9 +22,7 @@ class Evidence(ABC):
     def check(self, dataset: Dataset) -> None:
         """Raise InvalidInput where a log lacks what this needs."""
         if self.in_order and not dataset.time_ordered:
-            raise InvalidInput(
-                f"{self.name} need rows in order of time, and these are a sample; give the whole recording."
-            )
+            raise InvalidInput(f"{self.name} need rows in order of time, not a sample; give the whole recording.")
 
     def __str__(self) -> str:
         given = [f"{f.name} {getattr(self, f.name)}" for f in fields(self) if getattr(self, f.name) != f.default]  # type: ignore[arg-type]  # every evidence is a dataclass
@@ -87,10 +85,9 @@ class Motions(Evidence):
     def refuse(unknown_forces: Sequence[object]) -> None:
         """Raise InvalidInput where there are unknown forces: these learn from accelerations."""
         if unknown_forces:
-            raise InvalidInput(
-                "motions refine numbers of laws and bodies, and the model has unknown forces, which learn from "
-                "accelerations; refine the laws first, and learn the forces beside them without motions."
-            )
+            why = "the model has unknown forces, which learn from accelerations"
+            advice = "refine the laws first, and learn the forces beside them without motions."
+            raise InvalidInput(f"motions refine numbers of laws and bodies, and {why}; {advice}")
 
 
 @dataclass(frozen=True)
@@ -117,10 +114,9 @@ class Sensor(Evidence):
     def check(self, dataset: Dataset) -> None:
         """Raise InvalidInput where the log has no such sensor."""
         if not self.names(dataset):
-            raise InvalidInput(
-                f"{self.name} need the sensor {self.kind}{self.frame or 'FRAME'}; the log has {[*dataset.measured]}: "
-                "name its columns, as in `forcegp import --force foot=fx,fy,fz,imu:hand=ax,ay,az`."
-            )
+            seen = f"{self.name} need the sensor {self.kind}{self.frame or 'FRAME'}; the log has {[*dataset.measured]}"
+            advice = "name its columns, as in `forcegp import --force foot=fx,fy,fz,imu:hand=ax,ay,az`."
+            raise InvalidInput(f"{seen}: {advice}")
 
 
 @dataclass(frozen=True)

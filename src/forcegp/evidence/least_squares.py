@@ -20,6 +20,8 @@ ROWS = 2000  # rows that levels are found from at most, evenly spread
 LEAST, MOST = 1e-3, 1e2
 """Smallest and largest standard deviation, relative to that of all residuals: where constraints hide directions, a step
 of the search that goes further has a covariance that rounding makes singular."""
+Rows = Float[np.ndarray, "rows nv"]
+Matrices = Float[np.ndarray, "rows nv nv"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +33,7 @@ class NoiseLevels:
 
     @classmethod
     def of(
-        cls,
-        residual: Float[np.ndarray, "rows nv"],
-        M: Float[np.ndarray, "rows nv nv"],
-        H: Float[np.ndarray, "rows nv nv"] | None = None,
-        near: "NoiseLevels | None" = None,
+        cls, residual: Rows, M: Matrices, H: Matrices | None = None, near: "NoiseLevels | None" = None
     ) -> "NoiseLevels":
         """Those of largest likelihood, each between `LEAST` and `MOST` times the whole: Fisher scoring of logarithms.
 
@@ -126,7 +124,7 @@ class Chained:
         return np.concatenate([self.regressor.values @ self.inner, self.others], axis=-1)
 
     def normal_equations(
-        self, white: Float[np.ndarray, "rows nv"], noise: Float[np.ndarray, " nv"]
+        self, white: Rows, noise: Float[np.ndarray, " nv"]
     ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k k"]]:
         """J^T r and J^T J over the noise, without J, which takes longer to write than all products."""
         Y, p, count = self.regressor.values, len(self.inner), self.others.shape[-1]
@@ -159,7 +157,7 @@ class Fit:
     """
 
     x: Float[np.ndarray, " k"]
-    residual: Float[np.ndarray, "rows nv"]
+    residual: Rows
     jacobian: Float[np.ndarray, "rows nv k"]
     noise: Float[np.ndarray, " nv"]
     prior_information: Float[np.ndarray, "k k"]
@@ -169,7 +167,7 @@ class Fit:
     expected: float = 0.0
 
     @property
-    def white(self) -> Float[np.ndarray, "rows nv"]:
+    def white(self) -> Rows:
         """Residuals over their noise, without what unknown forces explain."""
         return without(self.residual / self.noise, self.span)
 
@@ -353,7 +351,7 @@ def _noise(r: np.ndarray, span: np.ndarray | None) -> np.ndarray:
     return np.maximum(np.sqrt((without(r, span) ** 2).mean(axis=0)) / left, 1e-12)
 
 
-def correlation_time(residual: Float[np.ndarray, "rows nv"], episode: Int[np.ndarray, " rows"]) -> np.ndarray:
+def correlation_time(residual: Rows, episode: Int[np.ndarray, " rows"]) -> np.ndarray:
     """Rows that one independent residual is worth, per joint: 1 + 2 sum of autocorrelations until they turn negative.
 
     The sum ends as Geyer's initial positive sequence does ("Practical Markov chain Monte Carlo", Stat. Science 1992).

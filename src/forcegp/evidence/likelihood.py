@@ -129,17 +129,12 @@ def check_distance(model: Model, training: TrainingData) -> None:
         what = f"the surface of contact {index} (frame {contact.frame!r})"
         remedy = "check its surface, point and units (m), or leave the contact out"
         if float(distances.min()) > FAR_FROM_SURFACE:
-            raise ContactError(
-                f"no training point touches {what}: the nearest is {float(distances.min()):.3g} m away, half of them "
-                f"more than {distance:.3g} m; {remedy}"
-            )
+            seen = f"no training point touches {what}: the nearest is {float(distances.min()):.3g} m away"
+            raise ContactError(f"{seen}, half of them more than {distance:.3g} m; {remedy}")
         if distance > FAR_FROM_SURFACE:
-            warnings.warn(
-                f"half of the training points lie more than {distance:.3g} m from {what}; {remedy}, or train on the "
-                "rows in contact only (forcegp.data.rows_in_contact)",
-                DataWarning,
-                stacklevel=5,
-            )
+            seen = f"half of the training points lie more than {distance:.3g} m from {what}"
+            advice = f"{remedy}, or train on the rows in contact only (forcegp.data.rows_in_contact)"
+            warnings.warn(f"{seen}; {advice}", DataWarning, stacklevel=5)
 
 
 def checked_values(forces: UnknownForces, dynamics: ConstrainedDynamics) -> tuple[Tensor, tuple[Tensor, ...]]:
@@ -174,9 +169,8 @@ def _tensor(what: str, given: Any, shape: tuple[int | None, ...], wanted: str) -
     if not isinstance(given, Tensor) or not fits or given.dtype != torch.float64 or given.requires_grad:
         kind = f"a {getattr(given, 'dtype', type(given).__name__)} of shape {found}"
         sizes = ", ".join("any" if size is None else str(size) for size in shape)
-        raise InvalidInput(
-            f"{what} is {kind}; it must be a float64 tensor ({sizes}) without gradients, that is {wanted}"
-        )
+        seen = f"{what} is {kind}"
+        raise InvalidInput(f"{seen}; it must be a float64 tensor ({sizes}) without gradients, that is {wanted}")
     lost = ~torch.isfinite(given).flatten(1).all(1)
     if bool(lost.any()):
         raise InvalidInput(f"{what} is not finite at training row {int(lost.nonzero()[0])}; mend it there")
@@ -251,10 +245,8 @@ class MarginalLikelihood:
         variances = (torch.linalg.pinv(self.mixing, rtol=1e-8) @ self.residual[..., None])[..., 0].square().mean(0)
         largest = float(variances.max()) if variances.numel() else 0.0
         if variances.numel() and not largest > 0.0:
-            raise InvalidInput(
-                "the accelerations equal the mean exactly, so no unknown force can be learned; check that a was "
-                "measured and not computed from the model itself"
-            )
+            seen = "the accelerations equal the mean exactly, so no unknown force can be learned"
+            raise InvalidInput(f"{seen}; check that a was measured and not computed from the model itself")
         variances = variances.clamp_min(RESIDUAL_FLOOR * largest)
         kernels = self.model.unknown.kernels(self.model.robot, tuple(z.shape[-1] for z in features), variances)
         for kernel, z in zip(kernels, features, strict=True):

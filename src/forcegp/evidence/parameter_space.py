@@ -16,8 +16,7 @@ from torch import Tensor
 
 from forcegp.errors import InvalidInput
 from forcegp.evidence.bodies import QUANTITIES, Bodies, body_names, body_pseudo_inertias, carrying, with_bodies
-from forcegp.forces import Actuation, Law, LogNormal, Normal, Parameter, Payload, RigidBodies
-from forcegp.forces.force import Body
+from forcegp.forces import Actuation, Body, Law, LogNormal, Normal, Parameter, Payload, RigidBodies
 from forcegp.forces.joint_law import PerJointLaw
 from forcegp.forces.registry import force_name
 from forcegp.mechanics import State
@@ -28,6 +27,10 @@ LINEAR_SPREAD = 10.0
 """Standard deviation of the weak prior on numbers that are not logarithms, in their sizes: as large as the torques."""
 SCALES = 1e-4  # half the relative error of a mass that was weighed: of scales, far below that of any log
 FARTHEST = 25.0  # largest coordinate of a number that is estimated on a log scale about a median: a factor of 7e10
+Coordinates = Float[np.ndarray, " k"]
+Rows = Float[np.ndarray, "rows nv"]
+InLaws = Float[np.ndarray, "rows nv t"]
+"""Derivatives in the coordinates of laws."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +51,11 @@ class Term:
     high: Float[np.ndarray, " k"]
     logarithm: bool
 
-    def values(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    def values(self, x: Coordinates) -> Float[np.ndarray, " k"]:
         """In SI units."""
         return self.size * (np.exp(x) if self.logarithm else x)
 
-    def slopes(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    def slopes(self, x: Coordinates) -> Float[np.ndarray, " k"]:
         """Derivatives of the values in x."""
         return self.values(x) if self.logarithm else self.size
 
@@ -92,13 +95,13 @@ class ParameterSpace:
         """Number of coordinates."""
         return self.bodies.size + sum(len(term.size) for term in self.terms)
 
-    def split(self, x: Float[np.ndarray, " k"]) -> tuple[np.ndarray, list[np.ndarray]]:
+    def split(self, x: Coordinates) -> tuple[np.ndarray, list[np.ndarray]]:
         """Coordinates of bodies, and of each term."""
         of_bodies, rest = x[: self.bodies.size], x[self.bodies.size :]
         return of_bodies, np.split(rest, np.cumsum([len(term.size) for term in self.terms])[:-1]) if self.terms else []
 
     @property
-    def start(self) -> Float[np.ndarray, " k"]:
+    def start(self) -> Coordinates:
         """Where the search begins."""
         return np.concatenate([np.zeros(self.bodies.size), *(term.start for term in self.terms)])
 
@@ -109,7 +112,7 @@ class ParameterSpace:
         least, most = (term.low for term in self.terms), (term.high for term in self.terms)
         return np.concatenate([-free, *least]), np.concatenate([free, *most])
 
-    def longest_steps(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    def longest_steps(self, x: Coordinates) -> Coordinates:
         """Most that a coordinate should change at once: infinite for those that the torque is linear in.
 
         What lies off the diagonal of a body's factor may double: a light one may be far away, or have its mass there.
@@ -118,7 +121,7 @@ class ParameterSpace:
         off = np.abs(x[: self.bodies.size].reshape(-1, 10)) * (np.arange(10) > 3)
         return np.concatenate([np.maximum(1.0, off).ravel(), *each])
 
-    def prior(self, x: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " entries"], Float[np.ndarray, "entries k"]]:
+    def prior(self, x: Coordinates) -> tuple[Float[np.ndarray, " entries"], Float[np.ndarray, "entries k"]]:
         """Distance from the prior in its standard deviations, and its Jacobian."""
         of_bodies, of_terms = self.split(x)
         distance, jacobian = self.bodies.distance(of_bodies)
@@ -129,7 +132,7 @@ class ParameterSpace:
         slopes = [1.0 / term.spread for term in self.terms]
         return np.concatenate([distance, *values]), block_diag(jacobian, np.diag(np.concatenate([[], *slopes])))
 
-    def moved(self, x: Float[np.ndarray, " k"], step: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+    def moved(self, x: Coordinates, step: Coordinates) -> Coordinates:
         """x + step to first order, along which parameters of bodies are straight (`Bodies.moved`)."""
         count = self.bodies.size
         return np.concatenate([self.bodies.moved(x[:count], step[:count]), x[count:] + step[count:]])
@@ -140,12 +143,9 @@ class ParameterSpace:
     def parameters(self) -> tuple[Parameter, ...]:
         """Name, unit, start and prior of each of `numbers`: ten of a body, and every entry of a coefficient."""
         stated = np.concatenate([np.zeros(self.bodies.size), *(term.center for term in self.terms)])
-        robot, starts = self.model.robot, self.numbers(stated)
-        out, place = [], 0
+        robot, starts, out = self.model.robot, iter(self.numbers(stated).tolist()), list[Parameter]()
         for each in self.carried:
-            for name, unit in QUANTITIES:
-                out.append(Parameter(f"{each.name}.{name}", unit, float(starts[place]), each.prior))
-                place += 1
+            out += [Parameter(f"{each.name}.{name}", unit, next(starts), each.prior) for name, unit in QUANTITIES]
         for term in self.terms:
             law = self.model.laws[term.law]
             own = force_title(law)
@@ -156,11 +156,10 @@ class ParameterSpace:
                 center = term.values(term.center)[k]
                 spread = term.spread[k] if term.logarithm else term.spread[k] * term.size[k]
                 name = label if joint is None else f"{label}.{joint}"
-                out.append(Parameter(name, unit, float(starts[place]), kind(float(center), float(spread))))
-                place += 1
+                out.append(Parameter(name, unit, next(starts), kind(float(center), float(spread))))
         return tuple(out)
 
-    def numbers(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, " n"]:
+    def numbers(self, x: Coordinates) -> Float[np.ndarray, " n"]:
         """What people read: mass, center and inertia of bodies, then coefficients, in SI units; whole rotors."""
         of_bodies, of_terms = self.split(x)
         values = [self.bodies.numbers(of_bodies, self._frames)]
@@ -171,7 +170,7 @@ class ParameterSpace:
             values.append(value)
         return np.concatenate(values)
 
-    def number_slopes(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n k"]:
+    def number_slopes(self, x: Coordinates) -> Float[np.ndarray, "n k"]:
         """Derivatives of the numbers in the coordinates."""
         of_bodies, of_terms = self.split(x)
         slopes = [term.slopes(own) for own, term in zip(of_terms, self.terms, strict=True)]
@@ -184,11 +183,11 @@ class ParameterSpace:
 
     # --- what the model is at x
 
-    def standard_parameters(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "n 10"]:
+    def standard_parameters(self, x: Coordinates) -> Float[np.ndarray, "n 10"]:
         """Of the bodies that are estimated."""
         return self.bodies.parameters(x[: self.bodies.size])
 
-    def values(self, x: Float[np.ndarray, " k"]) -> dict[int, dict[str, Tensor]]:
+    def values(self, x: Coordinates) -> dict[int, dict[str, Tensor]]:
         """Coefficients of the laws that are estimated, by number of the law."""
         out: dict[int, dict[str, Tensor]] = {}
         for own, term in zip(self.split(x)[1], self.terms, strict=True):
@@ -205,7 +204,7 @@ class ParameterSpace:
                 named[term.name] = named[term.name].index_copy(0, places, value)
         return out
 
-    def model_at(self, x: Float[np.ndarray, " k"]) -> Model:
+    def model_at(self, x: Coordinates) -> Model:
         """The model with the numbers of these coordinates, all of them known. Raises NonPhysicalInertia."""
         values, robot = self.values(x), self.model.robot
         pseudo, laws = self.bodies.pseudo_inertias(x[: self.bodies.size]), list[Any](self.model.laws)
@@ -229,9 +228,7 @@ class ParameterSpace:
         """The law that is estimated and depends on the torque of the actuators."""
         return next((law for law in self._estimated.values() if law.under_load), None)
 
-    def torque(
-        self, x: Float[np.ndarray, " k"], state: State, a: Float[np.ndarray, "rows nv"], cache: dict[Any, Any]
-    ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv t"]]:
+    def torque(self, x: Coordinates, state: State, a: Rows, cache: dict[Any, Any]) -> tuple[Rows, InLaws]:
         """What the laws add to the torque of a motion, and the derivatives in their coordinates (without bodies).
 
         `cache` holds features and directions of these states, which no coordinate changes.
@@ -258,13 +255,7 @@ class ParameterSpace:
                 column += width
         return total, jacobian
 
-    def delivered(
-        self,
-        x: Float[np.ndarray, " k"],
-        state: State,
-        known: Float[np.ndarray, "rows nv"],
-        slopes: Float[np.ndarray, "rows nv t"],
-    ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv t"]]:
+    def delivered(self, x: Coordinates, state: State, known: Rows, slopes: InLaws) -> tuple[Rows, InLaws]:
         """Torques of actuators and their derivatives, by `slopes` of `torque`; those `known` where no gain is free."""
         values, of_gain, column = self.values(x), np.zeros(slopes.shape[-1], dtype=bool), 0
         for term in self.terms:
@@ -278,7 +269,7 @@ class ParameterSpace:
     def _estimated(self) -> dict[int, Law]:
         return {index: self.model.laws[index] for index in dict.fromkeys(term.law for term in self.terms)}
 
-    def added_inertia(self, x: Float[np.ndarray, " k"]) -> Float[np.ndarray, "nv nv"]:
+    def added_inertia(self, x: Coordinates) -> Float[np.ndarray, "nv nv"]:
         """What the rotors that are estimated add to the mass matrix."""
         values, total = self.values(x), np.zeros((self.model.robot.nv,) * 2)
         for index, law in self._estimated.items():
@@ -300,9 +291,7 @@ def _derivatives(
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """The force (rows, nv), and slopes of minus that by entry: (rows, nv, k), or (rows, nv) for joints alone."""
     rows, wanted = features[0].shape[:-1], {term.name for term in terms}
-    numbers = {
-        name: value.expand(*rows, *value.shape).clone().requires_grad_(name in wanted) for name, value in values.items()
-    }
+    numbers = {name: x.expand(*rows, *x.shape).clone().requires_grad_(name in wanted) for name, x in values.items()}
     with torch.enable_grad():
         # a number that all directions share has no last dimension to broadcast along
         given = {name: value[..., None] if value.dim() == len(rows) else value for name, value in numbers.items()}

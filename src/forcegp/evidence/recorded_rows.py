@@ -33,10 +33,12 @@ from forcegp.model import Model
 from forcegp.robots import Kinematics
 from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_of_pseudo_inertia
 
+Positions = Float[np.ndarray, "rows nq"]
+Rows = Float[np.ndarray, "rows nv"]
+Inputs = Float[np.ndarray, "rows nu"]
 
-def motion_residuals(
-    dataset: Dataset, model: Model
-) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv"]]:
+
+def motion_residuals(dataset: Dataset, model: Model) -> tuple[Rows, Rows]:
     """Residuals of joint forces, Q_K - M a (Nm or N), and of accelerations, measured less predicted.
 
     Forces of feet that stand are left out, where no sensor measured them; those of contacts that slide are
@@ -80,10 +82,8 @@ def arm(kinematics: Kinematics, model: Model, frame: str) -> Float[Tensor, "rows
     """Joint forces of a force on the robot at a frame, or at the point of its contacts. Raises InvalidInput."""
     points = {contact.point for contact in model.contacts if contact.frame == frame}
     if len(points) > 1:
-        raise InvalidInput(
-            f"a force at {frame!r} was measured, which is held at {len(points)} points: only a torque tells how they "
-            "share it; hold one point."
-        )
+        seen = f"a force at {frame!r} was measured, which is held at {len(points)} points"
+        raise InvalidInput(f"{seen}: only a torque tells how they share it; hold one point.")
     [point] = points or {(0.0, 0.0, 0.0)}
     return kinematics.frame_jacobian(frame, point)[..., :3, :].mT
 
@@ -103,9 +103,6 @@ def _under_load(state: State, load: Tensor) -> State:
 
 
 FIRST = 1e-2  # of the root mean square of the residual forces, what rough searches take for noise of forces
-Positions = Float[np.ndarray, "rows nq"]
-Rows = Float[np.ndarray, "rows nv"]
-Inputs = Float[np.ndarray, "rows nu"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -385,10 +382,9 @@ def kept_laws(space: ParameterSpace, any_contact: bool = False, sensed: Iterable
     frames = (contact.frame for contact in model.contacts if slides(contact) and contact.frame not in sensed)
     sliding = ", ".join(dict.fromkeys(frames))
     if sliding and not any_contact:
-        raise InvalidInput(
-            f"the robot touches something with {sliding} and slides on it, with friction that is not measured; "
-            "learn from a motion in the air (model.with_contacts([])), or give the model an unknown force there."
-        )
+        seen = f"the robot touches something with {sliding} and slides on it, with friction that is not measured"
+        advice = "learn from a motion in the air (model.with_contacts([])), or give the model an unknown force there."
+        raise InvalidInput(f"{seen}; {advice}")
     if model.carries_known_forces:
         raise InvalidInput("the forces lack RigidBodies(); list it, since without gravity no number can be estimated.")
     skipped: Sequence[type[Law]] = (RigidBodies, *OBSERVED)

@@ -54,10 +54,9 @@ class Actuation(PerJointLaw):
         matrix = as_numbers("Actuation matrix", self.matrix, robot, f"{robot.nv} rows of numbers")
         names = tuple(self.names) or tuple(f"actuator_{k + 1}" for k in range(matrix.shape[-1] if matrix.dim() else 0))
         if matrix.dim() != 2 or len(matrix) != robot.nv or not bool(torch.isfinite(matrix).all()):
-            raise InvalidInput(
-                f"Actuation matrix has shape {tuple(matrix.shape)}; {robot.name} needs finite numbers in {robot.nv} "
-                f"rows, one per degree of freedom: {', '.join(robot.joint_names)}."
-            )
+            seen = f"Actuation matrix has shape {tuple(matrix.shape)}"
+            rows = f"{robot.nv} rows, one per degree of freedom: {', '.join(robot.joint_names)}"
+            raise InvalidInput(f"{seen}; {robot.name} needs finite numbers in {rows}.")
         if len(names) != matrix.shape[1] or len(set(names)) != len(names):
             raise InvalidInput(f"Actuation names are {names}; give {matrix.shape[1]} different ones, one per column.")
         return Actuation(matrix, names, self.known, gain)
@@ -263,9 +262,8 @@ def _fitting(name: str, given: object, shape: tuple[int, ...], robot: Robot) -> 
     try:
         return values.expand(shape).clone()
     except RuntimeError:
-        raise InvalidInput(
-            f"Thrusters {name} has shape {tuple(values.shape)}; give one for all, or {shape[0]}, one for each thruster."
-        ) from None
+        seen = f"Thrusters {name} has shape {tuple(values.shape)}"
+        raise InvalidInput(f"{seen}; give one for all, or {shape[0]}, one for each thruster.") from None
 
 
 def forces_of_file(robot: Robot) -> tuple[Force, ...]:

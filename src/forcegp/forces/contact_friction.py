@@ -14,14 +14,7 @@ from typing_extensions import override
 from forcegp.errors import InvalidInput, NumericalWarning, require_type, usable_arguments
 from forcegp.forces.joint_forces import JointFriction, joint_indices
 from forcegp.forces.kernels import checked_kernel
-from forcegp.forces.link_forces import (
-    SMALLEST_SPEED,
-    ToolPoint,
-    contact_axes,
-    nominal_normal_force,
-    require_contact,
-    require_contact_number,
-)
+from forcegp.forces.link_forces import SMALLEST_SPEED, ToolPoint, contact_axes, require_contact, require_contact_number
 from forcegp.forces.unknown import ExpressedKernels, Scaling, UnknownForces
 from forcegp.mechanics import ConstrainedDynamics, Contact
 from forcegp.robots import Robot
@@ -30,6 +23,7 @@ from forcegp.robots.arguments import finite_vector, is_sequence
 SMALLEST_SHARE = 0.1
 """Smallest 1 + mu g: where it nears 0, friction and normal force lift each other without end (jamming)."""
 JAMMING = "the expected friction nearly jams"  # how the warning of it begins
+Numbers = Float[Tensor, "*batch"]
 
 
 @dataclass(frozen=True)
@@ -49,12 +43,10 @@ class TabulatedCurve:
             found = finite_vector(f"{name} of a tabulated curve", values, len(values))
             object.__setattr__(self, name, tuple(found.tolist()))
         if len(self.at) < 2 or len(self.at) != len(self.values) or any(b <= a for a, b in pairwise(self.at)):
-            raise InvalidInput(
-                f"a tabulated curve has {len(self.at)} places and {len(self.values)} values; give two or more of each, "
-                "places increasing"
-            )
+            seen = f"a tabulated curve has {len(self.at)} places and {len(self.values)} values"
+            raise InvalidInput(f"{seen}; give two or more of each, places increasing")
 
-    def __call__(self, x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def __call__(self, x: Numbers) -> Numbers:
         """The value at x; differentiable in x, with steps in the derivative at the places."""
         at, values = (torch.tensor(part, dtype=x.dtype, device=x.device) for part in (self.at, self.values))
         # counted, since torch.searchsorted warns of its copies under vmap
@@ -94,12 +86,8 @@ class ExpectedFriction:
         return cls(TabulatedCurve((0.0, 1.0), (coefficient, coefficient)))
 
     def normal_force(
-        self,
-        dynamics: ConstrainedDynamics,
-        contact: int,
-        direction: Float[Tensor, "*batch 3"],
-        speed: Float[Tensor, "*batch"],
-    ) -> Float[Tensor, "*batch"]:
+        self, dynamics: ConstrainedDynamics, contact: int, direction: Float[Tensor, "*batch 3"], speed: Numbers
+    ) -> Numbers:
         """|normal force| in N under the known forces and the expected friction.
 
         |lambda| = |lambda_0| / (1 + sign(lambda_0) mu |s_p| g), g = (d lambda / d Q_U) J_p^T d, for sliding along d
@@ -118,15 +106,19 @@ class ExpectedFriction:
         # no value may decide anything while torch transforms or records the function
         traced = torch._C._are_functorch_transforms_active() or _get_current_dispatch_mode() is not None
         if not traced and bool(jammed.any()):
-            warnings.warn(
-                f"{JAMMING} contact {contact} in {int(jammed.sum())} of {jammed.numel()} states: "
-                "friction and normal force lift each other almost without end, and the normal force is taken as "
-                f"{1.0 / SMALLEST_SHARE:g} times that without sliding friction. Check the contact's frame, point and "
-                "surface, leave such states out, or give a smaller coefficient, expected=COEFFICIENT (0 for none).",
-                NumericalWarning,
-                stacklevel=2,
-            )
+            seen = f"{JAMMING} contact {contact} in {int(jammed.sum())} of {jammed.numel()} states"
+            why = "friction and normal force lift each other almost without end"
+            taken = f"the normal force is taken as {1.0 / SMALLEST_SHARE:g} times that without sliding friction"
+            advice = "leave such states out, or give a smaller coefficient, expected=COEFFICIENT (0 for none)."
+            text = f"{seen}: {why}, and {taken}. Check the contact's frame, point and surface, {advice}"
+            warnings.warn(text, NumericalWarning, stacklevel=2)
         return size * free.abs() / growth.clamp_min(SMALLEST_SHARE)
+
+
+def nominal_normal_force(dynamics: ConstrainedDynamics, contact: int) -> Numbers:
+    """|normal force| in N that the contact would have if the known forces were all: |s_p| |lambda(Q_U = 0)|."""
+    size = torch.linalg.vector_norm(dynamics.normals[..., contact, :], dim=-1)
+    return size * dynamics.multiplier_map().offset[..., contact].abs()
 
 
 @dataclass(frozen=True)

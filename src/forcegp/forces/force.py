@@ -117,7 +117,11 @@ def per_joint(name: str, joints: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{name}.{joint}" for joint in joints)
 
 
-def _times(T: Float[Tensor, "nv nv"], x: Float[Tensor, "*batch nv"]) -> Float[Tensor, "*batch nv"]:
+Joints = Float[Tensor, "*batch nv"]
+Remembered = Float[Tensor, "*batch m"]
+
+
+def _times(T: Float[Tensor, "nv nv"], x: Joints) -> Joints:
     return (T @ x[..., None])[..., 0]
 
 
@@ -218,17 +222,17 @@ class Law(Force):
         """The state as `features` are to see it."""
         return state
 
-    def turning(self, motion: Float[Tensor, "*batch nv"]) -> Float[Tensor, "*batch nv"]:
+    def turning(self, motion: Joints) -> Joints:
         """Velocities or displacements of the motors, where joints have these."""
         return motion if self.transmission is None else _times(torch.as_tensor(self.transmission), motion)
 
-    def at_motors(self, forces: Float[Tensor, "*batch nv"]) -> Float[Tensor, "*batch nv"]:
+    def at_motors(self, forces: Joints) -> Joints:
         """What motors deliver that make these joint forces."""
         if self.transmission is None:
             return forces
         return _times(torch.linalg.inv(torch.as_tensor(self.transmission)).mT, forces)
 
-    def at_joints(self, forces: Float[Tensor, "*batch nv"]) -> Float[Tensor, "*batch nv"]:
+    def at_joints(self, forces: Joints) -> Joints:
         """Joint forces of motors that deliver these."""
         return forces if self.transmission is None else _times(torch.as_tensor(self.transmission).mT, forces)
 
@@ -250,19 +254,17 @@ class Law(Force):
         """The joints whose velocities tell the sign of each of these numbers; None where none does."""
         return None
 
-    def remembered(self, state: State) -> Float[Tensor, "*batch m"]:
+    def remembered(self, state: State) -> Remembered:
         """What it remembers at these states."""
         names = self.memory_names(state.robot)
         first = state.inputs.index(names[0])
         return state.u[..., first : first + len(names)]
 
-    def remember(
-        self, memory: Float[Tensor, "*batch m"], step: Tensor, dt: float | Tensor
-    ) -> Float[Tensor, "*batch m"]:
+    def remember(self, memory: Remembered, step: Tensor, dt: float | Tensor) -> Remembered:
         """The memory after the joints have moved by `step` (..., nv) in dt: exact and differentiable."""
         return memory
 
-    def past_of(self, strokes: Float[Tensor, "*batch nv strokes"]) -> Float[Tensor, "*batch m"]:
+    def past_of(self, strokes: Float[Tensor, "*batch nv strokes"]) -> Remembered:
         """The memory after displacements of the joints, the last one first."""
         raise NotImplementedError(f"{type(self).__name__} remembers, and has no `past_of`")
 
@@ -360,11 +362,11 @@ class Memory:
         variance = torch.where(signs == 0.0, seen.square().mean(0), (seen * seen_signs - mean).square().mean(0))
         return mean * signs, variance
 
-    def after(self, memory: Float[Tensor, "*batch m"], step: Float[Tensor, "*batch nv"], dt: float | Tensor) -> Tensor:
+    def after(self, memory: Remembered, step: Joints, dt: float | Tensor) -> Tensor:
         """The memory after the joints have moved by `step` in dt."""
         parts = memory.split([size for _, size in self._laws], dim=-1)
         return torch.cat([law.remember(x, step, dt) for (law, _), x in zip(self._laws, parts, strict=True)], dim=-1)
 
-    def past_of(self, strokes: Float[Tensor, "*batch nv strokes"]) -> Float[Tensor, "*batch m"]:
+    def past_of(self, strokes: Float[Tensor, "*batch nv strokes"]) -> Remembered:
         """The memory after these displacements of the joints, the last one first."""
         return torch.cat([law.past_of(strokes) for law, _ in self._laws], dim=-1)

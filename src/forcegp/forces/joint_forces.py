@@ -121,9 +121,7 @@ class PerJoint(ExpressedKernels):
         names, prior = as_names(self.joints), type(self).__name__
         if self.joints is not None:
             if not names or any(not isinstance(name, str) for name in names) or len(set(names)) < len(names):
-                raise InvalidInput(
-                    f"{prior} joints are {self.joints!r}; give names of joints, each once, or None for all."
-                )
+                raise InvalidInput(f"{prior} joints are {self.joints!r}; give names, each once, or None for all.")
             object.__setattr__(self, "joints", names)
         checked_kernel(self.kernel)
 
@@ -134,10 +132,8 @@ class PerJoint(ExpressedKernels):
     @override
     def check(self, robot: Robot, contacts: Sequence[Contact]) -> None:
         if not joint_indices(self.joints, robot):
-            raise InvalidInput(
-                f"{type(self).__name__} acts in joints, and {robot.name} has none but its base; leave it out, "
-                "or use aerodynamic."
-            )
+            seen = f"{type(self).__name__} acts in joints, and {robot.name} has none but its base"
+            raise InvalidInput(f"{seen}; leave it out, or use aerodynamic.")
 
     @override
     def direction(self, dynamics: ConstrainedDynamics) -> Float[Tensor, "*batch nv C"]:

@@ -50,10 +50,8 @@ class PerJointLaw(Law):
             values = values * torch.tensor(driven, dtype=values.dtype, device=values.device)
         values = values.clone()  # which keeps the graph
         if values.shape != (robot.nv,):
-            raise InvalidInput(
-                f"{what} has {tuple(values.shape)} values; {robot.name} has {robot.nv} joints: "
-                f"{', '.join(robot.joint_names)}"
-            )
+            seen = f"{what} has {tuple(values.shape)} values"
+            raise InvalidInput(f"{seen}; {robot.name} has {robot.nv} joints: {', '.join(robot.joint_names)}")
         least = "a finite number"
         checked = torch.where(values.isnan(), 1.0, values) if weak else values
         good = torch.isfinite(checked)
@@ -111,10 +109,9 @@ def bound_transmission(owner: str, given: Transmission, robot: Robot) -> Tensor 
         matrix = torch.eye(nv, dtype=torch.float64, device=robot.device)
         for row in given.replace(" ", "").split("/"):
             if not re.fullmatch(f"({term})+", row):
-                raise InvalidInput(
-                    f"{what} is {given!r}; write the joints that a motor turns with, its own first, as in "
-                    f"{robot.joint_names[-1]}+{robot.joint_names[-2 % nv]}, with / between motors."
-                )
+                example = f"{robot.joint_names[-1]}+{robot.joint_names[-2 % nv]}, with / between motors"
+                advice = f"write the joints that a motor turns with, its own first, as in {example}."
+                raise InvalidInput(f"{what} is {given!r}; {advice}")
             terms = [(sign, size, robot.joint_names.index(name)) for sign, size, name in re.findall(term, row)]
             for sign, size, j in terms:
                 matrix[terms[0][2], j] = float(f"{sign}{size or 1.0}")
@@ -122,10 +119,9 @@ def bound_transmission(owner: str, given: Transmission, robot: Robot) -> Tensor 
         matrix = as_numbers(what, given, robot, f"{nv} rows of numbers")
     free = [j for j, name in enumerate(robot.joint_names) if name not in robot.single_joint_names]
     if matrix.shape != (nv, nv) or not bool(torch.isfinite(matrix).all() and torch.linalg.matrix_rank(matrix) == nv):
-        raise InvalidInput(
-            f"{what} has shape {tuple(matrix.shape)}; {robot.name} needs a finite regular matrix ({nv}, {nv}): a row "
-            f"per motor, a column per joint {', '.join(robot.joint_names)}."
-        )
+        seen = f"{what} has shape {tuple(matrix.shape)}; {robot.name} needs a finite regular matrix ({nv}, {nv})"
+        advice = f"a row per motor, a column per joint {', '.join(robot.joint_names)}."
+        raise InvalidInput(f"{seen}: {advice}")
     one = torch.eye(nv).to(matrix)
     if bool((matrix != one)[free].any() | (matrix != one)[:, free].any()):
         raise InvalidInput(f"{what} has other numbers than the identity at a base that moves, which has no motor.")

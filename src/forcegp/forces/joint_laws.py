@@ -1,6 +1,5 @@
 """Laws that act in every joint by itself: friction, offsets, springs, rotors; and what each needs of the torque."""
 
-from abc import abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
@@ -51,6 +50,25 @@ class DirectionalFriction(JointLaw):
 
 
 DRY = "dry friction"
+HIGHEST = 0.5  # largest share of the load that friction takes: beyond it something else is explained
+NUMBERS = {
+    "level": Coefficient(),
+    "factor": Coefficient("1", highest=HIGHEST),
+    "root": Coefficient("force/velocity^.5", lowest=-np.inf),
+    "breakaway": Coefficient(),
+    "stribeck_velocity": Coefficient("velocity", 0.1, 0.3, 0.1, 10.0, logarithm=True),
+    "velocity_scale": Coefficient("velocity", 0.01, 0.1, 0.03, 20.0, logarithm=True),
+    "sigma": Coefficient("1/position", 1000.0, 500.0, 0.02, 50.0, logarithm=True),
+}
+"""Of dry friction: of its level, of which a law has some, and of its sign, which all have."""
+SIGN = ("velocity_scale", "sigma")
+
+
+def of_friction(*more: str) -> dict[str, Coefficient]:
+    """The coefficients of a law of dry friction whose level has these numbers, too."""
+    return {name: NUMBERS[name] for name in ("level", *more, *SIGN)}
+
+
 Memory = bool | tuple[str, ...] | tuple[bool, ...]
 
 
@@ -64,15 +82,22 @@ class DryFriction(JointLaw):
 
     sigma: Number = field(default=None, kw_only=True)
     memory: Memory = field(default=False, kw_only=True)
+    level: Number = None
     part: ClassVar[str] = DRY
-    sign: ClassVar[Mapping[str, Coefficient]] = {
-        "velocity_scale": Coefficient("velocity", 0.01, 0.1, 0.03, 20.0, logarithm=True),
-        "sigma": Coefficient("1/position", 1000.0, 500.0, 0.02, 50.0, logarithm=True),
-    }
 
-    @abstractmethod
     def level_at(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Float[Tensor, "*batch nv"]:
-        """The friction of a joint that slides, from the velocity and what else `features` gives before the past."""
+        """The friction of a joint that slides, from the velocity and what else `features` gives before the past.
+
+        c + mu |u| + r sqrt|v| + b exp(-(v / v_s)^2), of which it has the terms whose numbers the law has.
+        """
+        v, level = features[0], parameters["level"]
+        if "factor" in parameters:
+            level = level + parameters["factor"] * features[1]
+        if "root" in parameters:
+            level = level + parameters["root"] * v.abs().sqrt()
+        if "breakaway" in parameters:
+            level = level + parameters["breakaway"] * torch.exp(-((v / parameters["stribeck_velocity"]) ** 2))
+        return level
 
     @override
     def features(self, state: State) -> tuple[Tensor, ...]:
@@ -116,7 +141,7 @@ class DryFriction(JointLaw):
     def acts_on(self, name: str, robot: Robot) -> Bool[np.ndarray, " nv"]:
         acts = super().acts_on(name, robot)
         remembers = np.array(self._mask or [False] * robot.nv)
-        return acts & (remembers == (name == "sigma")) if name in self.sign else acts
+        return acts & (remembers == (name == "sigma")) if name in SIGN else acts
 
     @override
     def memory_names(self, robot: Robot) -> tuple[str, ...]:
@@ -151,13 +176,8 @@ class DryFriction(JointLaw):
 class Coulomb(DryFriction):
     """-c s: dry friction of `level` c in Nm or N."""
 
-    level: Number = None
     velocity_scale: Number = None
-    coefficients: ClassVar[Mapping[str, Coefficient]] = {"level": Coefficient(), **DryFriction.sign}
-
-    @override
-    def level_at(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
-        return parameters["level"]
+    coefficients: ClassVar[Mapping[str, Coefficient]] = of_friction()
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,24 +187,10 @@ class Stribeck(DryFriction):
     `level` c, `breakaway` b in Nm or N, `stribeck_velocity` v_s in rad/s or m/s (Olsson et al. 1998, eq. 4).
     """
 
-    level: Number = None
     breakaway: Number = None
     stribeck_velocity: Number = None
     velocity_scale: Number = None
-    coefficients: ClassVar[Mapping[str, Coefficient]] = {
-        "level": Coefficient(),
-        "breakaway": Coefficient(),
-        "stribeck_velocity": Coefficient("velocity", 0.1, 0.3, 0.1, 10.0, logarithm=True),
-        **DryFriction.sign,
-    }
-
-    @override
-    def level_at(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
-        c, b, v_s = (parameters[name] for name in ("level", "breakaway", "stribeck_velocity"))
-        return c + b * torch.exp(-((features[0] / v_s) ** 2))
-
-
-HIGHEST = 0.5  # largest share of the load that friction takes: beyond it something else is explained
+    coefficients: ClassVar[Mapping[str, Coefficient]] = of_friction("breakaway", "stribeck_velocity")
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,19 +200,10 @@ class LoadFriction(DryFriction):
     `level` c in Nm or N, `factor` mu without unit (Hamon, Gautier & Garrec, IROS 2010, with the output torque).
     """
 
-    level: Number = None
     factor: Number = None
     velocity_scale: Number = None
-    coefficients: ClassVar[Mapping[str, Coefficient]] = {
-        "level": Coefficient(),
-        "factor": Coefficient("1", highest=HIGHEST),
-        **DryFriction.sign,
-    }
+    coefficients: ClassVar[Mapping[str, Coefficient]] = of_friction("factor")
     under_load: ClassVar[bool] = True
-
-    @override
-    def level_at(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
-        return parameters["level"] + parameters["factor"] * features[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,19 +219,7 @@ class GearFriction(LoadFriction):
     breakaway: Number = None
     stribeck_velocity: Number = None
     memory: Memory | None = field(default=None, kw_only=True)  # type: ignore[assignment]  # open until a fit decides
-    coefficients: ClassVar[Mapping[str, Coefficient]] = {
-        "level": Coefficient(),
-        "factor": Coefficient("1", highest=HIGHEST),
-        "root": Coefficient("force/velocity^.5", lowest=-np.inf),
-        **{name: Stribeck.coefficients[name] for name in ("breakaway", "stribeck_velocity")},
-        **DryFriction.sign,
-    }
-
-    @override
-    def level_at(self, features: tuple[Tensor, ...], parameters: Mapping[str, Tensor]) -> Tensor:
-        r, b, v_s = (parameters[name] for name in ("root", "breakaway", "stribeck_velocity"))
-        v = features[0]
-        return super().level_at(features, parameters) + r * v.abs().sqrt() + b * torch.exp(-((v / v_s) ** 2))
+    coefficients: ClassVar[Mapping[str, Coefficient]] = of_friction("factor", "root", "breakaway", "stribeck_velocity")
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,16 +8,7 @@ from typing import Any
 import torch
 from gpytorch import Module
 from gpytorch.constraints import Interval, Positive
-from gpytorch.kernels import (
-    AdditiveKernel,
-    ConstantKernel,
-    Kernel,
-    LinearKernel,
-    MaternKernel,
-    ProductKernel,
-    RBFKernel,
-    ScaleKernel,
-)
+from gpytorch.kernels import AdditiveKernel, ConstantKernel, Kernel, LinearKernel, MaternKernel, RBFKernel, ScaleKernel
 from gpytorch.priors import NormalPrior
 from torch import Tensor
 from typing_extensions import override
@@ -122,17 +113,15 @@ def friction(dimension: int, variance: float | Tensor) -> AdditiveKernel:
     where a law bends slowly, and fail where it bends within a few cm/s (docs/how-to/forces.md).
     """
     if dimension != 1:
-        raise InvalidInput(
-            f"the kernel 'friction' is a function of one velocity and was given {dimension} features; give it a latent "
-            "with one feature"
-        )
+        seen = f"the kernel 'friction' is a function of one velocity and was given {dimension} features"
+        raise InvalidInput(f"{seen}; give it a latent with one feature")
     share = float64(variance) / 3.0
     change = ScaleKernel(LogVelocityKernel(), outputscale_constraint=log_scale()).double()
     change.outputscale = share
     register_log_normal_prior(change, "outputscale", share, LOG_VARIANCE_SPREAD)
     level = AdditiveKernel(constant(1, share), change)
     viscous = linear(1, share)
-    return AdditiveKernel(ProductKernel(SmoothSignKernel(), level), viscous, BeyondVisitedKernel(level, viscous))
+    return AdditiveKernel(SmoothSignKernel() * level, viscous, BeyondVisitedKernel(level, viscous))
 
 
 class _WidthKernel(Kernel):

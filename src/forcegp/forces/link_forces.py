@@ -50,12 +50,6 @@ def contact_axes(dynamics: ConstrainedDynamics, contact: int) -> Float[Tensor, "
     return surface_axes(dynamics.normals[..., contact, :])
 
 
-def nominal_normal_force(dynamics: ConstrainedDynamics, contact: int) -> Float[Tensor, "*batch"]:
-    """|normal force| in N that the contact would have if the known forces were all: |s_p| |lambda(Q_U = 0)|."""
-    size = torch.linalg.vector_norm(dynamics.normals[..., contact, :], dim=-1)
-    return size * dynamics.multiplier_map().offset[..., contact].abs()
-
-
 def require_contact_number(force: str, contact: object) -> None:
     """Raise InvalidInput for what cannot be the number of a contact, counted from 0."""
     if isinstance(contact, bool) or not isinstance(contact, int) or contact < 0:
@@ -67,10 +61,9 @@ def require_contact(force: str, contact: int, contacts: Sequence[Contact]) -> No
     numbers = range(len(contacts))
     if contact not in numbers:
         have = f"only contact {', '.join(map(str, numbers))}" if numbers else "no contact with a surface to slide on"
-        raise InvalidInput(
-            f"{force} acts at contact {contact}, but the model has {have}; give the contact (`contacts`), or use a "
-            "force that needs none, such as JointFriction or AerodynamicForce(frame=...)."
-        )
+        seen = f"{force} acts at contact {contact}, but the model has {have}"
+        other = "a force that needs none, such as JointFriction or AerodynamicForce(frame=...)"
+        raise InvalidInput(f"{seen}; give the contact (`contacts`), or use {other}.")
 
 
 TANGENTS = ("tangent-1", "tangent-2")
@@ -203,20 +196,16 @@ class AerodynamicForce(SharedInputs):
         frame = self.link(robot)
         if robot.frame(frame)[0] < 0:
             moving = ", ".join(name for name in robot.link_names if robot.frame(name)[0] >= 0)
-            raise InvalidInput(
-                f"AerodynamicForce acts on frame {frame!r}, which is fixed in the world and never moves, so its forces "
-                f"move nothing; give a frame of a moving link: {moving}."
-            )
+            seen = f"AerodynamicForce acts on frame {frame!r}, which is fixed in the world and never moves"
+            raise InvalidInput(f"{seen}, so its forces move nothing; give a frame of a moving link: {moving}.")
 
     def link(self, robot: Robot) -> str:
         """The link that the force acts on. Raises InvalidInput where none is named and none moves freely."""
         if self.frame is not None:
             return self.frame
         if not robot.layout.groups:
-            raise InvalidInput(
-                f"AerodynamicForce acts on a base that moves, and {robot.name} is fixed to the world; read it "
-                "with base='floating', or name a link: frame=..."
-            )
+            seen = f"AerodynamicForce acts on a base that moves, and {robot.name} is fixed to the world"
+            raise InvalidInput(f"{seen}; read it with base='floating', or name a link: frame=...")
         body = robot.layout.groups[0].bodies.stop - 1
         return next(name for name in robot.link_names if robot.frame(name)[0] == body)
 

@@ -11,23 +11,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 HIDDEN = 40.0  # exponent from which on nothing is left of what was before: exp(-40) is less than rounding
+PerJoint = Float[Tensor, "*batch nv"]
+Sigma = Float[Tensor, "*#batch nv"] | Float[Tensor, ""]
+"""In 1/rad or 1/m, of each joint or of all."""
 
 
-def after_step(
-    z: Float[Tensor, "*batch nv"],
-    step: Float[Tensor, "*batch nv"],
-    sigma: Float[Tensor, "*#batch nv"] | Float[Tensor, ""],
-) -> Float[Tensor, "*batch nv"]:
+def after_step(z: PerJoint, step: PerJoint, sigma: Sigma) -> PerJoint:
     """The state after the joints have moved by `step` (rad or m), with sigma in 1/rad or 1/m."""
     toward = step.sign()
     return toward + (z - toward) * torch.exp(-sigma * step.abs())
 
 
-def after_strokes(
-    strokes: Float[Tensor, "*batch nv strokes"],
-    sigma: Float[Tensor, "*#batch nv"] | Float[Tensor, ""],
-    start: float = 0.0,
-) -> Float[Tensor, "*batch nv"]:
+def after_strokes(strokes: Float[Tensor, "*batch nv strokes"], sigma: Sigma, start: float = 0.0) -> PerJoint:
     """The state after these displacements (rad or m), the last one first, from `start` on; smooth in sigma.
 
     `after_step` of one after the other: each leaves its sign times by how much the later ones fall short of hiding it.

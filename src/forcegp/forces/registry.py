@@ -75,10 +75,8 @@ def force_name(force: Force) -> str:
     for name, entry in FORCES.items():
         if entry is kind or f"{kind.__module__}.{kind.__name__}" == f"forcegp.forces.{entry}":
             return name
-    raise InvalidInput(
-        f"a {kind.__name__} cannot be stored: register it first, FORCES['my-force'] = {kind.__name__}; registered: "
-        f"{', '.join(FORCES)}"
-    )
+    seen = f"a {kind.__name__} cannot be stored: register it first, FORCES['my-force'] = {kind.__name__}"
+    raise InvalidInput(f"{seen}; registered: {', '.join(FORCES)}")
 
 
 def force_to_dict(force: Force) -> dict[str, Any]:
@@ -162,9 +160,8 @@ def _refuse(name: str, unknown: bool, expression: Any) -> None:
 
     whole = repr(expression if isinstance(expression, str) else ",".join(expression))
     if name in KERNELS and name not in FORCES:
-        raise InvalidInput(
-            f"{name!r} in {whole} is a kernel, not a force; write it as an option, gp:tool-friction:kernel={name}"
-        )
+        seen = f"{name!r} in {whole} is a kernel, not a force"
+        raise InvalidInput(f"{seen}; write it as an option, gp:tool-friction:kernel={name}")
     if name in FORCES or name in SHORT:
         other = name if unknown else f"{UNKNOWN}{name}"
         kind = "a law with coefficients" if unknown else "an unknown force"

@@ -91,9 +91,7 @@ class Payload(WholeLaw):
         if self.link is None and self.known:
             raise InvalidInput(f"Payload has a mass of {self.mass} kg and no link; name the link that carries it.")
         if self.mass is not None and not 0.0 < self.mass < np.inf:
-            raise InvalidInput(
-                f"Payload mass is {self.mass!r}; give a positive number in kg, or None to have it found."
-            )
+            raise InvalidInput(f"Payload mass is {self.mass!r}; give a positive one in kg, or None to have it found.")
         if self.center_of_mass is None:
             return
         center = np.array(self.center_of_mass, dtype=np.float64)

@@ -95,9 +95,7 @@ class _AtRoot(torch.autograd.Function):
     @override
     def backward(ctx: Any, *grads: Tensor) -> tuple[None, None, Tensor]:  # type: ignore[override]  # as in torch's guide
         if torch.is_grad_enabled():
-            raise InvalidInput(
-                "an implicit step is differentiable once; leave out create_graph, or take explicit steps."
-            )
+            raise InvalidInput("an implicit step is differentiable once; leave out create_graph, or step explicitly.")
         return None, None, -_solve(ctx.saved_tensors[0].mT, grads[0])
 
 
@@ -271,10 +269,9 @@ def check_start(v0: Tensor, dt: float) -> None:
     """Raise InvalidInput where `dt` is no positive number or a start is faster than the limit."""
     check_time_step(dt)
     if bool((v0.abs() > SPEED_LIMIT).any()):
-        raise InvalidInput(
-            f"v0 has a joint velocity of {float(v0.abs().max()):.3g}; a motion faster than {SPEED_LIMIT:g} rad/s or "
-            "m/s counts as diverged, check its units."
-        )
+        seen = f"v0 has a joint velocity of {float(v0.abs().max()):.3g}"
+        advice = f"a motion faster than {SPEED_LIMIT:g} rad/s or m/s counts as diverged, check its units."
+        raise InvalidInput(f"{seen}; {advice}")
 
 
 def warn_of_divergence(diverged_at: Tensor, not_found: Tensor, dt: float, what: str) -> None:
@@ -286,10 +283,7 @@ def warn_of_divergence(diverged_at: Tensor, not_found: Tensor, dt: float, what: 
     cause = f"a joint faster than {SPEED_LIMIT:g} rad/s or m/s, or a state that is not finite"
     if lost:
         cause = NO_ROOT + (f" ({lost} of them), or {cause}" if lost < int(ended.sum()) else "")
-    warnings.warn(
-        f"{int(ended.sum())} of {len(diverged_at)} {what} diverged, the first at step {first} ({first * dt:.4g} s): "
-        f"{cause}. They are NaN from there on; a smaller dt, a shorter motion or a model with more physics "
-        "avoids this.",
-        NumericalWarning,
-        stacklevel=3,
-    )
+    first_at = f"the first at step {first} ({first * dt:.4g} s)"
+    seen = f"{int(ended.sum())} of {len(diverged_at)} {what} diverged, {first_at}: {cause}"
+    advice = "a smaller dt, a shorter motion or a model with more physics avoids this."
+    warnings.warn(f"{seen}. They are NaN from there on; {advice}", NumericalWarning, stacklevel=3)

@@ -66,9 +66,8 @@ class Contact:
         if not isinstance(self.frame, str):
             raise InvalidInput(f"Contact frame is {self.frame!r}; give the name of a link.")
         if not isinstance(self.surface, Surface):
-            raise InvalidInput(
-                f"Contact surface is a {type(self.surface).__name__}; give a Plane, Sphere, ImplicitSurface ..."
-            )
+            seen = f"Contact surface is a {type(self.surface).__name__}"
+            raise InvalidInput(f"{seen}; give a Plane, Sphere, ImplicitSurface ...")
         if self.switch is not None and not (isinstance(self.switch, str) and self.switch):
             raise InvalidInput(f"Contact switch is {self.switch!r}; give the name of an input, or None.")
         point = finite_vector("Contact point", self.point, 3, f" x, y, z in m, in frame {self.frame!r}")
@@ -90,10 +89,8 @@ class Contact:
     def check(self, robot: Robot) -> None:
         """Raise UnknownName for a frame that is not there, ContactError where the contact constrains nothing."""
         if robot.frame(self.frame)[0] < 0:
-            raise ContactError(
-                f"frame {self.frame!r} of {robot.name} is fixed in the world, so a contact there constrains nothing; "
-                "name a frame that moves."
-            )
+            seen = f"frame {self.frame!r} of {robot.name} is fixed in the world, so a contact there constrains nothing"
+            raise ContactError(f"{seen}; name a frame that moves.")
 
     def position(self, kinematics: Kinematics) -> Float[Tensor, "*batch 3"]:
         """World position p(q) of the contact point (..., 3) in m."""
@@ -253,18 +250,16 @@ class ConstrainedDynamics:
         try:
             lower = torch.linalg.cholesky(self.M)
         except torch.linalg.LinAlgError:
-            raise NumericalError(
-                "the mass matrix is not positive definite; check the inertias, masses and armature of the robot"
-            ) from None
+            seen = "the mass matrix is not positive definite"
+            raise NumericalError(f"{seen}; check the inertias, masses and armature of the robot") from None
         inverse_lower = torch.linalg.solve_triangular(lower, identity.expand_as(self.M), upper=False)
         A_white = self.A @ inverse_lower.mT
         if self.A.shape[-2]:
             try:
                 pseudo_inverse = torch.linalg.pinv(A_white, rtol=REDUNDANCY_TOLERANCE)
             except torch.linalg.LinAlgError:
-                raise NumericalError(
-                    "the constraint matrix A is not finite; Model.check_states names the row and the contact"
-                ) from None
+                seen = "the constraint matrix A is not finite"
+                raise NumericalError(f"{seen}; Model.check_states names the row and the contact") from None
         else:
             pseudo_inverse = A_white.mT
         H = inverse_lower.mT @ (identity - pseudo_inverse @ A_white) @ inverse_lower

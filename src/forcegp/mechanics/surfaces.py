@@ -150,10 +150,9 @@ def surface_to_dict(surface: Surface) -> dict[str, Any]:
     """Plain numbers for `surface_from_dict`. Raises ContactError for a surface that holds code."""
     name = next((name for name, kind in SURFACES.items() if type(surface) is kind), None)
     if name is None:
-        raise ContactError(
-            f"a {type(surface).__name__} cannot be stored: files carry numbers, never code. Use one of "
-            f"{', '.join(SURFACES)}, or a Surface of your own with numbers as fields and an entry in SURFACES."
-        )
+        seen = f"a {type(surface).__name__} cannot be stored: files carry numbers, never code"
+        own = "a Surface of your own with numbers as fields and an entry in SURFACES"
+        raise ContactError(f"{seen}. Use one of {', '.join(SURFACES)}, or {own}.")
     return {"type": name, **asdict(surface)}  # type: ignore[call-overload]  # every entry of SURFACES is a dataclass
 
 

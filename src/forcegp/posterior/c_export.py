@@ -71,15 +71,11 @@ def export_c(
     if steps is not None:
         require_step(steps, integrator, posterior.model)
         if jacobian and len({*posterior.model.sizes}) > 1:
-            raise InvalidInput(
-                "derivatives of exported steps need a base that is fixed and one input per joint; export `jacobian` "
-                "without `steps`, or take `predictor.linearize_step`."
-            )
+            seen = "derivatives of exported steps need a base that is fixed and one input per joint"
+            raise InvalidInput(f"{seen}; export `jacobian` without `steps`, or take `predictor.linearize_step`.")
     if covariance and not (isinstance(posterior.latent, ExactPosterior) and posterior.latent_names):
-        raise InvalidInput(
-            "this model has no covariance that could be exported: it has no unknown forces, or its engine does not "
-            "keep the factor of all rows; export without `covariance`."
-        )
+        why = "it has no unknown forces, or its engine does not keep the factor of all rows"
+        raise InvalidInput(f"this model has no covariance that could be exported: {why}; export without `covariance`.")
     folder = Path(folder)
     require_replaceable(folder, "export_c", lambda _: False, overwrite=False)
     require_writable(folder)
@@ -91,11 +87,9 @@ def export_c(
         same = known is posterior.model or getattr(known, "posterior", None) is posterior
         kind = known.kind if same and monitor.open and posterior.latent_names else "none"
         if not same or kind != ("compressed" if reference.kind == "compressed" else "none"):
-            raise InvalidInput(
-                "the monitor is that of another model, or counts another covariance than the program has; make it of "
-                "posterior.predictor() and export with `covariance`, or of posterior.predictor(covariance='none') "
-                "without."
-            )
+            seen = "the monitor is that of another model, or counts another covariance than the program has"
+            own = "posterior.predictor() and export with `covariance`"
+            raise InvalidInput(f"{seen}; make it of {own}, or of posterior.predictor(covariance='none') without.")
     export = CFiles(posterior, reference, code, called, jacobian, steps, integrator, monitor)
     checks = _checks(export)
     with atomic_folder(folder, overwrite=False) as temporary:
@@ -203,11 +197,10 @@ def _compared(export: CFiles, checks: Sequence[Check], folder: Path) -> dict[str
             bounds |= dict.fromkeys(apart, LOOSER["covariance"] * checks[0].tolerance)
         for name, worst in found.items():
             if not worst <= bounds[name]:
-                raise NumericalError(
-                    f"{name} of the compiled program and forcegp differ by {worst:.2g} of the largest value, more than "
-                    f"{bounds[name]:.2g}, so nothing was written; name another compiler by the environment variable "
-                    "CC, or look at the model: its kernel matrix may be near singular."
-                )
+                seen = f"{name} of the compiled program and forcegp differ by {worst:.2g} of the largest value"
+                doubt = "look at the model: its kernel matrix may be near singular"
+                advice = f"name another compiler by the environment variable CC, or {doubt}."
+                raise NumericalError(f"{seen}, more than {bounds[name]:.2g}, so nothing was written; {advice}")
     return found
 
 

@@ -99,18 +99,15 @@ def export_casadi(
         try:
             parts = function.map(len(q))(*(x.numpy().T for x in (q, v, u)))
         except RuntimeError:  # many lines
-            raise NumericalError(
-                f"CasADi finds no step of {steps:g} s by {integrator} somewhere near the training data, so nothing is "
-                "written; give shorter steps, or export to C, whose Newton method shortens what overshoots."
-            ) from None
+            seen = f"CasADi finds no step of {steps:g} s by {integrator} somewhere near the training data"
+            advice = "give shorter steps, or export to C, whose Newton method shortens what overshoots."
+            raise NumericalError(f"{seen}, so nothing is written; {advice}") from None
         made = np.concatenate([np.array(x) for x in (parts if isinstance(parts, tuple) else (parts,))]).T
         apart = made[:, : expected[file].shape[1]] - expected[file].numpy()
         worst = float(np.abs(apart).max() / expected[file].abs().max())
         if not worst <= max(STEP_TOLERANCE if file != called else TOLERANCE, lost):
-            raise NumericalError(
-                f"{file}.casadi and forcegp differ by {worst:.2g} of the largest value, so nothing is written; export "
-                "to C, or fit with fewer points, which cancel less."
-            )
+            seen = f"{file}.casadi and forcegp differ by {worst:.2g} of the largest value, so nothing is written"
+            raise NumericalError(f"{seen}; export to C, or fit with fewer points, which cancel less.")
         found[f"{file}.casadi"] = worst
     for file, function in functions.items():
         text = casadi.StringSerializer()

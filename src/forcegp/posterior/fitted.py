@@ -12,7 +12,7 @@ what another friction level would change (`posterior.drift`) is added in squares
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Literal, TypeVar
 
@@ -26,6 +26,7 @@ from typing_extensions import override
 from forcegp.errors import UnknownName, require_known
 from forcegp.evidence.likelihood import MarginalLikelihood, TrainingData
 from forcegp.forces import IndependentAccelerations, JointAccelerations, JointForces
+from forcegp.forces.force import plain
 from forcegp.inference import Engine, Exact, LatentKernels, LatentPosterior, OptimizationResult, exact
 from forcegp.model import Model
 from forcegp.noise import ACCELERATION
@@ -126,13 +127,8 @@ class Estimates(Summary, Mapping[str, Estimate]):
 
     def to_dict(self) -> dict[str, Any]:
         """Everything as plain JSON values."""
-        return {
-            "parameters": {each.name: each.to_dict() for each in self.entries},
-            "covariance": None if self.covariance is None else self.covariance.tolist(),
-            "by_body": None if self.by_body is None else dict(self.by_body),
-            **{name: getattr(self, name) for name in ("evidence", "rows", "evaluations", "settled")},
-            "thickened": list(self.thickened),
-        }
+        more = {item.name: plain(getattr(self, item.name)) for item in fields(self) if item.name != "entries"}
+        return {"parameters": {each.name: each.to_dict() for each in self.entries}, **more}
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> "Estimates":

@@ -19,6 +19,7 @@ Posterior = Any
 """A `Posterior`, whose module imports this one."""
 
 OBSERVERS = ObservedWind | ObservedWrench
+Wrenches = Float[np.ndarray, "rows 6"]
 TRIED = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # s
 MEMORY, LEAST = 1.0, 0.1  # s, of how much each time missed, and of the past that the first row needs
 
@@ -93,10 +94,8 @@ def unobserved(model: Model) -> Model:
 def require_unobserved(posterior: Posterior, what: str) -> None:
     """Raise InvalidInput for what `observing` gave, where `what` observes by itself."""
     if len(posterior.model.inputs) > len(posterior.trained.inputs):
-        raise InvalidInput(
-            f"{what} include the observers of the model: give the posterior and the recording as they were before "
-            "`observing`."
-        )
+        seen = f"{what} include the observers of the model"
+        raise InvalidInput(f"{seen}: give the posterior and the recording as they were before `observing`.")
 
 
 def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
@@ -105,10 +104,8 @@ def rows_of_own_system(posterior: Posterior, rows: Dataset) -> Dataset:
     if target is None or not own.unknown_forces:  # laws alone learn nothing from rows but their level
         return rows
     if "air" not in posterior.settings or target.known.to_dict() != unobserved(own).known.to_dict():
-        raise InvalidInput(
-            "the posterior was carried to another system than the one that its rows were measured on; update it "
-            "before it is carried there: posterior.update(rows).with_model(model)."
-        )
+        seen = "the posterior was carried to another system than the one that its rows were measured on"
+        raise InvalidInput(f"{seen}; update it before it is carried there: posterior.update(rows).with_model(model).")
     return in_own_air(posterior, rows)
 
 
@@ -125,9 +122,7 @@ def _with_past(dataset: Dataset, seconds: float) -> Int[np.ndarray, " late"]:
     first = {number: rows.time[0] for number, rows, _ in episodes_in_order(dataset)}
     late = np.flatnonzero(dataset.time - np.array([first[number] for number in dataset.episode]) >= seconds)
     if not len(late):
-        raise InvalidInput(
-            f"the rows hold less than {seconds:g} s of flight, which does not show their wind; give longer pieces."
-        )
+        raise InvalidInput(f"rows hold less than {seconds:g} s of flight, which shows no wind; give longer pieces.")
     return late
 
 
@@ -141,9 +136,7 @@ def _in_observed_wind(posterior: Posterior, dataset: Dataset) -> tuple[Posterior
     return posterior.with_model(seen.model), seen
 
 
-def _observed(
-    wrench: Float[np.ndarray, "rows 6"], dataset: Dataset, times: Sequence[float]
-) -> Float[np.ndarray, "rows 6"]:
+def _observed(wrench: Wrenches, dataset: Dataset, times: Sequence[float]) -> Wrenches:
     """The wrench that the rows before each show, none at the first of an episode."""
     observed = np.zeros_like(wrench)
     for number, rows, _ in episodes_in_order(dataset):

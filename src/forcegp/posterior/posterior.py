@@ -97,11 +97,9 @@ class Posterior(Fitted):
         variance = predicted.mean if predicted.covariance is None else predicted.variance
         finite = torch.isfinite(predicted.mean.detach() + variance.detach()).reshape(-1, variance.shape[-1]).all(-1)
         if not bool(finite.all()):
-            raise NumericalError(
-                f"the prediction of row {int((~finite).nonzero()[0])} is not finite: q, v or u is too large for "
-                "float64 there, the mass matrix is singular, or a surface has no normal; check q, v and u of that "
-                "row, and the model by Model.check_states."
-            )
+            seen = f"the prediction of row {int((~finite).nonzero()[0])} is not finite"
+            why = "q, v or u is too large for float64 there, the mass matrix is singular, or a surface has no normal"
+            raise NumericalError(f"{seen}: {why}; check q, v and u of that row, and the model by Model.check_states.")
         return predicted
 
     def predict_rows(self, q: Positions, v: Rows, u: Inputs, covariance: bool, a: Rows | None = None) -> Prediction:
@@ -323,20 +321,16 @@ class Posterior(Fitted):
         require_type("model", model, Model)
         trained = self.trained
         if self.is_black_box:
-            raise InvalidInput(
-                f"a {self.description} learned the accelerations of one robot, so it cannot move to another model; fit "
-                "it to data from there, or learn forces."
-            )
+            seen = f"a {self.description} learned the accelerations of one robot, so it cannot move to another model"
+            raise InvalidInput(f"{seen}; fit it to data from there, or learn forces.")
         if model.robot.joint_names != trained.robot.joint_names:
-            raise InvalidInput(
-                f"the model was trained on joints {', '.join(trained.robot.joint_names)}; the other robot has "
-                f"{', '.join(model.robot.joint_names)}. Forces can move to robots with the same joints only."
-            )
+            seen = f"the model was trained on joints {', '.join(trained.robot.joint_names)}"
+            other = f"the other robot has {', '.join(model.robot.joint_names)}"
+            raise InvalidInput(f"{seen}; {other}. Forces can move to robots with the same joints only.")
         if self.carries_known_forces and not model.robot.tree.equals(trained.robot.tree):
-            raise InvalidInput(
-                "the mean has no rigid bodies, so the processes hold gravity and inertia of the robot that it was "
-                "trained on and cannot move to another; fit a model with RigidBodies()."
-            )
+            held = "gravity and inertia of the robot that it was trained on and cannot move to another"
+            seen = f"the mean has no rigid bodies, so the processes hold {held}"
+            raise InvalidInput(f"{seen}; fit a model with RigidBodies().")
         # asks for the frames, at a state where a surface is likely to have a normal
         q, v, u = (x[:1].to(model.robot.device) for x in (self.training.q, self.training.v, self.training.u))
         u = u.new_zeros(1, model.sizes[2]) if len(u[0]) != model.sizes[2] else u

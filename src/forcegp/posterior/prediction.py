@@ -212,9 +212,7 @@ def state_tensor(name: str, values: Array, size: int, device: torch.device) -> T
     """Finite float64 numbers (..., size). Raises InvalidInput."""
     tensor = real_tensor(name, values, device)
     if tensor.dim() == 0 or tensor.shape[-1] != size:
-        raise InvalidInput(
-            f"{name} has shape {tuple(tensor.shape)}; its last dimension must be {size}, one value per joint."
-        )
+        raise InvalidInput(f"{name} has shape {tuple(tensor.shape)}; its last dimension must be {size}, one per joint.")
     require_finite(name, tensor)
     return tensor
 
@@ -266,15 +264,13 @@ def require_actuated(posterior: Any) -> None:
     actuated = any(isinstance(force, Actuation) and force.known for force in posterior.model.laws)
     nv, nu = posterior.model.sizes[1], posterior.model.sizes[2] - len(posterior.model.memory.names)
     if nv != nu:
-        raise InvalidInput(
-            f"no u makes every acceleration: {posterior.model.robot.name} has {nv} degrees of freedom and u has {nu} "
-            "entries; search for u with `predictor.linearize` or `predictor.rollouts`."
-        )
+        seen = f"{posterior.model.robot.name} has {nv} degrees of freedom and u has {nu} entries"
+        advice = "search for u with `predictor.linearize` or `predictor.rollouts`."
+        raise InvalidInput(f"no u makes every acceleration: {seen}; {advice}")
     if posterior.carries_known_forces or not actuated:
         lacks = "RigidBodies()" if posterior.carries_known_forces else "Actuation()"
-        raise InvalidInput(
-            f"this model has no {lacks} among its laws, so no u can be solved for; call `predict`, or fit one that has."
-        )
+        seen = f"this model has no {lacks} among its laws, so no u can be solved for"
+        raise InvalidInput(f"{seen}; call `predict`, or fit one that has.")
 
 
 def inverse_dynamics(
@@ -290,9 +286,7 @@ def inverse_dynamics(
     shape = (len(q), len(posterior.model.contacts))
     wanted = q.new_zeros(shape) if normal_force is None else real_tensor("normal_force", normal_force, q.device)
     if wanted.shape not in (shape, shape[1:]):
-        raise InvalidInput(
-            f"normal_force has shape {tuple(wanted.shape)}; give {shape[1:]} or {shape}, one per contact."
-        )
+        raise InvalidInput(f"normal_force has shape {tuple(wanted.shape)}; give {shape[1:]} or {shape}, by contact.")
     require_finite("normal_force", wanted)
     names, first = posterior.model.memory.names, posterior.model.memory_column
     if names and memory is None:
@@ -312,10 +306,9 @@ def inverse_dynamics(
         # from the u without what was learned: from u = 0 the load, and friction under it, would be those of free fall
         u, found = find_roots(surplus, -surplus(torch.zeros_like(a), learned=False))
         if not bool(found.all()):
-            raise NumericalError(
-                f"no u was found that gives row {int((~found).nonzero()[0])} its acceleration: friction takes as much "
-                "as u adds, or a number is too large; check q, v, a and normal_force of that row."
-            )
+            seen = f"no u was found that gives row {int((~found).nonzero()[0])} its acceleration"
+            why = "friction takes as much as u adds, or a number is too large"
+            raise NumericalError(f"{seen}: {why}; check q, v, a and normal_force of that row.")
         if not covariance:
             return Gaussian(u, None)
         at = posterior.dynamics(q, v, whole(u))

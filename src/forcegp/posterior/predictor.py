@@ -18,16 +18,7 @@ from forcegp.inference.prepared_kernels import CompressedCovariance
 from forcegp.integration.integrators import Trajectory, rows_jacobian, steps_by
 from forcegp.posterior.prediction import Gaussian, JointForces, Linearization, inverse_dynamics, joint_force
 from forcegp.posterior.programs import Programs, steps_of
-from forcegp.posterior.rollout import (
-    AccelerationFunction,
-    StepLinearization,
-    accelerations,
-    checked_start,
-    linearized_on_manifold,
-    linearized_step,
-    moved,
-    stepped,
-)
+from forcegp.posterior.rollout import StepLinearization, accelerations, checked_start, linearized_step, moved, stepped
 from forcegp.robots.arguments import real_tensor, require_finite, whole_number
 from forcegp.robots.manifold import ConfigurationSpace
 from forcegp.summary import Summary
@@ -69,7 +60,7 @@ class Predictor(Summary):
         return kept | {"_made": {}}  # loaded code means nothing in another process
 
     @cached_property
-    def by_torch(self) -> AccelerationFunction:
+    def by_torch(self) -> Callable[[Tensor, Tensor, Tensor], Tensor]:
         """The mean acceleration of rows."""
         return accelerations(self.posterior, self.posterior.model)
 
@@ -140,11 +131,11 @@ class Predictor(Summary):
         other names and a dt that is no positive number, NumericalError where an implicit step is not found.
         """
         states, single = self._states(q, v, u)
-        state = self._stepped(torch.cat(states, dim=-1), dt, integrator)
+        state = self.stepped(torch.cat(states, dim=-1), dt, integrator)
         q, v = (state[0] if single else state).split(self.sizes[:2], dim=-1)
         return q, v
 
-    def _stepped(self, x: Tensor, dt: float, integrator: str) -> Tensor:
+    def stepped(self, x: Tensor, dt: float, integrator: str) -> Tensor:
         """[q, v] after a step from the rows x = [q, v, u]; implicit ones by the compiled loop where that finds it."""
         implicit = integrator == "implicit-midpoint" and integrator in steps_of(self.space)
         if implicit and self.code is not None and not x.requires_grad and len(x):
@@ -161,11 +152,7 @@ class Predictor(Summary):
     ) -> StepLinearization:
         """That state and the affine model x+ = A x + B u + c, x = (q, v) or (step from q, v), without a graph."""
         states, single = self._states(q, v, u)
-        model, rows = self.posterior.model, torch.cat(states, dim=-1)
-        if self.space.is_vector_space:
-            linear = linearized_step(self._stepped, self.linearize, model, rows, dt, integrator)
-        else:
-            linear = linearized_on_manifold(self.mean, model, rows, dt, integrator)
+        linear = linearized_step(self, torch.cat(states, dim=-1), dt, integrator)
         return StepLinearization(*(part[0] for part in linear)) if single else linear
 
     def rollouts(
@@ -212,10 +199,8 @@ class Predictor(Summary):
         else:
             states, single = self._states(q, v, u)
             Q, around = (_single(x, single) for x in self.run("forces", states))
-        slope, M, A, b, off = around.split([nv * nu, nv**2, m * nv, m, m], dim=-1)
-        return JointForces(
-            Q, slope.unflatten(-1, (nv, nu)), M.unflatten(-1, (nv, nv)), A.unflatten(-1, (m, nv)), b, off
-        )
+        dQ, M, A, b, off = around.split([nv * nu, nv**2, m * nv, m, m], dim=-1)
+        return JointForces(Q, dQ.unflatten(-1, (nv, nu)), M.unflatten(-1, (nv, nv)), A.unflatten(-1, (m, nv)), b, off)
 
     def inverse_dynamics(self, q: Any, v: Any, a: Any, normal_force: Any = None, memory: Any = None) -> Gaussian:
         """The actuator forces u (nv,) or (n, nv) in Nm or N that make the acceleration a (rad/s^2 or m/s^2).
@@ -380,9 +365,7 @@ class MeanWithGradient(torch.autograd.Function):
     @override
     def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():  # create_graph=True: the gradients would pass for constants
-            raise InvalidInput(
-                "a compiled predictor has first derivatives only; for second ones make it with compile=False."
-            )
+            raise InvalidInput("a compiled predictor has first derivatives only; for more make it with compile=False.")
         (_, nv, nu), space = ctx.predictor.sizes, ctx.predictor.space
         jacobian = ctx.predictor.run("linearize", ctx.saved_tensors)[1].view(-1, nv, 2 * nv + nu)
         in_q, in_v, in_u = (grad_outputs[0][:, None] @ jacobian)[:, 0].split([nv, nv, nu], dim=-1)

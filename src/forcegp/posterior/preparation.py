@@ -38,11 +38,10 @@ def prepared_predictor(posterior: Any, covariance: str, compile: bool) -> Predic
     compressed = None
     if covariance == "compressed" and len(latent.kernels.dense):
         if not isinstance(latent, ExactPosterior):
-            raise InvalidInput(
-                "covariance='compressed' needs the factorised covariance of all rows, which a model with a "
-                f"{type(latent).__name__} does not have; give covariance='exact', which is the one that it has, "
-                f"'none', or {latent.remedy}."
-            )
+            seen = "covariance='compressed' needs the factorised covariance of all rows"
+            why = f"which a model with a {type(latent).__name__} does not have"
+            advice = f"give covariance='exact', which is the one that it has, 'none', or {latent.remedy}."
+            raise InvalidInput(f"{seen}, {why}; {advice}")
         # functions of one input are rough: between two training values, what is uncertain hangs on these two alone
         rough = any(z.shape[-1] == 1 for z in latent.features)
 
@@ -57,12 +56,9 @@ def prepared_predictor(posterior: Any, covariance: str, compile: bool) -> Predic
         compressed = compress(latent, chosen, check, tolerance=TOLERANCE, largest=LARGEST_RANK)
         reached = float(compressed.inflation.max()) if len(compressed.inflation) else 0.0
         if reached > TOLERANCE:
-            warnings.warn(
-                f"rank {compressed.rank} makes standard deviations up to {reached:.2g} (relative) too large, more "
-                f"than {TOLERANCE:.2g}; give covariance='exact' where that matters.",
-                NumericalWarning,
-                stacklevel=3,
-            )
+            seen = f"rank {compressed.rank} makes standard deviations up to {reached:.2g} (relative) too large"
+            advice = "give covariance='exact' where that matters."
+            warnings.warn(f"{seen}, more than {TOLERANCE:.2g}; {advice}", NumericalWarning, stacklevel=3)
     code = posterior.programs(compressed=compressed) if compile else None
     made = Predictor(posterior, model.robot.space, model.sizes, training.q.device, code, covariance, compressed)
     made.compiled("mean" if compressed is None else "covariance")
@@ -76,9 +72,8 @@ def rows_for(training: TrainingData, trained: Model, model: Model) -> TrainingDa
         return training
     reported = [name for force in model.forces if isinstance(force, ObservedWrench) for name in force.names]
     if new := [name for name in model.inputs if name not in (*had, *reported)]:
-        raise InvalidInput(
-            f"the training rows lack inputs ({', '.join(new)}), so no predictor can be checked; call predict."
-        )
+        seen = f"the training rows lack inputs ({', '.join(new)}), so no predictor can be checked"
+        raise InvalidInput(f"{seen}; call predict.")
     with_zero = torch.nn.functional.pad(training.u, (0, 1))
     return replace(training, u=with_zero[..., [had.index(name) if name in had else -1 for name in model.inputs]])
 

@@ -45,9 +45,8 @@ def require_step(seconds: object, integrator: str, model: Model) -> None:
     steps_by(integrator, model, seconds)
     there = steps_of(model.robot.space)
     if integrator not in there:
-        raise InvalidInput(
-            f"an exported step is not {integrator!r}; give one of {', '.join(map(repr, there))} as `integrator`."
-        )
+        seen = f"an exported step is not {integrator!r}"
+        raise InvalidInput(f"{seen}; give one of {', '.join(map(repr, there))} as `integrator`.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,10 +151,8 @@ class Programs:
         self.space: ConfigurationSpace = self.physics.model.robot.space
         self.sizes: tuple[int, int, int] = self.physics.model.sizes
         if self.example[0].device.type != "cpu":
-            raise InvalidInput(
-                f"compiled code runs on the CPU, and the model is on {self.example[0].device}; give compile=False, or "
-                "a model on the CPU."
-            )
+            seen = f"compiled code runs on the CPU, and the model is on {self.example[0].device}"
+            raise InvalidInput(f"{seen}; give compile=False, or a model on the CPU.")
 
     @cached_property
     def sums(self) -> tuple[KernelSum, ...]:

@@ -13,17 +13,8 @@ from torch import Tensor
 from forcegp.codegen.library import RowFunction
 from forcegp.errors import CompilerError, InvalidInput, NumericalError, NumericalWarning
 from forcegp.inference.pathwise import draw_functions
-from forcegp.integration.integrators import (
-    NO_ROOT,
-    Feedback,
-    Integrator,
-    Trajectory,
-    check_start,
-    integrate,
-    rows_jacobian,
-    steps_by,
-    warn_of_divergence,
-)
+from forcegp.integration import Feedback, Integrator, Trajectory, integrate
+from forcegp.integration.integrators import NO_ROOT, check_start, rows_jacobian, steps_by, warn_of_divergence
 from forcegp.model import Model
 from forcegp.posterior.fitted import MotionIntervals
 from forcegp.posterior.prediction import state_tensor
@@ -36,6 +27,8 @@ STEPS_TO_COMPILE = 2000
 TOGETHER, FUNCTIONS = 10, 3  # motions, and unknown functions, that cost as much as one step again
 ROWS_PER_BLOCK = 4096  # states whose constraint is evaluated at once
 
+Inputs = Float[Tensor, "T n nu"]
+States = Float[Tensor, "n rows"]
 AccelerationFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(q, v, u) -> a, all of one shape."""
 
@@ -69,7 +62,7 @@ def moved(
     model: Model,
     q: Float[Tensor, "n nq"],
     v: Float[Tensor, "n nv"],
-    u: Float[Tensor, "T n nu"],
+    u: Inputs,
     dt: float,
     *,
     feedback: Feedback | None = None,
@@ -175,9 +168,8 @@ class Rollout:
     def _sampled(self, quantity: Literal["q", "v"], least: int) -> Tensor:
         count = 0 if self.samples is None else self.samples.q.shape[0]
         if count < least:
-            raise InvalidInput(
-                f"this rollout has {count} samples, {least} are needed; ask for rollout(..., samples=20)."
-            )
+            seen = f"this rollout has {count} samples, {least} are needed"
+            raise InvalidInput(f"{seen}; ask for rollout(..., samples=20).")
         values: Tensor = getattr(self.samples, quantity)
         return values if quantity != "q" or self.space.is_vector_space else self.steps_to(values)
 
@@ -196,9 +188,7 @@ class Rollout:
         return torch.where(torch.isnan(high - low), torch.nan, ((low <= off) & (off <= high)).to(off))
 
 
-def remembering(
-    model: Model, u: Float[Tensor, "T n nu"], dt: float, feedback: Feedback | None
-) -> tuple[Float[Tensor, "T n nu"], Feedback | None]:
+def remembering(model: Model, u: Inputs, dt: float, feedback: Feedback | None) -> tuple[Inputs, Feedback | None]:
     """u without memory but in its first row, and feedback that adds what laws remember of the motion since then."""
     memory, first = model.memory, model.memory_column
     if not memory.names:
@@ -261,10 +251,9 @@ def checked_start(
     for size, (name, values) in zip(sizes, (("q0", q0), ("v0", v0), ("u", u)), strict=True):
         tensor = given[name] = state_tensor(name, values, size, device).to(device)
         if tensor.requires_grad and torch.is_grad_enabled():
-            raise InvalidInput(
-                f"{name} requires a gradient, which a rollout drops; multiply the A and B of steps, "
-                f"predictor.linearize_step, and give {name}.detach()."
-            )
+            seen = f"{name} requires a gradient, which a rollout drops"
+            advice = f"multiply the A and B of steps, predictor.linearize_step, and give {name}.detach()."
+            raise InvalidInput(f"{seen}; {advice}")
         if name == "u" and tensor.dim() < 2:
             raise InvalidInput(f"u has shape {tuple(tensor.shape)}; it must be (..., T, {size}), one row per step.")
     q, v, forces = given.values()
@@ -292,9 +281,7 @@ class StepLinearization(NamedTuple):
     c: Tensor
 
 
-def stepped(
-    mean: AccelerationFunction, model: Model, x: Float[Tensor, "n rows"], dt: Any, integrator: Any
-) -> Float[Tensor, "n state"]:
+def stepped(mean: AccelerationFunction, model: Model, x: States, dt: Any, integrator: Any) -> Float[Tensor, "n state"]:
     """[q, v] one step after the rows x = [q, v, u], as `Predictor.step` documents it."""
     q, v, u = x.split(model.sizes, dim=-1)
     step = steps_by(integrator, model, dt)(lambda q, v: mean(q, v, u), q, v, dt)
@@ -304,18 +291,11 @@ def stepped(
     return torch.cat([step.q, step.v], dim=-1)
 
 
-def linearized_step(
-    step: Callable[[Tensor, float, str], Tensor],
-    linearize: Callable[[Tensor, Tensor, Tensor], Sequence[Tensor]],
-    model: Model,
-    x: Float[Tensor, "n rows"],
-    dt: Any,
-    integrator: Any,
-) -> StepLinearization:
-    """The same with its derivatives, by the chain rule; of an implicit step by the implicit function theorem.
-
-    `step` gives [q, v] after it from the rows x, `linearize` gives a (n, nv), da/dq, da/dv and da/du (n, nv, nv).
-    """
+def linearized_step(predictor: Any, x: States, dt: Any, integrator: Any) -> StepLinearization:
+    """The step of a `Predictor` with its derivatives, by the chain rule; of an implicit one by implicit functions."""
+    model = predictor.posterior.model
+    if not model.robot.space.is_vector_space:
+        return _on_manifold(predictor.mean, model, x, dt, integrator)
     method, (q, v, u) = steps_by(integrator, model, dt), x.detach().split(model.sizes, dim=-1)
     nv, unit = q.shape[-1], torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
 
@@ -325,13 +305,13 @@ def linearized_step(
 
     def acceleration(at_q: Tensor, at_v: Tensor) -> Tensor:
         at_q, at_v = (part.unflatten(1, (nv, -1)) for part in (at_q, at_v))
-        a, da_dq, da_dv, da_du = linearize(at_q[..., 0], at_v[..., 0], u)
+        a, da_dq, da_dv, da_du = predictor.linearize(at_q[..., 0], at_v[..., 0], u)
         return joined(a, da_dq @ at_q[..., 1:] + da_dv @ at_v[..., 1:] + da_du @ unit[2 * nv :])
 
     start_q, start_v = joined(q, unit[:nv]), joined(v, unit[nv : 2 * nv])
     if integrator == "implicit-midpoint":
-        middle = 0.5 * (v + step(x.detach(), dt, integrator)[:, nv:])
-        _, da_dq, da_dv, da_du = linearize(q + 0.5 * dt * middle, middle, u)
+        middle = 0.5 * (v + predictor.stepped(x.detach(), dt, integrator)[:, nv:])
+        _, da_dq, da_dv, da_du = predictor.linearize(q + 0.5 * dt * middle, middle, u)
         J = unit[:nv, :nv] - 0.5 * dt * (da_dv + 0.5 * dt * da_dq)
         right = torch.cat([0.5 * dt * da_dq, unit[:nv, :nv].expand_as(J), 0.5 * dt * da_du], dim=-1)
         at_middle = joined(middle, torch.linalg.solve(J, right))
@@ -345,9 +325,7 @@ def linearized_step(
     return StepLinearization(q, v, A, B, c)
 
 
-def linearized_on_manifold(
-    mean: AccelerationFunction, model: Model, x: Float[Tensor, "n rows"], dt: Any, integrator: Any
-) -> StepLinearization:
+def _on_manifold(mean: AccelerationFunction, model: Model, x: States, dt: Any, integrator: Any) -> StepLinearization:
     """The same where positions do not add up, in steps from q and from the q after it; by backward passes of `mean`."""
     space, (nq, nv, _) = model.robot.space, model.sizes
     q, rest = x.detach().split([nq, x.shape[-1] - nq], dim=-1)

@@ -169,8 +169,6 @@ def _document(path: Path) -> dict[str, Any]:
         raise FileFormatError(f"{file} is not a stored forcegp model.")
     version = document.get("format_version")
     if version != FORMAT_VERSION:
-        raise FileFormatError(
-            f"{file} has format version {version!r}, this forcegp {__version__} reads {FORMAT_VERSION}; use the "
-            f"version that wrote it ({document.get('forcegp_version')}) or fit again"
-        )
+        seen = f"{file} has format version {version!r}, this forcegp {__version__} reads {FORMAT_VERSION}"
+        raise FileFormatError(f"{seen}; use the version that wrote it ({document.get('forcegp_version')}) or fit again")
     return document

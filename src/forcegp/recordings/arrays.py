@@ -38,7 +38,7 @@ from forcegp.sandbox import MEMORY, SECONDS, read_apart
 from forcegp.summary import listed
 
 SEPARATOR = "/"
-MOST_NAMES = 12  # of arrays in a message
+SHOWN = 12  # names of arrays in a message
 NUMPY, HDF5, MATLAB, PARQUET = "a NumPy archive", "an HDF5 file", "a MATLAB file", "a Parquet file"
 INTERNAL = "#"  # begins names under which MATLAB keeps the contents of cells
 REFERENCE = np.dtype(object)
@@ -71,9 +71,7 @@ class ArrayFile(Source):
         names = dict.fromkeys(SEPARATOR.join(name.split(SEPARATOR)[:depth]) for name in self.arrays)
         found = [name for name in names if fnmatch.fnmatchcase(name, pattern)]
         if not found:
-            raise InvalidInput(
-                f"no array or group of {self.path} matches {pattern!r}; it has {listed(names, MOST_NAMES)}."
-            )
+            raise InvalidInput(f"no array or group of {self.path} matches {pattern!r}; it has {listed(names, SHOWN)}.")
         # demo_10 after demo_9
         return sorted(found, key=lambda name: [x.zfill(20) for x in re.findall(r"\d+|\D", name)])
 
@@ -95,10 +93,8 @@ class ArrayFile(Source):
                 places |= {element: (full, index) for index, element in enumerate(element_names(name, shape[1]))}
         if not places:
             inside = f" under {self.within!r}" if self.within else ""
-            raise FileFormatError(
-                f"{self.path} has no array of numbers with one or two dimensions and more than one row{inside}; "
-                f"it has {listed(self.arrays, MOST_NAMES)}."
-            )
+            seen = f"{self.path} has no array of numbers with one or two dimensions and more than one row{inside}"
+            raise FileFormatError(f"{seen}; it has {listed(self.arrays, SHOWN)}.")
         return places
 
     @override
@@ -110,9 +106,7 @@ class ArrayFile(Source):
         chosen = {self._places[name][0]: self.arrays[self._places[name][0]] for name in names}
         if len({shape[0] for shape, _ in chosen.values()}) > 1:
             counts = ", ".join(f"{array} {shape[0]}" for array, (shape, _) in chosen.items())
-            raise FileFormatError(
-                f"{self.path}: its arrays have different numbers of rows ({counts}); map those of one."
-            )
+            raise FileFormatError(f"{self.path}: arrays have different numbers of rows ({counts}); map those of one.")
         tables = {name: content() for name, (_, content) in chosen.items()}
         places = {name: self._places[name] for name in names}
         return {name: tables[own] if at is None else tables[own][:, at] for name, (own, at) in places.items()}
@@ -140,14 +134,10 @@ def numpy_arrays(path: Path) -> Arrays:
                 read = npy.read_array_header_1_0 if npy.read_magic(stream) == (1, 0) else npy.read_array_header_2_0
                 shape, _, dtype = read(stream)
             if dtype.hasobject:
-                raise FileFormatError(
-                    f"{path}: {name!r} holds Python objects, which are never read because reading them runs code; save "
-                    "it as an array of numbers."
-                )
+                seen = f"{path}: {name!r} holds Python objects, which are never read because reading them runs code"
+                raise FileFormatError(f"{seen}; save it as an array of numbers.")
             if math.prod(shape) * dtype.itemsize > member.file_size:
-                raise FileFormatError(
-                    f"{path}: {name!r} claims the shape {shape}, but the file does not hold that much."
-                )
+                raise FileFormatError(f"{path}: {name!r} claims the shape {shape}, but the file holds less than that.")
             if dtype.kind in "fiu":
                 if len(shape) < 3:
                     require_plausible_size(path, repr(name), 8 * math.prod(shape), member.compress_size)
@@ -179,10 +169,8 @@ def _stored(path: Path, group: h5py.Group, prefix: str, seen: set[Any]) -> Itera
         item = group[name] if isinstance(link, h5py.HardLink) else None  # a soft link is another name
         outside = isinstance(item, h5py.Dataset) and (item.external or item.is_virtual)
         if isinstance(link, h5py.ExternalLink) or outside:
-            raise FileFormatError(
-                f"{path}: {full!r} is in another file, and links to other files are not followed; give that file, or "
-                "copy the data into one."
-            )
+            outer = f"{path}: {full!r} is in another file, and links to other files are not followed"
+            raise FileFormatError(f"{outer}; give that file, or copy the data into one.")
         if isinstance(item, h5py.Group) and item not in seen:
             if prefix.count("/") > 32:
                 raise FileFormatError(f"{path}: its groups are nested more than 32 deep.")
@@ -300,10 +288,8 @@ def parquet_arrays(path: Path) -> Arrays:
                 return arrow_numbers(column)
             lengths = pc.call_function("list_value_length", [column]).fill_null(0).to_numpy(zero_copy_only=False)
             for row in np.flatnonzero(lengths != width)[:1]:
-                raise FileFormatError(
-                    f"{path}: column {name!r} has {lengths[row]} elements at row {row}, {width} before; lists must be "
-                    "of one length."
-                )
+                seen = f"{path}: column {name!r} has {lengths[row]} elements at row {row}, {width} before"
+                raise FileFormatError(f"{seen}; lists must be of one length.")
             return arrow_numbers(column.flatten()).reshape(len(column), width)
 
     widths: dict[str, int | None] = {}
@@ -333,11 +319,7 @@ def parquet_arrays(path: Path) -> Arrays:
 ARRAYS: dict[str, Callable[[Path], Arrays]] = {
     ".npz": numpy_arrays,
     ".mat": matlab_arrays,
-    ".h5": hdf5_arrays,
-    ".hdf5": hdf5_arrays,
-    ".parquet": parquet_arrays,
-    ".pq": parquet_arrays,
-    ".json": json_arrays,
-    ".jsonl": json_arrays,
-    ".ndjson": json_arrays,
+    **dict.fromkeys((".h5", ".hdf5"), hdf5_arrays),
+    **dict.fromkeys((".parquet", ".pq"), parquet_arrays),
+    **dict.fromkeys((".json", ".jsonl", ".ndjson"), json_arrays),
 }

@@ -88,21 +88,18 @@ def import_recordings(
     if not paths:
         raise InvalidInput("no logs are given.")
     sources = _sources([Path(path) for path in paths], mapping)
-    lacks = {"may_lack_switches": options.stance == "auto"}
-    plans = [signal_plan(mapping, source, model, **lacks) for _, source in sources]
+    plans = [signal_plan(mapping, source, model, options.stance == "auto") for _, source in sources]
     plan = plans[0]
     for (label, _), other in zip(sources, plans, strict=True):
         if (other.joints, other.logged) != (plan.joints, plan.logged):
-            raise InvalidInput(
-                f"{label} has the signals {other.logged} and {sources[0][0]} {plan.logged}; import alike."
-            )
+            raise InvalidInput(f"{label} has signals {other.logged} and {sources[0][0]} {plan.logged}; import alike.")
     recordings = []
     for index, ((label, source), own) in enumerate(zip(sources, plans, strict=True)):
         tell(index, len(sources), f"reading {label}")
         believed = own.joints if "q" in mapping.unit else ()
         recordings.append(read_recording(source, own, label, options, model.robot, believed))
     step = _even_step(recordings, options)
-    done = _what_was_done(mapping, plan, recordings, step, sources)
+    done = _what_was_done(mapping, plan, recordings, step)
     pieces: list[dict[str, np.ndarray]] = []
     for recording in recordings:
         for number, rows in recording.stretches:
@@ -157,12 +154,10 @@ def _even_step(recordings: Sequence[Recording], options: ImportOptions) -> float
     median = float(np.median([own.step for own in recordings]))
     if not isinstance(options.rate, str):
         if options.rate < 0.9 / median:
-            warnings.warn(
-                f"`rate` {options.rate:g} Hz is below the {1 / median:.6g} Hz of the log; what moves faster than half "
-                "of that appears as slow motion. Filter first: forcegp import --cutoff --every.",
-                DataWarning,
-                stacklevel=3,
-            )
+            seen = f"`rate` {options.rate:g} Hz is below the {1 / median:.6g} Hz of the log"
+            effect = "what moves faster than half of that appears as slow motion"
+            advice = "Filter first: forcegp import --cutoff --every."
+            warnings.warn(f"{seen}; {effect}. {advice}", DataWarning, stacklevel=3)
         return 1.0 / options.rate
     alike = all(abs(own.step / median - 1.0) <= ROUND_RATE for own in recordings)
     if options.rate == "log" or (alike and all(own.worst <= JITTER for own in recordings)):
@@ -172,13 +167,9 @@ def _even_step(recordings: Sequence[Recording], options: ImportOptions) -> float
 
 
 def _what_was_done(
-    mapping: ColumnMapping,
-    plan: SignalPlan,
-    recordings: Sequence[Recording],
-    step: float | None,
-    sources: Sequence[tuple[str, Source]],
+    mapping: ColumnMapping, plan: SignalPlan, recordings: Sequence[Recording], step: float | None
 ) -> dict[str, Any]:
-    files = dict.fromkeys(file for _, source in sources for file in source.files())
+    files = dict.fromkeys(file for recording in recordings for file in recording.source.files())
     made = {"u": "none", "v": "central differences of q", "a": "central differences of v"}
     lacking = {name: max(len(own.layout.derived.get(name, ())) for own in recordings) for name in SIGNALS}
     entries = Counter(item.signal for item in plan.signals)
@@ -213,9 +204,7 @@ class SideBySide(Source):
 
     @cached_property
     def _owners(self) -> Mapping[str, tuple[Source, str]]:
-        return {
-            f"{name}:{column}": (source, column) for name, source in self.sources.items() for column in source.columns()
-        }
+        return {f"{stem}:{own}": (source, own) for stem, source in self.sources.items() for own in source.columns()}
 
     @override
     def columns(self) -> tuple[str, ...]:

@@ -25,7 +25,6 @@ UNIT_OF_A_NAME = re.compile(r"[\[(]([^\d\[(][^\[(]*)[\])]$|_([A-Za-z]{2,})$")
 NUMBERED = re.compile(r"(?P<stem>(?P<word>.*?)[\[(_. ]*)(?P<number>\d{1,4})?[\])]?\s*$")
 COMMA = re.compile(r",(?![^{\[]*[}\]])(?=(?:[^`]*`[^`]*`)*[^`]*$)")
 EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body", "force": "foot=fx,fy,fz"}
-OF_IMU, OF_LINKS = "imu", "torque"  # before the frame of an IMU, and the joint of a torque, in `force`
 BRACES = re.compile(r"\{([^{}]*)\}")
 RANGE = re.compile(r"(\d+)\.\.(\d+)")
 LONGEST_LIST = 4096
@@ -168,10 +167,9 @@ class ColumnMapping:
             raise InvalidInput(f"orientation is {self.orientation!r}; give {', '.join(ORIENTATIONS)}.")
         for signal, names in self.axes.items():
             if not 1 <= len(names) <= 2 or not set(names) <= set(AXES.get(signal, ())) or names[1:] == ("imu",):
-                raise InvalidInput(
-                    f"axes of {signal} are {','.join(names)}; give v body or world, a body, world or imu, or two of "
-                    "them: of the linear and of the angular part, which no `imu` measures as an acceleration."
-                )
+                seen = f"axes of {signal} are {','.join(names)}"
+                kinds = "v body or world, a body, world or imu, or two of them: of the linear and of the angular part"
+                raise InvalidInput(f"{seen}; give {kinds}, which no `imu` measures as an acceleration.")
         for quantity, names in self.unit.items():
             if quantity not in UNITS:
                 raise InvalidInput(f"unit names {quantity!r}; it has {', '.join(UNITS)}.")
@@ -433,10 +431,8 @@ def parse_expression(text: str, columns: Collection[str], owner: str) -> Express
         at_zero = _value(tree, [0.0] * len(words))
         slopes = {name: _value(tree, [float(word == name) for word in words]) - at_zero for name in words}
     except (SyntaxError, ValueError, ArithmeticError, RecursionError, MemoryError) as error:
-        raise InvalidInput(
-            f"{text!r:.200} is no combination of columns: {getattr(error, 'msg', error)}. For example: "
-            "theta2 - theta1, 0.5*`a-b` + pi/2."
-        ) from None
+        seen = f"{text!r:.200} is no combination of columns: {getattr(error, 'msg', error)}"
+        raise InvalidInput(f"{seen}. For example: theta2 - theta1, 0.5*`a-b` + pi/2.") from None
     if not all(map(math.isfinite, (at_zero, *slopes.values()))):
         raise InvalidInput(f"{text!r:.200} has a number that is not finite.")
     for word in words:

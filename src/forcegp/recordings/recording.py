@@ -19,9 +19,12 @@ from forcegp.errors import DatasetError, FileFormatError, MistakenUnit
 from forcegp.recordings.mapping import in_short, log_unit
 from forcegp.recordings.ros_bag import Read, read_on_one_clock
 from forcegp.recordings.signal_plan import Layout, SignalPlan, spans
-from forcegp.recordings.source import MOST_LOST, Columns, Source
+from forcegp.recordings.source import Columns, Source
 from forcegp.robots.manifold import POSITIONS, TURN, ConfigurationSpace
 
+Values = Float[np.ndarray, "rows signals"]
+Times = Float[np.ndarray, " rows"]
+Marked = Bool[np.ndarray, " rows"]
 Jumps = tuple[Int[np.ndarray, " jumps"], str, str]
 """Rows before which something moves too far, what was seen, and what to do."""
 LARGEST_ERROR = 0.01  # of the length of a quaternion: more is no rounding
@@ -57,7 +60,7 @@ class Recording:
     told: dict[str, Any]
     source: Source
     signals: Mapping[str, Float[np.ndarray, "rows _"]]
-    time: Float[np.ndarray, " rows"]
+    time: Times
     begin: float
     jumps: tuple[Jumps, ...]
     layout: Layout
@@ -125,7 +128,7 @@ def read_recording(
     return Recording(about, source, signals, time, begin, (*jumps, *turned), layout, stretches, step, worst)
 
 
-def _unlogged(plan: SignalPlan, values: Float[np.ndarray, "rows signals"]) -> tuple[dict[str, list[int]], list[str]]:
+def _unlogged(plan: SignalPlan, values: Values) -> tuple[dict[str, list[int]], list[str]]:
     """Entries of v and a to be derived, those that hold no number at all among them, which become 0; and remarks."""
     derived, notes = {name: list(rows) for name, rows in plan.layout.derived.items()}, list[str]()
     for name in ("v", "a"):
@@ -139,9 +142,7 @@ def _unlogged(plan: SignalPlan, values: Float[np.ndarray, "rows signals"]) -> tu
     return derived, notes
 
 
-def _lost(
-    label: str, plan: SignalPlan, columns: Columns, values: Float[np.ndarray, "rows signals"], *, skip: bool
-) -> Bool[np.ndarray, " rows"]:
+def _lost(label: str, plan: SignalPlan, columns: Columns, values: Values, *, skip: bool) -> Marked:
     """Rows to leave out: those without any value, and with `skip` those without one of them or without a stamp."""
     missing = np.logical_not(np.isfinite(values))
     there = ~missing.all(axis=0)  # what the log lacks throughout is no loss of rows
@@ -151,16 +152,14 @@ def _lost(
         lost = np.array(missing[:, there].any(axis=1))
         for name in (*(plan.time.weights if plan.time else ()), *([plan.episode] if plan.episode else ())):
             lost |= ~np.isfinite(columns[name])
-    count, rows = int(lost.sum()), len(values)
-    if skip and count > MOST_LOST * rows:
-        raise DatasetError(
-            f"{label}: {count} of {rows} rows lack a value, and `bad_rows` skip leaves out {MOST_LOST:.0%} at most. "
-            "Map other columns, or repair the log."
-        )
-    return lost if count <= MOST_LOST * rows else np.zeros(rows, bool)  # then the first value that is missing is named
+    count, rows, most = int(lost.sum()), len(values), Source.MOST_LOST
+    if skip and count > most * rows:
+        seen = f"{label}: {count} of {rows} rows lack a value, and `bad_rows` skip leaves out {most:.0%} at most"
+        raise DatasetError(f"{seen}. Map other columns, or repair the log.")
+    return lost if count <= most * rows else np.zeros(rows, bool)  # then the first value that is missing is named
 
 
-def _at_ends(plan: SignalPlan, values: np.ndarray, lost: Bool[np.ndarray, " rows"]) -> list[str]:
+def _at_ends(plan: SignalPlan, values: np.ndarray, lost: Marked) -> list[str]:
     """Marks rows in which a sensor stays at an end of its range as lost, and says so."""
     sensors, notes = np.array([item.signal.startswith(SENSORS) for item in plan.signals]), list[str]()
     changes = np.r_[False, (np.diff(values[:, ~sensors], axis=0) != 0.0).any(1)] & ~lost
@@ -183,10 +182,8 @@ def _seconds(plan: SignalPlan, source: Source, columns: Columns, rows: int) -> t
     raw = columns[name] if whole else plan.time.value(columns, rows)
     if not whole and not np.isfinite(raw).all():
         row = int(np.argmin(np.isfinite(raw)))
-        raise DatasetError(
-            f"{source.path}: column {name!r}, the time, is {_shown(raw[row])} at {source.place(row)}. Repair or remove "
-            "that row."
-        )
+        seen = f"{source.path}: column {name!r}, the time, is {_shown(raw[row])} at {source.place(row)}"
+        raise DatasetError(f"{seen}. Repair or remove that row.")
     begin = float(plan.time_unit.in_si(raw[:1].astype(np.float64))[0])
     return plan.time_unit.in_si((raw - raw[0]).astype(np.float64)), begin
 
@@ -209,11 +206,7 @@ def _continued(plan: SignalPlan, values: np.ndarray, begins: np.ndarray, unwrap:
 
 
 def read_poses(
-    space: ConfigurationSpace,
-    orientation: str,
-    source: Source,
-    table: Float[np.ndarray, "rows columns"],
-    begins: Int[np.ndarray, " episodes"],
+    space: ConfigurationSpace, orientation: str, source: Source, table: Values, begins: Int[np.ndarray, " episodes"]
 ) -> tuple[Float[np.ndarray, "rows nq"], list[Jumps], list[str]]:
     """Positions as the log writes them, as q: turns of length 1, quaternions whose sign never jumps.
 
@@ -233,39 +226,34 @@ def read_poses(
             row = int(error.argmax())
             if error[row] > LARGEST_ERROR:
                 names = ", ".join(POSITIONS[TURN])
-                raise DatasetError(
-                    f"{source.path}: the orientation of {group.name!r} ({names}) has the length {length[row, 0]:.4g} "
-                    f"at {source.place(row)}; a turn has length 1. Map its columns, give `orientation` angles if they "
-                    "are roll, pitch and yaw, or repair or remove these rows."
-                )
+                where = f"({names}) has the length {length[row, 0]:.4g} at {source.place(row)}"
+                angles = "give `orientation` angles if they are roll, pitch and yaw"
+                advice = f"a turn has length 1. Map its columns, {angles}, or repair or remove these rows."
+                raise DatasetError(f"{source.path}: the orientation of {group.name!r} {where}; {advice}")
             if error[row] > ROUNDED:
                 notes.append(f"orientations divided by their length, which differs from 1 by up to {error[row]:.2g}")
             turn = given[:, first:] / length
         turn, jumped = following(turn, turn[0])
         jumped[begins] = False
         seen = f"{group.name!r} turns by more than a quarter of a turn"
-        remedy = (
-            "give the order of its columns (`orientation`), the unit of its angles (`unit` q=deg), or leave it out."
-        )
+        unit = "the unit of its angles (`unit` q=deg)"
+        remedy = f"give the order of its columns (`orientation`), {unit}, or leave it out."
         jumps.append((np.flatnonzero(jumped), seen, remedy))
         q = np.hstack([q[:, : group.place], given[:, :first], turn, q[:, group.place :]])
     return q, jumps, notes
 
 
-def _require_finite(
-    values: np.ndarray, columns: Columns, plan: SignalPlan, source: Source, time: Float[np.ndarray, " rows"]
-) -> None:
+def _require_finite(values: np.ndarray, columns: Columns, plan: SignalPlan, source: Source, time: Times) -> None:
     if np.isfinite(values).all():
         return
     row, index = (int(position) for position in np.argwhere(~np.isfinite(values))[0])
     item = plan.signals[index]
     wrong = [name for name in item.expression.weights if not np.isfinite(columns[name][row])]
     name, value = (wrong[0], columns[wrong[0]][row]) if wrong else (item.expression.text, values[row, index])
-    raise DatasetError(
-        f"{source.path}: column {name!r} ({item.signal} of joint {item.joint!r}) is {_shown(value)} at "
-        f"{source.place(row)}, {time[row]:.6g} s from the start; {int((~np.isfinite(values)).sum())} such values. "
-        "Repair these rows, map another column, or leave such rows out by `bad_rows` skip."
-    )
+    seen = f"{source.path}: column {name!r} ({item.signal} of joint {item.joint!r}) is {_shown(value)}"
+    where = f"{source.place(row)}, {time[row]:.6g} s from the start; {int((~np.isfinite(values)).sum())} such values"
+    advice = "Repair these rows, map another column, or leave such rows out by `bad_rows` skip."
+    raise DatasetError(f"{seen} at {where}. {advice}")
 
 
 def _shown(value: float) -> str:
@@ -283,19 +271,13 @@ def _episodes(column: np.ndarray, source: Source) -> Int[np.ndarray, "n 2"]:
     own = numbers[starts].astype(np.int64)
     again = np.setdiff1d(np.arange(len(own)), np.unique(own, return_index=True)[1])
     if len(again):
-        raise DatasetError(
-            f"{source.path}: episode {own[again[0]]} begins again at {source.place(int(starts[again[0]]))}; rows of an "
-            "episode must lie together. Sort the log by episode and time."
-        )
+        seen = f"{source.path}: episode {own[again[0]]} begins again at {source.place(int(starts[again[0]]))}"
+        raise DatasetError(f"{seen}; rows of an episode must lie together. Sort the log by episode and time.")
     return np.stack([own, starts], axis=1)
 
 
 def _require_plausible_positions(
-    label: str,
-    values: Float[np.ndarray, "rows signals"],
-    plan: SignalPlan,
-    robot: forcegp.robots.Robot,
-    believed: Collection[str],
+    label: str, values: Values, plan: SignalPlan, robot: forcegp.robots.Robot, believed: Collection[str]
 ) -> None:
     """Refuse positions far beyond the limits of the URDF; without limits, those that look like degrees."""
     limits = {joint.name: (joint.lower, joint.upper) for joint in robot.joints}
@@ -330,7 +312,7 @@ def _require_plausible_positions(
 
 
 def _stretches(
-    label: str, source: Source, time: Float[np.ndarray, " rows"], episodes: np.ndarray, read: Read, options: Any
+    label: str, source: Source, time: Times, episodes: np.ndarray, read: Read, options: Any
 ) -> tuple[tuple[tuple[int, np.ndarray], ...], float, float, dict[str, Any]]:
     """Rows between gaps, their median step, the worst relative deviation from it, and what was left out.
 
@@ -341,11 +323,10 @@ def _stretches(
     backwards = np.flatnonzero(steps < 0)
     if backwards.size:
         row = int(backwards[0]) + 1
-        raise DatasetError(
-            f"{label}: time runs backwards by {-steps[row - 1]:.6g} s at {source.place(row)} ({time[row]:.6g} s from "
-            f"the start), {backwards.size} times in all. Sort the log, map another column as the time, or name the "
-            "column that numbers its episodes (`episode`)."
-        )
+        where = f"{source.place(row)} ({time[row]:.6g} s from the start), {backwards.size} times in all"
+        seen = f"{label}: time runs backwards by {-steps[row - 1]:.6g} s at {where}"
+        advice = "map another column as the time, or name the column that numbers its episodes (`episode`)."
+        raise DatasetError(f"{seen}. Sort the log, {advice}")
     positive = steps[steps > 0]
     if len(time) < FEWEST_ROWS:
         raise DatasetError(f"{label} has {len(time)} rows; an episode has at least {FEWEST_ROWS}.")
@@ -372,10 +353,8 @@ def _stretches(
     pieces = np.split(np.arange(len(used)), np.flatnonzero(~inside) + 1)
     stretches = [(int(episodes[number[own[0]], 0]), used[own]) for own in pieces if len(own) >= FEWEST_ROWS]
     if not stretches:
-        raise DatasetError(
-            f"{label}: no {FEWEST_ROWS} rows lie together without a gap of more than {limit:.6g} s; "
-            "a longer `gap` may be right."
-        )
+        seen = f"{label}: no {FEWEST_ROWS} rows lie together without a gap of more than {limit:.6g} s"
+        raise DatasetError(f"{seen}; a longer `gap` may be right.")
     worst = float(np.abs(between[inside] / step - 1.0).max())
     left_out = {"repeated_stamps_dropped": repeated, "gaps": between[same & ~inside].tolist()}
     left_out["rows_in_stretches_too_short"] = len(used) - sum(len(rows) for _, rows in stretches)

@@ -134,10 +134,8 @@ class RosBag(Source):
     def table(self, names: Sequence[str]) -> Columns:
         topics = sorted({self.topic_of(name) for name in names})
         if len(topics) != 1:
-            raise InvalidInput(
-                f"{self.path}: the columns come from the topics {', '.join(topics)}, whose messages have times of "
-                "their own; read them one by one."
-            )
+            seen = f"{self.path}: the columns come from the topics {', '.join(topics)}"
+            raise InvalidInput(f"{seen}, whose messages have times of their own; read them one by one.")
         answer, columns = self._answer({"topic": topics[0], "wanted": [name[len(topics[0]) + 1 :] for name in names]})
         self._left_out = answer["left_out"]
         return dict(zip(names, columns, strict=True))
@@ -308,10 +306,9 @@ def read_on_one_clock(source: Source, plan: Any) -> Read:
         notes += source.notes()
         steps = np.diff(track[stamp]) * seconds
         if len(steps) and steps.min() < 0.0:
-            raise DatasetError(
-                f"{source.path}: the stamps of {topic} run backwards by {-steps.min():.6g} s; topics are joined in the "
-                f"order of time. Name `time` {clock}:{LOG_TIME}, or mend the bag."
-            )
+            seen = f"{source.path}: the stamps of {topic} run backwards by {-steps.min():.6g} s"
+            advice = f"topics are joined in the order of time. Name `time` {clock}:{LOG_TIME}, or mend the bag."
+            raise DatasetError(f"{seen}; {advice}")
         largest = np.array([most.get(name, np.inf) for name in own[topic]])
         places = [[own[topic].index(name) for name in turn] for turn in turns.values() if {*turn} <= {*own[topic]}]
         table = np.stack([track[name] for name in own[topic]], axis=1).astype(np.float64)
@@ -322,10 +319,8 @@ def read_on_one_clock(source: Source, plan: Any) -> Read:
         tracks.append((float(np.median(steps)) if len(steps) else np.inf, ages * seconds))
         found |= {name: values[:, column] for column, name in enumerate(own[topic])}
     if not kept.any():
-        raise DatasetError(
-            f"{source.path}: the stamps of {', '.join(own)} do not overlap; compare their clocks, or name `time` "
-            f"{clock}:{LOG_TIME}."
-        )
+        seen = f"{source.path}: the stamps of {', '.join(own)} do not overlap"
+        raise DatasetError(f"{seen}; compare their clocks, or name `time` {clock}:{LOG_TIME}.")
     outside = int((~kept).sum())
     lost = f"; {outside} rows before the first or behind the last message of a topic left out" * bool(outside)
     notes.append(f"rows are those of {clock}: {', '.join(ways)}{lost}")

@@ -15,8 +15,6 @@ from forcegp.data.configurations import in_base
 from forcegp.data.dataset import FORCE, IMU, ROTATION, TORQUE, TRANSLATION, imu_place
 from forcegp.errors import FileFormatError, InvalidInput, require_known
 from forcegp.recordings.mapping import (
-    OF_IMU,
-    OF_LINKS,
     ORIENTATIONS,
     SIGNALS,
     UNITS,
@@ -44,6 +42,7 @@ TURNED = ("y", "z", "qy", "qz", "sin", "ry", "rz", "pitch", "yaw")
 """What changes sign by half a turn of world and base about x: north, east, down becomes north, west, up."""
 LACKING = Expression("derive", {}, ast.Constant(0.0), ())
 """This very object: an entry of v or a that the log lacks, which is differentiated, or a switch of a contact."""
+OF_IMU, OF_LINKS = "imu", "torque"  # before the frame of an IMU, and the joint of a torque, in `force`
 LACKS = re.compile(r"derive\d*")
 EPISODE = "episode_index"  # numbers the episodes where nothing else is stated, as in datasets of LeRobot
 MOST_NAMES = 40  # of columns in a message
@@ -146,13 +145,11 @@ class SignalPlan:
         return tuple(dict.fromkeys([*needed, *([] if self.episode is None else [self.episode])]))
 
 
-def signal_plan(
-    mapping: ColumnMapping, source: Source, model: forcegp.Model, *, may_lack_switches: bool = False
-) -> SignalPlan:
+def signal_plan(mapping: ColumnMapping, source: Source, model: forcegp.Model, open_u: bool = False) -> SignalPlan:
     """What a mapping means for this table, with joints in the order of the robot.
 
     Signals that the mapping does not name are looked for by the names of the joints (`guessed` lists what was found).
-    With `may_lack_switches`, u may end with the actuators.
+    With `open_u` it may end with the actuators, without switches of contacts.
     Raises InvalidInput for columns, joints and numbers of them that do not fit, FileFormatError for missing columns.
     """
     robot = model.robot
@@ -171,7 +168,7 @@ def signal_plan(
                 rest = guessed_columns(signal, joints, source) if joints else ()
                 found_by = {**dict(zip(own, pose or (), strict=False)), **dict(zip(joints, rest or (), strict=False))}
                 patterns = tuple(found_by[name] for name in names) if len(found_by) == len(names) else None
-            if patterns is None and signal == "u" and may_lack_switches and model.actuators:
+            if patterns is None and signal == "u" and open_u and model.actuators:
                 patterns = guessed_columns(signal, names[: len(model.actuators)], source)
             if patterns is None and signal in by_number and {*names} <= {*joints}:
                 patterns = counted_columns(signal, len(names), source)
@@ -181,28 +178,22 @@ def signal_plan(
                 found[signal] = [parse_expression(name, [name], str(source.path)) for name in patterns]
         elif patterns is not None:
             found[signal] = _expressions(patterns, joints, source, may_lack=signal in ("v", "a"))
-    switches = len({x.switch for x in (model.contacts if may_lack_switches else ())} - {None})
+    switches = len({x.switch for x in (model.contacts if open_u else ())} - {None})
     if switches and len(found.get("u", ())) == len(model.inputs) - switches:
         found["u"] = [*found.get("u", ()), *[LACKING] * switches]
     for signal, why in (("q", "positions"), ("u", "forces or efforts of the actuators; 0 for a passive robot")):
         if signal not in found and log[signal]:
             lacking = [name for name in joints if not any(map(named_after(name).search, source.columns()))]
-            raise InvalidInput(
-                f"no columns for {signal} ({why}); name them with --{signal}"
-                + (f", in the order {', '.join(log[signal])} (angles: `orientation`)" if robot.space.groups else "")
-                + f". {source.path} has {listed(source.columns(), MOST_NAMES)}"
-                + f"; no column is named after {listed(lacking)} (`locked` holds what was not recorded)"
-                * (0 < len(lacking) < len(joints))
-                + "."
-            )
+            in_order = f", in the order {', '.join(log[signal])} (angles: `orientation`)" * bool(robot.space.groups)
+            few = f"; no column is named after {listed(lacking)} (`locked` holds what was not recorded)"
+            there = f"{source.path} has {listed(source.columns(), MOST_NAMES)}{few * (0 < len(lacking) < len(joints))}"
+            raise InvalidInput(f"no columns for {signal} ({why}); name them with --{signal}{in_order}. {there}.")
     if mapping.time is None and mapping.step is None:
         used = [name for expressions in found.values() for item in expressions for name in item.weights]
         name = guessed_time(source, used)
         if name is None:
-            raise InvalidInput(
-                "no column for the time; name it with `time`, or `step` for the time between rows. "
-                f"{source.path} has {listed(source.columns(), MOST_NAMES)}."
-            )
+            seen = "no column for the time; name it with `time`, or `step` for the time between rows"
+            raise InvalidInput(f"{seen}. {source.path} has {listed(source.columns(), MOST_NAMES)}.")
         guessed.append(f"time = {name}")
         time = parse_expression(name, [name], str(source.path))
     else:
@@ -268,10 +259,8 @@ def _joints(mapping: ColumnMapping, robot: Robot) -> tuple[str, ...]:
         raise InvalidInput(f"{stated[0]} is about a base that moves; give a robot with one, by base='floating'.")
     own = robot.single_joint_names
     if mapping.joints and sorted(mapping.joints) != sorted(own):
-        raise InvalidInput(
-            f"the mapping names the joints {', '.join(mapping.joints)}; {robot.name!r} has {', '.join(own)}. "
-            "Give the columns of exactly these, or another `model`."
-        )
+        seen = f"the mapping names the joints {', '.join(mapping.joints)}; {robot.name!r} has {', '.join(own)}"
+        raise InvalidInput(f"{seen}. Give the columns of exactly these, or another `model`.")
     return mapping.joints or own
 
 
@@ -327,16 +316,14 @@ def _signals(
         what = "joints" if plain and names else {"q": "positions", "u": "inputs"}.get(signal, "velocities")
         remedy = "name one column for each"
         if signal == "q" and not plain and len(expressions) == len(set(names) & set(joints)):
-            remedy = (
-                "the base was not measured: record its pose by motion capture or a state estimator (position and "
-                "quaternion). Without, learn joint friction on a stand: a robot with `base` fixed."
-            )
+            pose = "its pose by motion capture or a state estimator (position and quaternion)"
+            stand = "Without, learn joint friction on a stand: a robot with `base` fixed."
+            remedy = f"the base was not measured: record {pose}. {stand}"
         elif signal in "qu":
             more = {"q": "angles of a base have `orientation` angles", "u": "0 for a joint that nothing drives"}
             remedy = f"{remedy}; {more[signal]}." if names else "leave u out, or give actuators (`identified`)."
-        raise InvalidInput(
-            f"{signal} has {len(expressions)} columns for {len(names)} {what} ({', '.join(names) or 'none'}); {remedy}"
-        )
+        seen = f"{signal} has {len(expressions)} columns for {len(names)} {what} ({', '.join(names) or 'none'})"
+        raise InvalidInput(f"{seen}; {remedy}")
     units = [{named_unit(signal, name, source.units) for name in x.weights} for x in expressions]
     named = [
         next(iter(u)) if len(u) == 1 and not x.has_numbers else None for u, x in zip(units, expressions, strict=True)
@@ -351,10 +338,9 @@ def _signals(
         unit = _unit(signal, given, index, columns)
         if si not in (None, unit.si):
             kind = "is part of a turn" if si == "1" else "turns" if si in ROTATION.values() else "slides"
-            raise InvalidInput(
-                f"unit of {signal} of joint {name!r} is {unit.name}, but the joint {kind}: give a unit of {si}, or one "
-                "per joint."
-            )
+            seen = f"unit of {signal} of joint {name!r} is {unit.name}, but the joint {kind}"
+            advice = f"give a unit of {si}, or one per joint."
+            raise InvalidInput(f"{seen}: {advice}")
         if len(signs) not in (1, len(names)):
             raise InvalidInput(f"sign of {signal} has {len(signs)} entries; give one, or {len(names)}, one per joint.")
         sign = signs[index if len(signs) > 1 else 0]
@@ -370,10 +356,9 @@ def _unit(signal: str, given: Sequence[LogUnit], index: int, columns: Mapping[st
     idle = [unit.name for unit in given if not any(unit in own for own in fitting)]
     if idle or any(len(own) > 1 for own in fitting):
         needed = ", ".join(dict.fromkeys(kind or "the actuators" for kind in kinds))
-        raise InvalidInput(
-            f"unit of {signal} is {', '.join(unit.name for unit in given)}; give at most one of each kind ({needed}), "
-            f"or one for each of the {len(kinds)} columns."
-        )
+        seen = f"unit of {signal} is {', '.join(unit.name for unit in given)}"
+        advice = f"give at most one of each kind ({needed}), or one for each of the {len(kinds)} columns."
+        raise InvalidInput(f"{seen}; {advice}")
     return fitting[index][0] if fitting[index] else log_unit(signal, kinds[index] or "1")
 
 
@@ -439,9 +424,7 @@ def layout_of(mapping: ColumnMapping, model: forcegp.Model, lacking: Mapping[str
     derived = {name: [row for row, lacks in enumerate(own) if lacks] for name, own in lacking.items()}
     axes = {name: (own[0], own[-1] if own[-1] != "imu" else "body") for name, own in mapping.axes.items()}
     for name in axes.keys() - lacking.keys() - ({"force"} if mapping.force else set()):
-        raise InvalidInput(
-            f"axes of {name} are stated, but the log has no {name}; name its columns, or leave axes out."
-        )
+        raise InvalidInput(f"axes of {name} are stated, and the log has no {name}; name its columns, or leave it out.")
     for name, group in ((name, group) for name in axes if name != "force" for group in groups):
         for part, words in (((0, 1, 2), "linear"), ((3, 4, 5), "angular")):
             rows = {group.row + k for k in part}

@@ -17,7 +17,6 @@ Columns = dict[str, np.ndarray]
 """Columns of equal length by name: float64 (rows,), or int64 where the file holds integers (stamps in nanoseconds)."""
 
 LONGEST_VECTOR = 4096  # columns of a table in one array; wider ones are pictures and the like, not signals of joints
-MOST_LOST = 0.05  # of the rows: a driver loses single messages; what lacks more is another topic, sensor or log
 ELEMENT = re.compile(r"(?P<vector>.*)\[\d+\]$", re.DOTALL)
 LARGEST_EXPANSION = 200
 """Logs of sensors shrink by a factor of 2 to 20, numbers written as text with all digits by 50 at most."""
@@ -35,6 +34,8 @@ class Source(ABC):
     Raises FileFormatError, with the path and what to do, from the constructor or from any method.
     """
 
+    MOST_LOST: ClassVar[float] = 0.05
+    """Of the rows: a driver loses single messages; what lacks more is another topic, sensor or log."""
     lenient = False
     """Whether rows that cannot be read, up to MOST_LOST of them, are left out."""
     units: Mapping[str, str] = MappingProxyType({})
@@ -96,10 +97,8 @@ def require_distinct(path: Path, names: Sequence[str]) -> None:
     repeated = sorted(name for name, count in Counter(names).items() if count > 1)
     if repeated:
         places = [str(index + 1) for index, name in enumerate(names) if name == repeated[0]]
-        raise FileFormatError(
-            f"{path}: column name {repeated[0]!r} stands over columns {', '.join(places)}; "
-            "rename all but one in the header."
-        )
+        seen = f"{path}: column name {repeated[0]!r} stands over columns {', '.join(places)}"
+        raise FileFormatError(f"{seen}; rename all but one in the header.")
 
 
 def element_names(name: str, width: int) -> list[str]:
@@ -122,17 +121,13 @@ def reading(path: Path, what: str) -> Iterator[None]:
         raise
     except Exception as error:  # parsers raise what their authors did not think of: a TokenError for a header of NumPy
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise FileFormatError(
-            f"{path} cannot be read as {what}: {reason.rstrip('.')}. It may be truncated or of another format; "
-            "copy or write it again."
-        ) from error
+        seen = f"{path} cannot be read as {what}: {reason.rstrip('.')}. It may be truncated or of another format"
+        raise FileFormatError(f"{seen}; copy or write it again.") from error
 
 
 def require_plausible_size(path: Path, what: str, declared: int, stored: int) -> None:
     """Refuse what claims to hold far more than it stores. Sizes in bytes. Raises FileFormatError."""
     if declared > HARMLESS and declared > LARGEST_EXPANSION * max(stored, 1):
-        raise FileFormatError(
-            f"{path}: {what} claims {declared / 2**20:.0f} MiB in {stored / 2**10:.0f} KiB of the file, more than "
-            f"{LARGEST_EXPANSION} times as much, and no log of sensors shrinks so far: it is truncated or no log. "
-            "Copy or write it again."
-        )
+        seen = f"{path}: {what} claims {declared / 2**20:.0f} MiB in {stored / 2**10:.0f} KiB of the file"
+        why = f"more than {LARGEST_EXPANSION} times as much, and no log of sensors shrinks so far"
+        raise FileFormatError(f"{seen}, {why}: it is truncated or no log. Copy or write it again.")

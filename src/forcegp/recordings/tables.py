@@ -21,15 +21,7 @@ from typing_extensions import override
 
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput
 from forcegp.recordings.mapping import UNITS, named_unit
-from forcegp.recordings.source import (
-    MOST_LOST,
-    Columns,
-    Source,
-    arrow_numbers,
-    reading,
-    require_distinct,
-    require_plausible_size,
-)
+from forcegp.recordings.source import Columns, Source, arrow_numbers, reading, require_distinct, require_plausible_size
 
 FIRST_BYTES = 2**16  # what is looked at to detect the header, the delimiter and whether there are comments
 BLOCK = 2**22  # bytes that pyarrow parses at a time; no line may be longer
@@ -46,9 +38,7 @@ _TIME = re.compile(
 _UNITS = {unit.lower() for units in UNITS.values() for unit in units} | {"%", "sec", "°", "°/s", "-", "", "degrees"}
 _REMEDY = "Repair or remove it, or leave such rows out by `bad_rows` skip."
 LAST_LINES = 20  # of those that are looked at: they are rows, whatever stands above
-_CONVERSION = re.compile(
-    r"In CSV column #(\d+): Row #(\d+): CSV conversion error to \w+: invalid value '(.*)'", re.DOTALL
-)
+_REFUSED = re.compile(r"In CSV column #(\d+): Row #(\d+): CSV conversion error to \w+: invalid value '(.*)'", re.DOTALL)
 _RAGGED = re.compile(r"Row #(\d+): Expected (\d+) columns, got (\d+)")
 
 
@@ -91,9 +81,8 @@ class DelimitedText(Source):
                 stream = io.BufferedReader(io.BytesIO(text.encode()), 2**20)
                 first = stream.peek(FIRST_BYTES)[:FIRST_BYTES]
             if b"\0" in first:
-                raise FileFormatError(
-                    f"{path} holds binary data, not text; if it is another format, give it that format's extension."
-                )
+                seen = f"{path} holds binary data, not text"
+                raise FileFormatError(f"{seen}; if it is another format, give it that format's extension.")
         except BaseException:
             stream.close()
             raise
@@ -130,10 +119,9 @@ class DelimitedText(Source):
         fields = table[begin] if begin < len(table) else []
         self._lines_per_row = 1
         if headerless is not None and (begin or len(fields) not in (1, headerless)):
-            raise FileFormatError(
-                f"{self.path} begins with {len(table[0])} fields, the first of them {table[0][0]!r}; `headerless` is "
-                f"{headerless}: so many numbers on every line, or one. Give another, or leave it out."
-            )
+            seen = f"{self.path} begins with {len(table[0])} fields, the first of them {table[0][0]!r}"
+            asked = f"`headerless` is {headerless}: so many numbers on every line, or one"
+            raise FileFormatError(f"{seen}; {asked}. Give another, or leave it out.")
         if not begin:
             self._lines_per_row = (headerless or 1) // len(fields) or 1
             named = self._fields(comments[-1]) if comments and headerless is None else []
@@ -203,10 +191,8 @@ class DelimitedText(Source):
             return columns
         values, width = columns["c1"], self._lines_per_row
         if len(values) % width:
-            raise FileFormatError(
-                f"{self.path} has {len(values)} numbers, which is no multiple of {width}; another `headerless` may be "
-                "right, or the file is truncated."
-            )
+            seen = f"{self.path} has {len(values)} numbers, which is no multiple of {width}"
+            raise FileFormatError(f"{seen}; another `headerless` may be right, or the file is truncated.")
         return {name: values[self._columns.index(name) :: width] for name in names}
 
     def _parsed(self, stored: list[str], wanted: list[str], kinds: dict[str, Any], again: bool = False) -> Any:
@@ -238,15 +224,14 @@ class DelimitedText(Source):
             except pa.ArrowInvalid as error:
                 if not again:
                     return self._parsed(stored, wanted, kinds, again=True)
-                found = _CONVERSION.search(str(error))
+                found = _REFUSED.search(str(error))
                 if self.lenient and found and len(self._no_numbers) < LAST_LINES:
                     self._no_numbers.append(found[3])
                     return self._parsed(stored, wanted, kinds, again=True)
                 raise self._told_by_pyarrow(error) from error
-            if len(ragged) > MOST_LOST * (len(table) + len(ragged)):
-                raise FileFormatError(
-                    f"{self.path}: {len(ragged)} lines have other than {len(stored)} fields; repair it."
-                )
+            if len(ragged) > self.MOST_LOST * (len(table) + len(ragged)):
+                seen = f"{self.path}: {len(ragged)} lines have other than {len(stored)} fields"
+                raise FileFormatError(f"{seen}; repair it.")
             if ragged:
                 self._notes += [f"lines left out because they have other than {len(stored)} fields: {len(ragged)}"]
             if cut:
@@ -260,7 +245,7 @@ class DelimitedText(Source):
         def line(number: str) -> str:
             return self.place((int(number) - 1) // self._lines_per_row)  # pyarrow counts from 1
 
-        if found := _CONVERSION.search(text):
+        if found := _REFUSED.search(text):
             name = "c1" if self._lines_per_row > 1 else self._columns[int(found[1])]
             text = f"column {name!r} holds {found[3]!r} at {line(found[2])}, which is no number. {_REMEDY}"
         elif found := _RAGGED.search(text):

@@ -115,7 +115,7 @@ def recorded_scene(
             arrows = learned_forces(posterior, dynamics)
         else:
             dynamics = model.dynamics(q, v, u)
-            arrows = [_at_joints(model.robot, dynamics, "recorded u", dynamics.state.delivered, None)]
+            arrows = [_at_joints(dynamics, "recorded u", dynamics.state.delivered, None)]
     poses = poses_of_links(model.robot, q, [shape.link for shape in drawn])
     time = rows.time - rows.time[0]
     return RecordedScene(model.robot, time, rows.q, drawn, poses, arrows, reach(model.robot), doubts)
@@ -137,7 +137,7 @@ def learned_forces(posterior: Posterior, dynamics: ConstrainedDynamics) -> list[
         own = latents.through(B * of_joints)
         mean = own.mean + sum(force.force(dynamics.state).expand_as(own.mean) for force in forces)
         title = "learned joint forces" if posterior.carries_known_forces else "friction and other joint forces"
-        groups.append(_at_joints(robot, dynamics, title, mean, own.std))
+        groups.append(_at_joints(dynamics, title, mean, own.std))
     if dynamics.contacts:
         map_ = dynamics.contact_force_map()
         matrix, offset = map_.matrix.unflatten(-2, (-1, 3)), map_.offset.unflatten(-1, (-1, 3))
@@ -162,11 +162,9 @@ def _place(term: Unknown, dynamics: ConstrainedDynamics) -> torch.Tensor:
     return placed(dynamics.state.kinematics, frame, getattr(term, "point", (0.0, 0.0, 0.0)))[1]
 
 
-def _at_joints(
-    robot: Robot, dynamics: ConstrainedDynamics, title: str, mean: torch.Tensor, std: torch.Tensor | None
-) -> Arrows:
+def _at_joints(dynamics: ConstrainedDynamics, title: str, mean: torch.Tensor, std: torch.Tensor | None) -> Arrows:
     """Forces of joints along their axes, from their origins."""
-    starts, axes = [], []
+    robot, starts, axes = dynamics.state.robot, [], []
     for joint in robot.joints:
         pose = dynamics.state.kinematics.frame_pose(joint.child)
         axis = torch.tensor(joint.axis, dtype=pose.dtype, device=pose.device)

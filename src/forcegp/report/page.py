@@ -86,10 +86,8 @@ def scores_sentence(scores: Scores, model: str | None = None) -> str:
     """What was found of one model, in one sentence."""
     error, known, held = (scores.value(x, model=model) or 0.0 for x in ("mae", "known_physics_mae", "coverage_95"))
     better = f", a factor {known / error:.3g} less than known physics alone" if known > error > 0.0 else ""
-    return (
-        f"On unseen rows, the mean absolute error of the acceleration is {error:.3g} {unit_of(scores, 'a')}{better}; "
-        f"95 % intervals contain {100.0 * held:.0f} %."
-    )
+    seen = f"the mean absolute error of the acceleration is {error:.3g} {unit_of(scores, 'a')}{better}"
+    return f"On unseen rows, {seen}; 95 % intervals contain {100.0 * held:.0f} %."
 
 
 def scores_table(scores: Scores, names: Mapping[str, str] | None = None) -> Table:

@@ -29,10 +29,8 @@ def real_array(name: str, given: Any, kinds: str = "fiu", error: type[ForceGPErr
     kind = "real numbers" if "f" in kinds else "integers"
     if np.ma.is_masked(given):
         where = np.argwhere(np.ma.getmaskarray(given))
-        raise error(
-            f"{name} has {len(where)} masked values, the first at {tuple(where[0].tolist())}; a mask would be lost: "
-            "drop these rows, or fill them with numbers that were measured."
-        )
+        seen = f"{name} has {len(where)} masked values, the first at {tuple(where[0].tolist())}"
+        raise error(f"{seen}; a mask would be lost: drop these rows, or fill them with numbers that were measured.")
     try:
         values = np.asarray(given)
     except (TypeError, ValueError, RuntimeError) as cause:  # ragged lists, tensors that require a gradient
@@ -59,10 +57,9 @@ def require_finite(name: str, values: Tensor) -> None:
         # the sum takes half as long, and is finite where all numbers are, unless they are very large
         finite = math.isfinite(float(values.detach().sum())) or bool(torch.isfinite(values.detach()).all())
     except RuntimeError:
-        raise InvalidInput(
-            f"{name} comes from torch.func.vmap, inside which numbers cannot be checked; batch dimensions lead, so "
-            "call this once without vmap, with all states as rows (n, nv)."
-        ) from None
+        seen = f"{name} comes from torch.func.vmap, inside which numbers cannot be checked"
+        advice = "batch dimensions lead, so call this once without vmap, with all states as rows (n, nv)."
+        raise InvalidInput(f"{seen}; {advice}") from None
     if not finite:
         raise InvalidInput(f"{name} has values that are not finite; drop or repair those rows.")
 
@@ -86,10 +83,8 @@ def usable_device(device: torch.device | str) -> torch.device:
         torch.zeros(1, dtype=torch.float64, device=asked)
     except (RuntimeError, AssertionError, TypeError, NotImplementedError):  # as torch's backends happen to raise
         there = ["cpu", *(f"cuda:{k}" for k in range(torch.cuda.device_count()))]
-        raise InvalidInput(
-            f"device {str(device)!r} cannot be used here; there is {', '.join(there)} for torch {torch.__version__} "
-            "(docs/how-to/gpu.md names builds for GPUs)."
-        ) from None
+        seen = f"device {str(device)!r} cannot be used here; there is {', '.join(there)} for torch {torch.__version__}"
+        raise InvalidInput(f"{seen} (docs/how-to/gpu.md names builds for GPUs).") from None
     return asked
 
 
@@ -105,16 +100,13 @@ Positions = Float[Tensor, "*#batch nq"]
 def checked_tensor(name: str, value: object, size: int, meaning: str, device: torch.device) -> Tensor:
     """The tensor in float64; :class:`~forcegp.errors.InvalidInput` unless it is real (..., size) on ``device``."""
     if not isinstance(value, Tensor):
-        raise InvalidInput(
-            f"{name} is a {type(value).__name__}; give a tensor: torch.as_tensor({name}, dtype=torch.float64)."
-        )
+        seen = f"{name} is a {type(value).__name__}"
+        raise InvalidInput(f"{seen}; give a tensor: torch.as_tensor({name}, dtype=torch.float64).")
     if value.dim() == 0 or value.shape[-1] != size:
         raise InvalidInput(f"{name} has shape {tuple(value.shape)}; its last dimension must be {size} ({meaning}).")
     if value.device != device:
-        raise InvalidInput(
-            f"{name} is on {value.device} but the robot on {device}; use robot.to({str(value.device)!r}) "
-            f"or {name}.to({str(device)!r})."
-        )
+        seen = f"{name} is on {value.device} but the robot on {device}"
+        raise InvalidInput(f"{seen}; use robot.to({str(value.device)!r}) or {name}.to({str(device)!r}).")
     return real_tensor(name, value, device)
 
 
@@ -127,9 +119,8 @@ def broadcast_batch(shapes: Mapping[str, torch.Size]) -> torch.Size:
         return torch.broadcast_shapes(*shapes.values())
     except RuntimeError:
         listed = ", ".join(f"{name} {tuple(shape)}" for name, shape in shapes.items())
-        raise InvalidInput(
-            f"batch shapes do not broadcast: {listed}; make them equal, or 1 where one value serves all."
-        ) from None
+        seen = f"batch shapes do not broadcast: {listed}"
+        raise InvalidInput(f"{seen}; make them equal, or 1 where one value serves all.") from None
 
 
 def finite_vector(name: str, values: Any, size: int, meaning: str = "") -> np.ndarray:

@@ -67,10 +67,8 @@ class CompiledRobot(RigidBodyDynamics):
 
     def __init__(self, robot: RobotStructure, folder: str | Path | None = None) -> None:
         if robot.device.type != "cpu":
-            raise InvalidInput(
-                f"compiled dynamics runs on the CPU, and the robot is on {robot.device}; compile robot.to('cpu'), or "
-                "use the robot itself."
-            )
+            seen = f"compiled dynamics runs on the CPU, and the robot is on {robot.device}"
+            raise InvalidInput(f"{seen}; compile robot.to('cpu'), or use the robot itself.")
         self.robot = robot
         self.folder = default_folder() if folder is None else Path(folder).expanduser()
         self._nv, self._space = robot.nv, robot.space

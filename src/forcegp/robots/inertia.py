@@ -116,10 +116,8 @@ def physical_objection(mass: float, center_of_mass: np.ndarray, inertia: np.ndar
     if moments[0] < -slack:
         return f"its inertia is not positive definite (principal moments {listed} kg m^2)"
     if moments[0] + moments[1] < moments[2] - slack:
-        return (
-            f"its principal moments {listed} kg m^2 break the triangle inequality "
-            "(the two smaller must add up to the largest at least)"
-        )
+        rule = "the triangle inequality (the two smaller must add up to the largest at least)"
+        return f"its principal moments {listed} kg m^2 break {rule}"
     return None
 
 

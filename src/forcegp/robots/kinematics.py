@@ -18,7 +18,7 @@ from forcegp.robots.arguments import JointValues, Vector, broadcast_batch, check
 from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_basis
 from forcegp.robots.layout import WORLD
 from forcegp.robots.manifold import Group, pose
-from forcegp.robots.structure import RobotStructure, Tree
+from forcegp.robots.structure import Forces, MassMatrix, RobotStructure, Tree
 
 Bodies = Float[Tensor, "n 4 4 batch"]
 """A 4x4 matrix of every body: its pose or its pseudo-inertia."""
@@ -155,32 +155,32 @@ class Kinematics:
         """Pseudo-inertias of the bodies in the world."""
         return world_inertias(self.poses, self.robot.tree.inertias)
 
-    def mass_matrix(self) -> Float[Tensor, "... nv nv"]:
+    def mass_matrix(self) -> MassMatrix:
         """Mass matrix M (..., nv, nv) in kg m^2 or kg, armature on the diagonal."""
         return self._rows(self._mass_matrix(self.inertias))
 
-    def bias_forces(self) -> Float[Tensor, "... nv"]:
+    def bias_forces(self) -> Forces:
         """Coriolis, centrifugal and gravity forces (..., nv) in Nm or N: the tau that gives zero acceleration."""
         return self._rows(self._bias_forces(self.inertias))
 
-    def mass_matrix_and_bias(self) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
+    def mass_matrix_and_bias(self) -> tuple[MassMatrix, Forces]:
         """:meth:`mass_matrix` and :meth:`bias_forces`."""
         return self.mass_matrix(), self.bias_forces()
 
-    def gravity_forces(self) -> Float[Tensor, "... nv"]:
+    def gravity_forces(self) -> Forces:
         """Joint forces (..., nv) in Nm or N that hold the robot still."""
         tree = self.robot.tree
         first_moments = over_tree(tree.descendants, self.inertias[..., 3:, :])
         forces = -(product(self.twists, first_moments)[:, :, 0] * tree.gravity[:, None]).sum(1).mT
         return self._rows(of_joints(tree, forces))
 
-    def inverse_dynamics(self, a: JointValues) -> Float[Tensor, "... nv"]:
+    def inverse_dynamics(self, a: JointValues) -> Forces:
         """Joint forces (..., nv) that give the accelerations ``a`` (..., nv): ``M a + bias``."""
         tree, a = self.robot.tree, self._given("a", a)
         forces = self._joint_forces(self._accelerations(a), self.inertias)
         return self._rows(forces + tree.armature * a.mT if tree.has_armature else forces)
 
-    def forward_dynamics(self, tau: JointValues) -> Float[Tensor, "... nv"]:
+    def forward_dynamics(self, tau: JointValues) -> Forces:
         """Accelerations (..., nv) under the joint forces ``tau`` (..., nv): ``M^-1 (tau - bias)``."""
         net = self._given("tau", tau).mT - self._bias_forces(self.inertias)
         try:
@@ -204,9 +204,7 @@ class Kinematics:
             columns.append((basis.mT @ gathered.flatten(1, 2)).permute(2, 0, 1))
         return self._rows(of_joints(tree, torch.stack(columns, dim=2)))
 
-    def dynamics_of_bodies(
-        self, parameters: Float[Tensor, "bodies 10"]
-    ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
+    def dynamics_of_bodies(self, parameters: Float[Tensor, "bodies 10"]) -> tuple[MassMatrix, Forces]:
         """Mass matrix and bias forces for standard parameters of the bodies, which no body need have."""
         frames = self._child_frames()
         inertias = world_inertias(self.poses, (frames @ pseudo_inertia_of_standard(parameters) @ frames.mT)[..., None])

@@ -168,9 +168,7 @@ def lay_out(
         if by_name[name].type == "fixed":
             raise InvalidInput(f"{description.source}: joint {name!r} is fixed already; remove it from `locked`.")
         if by_name[name].type == "floating" and position != 0.0:
-            raise InvalidInput(
-                f"{description.source}: joint {name!r} is {by_name[name].type}, so it can be locked at 0 alone."
-            )
+            raise InvalidInput(f"{description.source}: joint {name!r} is floating, so it can be locked at 0 alone.")
     held, drives = followed(description, locked, problems)
     root, children = _tree_of(description)
     bodies: list[Joint] = []
@@ -210,15 +208,12 @@ def lay_out(
             origins += [offset @ turn] * len(rows)
         stack.extend(reversed(children[joint.child]))
     if not bodies:
-        raise RobotModelError(
-            f"{description.source}: robot {description.name!r} has no movable joint, so it has no dynamics; "
-            f"use a URDF with at least one joint of type {', '.join(MOVABLE)} that is not locked, or "
-            "`base='floating'` for a body that moves freely."
-        )
+        seen = f"{description.source}: robot {description.name!r} has no movable joint, so it has no dynamics"
+        needed = f"at least one joint of type {', '.join(MOVABLE)} that is not locked"
+        raise RobotModelError(f"{seen}; use a URDF with {needed}, or `base='floating'` for a body that moves freely.")
     if len(bodies) > MOST_BODIES:
-        raise RobotModelError(
-            f"{description.source}: {len(bodies)} joints move; forcegp takes up to {MOST_BODIES}, lock the others."
-        )
+        seen = f"{description.source}: {len(bodies)} joints move"
+        raise RobotModelError(f"{seen}; forcegp takes up to {MOST_BODIES}, lock the others.")
     joints = {body.name: body for body in bodies if body.name not in drives}
     for body in (body for body in bodies if body.name in drives):  # rotors and friction of those that follow count, too
         name, multiplier, _ = drives[body.name]
@@ -246,13 +241,12 @@ def check_tree(layout: Layout, loops: Loops, problems: Problems) -> None:
 
     for name, *links in loops:
         if between := sorted(set(moving(links[0])) ^ set(moving(links[1]))):
-            advice = (
-                "; a robot is a tree here, which would move in another way. Lock the joints between these links "
-                f"({', '.join(layout.bodies[body].name for body in between)}) by `locked`, or take the "
-                "equality out of the file where nothing holds them together."
-            )
+            joints = ", ".join(layout.bodies[body].name for body in between)
+            lock = f"Lock the joints between these links ({joints}) by `locked`"
+            advice = f"{lock}, or take the equality out of the file where nothing holds them together."
             seen = f"{problems.source}: {name} closes a loop, from link {links[0]!r} to {links[1]!r}"
-            problems.errors.append(RobotModelError(seen, advice))
+            why = "; a robot is a tree here, which would move in another way. "
+            problems.errors.append(RobotModelError(seen, why + advice))
 
 
 def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]]:
@@ -262,18 +256,15 @@ def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]
     children: dict[str, list[Joint]] = {link: [] for link in description.links}
     for joint in description.joints:
         if joint.child in above:
-            raise RobotModelError(
-                f"{source}: link {joint.child!r} has two parents, through joints {above[joint.child].name!r} and "
-                f"{joint.name!r}; a link can be the child of one joint only, remove one of them."
-            )
+            both = f"joints {above[joint.child].name!r} and {joint.name!r}"
+            seen = f"{source}: link {joint.child!r} has two parents, through {both}"
+            raise RobotModelError(f"{seen}; a link can be the child of one joint only, remove one of them.")
         above[joint.child] = joint
         children[joint.parent].append(joint)
     roots = [link for link in description.links if link not in above]
     if len(roots) > 1:
-        raise RobotModelError(
-            f"{source}: the links form {len(roots)} separate parts, with base links {', '.join(map(repr, roots))}; "
-            "connect them by (fixed) joints so that one base link remains."
-        )
+        seen = f"{source}: the links form {len(roots)} separate parts, with base links {', '.join(map(repr, roots))}"
+        raise RobotModelError(f"{seen}; connect them by (fixed) joints so that one base link remains.")
     below = list(roots)
     for link in below:
         below += [joint.child for joint in children[link]]
@@ -284,10 +275,8 @@ def _tree_of(description: RobotDescription) -> tuple[str, dict[str, list[Joint]]
             loop.append(link)
             link = above[link].parent
         loop = [*loop[loop.index(link) :], link]
-        raise RobotModelError(
-            f"{source}: the links {' <- '.join(map(repr, loop))} form a loop, and a robot is a tree here; "
-            "remove one of its joints, and lock those that it leaves without a hold."
-        )
+        seen = f"{source}: the links {' <- '.join(map(repr, loop))} form a loop, and a robot is a tree here"
+        raise RobotModelError(f"{seen}; remove one of its joints, and lock those that it leaves without a hold.")
     return roots[0], children
 
 

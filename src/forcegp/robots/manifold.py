@@ -148,10 +148,9 @@ class ConfigurationSpace:
                 return
             if not worst <= LARGEST_NORM_ERROR:
                 names = ", ".join(f"{group.name}.{name}" for name in POSITIONS[TURN])
-                raise InvalidInput(
-                    f"q has ({names}) of length {float(length[(length - 1.0).abs().argmax()]):.4g}; a turn has length "
-                    "1: check the order of the columns, or divide by the length with robot.normalized(q)."
-                )
+                seen = f"q has ({names}) of length {float(length[(length - 1.0).abs().argmax()]):.4g}"
+                advice = "check the order of the columns, or divide by the length with robot.normalized(q)."
+                raise InvalidInput(f"{seen}; a turn has length 1: {advice}")
 
     def singles(self, q: Float[Tensor, "*batch nq"]) -> Float[Tensor, "*batch singles"]:
         """The positions of all joints of one degree of freedom."""
@@ -239,22 +238,20 @@ _COTANGENT = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160, 691 / 13076
 _ARCSINE = (1.0, 1 / 6, 3 / 40, 15 / 336, 105 / 3456, 945 / 42240, 10395 / 599040)
 
 
-def _smooth(
-    square: Tensor, series: Sequence[float], closed: Callable[[Tensor], Tensor], small: float = SMALL
-) -> Tensor:
-    """A function of t^2 that is smooth at 0: `closed` of t, or below `small` the power series in t^2."""
+def _smooth(square: Tensor, series: Sequence[float], exact: Callable[[Tensor], Tensor], small: float = SMALL) -> Tensor:
+    """A function of t^2 that is smooth at 0: `exact` of t, or below `small` the power series in t^2."""
     large, total = square > small, torch.full_like(square, series[-1])
     for coefficient in reversed(series[:-1]):
         total = total * square + coefficient
     # the branch that is not taken has a finite gradient, too
-    return torch.where(large, closed(torch.where(large, square, 1.0).sqrt()), total)
+    return torch.where(large, exact(torch.where(large, square, 1.0).sqrt()), total)
 
 
-_sine = partial(_smooth, series=_SINE, closed=lambda t: t.sin() / t)
+_sine = partial(_smooth, series=_SINE, exact=lambda t: t.sin() / t)
 """sin t / t."""
-_versine = partial(_smooth, series=_VERSINE, closed=lambda t: 2.0 * ((0.5 * t).sin() / t) ** 2)
+_versine = partial(_smooth, series=_VERSINE, exact=lambda t: 2.0 * ((0.5 * t).sin() / t) ** 2)
 """(1 - cos t) / t^2."""
-_rest = partial(_smooth, series=_REST, closed=lambda t: (t - t.sin()) / t**3)
+_rest = partial(_smooth, series=_REST, exact=lambda t: (t - t.sin()) / t**3)
 """(t - sin t) / t^3."""
-_cotangent = partial(_smooth, series=_COTANGENT, closed=lambda t: (1.0 - 0.5 * t / (0.5 * t).tan()) / t**2)
+_cotangent = partial(_smooth, series=_COTANGENT, exact=lambda t: (1.0 - 0.5 * t / (0.5 * t).tan()) / t**2)
 """(1 - t/2 cot(t/2)) / t^2."""

@@ -134,19 +134,15 @@ class MjcfWriter:
             for joint in robot.description.joints
             if joint.mimics is not None and joint.name in self.moving
         ]
-        return "\n".join(
-            [
-                f"<mujoco model={quoteattr(robot.name)}>",
-                '  <compiler angle="radian" autolimits="true" inertiafromgeom="false"/>',
-                f'  <option gravity="{numbers(robot.gravity.tolist())}"/>',
-                "  <worldbody>",
-                *self.lines,
-                "  </worldbody>",
-                *_block("equality", couplings),
-                *_block("actuator", motors),
-                "</mujoco>\n",
-            ]
-        )
+        text = [
+            f"<mujoco model={quoteattr(robot.name)}>",
+            '  <compiler angle="radian" autolimits="true" inertiafromgeom="false"/>',
+            f'  <option gravity="{numbers(robot.gravity.tolist())}"/>',
+            *("  <worldbody>", *self.lines, "  </worldbody>"),
+            *_block("equality", couplings),
+            *_block("actuator", motors),
+        ]
+        return "\n".join([*text, "</mujoco>\n"])
 
     def _body(self, link: str, pose: np.ndarray, joints: Sequence[tuple[Joint, np.ndarray]], depth: int) -> None:
         """One body with its joints, which have poses in its frame, and what hangs on it."""
@@ -174,19 +170,16 @@ class MjcfWriter:
             below = [(at @ each.origin, each) for name, at in rigid.items() for each in self.children[name]]
             below = [(step, each) for step, each in below if each.name in self.moving]
             if len(below) != 1 or joint.type == "floating":
-                raise RobotModelError(
-                    f"{self.robot.source}: link {joint.child!r} moves and has no mass, which MuJoCo takes only between "
-                    "two joints of one degree of freedom; give it a mass."
-                )
+                seen = f"{self.robot.source}: link {joint.child!r} moves and has no mass"
+                why = "which MuJoCo takes only between two joints of one degree of freedom"
+                raise RobotModelError(f"{seen}, {why}; give it a mass.")
             self.left_out += rigid
             step, joint = below[0]
             joints = [*((each, inverse(step) @ at) for each, at in joints), (joint, np.eye(4))]
             pose = pose @ step
         if joint.type == "floating" and (depth != 2 or not np.array_equal(pose, np.eye(4))):
-            raise RobotModelError(
-                f"{self.robot.source}: joint {joint.name!r} floats beside the origin of the world, which MuJoCo does "
-                "not take; move its origin there."
-            )
+            seen = f"{self.robot.source}: joint {joint.name!r} floats beside the origin of the world"
+            raise RobotModelError(f"{seen}, which MuJoCo does not take; move its origin there.")
         self._body(joint.child, pose, joints, depth)
 
     def _rigid(self, link: str) -> dict[str, np.ndarray]:

@@ -108,10 +108,9 @@ class CompiledModel:
 
     def _joint(self, name: str, kind: str, parent: str, child: str, origin: np.ndarray, more: str) -> None:
         xyz, rpy = numbers(origin[:3, 3]), numbers(rpy_from_rotation(origin[:3, :3]))
-        self.elements.append(
-            f'  <joint name={quoteattr(name)} type="{kind}"><parent link={quoteattr(parent)}/>'
-            f'<child link={quoteattr(child)}/><origin xyz="{xyz}" rpy="{rpy}"/>{more}</joint>'
-        )
+        links = f"<parent link={quoteattr(parent)}/><child link={quoteattr(child)}/>"
+        inside = f'{links}<origin xyz="{xyz}" rpy="{rpy}"/>{more}'
+        self.elements.append(f'  <joint name={quoteattr(name)} type="{kind}">{inside}</joint>')
 
     def _body(self, body: int) -> None:
         """The chain of joints of one body, and its link."""
@@ -286,6 +285,7 @@ class CompiledModel:
         sprung = [k for k in joints if model.jnt_stiffness[k] or _any(model, "jnt_stiffnesspoly", k)]
         linear = [k for k in sprung if self._is_sprung(k)]
         servos = [k for k in range(model.nu) if not self._is_motor(k)]
+        other = np.array(model.eq_active0, bool) & ~np.isin(model.eq_type, known)
         lost = {
             "springs (Model.from_mjcf has them)": 0 if self.for_system else len(linear),
             "springs": len(sprung) - len(linear),
@@ -298,9 +298,7 @@ class CompiledModel:
             "forces of deformable bodies": model.nflex,
             "forces of plugins": model.nplugin,
             "forces of a medium": int(bool(model.opt.density or model.opt.viscosity)),
-            "constraints of other kinds than joint, connect and weld": np.count_nonzero(
-                np.array(model.eq_active0, bool) & ~np.isin(model.eq_type, known)
-            ),
+            "constraints of other kinds than joint, connect and weld": np.count_nonzero(other),
         }
         for what, count in lost.items():
             if count:

@@ -21,6 +21,8 @@ from forcegp.summary import Summary, listed
 
 MASSLESS = Link(0.0, np.zeros(3), np.zeros((3, 3)))
 DOWN = ("down_x", "down_y", "down_z")
+Forces = Float[Tensor, "... nv"]
+MassMatrix = Float[Tensor, "... nv nv"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,29 +142,27 @@ class RigidBodyDynamics(ABC):
     def _dynamics(self, function: str, *arguments: Any) -> Any:
         """What the method of that name returns."""
 
-    def mass_matrix(self, q: Positions) -> Float[Tensor, "... nv nv"]:
+    def mass_matrix(self, q: Positions) -> MassMatrix:
         """Mass matrix M (..., nv, nv) in kg m^2 or kg, armature on the diagonal."""
         return self._dynamics("mass_matrix", q)
 
-    def bias_forces(self, q: Positions, v: JointValues) -> Float[Tensor, "... nv"]:
+    def bias_forces(self, q: Positions, v: JointValues) -> Forces:
         """Coriolis, centrifugal and gravity forces (..., nv) in Nm or N: ``M a + bias = tau``."""
         return self._dynamics("bias_forces", q, v)
 
-    def mass_matrix_and_bias(
-        self, q: Positions, v: JointValues
-    ) -> tuple[Float[Tensor, "... nv nv"], Float[Tensor, "... nv"]]:
+    def mass_matrix_and_bias(self, q: Positions, v: JointValues) -> tuple[MassMatrix, Forces]:
         """:meth:`mass_matrix` and :meth:`bias_forces` at once."""
         return self._dynamics("mass_matrix_and_bias", q, v)
 
-    def gravity_forces(self, q: Positions) -> Float[Tensor, "... nv"]:
+    def gravity_forces(self, q: Positions) -> Forces:
         """Joint forces (..., nv) in Nm or N that hold the robot still."""
         return self._dynamics("gravity_forces", q)
 
-    def inverse_dynamics(self, q: Positions, v: JointValues, a: JointValues) -> Float[Tensor, "... nv"]:
+    def inverse_dynamics(self, q: Positions, v: JointValues, a: JointValues) -> Forces:
         """Joint forces tau (..., nv) in Nm or N that give the accelerations ``a``: ``tau = M a + bias``."""
         return self._dynamics("inverse_dynamics", q, v, a)
 
-    def forward_dynamics(self, q: Positions, v: JointValues, tau: JointValues) -> Float[Tensor, "... nv"]:
+    def forward_dynamics(self, q: Positions, v: JointValues, tau: JointValues) -> Forces:
         """Accelerations (..., nv) ``M^-1 (tau - bias)``. Raises NumericalError where M is not positive definite."""
         return self._dynamics("forward_dynamics", q, v, tau)
 
@@ -320,10 +320,9 @@ class RobotStructure(Summary):
         """Raise InvalidInput where positions do not add up; `what` needs that, in the plural: "filters"."""
         if self.layout.groups:
             group = self.layout.groups[0]
-            raise InvalidInput(
-                f"{what} need a base that is fixed; {self.name} has the floating joint {group.name!r}. Fitting, "
-                "prediction, identification, predictors and `posterior.rollout` work without."
-            )
+            seen = f"{what} need a base that is fixed; {self.name} has the floating joint {group.name!r}"
+            advice = "Fitting, prediction, identification, predictors and `posterior.rollout` work without."
+            raise InvalidInput(f"{seen}. {advice}")
 
 
 def bodies_without_inertia(
@@ -357,9 +356,7 @@ def bodies_without_inertia(
             found.append((drive.joint, NonPhysicalInertia(seen, "; correct its <inertial> element.", remedy)))
         elif body not in whole and joint.type != "prismatic" and moments[:2].sum() <= SINGULAR * moments.sum():
             seen = f"{link} turns with joint {name!r} but has no rotational inertia about its axis"
-            advice = (
-                ": any force would accelerate it infinitely. Correct its <inertial> element, give the joint the "
-                "inertia of its rotor (`armature`, in kg m^2), or lock it."
-            )
+            rotor = "give the joint the inertia of its rotor (`armature`, in kg m^2)"
+            advice = f": any force would accelerate it infinitely. Correct its <inertial> element, {rotor}, or lock it."
             found.append((drive.joint, NonPhysicalInertia(seen, advice, remedy)))
     return found

@@ -35,10 +35,9 @@ def parse_xml(text: str, source: str) -> Element:
     try:
         return SafeElementTree.fromstring(text, forbid_dtd=True, forbid_entities=True, forbid_external=True)
     except (DTDForbidden, EntitiesForbidden, ExternalReferenceForbidden):
-        raise RobotModelError(
-            f"{source}: contains a DTD, an entity definition or an external reference, which can read files or exhaust "
-            "the memory; no URDF needs them, remove the <!DOCTYPE ...> block."
-        ) from None
+        seen = f"{source}: contains a DTD, an entity definition or an external reference"
+        why = "which can read files or exhaust the memory"
+        raise RobotModelError(f"{seen}, {why}; no URDF needs them, remove the <!DOCTYPE ...> block.") from None
     except (ParseError, UnicodeError) as error:
         raise RobotModelError(f"{source}: is not well-formed XML ({error}); correct that place.") from None
 
@@ -63,10 +62,8 @@ def refuse_xacro(root: Element, source: str) -> None:
     macros = (element for owner in (root, *owners) for element in owner if "xacro}" in element.tag)
     found = [element for element in macros if not element.tag.endswith(left)]
     for element in (*found, *(each for each in read if re.search(r"\$[{(]", " ".join(each.attrib.values())))):
-        raise RobotModelError(
-            f"{source}: is an unexpanded xacro file (see <{element.tag.rsplit('}', 1)[-1]}>); "
-            "name it .xacro, or run xacro first: xacro robot.urdf.xacro > robot.urdf."
-        )
+        seen = f"{source}: is an unexpanded xacro file (see <{element.tag.rsplit('}', 1)[-1]}>)"
+        raise RobotModelError(f"{seen}; name it .xacro, or run xacro first: xacro robot.urdf.xacro > robot.urdf.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,9 +228,7 @@ class _Part:
             return np.array(default, dtype=np.float64)
         words, what = text.split(), f"<{self.element.tag}> {attribute}"
         if len(words) != len(default):
-            raise RobotModelError(
-                f"{self}: {what} holds {len(words)} numbers ({' '.join(words)!r}), not {len(default)}."
-            )
+            raise RobotModelError(f"{self}: {what} holds {len(words)} numbers ({text!r}), not {len(default)}.")
         return np.array([self.parsed(word, what) for word in words])
 
     def origin(self) -> np.ndarray:

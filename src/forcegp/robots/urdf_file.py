@@ -19,9 +19,7 @@ from forcegp.sandbox import read_apart
 
 HEAVIEST = 1e9  # kg and kg m^2, of one link: far from where products of inertias overflow
 LARGEST_FILE = 16 << 20  # bytes; robot files have some hundred thousand
-IN_THE_FILE = (
-    ". Correct its <inertial> element (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>)"
-)
+IN_THE_FILE = ". Correct its <inertial> (inertia is about the centre of mass, in kg m^2, in the axes of its <origin>)"
 InertiaChoice = Literal["strict", "nearest"]
 """What to do about a link with an inertia that no body has: refuse it, or replace it by the nearest possible."""
 
@@ -43,9 +41,7 @@ def read_text(path: str | Path) -> str:
         hint = f" It holds {', '.join(inside)}." if inside else ""
         raise RobotModelError(f"{path}: is a directory; give the path of the URDF file itself.{hint}") from None
     except OSError as error:
-        raise RobotModelError(
-            f"{path}: cannot be read ({error.strerror}); check the path and its permissions."
-        ) from None
+        raise RobotModelError(f"{path}: cannot be read ({error.strerror}); check path and permissions.") from None
     try:
         return data.decode()
     except UnicodeDecodeError:
@@ -198,10 +194,8 @@ def with_chosen_inertias(
             problems.note("a mass without <inertia> is taken as a point", f"link {name!r}")
             continue
         relative = 100.0 * np.linalg.norm(nearest - given) / np.linalg.norm(given)
-        problems.note(
-            "an inertia that no body has is replaced by the nearest one that a body has",
-            f"link {name!r}: {objection}; changed by {relative:.2g} %",
-        )
+        where = f"link {name!r}: {objection}; changed by {relative:.2g} %"
+        problems.note("an inertia that no body has is replaced by the nearest one that a body has", where)
     links = dict(parse_urdf(text, Problems(source)).links) if changed else links
     for name, inertial in links.items():
         if inertial is not None and name not in layout.moving and np.isnan(inertial.inertia).all():
@@ -217,8 +211,7 @@ def read_robot_file(path: str | Path) -> str:
     required_extra("xacro", "xacro", f"{path}: a file that is not expanded elsewhere")
     answer = read_apart("xacro", str(path), {"path": str(Path(path).absolute())})
     if "refused" in answer:
-        raise RobotModelError(
-            f"{path}: xacro could not expand it ({answer['refused']}); correct it, or "
-            "expand it where its packages are: xacro robot.xacro > robot.urdf."
-        )
+        seen = f"{path}: xacro could not expand it ({answer['refused']})"
+        advice = "correct it, or expand it where its packages are: xacro robot.xacro > robot.urdf."
+        raise RobotModelError(f"{seen}; {advice}")
     return answer["text"]

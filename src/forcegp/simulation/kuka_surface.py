@@ -20,12 +20,14 @@ from forcegp.robots import Robot
 from forcegp.robots.structure import RigidBodyDynamics
 from forcegp.robots.urdf import numbers
 from forcegp.robots.urdf_file import inertial_element
-from forcegp.simulation.joint_friction import Friction, laws_of_joints
 from forcegp.simulation.scenarios import KukaSurfaceConfig
 from forcegp.simulation.trajectory import (
     ArmState,
+    Friction,
+    Vector,
     compiled_plant,
     joint_acceleration,
+    laws_of_joints,
     middle_of,
     over_table,
     random_path,
@@ -62,16 +64,14 @@ def kuka_urdf(config: KukaSurfaceConfig) -> str:
         dynamics.set("damping", repr(config.joint_damping))
     tool, base = (root.find(f"link[@name='{name}']/inertial") for name in (TOOL_LINK, BASE_LINK))
     if tool is None or base is None:
-        raise RobotModelError(
-            f"{path} lacks {TOOL_LINK!r} or {BASE_LINK!r} with inertia; install pybullet 3.2.6 or 3.2.7."
-        )
+        seen = f"{path} lacks {TOOL_LINK!r} or {BASE_LINK!r} with inertia"
+        raise RobotModelError(f"{seen}; install pybullet 3.2.6 or 3.2.7.")
     loaded = inertial_element(config.tool_mass, config.tool_center_of_mass, np.diag(config.tool_inertia))
     for link, element in ((tool, loaded), (base, inertial_element(0.0, np.zeros(3), np.zeros((3, 3))))):
         link[:] = ElementTree.fromstring(element)
-    joint = (
-        f'<joint name="world_joint" type="fixed"><parent link="world"/><child link="{BASE_LINK}"/>'
-        f'<origin rpy="0 0 0" xyz="{numbers((0.0, 0.0, BASE_HEIGHT))}"/></joint>'
-    )
+    inside = f'<parent link="world"/><child link="{BASE_LINK}"/>'
+    origin = f'<origin rpy="0 0 0" xyz="{numbers((0.0, 0.0, BASE_HEIGHT))}"/>'
+    joint = f'<joint name="world_joint" type="fixed">{inside}{origin}</joint>'
     root[:0] = [ElementTree.Element("link", name="world"), ElementTree.fromstring(joint)]
     ElementTree.indent(root)
     changes = "<!-- Changed by forcegp: base mounted on `world`, tool inertia and damping set, meshes left out. -->\n"
@@ -102,9 +102,7 @@ class PointFriction:
         """`|F| / |N|` of dry friction at tangential speeds [m/s]."""
         return np.asarray(self._per_velocity(speed) * speed)
 
-    def forces(
-        self, velocity: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"]
-    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    def forces(self, velocity: Vector, normal: Vector) -> tuple[Vector, Vector]:
         """Viscous friction [N], and dry friction per newton of normal force; `normal` is a unit vector."""
         tangential = velocity - (normal @ velocity) * normal
         return -self.viscous * velocity, -self._per_velocity(np.sqrt(tangential @ tangential)) * tangential
@@ -118,7 +116,7 @@ class ContactForces(NamedTuple):
     """What acts at the tool: normal force [N], friction (3,) [N, world axes] and joint torques, `push` all of these."""
 
     multiplier: float
-    tool_force: Float[np.ndarray, "3"]
+    tool_force: Vector
     tool_torques: Float[np.ndarray, " nv"]
     in_contact: bool
     push: Float[np.ndarray, " nv"]
@@ -173,11 +171,10 @@ def multiplier_with_friction(
     free, per_newton, per_friction = np.linalg.solve(mass, np.stack([force, row, per_load], axis=1)).T
     alpha, gamma, needed = float(row @ per_newton), float(row @ per_friction), b - float(row @ free)
     if not abs(gamma) < alpha:
-        raise SimulationError(
-            f"friction changes the normal acceleration by {abs(gamma):.3g} 1/kg per newton of normal force, the normal "
-            f"force itself by {alpha:.3g} 1/kg: the normal force is not determined (Painleve's paradox). Use smaller "
-            "friction coefficients or another posture (start_degrees)."
-        )
+        by = f"{abs(gamma):.3g} 1/kg per newton of normal force, the normal force itself by {alpha:.3g} 1/kg"
+        seen = f"friction changes the normal acceleration by {by}: the normal force is not determined"
+        advice = "Use smaller friction coefficients or another posture (start_degrees)."
+        raise SimulationError(f"{seen} (Painleve's paradox). {advice}")
     return needed / (alpha + gamma) if needed > 0 else needed / (alpha - gamma)
 
 
@@ -211,10 +208,9 @@ def simulate_episode(config: KukaSurfaceConfig, robot: Robot, plant: RigidBodyDy
         try:
             wanted = joint_acceleration(config, state, aim)
         except np.linalg.LinAlgError as error:
-            raise SimulationError(
-                f"episode {episode}: the arm is in a singular posture at {step * config.time_step:.3g} s. "
-                "Start from another posture (start_degrees) or keep the way-points nearer."
-            ) from error
+            seen = f"episode {episode}: the arm is in a singular posture at {step * config.time_step:.3g} s"
+            advice = "Start from another posture (start_degrees) or keep the way-points nearer."
+            raise SimulationError(f"{seen}. {advice}") from error
         asked = state.mass @ wanted + state.bias + config.joint_damping * v
         if config.pressing_force:
             normal = table.gradient(torch.from_numpy(state.position)).numpy()
@@ -227,19 +223,16 @@ def simulate_episode(config: KukaSurfaceConfig, robot: Robot, plant: RigidBodyDy
         v = v + config.time_step * a
         q = q + config.time_step * v
         if not np.abs(v).max() < DIVERGED:  # also NaN
-            raise SimulationError(
-                f"episode {episode} diverged after {(step + 1) * config.time_step:.3g} s (joint velocity "
-                f"{np.abs(v).max():.3g} rad/s). Use the published constants, a shorter time_step or another controller."
-            )
+            after = f"{(step + 1) * config.time_step:.3g} s (joint velocity {np.abs(v).max():.3g} rad/s)"
+            advice = "Use the published constants, a shorter time_step or another controller."
+            raise SimulationError(f"episode {episode} diverged after {after}. {advice}")
         if (step + 1) % STEPS_PER_REPORT == 0 or step + 1 == steps:
             tell(step + 1, steps)
 
     columns = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
     if config.surface != "none" and not columns["in_contact"][: settle + 1].any():
-        raise SimulationError(
-            f"episode {episode}: no contact within settle_seconds = {config.settle_seconds:.3g} s. "
-            "Give it more time, or a start posture nearer to the surface."
-        )
+        seen = f"episode {episode}: no contact within settle_seconds = {config.settle_seconds:.3g} s"
+        raise SimulationError(f"{seen}. Give it more time, or a start posture nearer to the surface.")
     columns["time"] = config.time_step * np.arange(steps)
     return {name: values[settle:] for name, values in columns.items()}
 

@@ -1,10 +1,10 @@
-"""An arm and its tool, what that slides on, a smooth path through way-points, and its controller."""
+"""What plants share: friction of joints and how they are recorded; an arm, its tool, a smooth path, its controller."""
 
 from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,11 +17,14 @@ from scipy.spatial.transform import Rotation
 from forcegp import __version__
 from forcegp.data import Dataset
 from forcegp.errors import CompilerError, NumericalWarning
-from forcegp.mechanics import Plane
+from forcegp.forces import JointLaw, Viscous, parse_forces
+from forcegp.mechanics import Plane, State
 from forcegp.model import Model
 from forcegp.robots import Robot
 from forcegp.robots.structure import RigidBodyDynamics
 from forcegp.simulation.scenarios import KukaSurfaceConfig
+
+Vector = Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +35,7 @@ class ArmState:
     v: Float[np.ndarray, " nv"]
     mass: Float[np.ndarray, "nv nv"]
     bias: Float[np.ndarray, " nv"]
-    position: Float[np.ndarray, "3"]
+    position: Vector
     rotation: Float[np.ndarray, "3 3"]
     jacobian: Float[np.ndarray, "6 nv"]
     bias_acceleration: Float[np.ndarray, "6"]
@@ -57,11 +60,10 @@ def compiled_plant(robot: Robot) -> RigidBodyDynamics:
     return plant
 
 
-Aim = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 Motions = tuple[Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"], Float[np.ndarray, "times 3"]]
 
 
-def middle_of(config: KukaSurfaceConfig) -> Float[np.ndarray, "3"]:
+def middle_of(config: KukaSurfaceConfig) -> Vector:
     """Of the region of way-points, on the table [m]."""
     return np.array([np.mean(config.waypoint_x), np.mean(config.waypoint_y), config.surface_height])
 
@@ -119,9 +121,7 @@ def over_table(config: KukaSurfaceConfig, motions: Motions) -> Motions:
     return motions
 
 
-def random_path(
-    config: KukaSurfaceConfig, start: Float[np.ndarray, "3"], seconds: float, rng: np.random.Generator
-) -> SegmentPath:
+def random_path(config: KukaSurfaceConfig, start: Vector, seconds: float, rng: np.random.Generator) -> SegmentPath:
     """Random way-points at `config.waypoint_height`, from `start` [m], for at least `seconds` [s]."""
     points, durations = [np.asarray(start, dtype=np.float64)], []
     while sum(durations) < seconds:
@@ -136,7 +136,9 @@ def random_path(
 TOOL_ORIENTATION = np.diag([-1.0, 1.0, -1.0])  # the tool points straight down
 
 
-def joint_acceleration(config: KukaSurfaceConfig, state: ArmState, reference: Aim) -> Float[np.ndarray, " nv"]:
+def joint_acceleration(
+    config: KukaSurfaceConfig, state: ArmState, reference: tuple[Vector, Vector, Vector]
+) -> Float[np.ndarray, " nv"]:
     """Commanded joint acceleration [rad/s^2] under which the tool follows an aimed position, velocity and acceleration.
 
     Resolved-acceleration control (Siciliano et al., Robotics, section 8.6.2) with a null-space posture: with `e` the
@@ -179,3 +181,35 @@ def recorded(
     rows |= {"a": motion["a"] + config.noise * noise, "episode": np.repeat(np.arange(config.episodes), steps)}
     rows |= {"truth": {"a": motion["a"], **truth}, "metadata": about | dict(metadata)}
     return Dataset(**rows, model=model, noise_std=np.full(nv, config.noise) if config.noise > 0 else None)
+
+
+Numbers = Mapping[str, Any]
+"""Coefficients by name, one number or one per joint; "velocity" stands for velocities that have no number here."""
+
+Friction = Callable[..., Float[np.ndarray, "*batch nv"]]
+"""(v, u, q), u [Nm or N] of the actuators, in joints; u, and q of a fixed base, may be None for 0 -> joint forces."""
+
+
+def laws_of_joints(expression: str, robot: Robot, numbers: Numbers) -> Friction:
+    """The laws of this expression (`parse_forces`) with viscous friction, step by step; none for "none".
+
+    Coefficients that it does not give have these numbers, or their defaults.
+    """
+    forces = () if expression == "none" else parse_forces(expression)
+    laws = forces if not forces or any(isinstance(force, Viscous) for force in forces) else (Viscous(), *forces)
+    known = []
+    for law in laws:
+        assert isinstance(law, JointLaw), "`require_joint_friction` sees to it"
+        found = {}
+        for name, coefficient in law.coefficients.items():
+            given = getattr(law, name)
+            usual = numbers["velocity"] if coefficient.unit == "velocity" else coefficient.default
+            found[name] = numbers.get(name, usual) if given is None else given
+        known.append(law.with_values(found).bound_to(robot))
+
+    def friction(v: np.ndarray, u: np.ndarray | None = None, q: np.ndarray | None = None) -> np.ndarray:
+        at_u, at_q = (torch.tensor(np.zeros_like(v) if each is None else each) for each in (u, q))
+        state = State(at_q, torch.tensor(v), at_u, robot)
+        return sum((law.force(state).numpy() for law in known), np.zeros_like(v))
+
+    return friction
