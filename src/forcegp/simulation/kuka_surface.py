@@ -20,14 +20,13 @@ from forcegp.robots import Robot
 from forcegp.robots.structure import RigidBodyDynamics
 from forcegp.robots.urdf import numbers
 from forcegp.robots.urdf_file import inertial_element
+from forcegp.simulation.joint_friction import Friction, laws_of_joints
 from forcegp.simulation.scenarios import KukaSurfaceConfig
 from forcegp.simulation.trajectory import (
     ArmState,
-    Friction,
     Vector,
     compiled_plant,
     joint_acceleration,
-    laws_of_joints,
     middle_of,
     over_table,
     random_path,
