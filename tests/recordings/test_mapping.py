@@ -14,6 +14,7 @@ from tests.recordings.test_mapping_file import mapped
 from forcegp import Model, Robot
 from forcegp.errors import InvalidInput
 from forcegp.recordings import ColumnMapping, by_quantity, listed, open_source
+from forcegp.recordings.expression import parse_expression
 from forcegp.recordings.mapping import (
     UNITS,
     counted_columns,
@@ -22,7 +23,6 @@ from forcegp.recordings.mapping import (
     guessed_time,
     log_unit,
     named_unit,
-    parse_expression,
 )
 from forcegp.recordings.signal_plan import signal_plan
 

@@ -205,7 +205,7 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     if left <= EXPLAINED:
         ends = [float(x) for x in seconds.split(",")]
         steps = np.diff(inputs.log.q[(inputs.log.time >= ends[0]) & (inputs.log.time <= ends[1])], axis=0)
-        still = inputs.named([k for k in bad if (steps[:, k] == 0.0).mean() > STILL])
+        still = inputs.named([k for k in bad.tolist() if (steps[:, k] == 0.0).mean() > STILL])
         why = f"the position of {listed(still)} stands still, as of a dead encoder or a brake" if still else ""
         where += (
             f", and elsewhere at most {100.0 * left:.2g} % stays: {why or 'a contact, or a load'}, in these seconds"
