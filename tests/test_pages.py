@@ -19,11 +19,17 @@ from forcegp.scores.models import candidates, usual_identification
 
 
 def test_the_page_on_ones_own_robot_runs(tmp_path: Path):
-    (example,) = blocks("your-robot")
-    noise, error, *_, any_force, friction = run_example(example, tmp_path).splitlines()
+    printed = run_example("\n".join(blocks("your-robot")), tmp_path)
+    noise, error, *_, any_force, friction, above, surface = printed.splitlines()
     assert f"{float(any_force):.2f} and {float(friction):.2f}" == "0.80 and 0.10"  # the comment on the page
     assert all(0.05 < float(std) < 0.2 for std in re.findall(r"\d\.\d+", noise))
     assert float(error) < 0.3
+    assert (above[:11], surface) == ("tensor(0.46", "Pipe(radius=0.5)")
+
+
+def test_the_own_sensor_of_the_page_on_contact_forces_is_learned_from(tmp_path: Path):
+    gain, mass = map(float, run_example(blocks("contact-forces")[-1], tmp_path).split())
+    assert (gain, mass) == pytest.approx((25.0, 50.0), rel=1e-3)
 
 
 def test_the_page_on_moving_bases_runs(tmp_path: Path):
