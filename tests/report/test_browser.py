@@ -103,7 +103,7 @@ def test_the_robot_moves_and_its_page_looks_as_before(opened, page, tmp_path):
         seen.append(np.asarray(grey(canvas), dtype=float))
         shown.wait_for_timeout(1_200)
     assert max(np.abs(seen[0] - seen[1]).max(), np.abs(seen[1] - seen[2]).max()) > 50.0
-    canvas.evaluate("canvas => { canvas.style.opacity = 0 }")  # it is never twice the same
+    shown.locator("iframe").evaluate("frame => { frame.style.opacity = 0 }")  # it is never twice the same
     assert_looks(shown, "report", *shown.locator("figure").all())
 
 
