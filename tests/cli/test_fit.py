@@ -45,11 +45,8 @@ def test_laws_and_bodies_are_estimated(identified, folder):
         assert kept["parameters"][f"coulomb.level.{joint}"]["value"] == pytest.approx(0.4, rel=0.2)
         assert kept["parameters"][f"viscous.{joint}"]["value"] == pytest.approx(0.2, abs=0.1)
     assert kept["evidence"] == "torques"
-    assert_unchanged(
-        "cli/fit",
-        {"kept": [each["value"] for each in kept["parameters"].values()], "shown": numbers_in(identified.stdout)},
-        rtol=1e-2,
-    )
+    values = [each["value"] for each in kept["parameters"].values()]
+    assert_unchanged("cli/fit", {"kept": values, "shown": numbers_in(identified.stdout)}, rtol=1e-2)
     assert kept["settled"]
     posterior = load_posterior(folder / "found")
     assert posterior.parameters["viscous.upper_hinge"].value == kept["parameters"]["viscous.upper_hinge"]["value"]
