@@ -19,11 +19,17 @@ from forcegp.scores.models import candidates, usual_identification
 
 
 def test_the_page_on_ones_own_robot_runs(tmp_path: Path):
-    (example,) = blocks("your-robot")
-    noise, error, *_, any_force, friction = run_example(example, tmp_path).splitlines()
+    printed = run_example("\n".join(blocks("your-robot")), tmp_path)
+    noise, error, *_, any_force, friction, above, surface = printed.splitlines()
     assert f"{float(any_force):.2f} and {float(friction):.2f}" == "0.80 and 0.10"  # the comment on the page
     assert all(0.05 < float(std) < 0.2 for std in re.findall(r"\d\.\d+", noise))
     assert float(error) < 0.3
+    assert (above[:11], surface) == ("tensor(0.46", "Pipe(radius=0.5)")
+
+
+def test_the_own_sensor_of_the_page_on_contact_forces_is_learned_from(tmp_path: Path):
+    gain, mass = map(float, run_example(blocks("contact-forces")[-1], tmp_path).split())
+    assert (gain, mass) == pytest.approx((25.0, 50.0), rel=1e-3)
 
 
 def test_the_page_on_moving_bases_runs(tmp_path: Path):
@@ -174,6 +180,15 @@ def test_the_page_on_deploying_runs(tmp_path: Path):
     for command in build.splitlines():
         subprocess.run(command, shell=True, cwd=tmp_path / "controller", check=True)
     assert {"lbr_iiwa.casadi", "lbr_iiwa_step.casadi"} <= {file.name for file in (tmp_path / "planner").iterdir()}
+
+
+@pytest.mark.nightly  # as the site is built, too
+def test_the_tutorial_on_the_mathematics_gives_the_numbers_of_fit(repository: Path, tmp_path: Path, monkeypatch):
+    monkeypatch.syspath_prepend(repository / "examples")
+    page = (repository / "docs" / "tutorials" / "mathematics.md").read_text(encoding="utf-8")
+    cells = re.findall(r"```{code-cell} ipython3\n(.*?)```", page, re.DOTALL)
+    assert cells[-1].count("assert_allclose") == 1
+    run_example("\n".join(cells), tmp_path)
 
 
 @pytest.mark.nightly

@@ -50,14 +50,10 @@ def workshop(forcegp, tmp_path_factory) -> Path:
     """A folder with train.h5, test.h5 (2 s each) and the model `run` fitted to 15 points."""
     folder = tmp_path_factory.mktemp("workshop")
     for name, seed in (("train", 1), ("test", 2)):
-        made = forcegp(
-            "simulate", "kuka-surface", "--seconds", 2, "--seed", seed, "--out", f"{name}.h5", "--json", folder=folder
-        ).ok()
+        words = ("simulate", "kuka-surface", "--seconds", 2, "--seed", seed, "--out", f"{name}.h5", "--json")
+        made = forcegp(*words, folder=folder).ok()
         (folder / f"{name}.json").write_text(made.stdout)
-    fitted = forcegp(
-        *("fit", "train.h5", "--forces", "gp:joint", "--points", 15, "--iterations", 8, "--restarts", 2),
-        *("--out", "run"),
-        folder=folder,
-    ).ok()
+    words = ("fit", "train.h5", "--forces", "gp:joint", "--points", 15, "--iterations", 8, "--restarts", 2)
+    fitted = forcegp(*words, "--out", "run", folder=folder).ok()
     (folder / "fit.txt").write_text(fitted.stdout)
     return folder

@@ -19,9 +19,6 @@ from forcegp.mechanics import Contact, Plane, Sphere, fixed_frame, fixed_point
 def test_reads_as_written(text, contact):
     assert parse_contact(text) == (contact,)
     assert parse_contacts([text, text]) == (contact, contact)
-
-
-def test_none_is_no_contact():
     assert parse_contacts(["none"]) == ()
 
 

@@ -54,7 +54,9 @@ WRONG = [
     ("robot zero.urdf", "is not a regular file"), ("check arm.h5 --identified /dev/zero", "is not a regular file"),
     ("fit --logs-from /dev/zero --out run", "it is not a regular file"),
     ("view arm.h5 --shapes zero.urdf", "is not a regular file"),
-    ("simulate mars --out a.h5", "'mars'"), ("learn arm.h5", "Available subcommands: auto, demo, simulate, "),
+    ("simulate quadruped --surface tilted --out a.h5", "--surface means nothing to quadruped"),
+    ("simulate quadruped --joint-friction lugre --out a.h5", "lugre"), ("simulate mars --out a.h5", "'mars'"),
+    ("learn arm.h5", "Available subcommands: auto, demo, simulate, "),
 ]  # fmt: skip
 
 

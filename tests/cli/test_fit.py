@@ -36,8 +36,7 @@ def folder(tmp_path_factory):
 def identified(forcegp, folder):
     """What fit prints of laws and bodies, which it wrote into `found`."""
     words = ("fit", "pendulum.h5", "--forces", "bodies,viscous,coulomb,offset", "--evidence", "torques")
-    done = forcegp(*words, "--out", "found", folder=folder).ok()
-    return done
+    return forcegp(*words, "--out", "found", folder=folder).ok()
 
 
 def test_laws_and_bodies_are_estimated(identified, folder):
@@ -46,11 +45,8 @@ def test_laws_and_bodies_are_estimated(identified, folder):
         assert kept["parameters"][f"coulomb.level.{joint}"]["value"] == pytest.approx(0.4, rel=0.2)
         assert kept["parameters"][f"viscous.{joint}"]["value"] == pytest.approx(0.2, abs=0.1)
     assert kept["evidence"] == "torques"
-    assert_unchanged(
-        "cli/fit",
-        {"kept": [each["value"] for each in kept["parameters"].values()], "shown": numbers_in(identified.stdout)},
-        rtol=1e-2,
-    )
+    values = [each["value"] for each in kept["parameters"].values()]
+    assert_unchanged("cli/fit", {"kept": values, "shown": numbers_in(identified.stdout)}, rtol=1e-2)
     assert kept["settled"]
     posterior = load_posterior(folder / "found")
     assert posterior.parameters["viscous.upper_hinge"].value == kept["parameters"]["viscous.upper_hinge"]["value"]
@@ -130,8 +126,7 @@ WRONG = [
     ("--forces viscous --evidence acceleration", "did you mean 'accelerations'?"),
     ("--evidence torques,accelerations --forces viscous", "the same rows twice"),
     ("--forces gp:independent --evidence motions:1", "motions refine numbers of laws and bodies"),
-    ("--jobs 0", "jobs is 0; give"),
-    ("--engine fast", "engine"),
+    *(("--jobs 0", "jobs is 0; give"), ("--engine fast", "engine")),
 ]
 
 

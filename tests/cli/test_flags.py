@@ -99,8 +99,5 @@ def test_a_box_becomes_a_sentence():
 │         Train on so many rows.         │
 ╰────────────────────────────────────────╯"""
     assert one_line(box) == "Unrecognized options: --pionts. Perhaps you meant: --points N."
-    lines = (
-        " Required options", " ----- ", "  Missing from forcegp fit:", "      --out FOLDER", "          Where.",
-        "  ---",
-    )  # fmt: skip
-    assert one_line("\n".join(lines)) == "Missing from forcegp fit: --out FOLDER."
+    lines = " Required options\n ----- \n  Missing from forcegp fit:\n      --out FOLDER\n          Where.\n  ---"
+    assert one_line(lines) == "Missing from forcegp fit: --out FOLDER."

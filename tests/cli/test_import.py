@@ -53,14 +53,13 @@ def test_a_mapping_beside_the_log_is_found_and_changed_by_flags(forcegp, folder)
 def test_an_existing_file_is_kept_unless_told_otherwise(forcegp, folder):
     write_text(folder / "log.csv", table(motion()))
     (folder / "log.h5").write_text("years of work")
-    forcegp("import", "log.csv", *FLAGS, "--out", "log.h5", folder=folder).refused("add --overwrite")
-    assert (folder / "log.h5").read_text() == "years of work"
-    refused = forcegp("import", "log.csv", *FLAGS, "--out", "log.h5", "--overwrite", folder=folder)
-    refused.refused("log.h5 is not a dataset of forcegp, so it is not overwritten")
-    assert (folder / "log.h5").read_text() == "years of work"
+    words, own = ("import", "log.csv", *FLAGS, "--out", "log.h5"), "is not a dataset of forcegp, so it is not"
+    for more, message in (((), "add --overwrite"), (("--overwrite",), f"log.h5 {own} overwritten")):
+        forcegp(*words, *more, folder=folder).refused(message)
+        assert (folder / "log.h5").read_text() == "years of work"
     (folder / "log.h5").write_text("")
-    assert forcegp("import", "log.csv", *FLAGS, "--out", "log.h5", "--overwrite", folder=folder).returncode == 0
-    forcegp("import", "log.csv", *FLAGS, "--out", "log.h5", "--overwrite", folder=folder).ok()
+    for _ in range(2):
+        forcegp(*words, "--overwrite", folder=folder).ok()
     assert len(Dataset.load(folder / "log.h5")) == 200
 
 

@@ -24,10 +24,14 @@ def folder(tmp_path_factory):
     return place
 
 
-def test_a_clean_log_is_fitted_without_a_word(forcegp, folder):
-    for name in ("clean.h5", "line.h5"):
+def test_a_clean_log_is_fitted_without_a_word_and_a_search_that_stopped_names_the_option(forcegp, folder):
+    for name in ("line.h5", "clean.h5"):
         done = forcegp("fit", name, *FIT, folder=folder).ok()
         assert not looked(done.stderr)
+    shown = " ".join(done.stdout.split())
+    assert "not converged" in shown
+    assert "raise --iterations" in shown
+    assert "`" not in shown
 
 
 def test_one_line_names_what_is_wrong_and_the_next_step(forcegp, folder):
@@ -58,10 +62,3 @@ def test_the_next_step_shows_what_the_fit_found(forcegp, folder):
     assert "warning: contact: " in said
     assert "See forcegp check" not in said
     assert "--contact" in said
-
-
-def test_the_table_of_a_search_that_stopped_names_the_option(forcegp, folder):
-    shown = " ".join(forcegp("fit", "clean.h5", *FIT, folder=folder).stdout.split())
-    assert "not converged" in shown
-    assert "raise --iterations" in shown
-    assert "`" not in shown

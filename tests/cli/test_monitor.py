@@ -50,10 +50,6 @@ def test_a_log_becomes_a_table_of_contacts(workshop, monkeypatch, tmp_path, caps
         (("--free", "free.h5", "--bandwidth", "500"), "below 50"),
     ],
 )  # fmt: skip
-def test_refusals_are_one_line(workshop, monkeypatch, tmp_path, capsys, words, message):
-    monkeypatch.chdir(workshop)
-    assert main(["monitor", "run", "log.h5", *words, "--out", str(tmp_path / "out")]) == 2
-    told = capsys.readouterr().err
-    assert message in told
-    assert len(told.strip().splitlines()) == 1
+def test_refusals_are_one_line(forcegp, workshop, tmp_path, words, message):
+    forcegp("monitor", "run", "log.h5", *words, "--out", tmp_path / "out", folder=workshop).refused(message)
     assert not (tmp_path / "out").exists()

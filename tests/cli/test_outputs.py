@@ -45,8 +45,10 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 
 @pytest.fixture
-def no_work(monkeypatch) -> None:
-    """Whoever begins the work fails."""
+def no_work(monkeypatch, request) -> None:
+    """Whoever begins the work of the command `name` fails."""
+    name = request.node.callspec.params["name"] if hasattr(request.node, "callspec") else ""
+    monkeypatch.setattr(sys, "argv", [name])
 
     def begun(*_, **__):
         raise AssertionError("the work has begun")
@@ -78,20 +80,19 @@ def refused(words: list[str], capfd) -> str:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_pipes_and_devices_are_never_replaced(folder, no_work, monkeypatch, capfd, name):
-    monkeypatch.setattr(sys, "argv", [name])
+def test_what_cannot_be_written_is_noticed_before_the_work_and_pipes_stay(folder, no_work, capfd, name):
     os.mkfifo("pipe")
     Path("link").symlink_to("pipe")
-    for out in ("pipe", "link"):
+    for out in ("pipe", "link", "arm.urdf/out", *["/proc/forcegp-out"] * Path("/proc/self").exists()):
         refused(filled(name, out), capfd)
         assert stat.S_ISFIFO(Path("pipe").stat().st_mode)
         assert Path("link").is_symlink()
+    assert Path("arm.urdf").read_text() == URDF
     assert not hidden(folder)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_two_commands_do_not_write_to_one_place(folder, no_work, monkeypatch, capfd, name):
-    monkeypatch.setattr(sys, "argv", [name])
+def test_two_commands_do_not_write_to_one_place(folder, no_work, capfd, name):
     Path("link").symlink_to("new")
     with parse_arguments(filled(name, "link")).alone():
         assert "another command of forcegp is writing" in refused(filled(name, "new"), capfd)
@@ -113,18 +114,7 @@ def test_locks_of_another_user_are_not_used(folder, no_work, monkeypatch, capfd)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_what_cannot_be_written_is_noticed_before_the_work(folder, no_work, monkeypatch, capfd, name):
-    monkeypatch.setattr(sys, "argv", [name])
-    places = ["arm.urdf/out"] + ["/proc/forcegp-out"] * Path("/proc/self").exists()
-    for out in places:
-        refused(filled(name, out), capfd)
-    assert Path("arm.urdf").read_text() == URDF
-    assert not hidden(folder)
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_full_disk_is_noticed_before_the_work(folder, no_work, monkeypatch, capfd, limited_file_size, name):
-    monkeypatch.setattr(sys, "argv", [name])
+def test_a_full_disk_is_noticed_before_the_work(folder, no_work, capfd, limited_file_size, name):
     with limited_file_size(2000):
         told = refused(filled(name, "out"), capfd)
     assert "File too large" in told
@@ -132,8 +122,7 @@ def test_a_full_disk_is_noticed_before_the_work(folder, no_work, monkeypatch, ca
 
 
 @pytest.mark.parametrize("name", FOLDERS)
-def test_files_that_a_user_put_there_are_never_deleted(folder, no_work, monkeypatch, capfd, name):
-    monkeypatch.setattr(sys, "argv", [name])
+def test_files_that_a_user_put_there_are_never_deleted(folder, no_work, capfd, name):
     Path("out").mkdir()
     kind = f"forcegp {name}"
     Path("out/config.json").write_text(json.dumps({"kind": kind}))

@@ -63,8 +63,7 @@ WORDS = ("payload", "loaded.h5", "--cutoff", "none", "--delay", 0)
 
 @pytest.fixture(scope="module")
 def held(folder, forcegp):
-    done = forcegp(*WORDS, "--out", "held", "--json", folder=folder).ok()
-    return done
+    return forcegp(*WORDS, "--out", "held", "--json", folder=folder).ok()
 
 
 def require_mass(content):
