@@ -32,6 +32,7 @@ STIFFNESS = 50.0, 200.0, 800.0  # of what friction remembers, over the reciproca
 SURE, TELLS = 200.0, 30.0  # nats that a stretch of time in which something is touched explains: in all, and of a joint
 SEEN, WARMER = 1e-3, 0.1  # share of the largest direction of columns; logarithm of a ratio of friction that is told
 ROUNDS = 2  # in which a push is sought anew, by what the other rows tell
+SHORT = 2.0  # s, of what stays between pushes: up to which filters and splits have no use for it
 RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
 
 
@@ -307,7 +308,8 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
     rows = replace(inputs, compared=compared, most_rows=1000).rows()
     columns, standing = _needs(inputs.robot, rows), _needs(inputs.robot, at)
     ends = [np.flatnonzero(log.episode == log.episode[rest[0]])[[0, -1]] for rest in found]
-    outer = [np.abs(rest[[0, -1]] - both).min() < FEWEST_ROWS for rest, both in zip(found, ends, strict=True)]
+    long = (np.ptp(log.time[rest]) > SHORT for rest in found)
+    outer = [np.abs(x[[0, -1]] - y).min() < FEWEST_ROWS and z for x, y, z in zip(found, ends, long, strict=True)]
     idle = np.isin(
         still, np.concatenate([still[:0], *(rest for rest, at_end in zip(found, outer, strict=True) if at_end)])
     )
@@ -342,9 +344,6 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
         numbers={"seconds": spans},
     )
     return _cut(log, out), [doubt]
-
-
-SHORT = 2.0  # s, of what stays between pushes: up to which filters and splits have no use for it
 
 
 def without_pushes(log: Dataset, doubts: Sequence[Doubt]) -> Dataset:

@@ -118,7 +118,8 @@ def recorded_scene(
             arrows = [_at_joints(dynamics, "recorded u", dynamics.state.delivered, None)]
     poses = poses_of_links(model.robot, q, [shape.link for shape in drawn])
     time = rows.time - rows.time[0]
-    return RecordedScene(model.robot, time, rows.q, drawn, poses, arrows, reach(model.robot), doubts)
+    alone = [2.0 * float(np.linalg.norm(shape.vertices, axis=1).max()) for shape in drawn if len(drawn) == 1]
+    return RecordedScene(model.robot, time, rows.q, drawn, poses, arrows, max(reach(model.robot), *alone, 0.0), doubts)
 
 
 def learned_forces(posterior: Posterior, dynamics: ConstrainedDynamics) -> list[Arrows]:
@@ -216,10 +217,11 @@ def recording(recorded: RecordedScene) -> str:
 def _drawn(server: Any, recorded: RecordedScene) -> Callable[[int], None]:
     """The nodes of one recorded scene; what is returned moves them to a row."""
     scene, size, length = server.scene, recorded.size, recorded.arrow_length
+    places = recorded.poses[..., :3, 3].reshape(-1, 3) if recorded.shapes else np.zeros((1, 3))
+    center, far = (places.max(0) + places.min(0)) / 2.0, max(size, 1.4 * float(np.ptp(places, axis=0).max()))
     scene.set_up_direction("+z")
-    scene.add_grid("/ground", width=2.0 * size, height=2.0 * size, cell_size=size / 5.0, section_size=size)
-    center = recorded.poses[..., :3, 3].mean(axis=(0, 1)) if recorded.shapes else np.zeros(3)
-    server.initial_camera.position = tuple(center + size * np.array([0.6, -0.55, 0.28]))
+    scene.add_grid("/ground", width=2.0 * far, height=2.0 * far, cell_size=far / 5.0, section_size=far)
+    server.initial_camera.position = tuple(center + far * np.array([0.6, -0.55, 0.28]))
     server.initial_camera.look_at = tuple(center)
     links, arrows = [], []
     for place, shape in enumerate(recorded.shapes):
