@@ -6,6 +6,7 @@ One unit is the typical size of a number in the log, or a factor of e on a log s
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -230,32 +231,44 @@ class ParameterSpace:
         return next((law for law in self._estimated.values() if law.under_load), None)
 
     def torque(
-        self, x: Float[np.ndarray, " k"], state: State, a: Float[np.ndarray, "rows nv"], cache: dict[Any, Any]
-    ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv t"]]:
+        self,
+        x: Float[np.ndarray, " k"],
+        state: State,
+        a: Float[np.ndarray, "rows nv"],
+        cache: dict[Any, Any],
+        loads: State | None = None,
+    ) -> tuple[Float[np.ndarray, "loads rows nv"], Float[np.ndarray, "loads rows nv t"]]:
         """What the laws add to the torque of a motion, and the derivatives in their coordinates (without bodies).
 
+        With `loads` (2, rows, nv), laws under load see the first one, and after that comes what the second adds.
         `cache` holds features and directions of these states, which no coordinate changes.
         """
-        total, jacobian = np.zeros_like(a), np.zeros((*a.shape, self.size - self.bodies.size))
+        count = 1 if loads is None else 2
+        total, jacobian = np.zeros((count, *a.shape)), np.zeros((count, *a.shape, self.size - self.bodies.size))
         values, of_terms, column = self.values(x), self.split(x)[1], 0
         for index, law in self._estimated.items():
             terms = [(own, term) for own, term in zip(of_terms, self.terms, strict=True) if term.law == index]
             if (basis := law.inertia_basis(self.model.robot)) is not None:
-                moved = np.tensordot(a, basis.cpu().numpy(), (1, 2)).swapaxes(1, 2)
-                total += moved @ values[index][next(iter(law.coefficients))].cpu().numpy()
-                derivatives = [moved[:, :, list(term.joints or ())] for _, term in terms]
+                if index not in cache or cache[index][0] is not a:
+                    cache[index] = a, np.tensordot(a, basis.cpu().numpy(), (1, 2)).swapaxes(1, 2)
+                moved = cache[index][1]
+                needed = moved @ values[index][next(iter(law.coefficients))].cpu().numpy()
+                found = [(needed, [moved[:, :, list(term.joints or ())] for _, term in terms])]
             else:
                 if index not in cache:
-                    cache[index] = law.features(law.seen(state)), law.direction(state)
-                force, derivatives = _derivatives(law, values[index], [term for _, term in terms], *cache[index])
-                total -= force
-            for (own, term), derivative in zip(terms, derivatives, strict=True):
-                places, width = list(term.joints or ()), len(term.size)
-                if derivative.ndim == 2:  # number j acts on joint j alone
-                    jacobian[:, places, range(column, column + width)] = derivative[:, places] * term.slopes(own)
-                else:
-                    jacobian[..., column : column + width] = derivative * term.slopes(own)
-                column += width
+                    seen = law.seen(loads if loads is not None and law.under_load else state)
+                    cache[index] = law.features(seen), law.direction(state)
+                found = _derivatives(law, values[index], [term for _, term in terms], *cache[index])
+            ends = list(accumulate((len(term.size) for _, term in terms), initial=column))
+            for k, (needed, derivatives) in enumerate(found):
+                total[k] += needed
+                for (own, term), derivative, (first, end) in zip(terms, derivatives, pairwise(ends), strict=True):
+                    if derivative.ndim == 2:  # number j acts on joint j alone
+                        places = list(term.joints or ())
+                        jacobian[k][:, places, range(first, end)] = derivative[:, places] * term.slopes(own)
+                    else:
+                        jacobian[k][..., first:end] = derivative * term.slopes(own)
+            column = ends[-1]
         return total, jacobian
 
     def delivered(
@@ -297,31 +310,36 @@ def force_title(law: Law) -> str:
 
 def _derivatives(
     law: Law, values: Mapping[str, Tensor], terms: Sequence[Term], features: tuple[Tensor, ...], B: Tensor | None
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The force (rows, nv), and slopes of minus that by entry: (rows, nv, k), or (rows, nv) for joints alone."""
+) -> list[tuple[np.ndarray, list[np.ndarray]]]:
+    """Minus the force (rows, nv), and slopes of that by entry: (rows, nv, k), or (rows, nv) for joints alone.
+
+    Under several loads those of the first, and what each of the others adds.
+    """
     rows, wanted = features[0].shape[:-1], {term.name for term in terms}
     numbers = {
         name: value.expand(*rows, *value.shape).clone().requires_grad_(name in wanted) for name, value in values.items()
     }
+    found = []
     with torch.enable_grad():
         # a number that all directions share has no last dimension to broadcast along
         given = {name: value[..., None] if value.dim() == len(rows) else value for name, value in numbers.items()}
-        amplitude, out = law.amplitude(features, given), []
-        for term in terms:
-            if term.joints is not None:  # amplitude j depends on entry j alone
-                total, number = amplitude.sum(), numbers[term.name]
-                slope = torch.autograd.grad(total, number, retain_graph=True, materialize_grads=True)[0]
-                if B is None:
-                    out.append(-slope.cpu().numpy())
-                    continue
-                each = slope.diag_embed()[..., list(term.joints)]
+        needed = -law.amplitude(features, given)
+        first, *others = needed.unbind() if needed.dim() > len(rows) + 1 else [needed]
+        for part in (first, *(other - first for other in others)):
+            if terms[0].joints is not None:  # amplitude j depends on entries j alone
+                own = [numbers[term.name] for term in terms]
+                each = torch.autograd.grad(part.sum(), own, retain_graph=True, materialize_grads=True)
+                if B is not None:
+                    each = [x.diag_embed()[..., list(term.joints or ())] for x, term in zip(each, terms, strict=True)]
             else:
-                totals = amplitude.flatten(0, -2).sum(0)
-                parts = [torch.autograd.grad(total, numbers[term.name], retain_graph=True)[0] for total in totals]
-                each = torch.stack(parts, dim=-1)[..., None]
-            out.append(-(each if B is None else B @ each).cpu().numpy())
-    amplitude = amplitude.detach()
-    return (amplitude if B is None else (B @ amplitude[..., None])[..., 0]).cpu().numpy(), out
+                each, totals = [], part.flatten(0, -2).sum(0)
+                for term in terms:
+                    parts = [torch.autograd.grad(total, numbers[term.name], retain_graph=True)[0] for total in totals]
+                    each.append(torch.stack(parts, dim=-1)[..., None])
+            force = part.detach()
+            force = force if B is None else (B @ force[..., None])[..., 0]
+            found.append((force.cpu().numpy(), [(x if B is None else B @ x).cpu().numpy() for x in each]))
+    return found
 
 
 def _terms(model: Model, typical: Mapping[str, np.ndarray]) -> list[Term]:
