@@ -139,4 +139,5 @@ def _without(posterior: Posterior, rest: Dataset) -> Posterior:
     rows = farthest_rows(rest, len(own)) if len(own) < len(rest) else rest
     given = replace(TrainingData.of(rows, own.q.device, own.sensed), reference=own.reference or own)
     how = posterior.hyperparameters, posterior.result, posterior.settings, posterior.engine
-    return replace(posterior.conditioned(posterior.trained, given, *how), target=posterior.target)
+    other = posterior.conditioned(posterior.trained, given, *how, near=posterior.latent)
+    return replace(other, target=posterior.target)
