@@ -178,7 +178,7 @@ class Fit:
         """The Jacobian over the noise, without what unknown forces explain."""
         return without(self.jacobian / self.noise[:, None], self.span)
 
-    @property
+    @cached_property
     def information(self) -> Float[np.ndarray, "k k"]:
         """Gauss-Newton curvature of the data, each residual weighted by its noise."""
         weighted = self.white_jacobian.reshape(-1, len(self.x))
