@@ -236,6 +236,12 @@ class RecordedMotions:
     v: Float[np.ndarray, "motions rows nv"]
     u: Float[np.ndarray, "motions steps nu"]
 
+    @classmethod
+    def joined(cls, each: Sequence["RecordedMotions"]) -> "RecordedMotions":
+        """One after the other, of the same steps; rows are those of their own datasets."""
+        motions = {name: np.concatenate([getattr(one, name) for one in each]) for name in ("q", "v", "u")}
+        return cls(tuple(row for one in each for row in one.rows), each[0].dt, **motions)
+
 
 def require_order_of_time(dataset: Dataset) -> None:
     """Raises InvalidInput for rows out of it."""
