@@ -76,8 +76,10 @@ def calibrated(
                 louder = replace(other, target=scaled(other.model, 1.0 + torch.as_tensor(drift["between"]), kind))
                 moved = louder.rollout(motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, integrator=integrator)
                 shifts.append(torch.stack([moved.q - rollout.q, moved.v - rollout.v], dim=2)[:, at].cpu().numpy())
+                del louder, moved
         errors.append(np.stack(error, axis=2))
         spreads.append(np.stack(spread, axis=2))
+        del other, rollout
     error, spread = np.concatenate(errors), np.concatenate(spreads)  # (motions, H, 2, nv)
     lasting = np.isfinite(error + spread).all(axis=(1, 2, 3))
     if not lasting.any():
@@ -104,6 +106,7 @@ def _left_out(
         found.append((other, _motions(rows, seconds)))
         if posterior.latent_names or posterior.settings.get("motions"):
             yield found.pop()
+            del other  # of which two would need twice the memory
     alike = len({(round(x.dt, 9), x.u.shape[1]) for _, x in found}) == 1
     yield from [(found[0][0], RecordedMotions.joined([x for _, x in found]))] if alike else found
 
