@@ -292,10 +292,7 @@ class MarginalLikelihood:
         at_parameters: bool = False,
         near: LatentPosterior | None = None,
     ) -> LatentPosterior:
-        """The posterior of latent functions at fixed parameters; kernels that are `at_parameters` are not copied.
-
-        One at the same parameters from other rows, or under other noise, may be `near`.
-        """
+        """The posterior of latent functions at fixed parameters; kernels that are `at_parameters` are not copied."""
         kernels = kernels if at_parameters else kernels.at(parameters)
         with torch.no_grad():
             return (engine or Exact()).condition(kernels, self.terms(parameters), near)

@@ -6,7 +6,6 @@ One unit is the typical size of a number in the log, or a factor of e on a log s
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -240,35 +239,34 @@ class ParameterSpace:
     ) -> tuple[Float[np.ndarray, "loads rows nv"], Float[np.ndarray, "loads rows nv t"]]:
         """What the laws add to the torque of a motion, and the derivatives in their coordinates (without bodies).
 
-        With `loads` (2, rows, nv), laws under load see the first one, and after that comes what the second adds.
-        `cache` holds features and directions of these states, which no coordinate changes.
+        Of `loads` (2, rows, nv), laws under load see the first; after that comes what the second adds. `cache` holds
+        features and directions of these states, which no coordinate changes.
         """
-        count = 1 if loads is None else 2
-        total, jacobian = np.zeros((count, *a.shape)), np.zeros((count, *a.shape, self.size - self.bodies.size))
+        total = np.zeros((1 if loads is None else 2, *a.shape))
+        jacobian = np.zeros((*total.shape, self.size - self.bodies.size))
         values, of_terms, column = self.values(x), self.split(x)[1], 0
         for index, law in self._estimated.items():
             terms = [(own, term) for own, term in zip(of_terms, self.terms, strict=True) if term.law == index]
             if (basis := law.inertia_basis(self.model.robot)) is not None:
                 if index not in cache or cache[index][0] is not a:
                     cache[index] = a, np.tensordot(a, basis.cpu().numpy(), (1, 2)).swapaxes(1, 2)
-                moved = cache[index][1]
-                needed = moved @ values[index][next(iter(law.coefficients))].cpu().numpy()
-                found = [(needed, [moved[:, :, list(term.joints or ())] for _, term in terms])]
+                moved, own = cache[index][1], values[index][next(iter(law.coefficients))].cpu().numpy()
+                found = [(moved @ own, [moved[:, :, list(term.joints or ())] for _, term in terms])]
             else:
                 if index not in cache:
                     seen = law.seen(loads if loads is not None and law.under_load else state)
                     cache[index] = law.features(seen), law.direction(state)
                 found = _derivatives(law, values[index], [term for _, term in terms], *cache[index])
-            ends = list(accumulate((len(term.size) for _, term in terms), initial=column))
-            for k, (needed, derivatives) in enumerate(found):
-                total[k] += needed
-                for (own, term), derivative, (first, end) in zip(terms, derivatives, pairwise(ends), strict=True):
-                    if derivative.ndim == 2:  # number j acts on joint j alone
-                        places = list(term.joints or ())
-                        jacobian[k][:, places, range(first, end)] = derivative[:, places] * term.slopes(own)
+            for needed, each in zip(total, found, strict=False):
+                needed += each[0]
+            for place, (own, term) in enumerate(terms):
+                places, width = list(term.joints or ()), len(term.size)
+                for slopes, (_, each) in zip(jacobian, found, strict=False):
+                    if each[place].ndim == 2:  # number j acts on joint j alone
+                        slopes[:, places, range(column, column + width)] = each[place][:, places] * term.slopes(own)
                     else:
-                        jacobian[k][..., first:end] = derivative * term.slopes(own)
-            column = ends[-1]
+                        slopes[..., column : column + width] = each[place] * term.slopes(own)
+                column += width
         return total, jacobian
 
     def delivered(
@@ -311,10 +309,7 @@ def force_title(law: Law) -> str:
 def _derivatives(
     law: Law, values: Mapping[str, Tensor], terms: Sequence[Term], features: tuple[Tensor, ...], B: Tensor | None
 ) -> list[tuple[np.ndarray, list[np.ndarray]]]:
-    """Minus the force (rows, nv), and slopes of that by entry: (rows, nv, k), or (rows, nv) for joints alone.
-
-    Under several loads those of the first, and what each of the others adds.
-    """
+    """Minus the force (rows, nv), with slopes by entry (rows, nv, k), or (rows, nv); then what another load adds."""
     rows, wanted = features[0].shape[:-1], {term.name for term in terms}
     numbers = {
         name: value.expand(*rows, *value.shape).clone().requires_grad_(name in wanted) for name, value in values.items()
@@ -324,8 +319,8 @@ def _derivatives(
         # a number that all directions share has no last dimension to broadcast along
         given = {name: value[..., None] if value.dim() == len(rows) else value for name, value in numbers.items()}
         needed = -law.amplitude(features, given)
-        first, *others = needed.unbind() if needed.dim() > len(rows) + 1 else [needed]
-        for part in (first, *(other - first for other in others)):
+        parts = [needed[0], needed[1] - needed[0]] if needed.dim() > len(rows) + 1 else [needed]
+        for part in parts:
             if terms[0].joints is not None:  # amplitude j depends on entries j alone
                 own = [numbers[term.name] for term in terms]
                 each = torch.autograd.grad(part.sum(), own, retain_graph=True, materialize_grads=True)
@@ -334,10 +329,9 @@ def _derivatives(
             else:
                 each, totals = [], part.flatten(0, -2).sum(0)
                 for term in terms:
-                    parts = [torch.autograd.grad(total, numbers[term.name], retain_graph=True)[0] for total in totals]
-                    each.append(torch.stack(parts, dim=-1)[..., None])
-            force = part.detach()
-            force = force if B is None else (B @ force[..., None])[..., 0]
+                    own = [torch.autograd.grad(total, numbers[term.name], retain_graph=True)[0] for total in totals]
+                    each.append(torch.stack(own, dim=-1)[..., None])
+            force = part.detach() if B is None else (B @ part.detach()[..., None])[..., 0]
             found.append((force.cpu().numpy(), [(x if B is None else B @ x).cpu().numpy() for x in each]))
     return found
 

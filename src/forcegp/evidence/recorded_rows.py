@@ -242,11 +242,10 @@ class RecordedRows:
 
     def _terms(self, x: np.ndarray, a: Rows, loads: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """`ParameterSpace.torque` under the measured load, or under none; then what a load of 1 of all motors adds."""
-        state, both, law = self.state, None, self.space.under_load
-        if loads:
-            state = _under_load(state, torch.zeros_like(state.v))
-            ones = torch.ones_like(state.v)
-            both = None if law is None else _under_load(state, torch.stack([0.0 * ones, law.at_joints(ones)]))
+        none, law, both = torch.zeros_like(self.state.v), self.space.under_load, None
+        if loads and law is not None:
+            both = _under_load(self.state, torch.stack([none, law.at_joints(none + 1.0)]))
+        state = _under_load(self.state, none) if loads else self.state
         return self.space.torque(x, state, a, self._caches[loads], both)
 
     def in_torque(self, x: np.ndarray, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray, Response]:
@@ -256,7 +255,6 @@ class RecordedRows:
         joints, regressor, law = rigid[:, :nv], motion.regressor, self.space.under_load
         (torque, *more), (in_x, *more_in_x) = self._terms(x, motion.a, True)
         beyond = in_x[:, self.links] * self._beyond
-
         r, response = joints + torque, lambda values: values
         if law is not None:
             T = None if law.transmission is None else np.asarray(torch.as_tensor(law.transmission).cpu())

@@ -64,10 +64,7 @@ class Engine(ABC):
 
     @abstractmethod
     def condition(self, kernels: LatentKernels, terms: Terms, near: LatentPosterior | None = None) -> LatentPosterior:
-        """The posterior given the data, sooner where another one of these kernels is `near`.
-
-        Raises NotEnoughMemory beforehand, NumericalError where the engine fails.
-        """
+        """The posterior given the data, sooner with another at hand. Raises NotEnoughMemory, NumericalError."""
 
     def require_memory(self, size: ProblemSize, device: torch.device) -> None:
         """Raise NotEnoughMemory where conditioning needs more memory than is free."""

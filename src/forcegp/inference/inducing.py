@@ -16,7 +16,7 @@ from typing_extensions import override
 
 from forcegp.inference.dense_kernels import DenseKernel, LatentKernels
 from forcegp.inference.likelihood import CholeskyFactor, Terms, factorize
-from forcegp.inference.posterior import BLOCK_BYTES, LatentPosterior
+from forcegp.inference.posterior import BLOCK_BYTES, Features, LatentPosterior
 
 ROUNDING = 1e-13  # remainders below this fraction of the largest k(z, z) are rounding
 
@@ -75,8 +75,8 @@ class InducingPosterior(LatentPosterior):
     ) -> "InducingPosterior":
         """On all rows, by at most `points` points per latent; fewer where its share of `tolerance` suffices.
 
-        Points are those of another posterior of the same kernels `near`, where these suffice: the search is half the
-        work. Time O(N P^2). Raises NumericalError where the points cannot be factorised.
+        Points are those of another posterior of the same kernels, where these suffice: to search is half the work.
+        Time O(N P^2). Raises NumericalError where the points cannot be factorised.
         """
         with torch.no_grad():
             deflation, features = terms.deflated(), terms.features
@@ -85,13 +85,13 @@ class InducingPosterior(LatentPosterior):
             some = torch.linspace(0, count - 1, min(count, CANDIDATES), dtype=torch.float64).round().long().to(C.device)
             share, centers, lowers = tolerance / max(1, C.shape[-1]) * len(some), [], []
             for c, (kernel, z, own) in enumerate(zip(kernels.dense, features, relevance[some].mT, strict=True)):
-                enough = near._enough(c, z[some], own, points, share) if isinstance(near, cls) else 0
-                if isinstance(near, cls) and enough:
-                    centers.append(near.features[c][:enough])
-                    lowers.append(near.lowers[c][:enough, :enough])
+                if isinstance(near, cls) and (enough := near._enough(c, z[some], own, points, share)):
+                    at, lower = near.features[c][:enough], near.lowers[c][:enough, :enough]
                 else:
-                    centers.append(at := z[some[pivoted_cholesky(kernel, z[some], own, points, share)]].detach())
-                    lowers.append(factorize(partial(kernel.cross, at, at)).lower.tril())
+                    at = z[some[pivoted_cholesky(kernel, z[some], own, points, share)]].detach()
+                    lower = factorize(partial(kernel.cross, at, at)).lower.tril()
+                centers.append(at)
+                lowers.append(lower)
             size = sum(map(len, lowers))
             bare = cls(kernels, tuple(centers), tuple(lowers), CholeskyFactor(C.new_empty(0, 0)), C.new_empty(0), 0.0)
             pairs = (C[..., :, None] * C[..., None, :]).sum(1)  # C_i^T C_i
@@ -119,9 +119,7 @@ class InducingPosterior(LatentPosterior):
 
     def _enough(self, c: int, z: Float[Tensor, "N d"], relevance: Float[Tensor, " N"], most: int, share: float) -> int:
         """How many points of a latent, first ones first, `pivoted_cholesky` would be content with; 0 for not all."""
-        phi = torch.linalg.solve_triangular(
-            self.lowers[c], self.kernels.dense[c].cross(self.features[c], z), upper=False
-        )
+        [phi] = self.columns([z], [c])
         left = (self.kernels.dense[c].diagonal(z) - phi.square().cumsum(0)).clamp_min(0.0) @ relevance
         reached = (left <= share).nonzero()
         return 1 + int(reached[0]) if len(reached) else most * (len(left) == most)
@@ -132,9 +130,7 @@ class InducingPosterior(LatentPosterior):
         ends = accumulate((len(lower) for lower in self.lowers), initial=0)
         return tuple(slice(start, stop) for start, stop in pairwise(ends))
 
-    def columns(
-        self, features: Sequence[Float[Tensor, "n _"]], which: Sequence[int] | None = None
-    ) -> list[Float[Tensor, "_ n"]]:
+    def columns(self, features: Features, which: Sequence[int] | None = None) -> list[Float[Tensor, "_ n"]]:
         """phi_c at points, one column each; of some latents, or of all."""
         own = zip(range(len(self.lowers)) if which is None else which, features, strict=True)
         crosses = ((c, self.kernels.dense[c].cross(self.features[c], z)) for c, z in own)
@@ -151,9 +147,7 @@ class InducingPosterior(LatentPosterior):
         return tuple(w[:, 0] for w in self.center_weights(self.mean_weights[:, None]))
 
     @override
-    def _covariance_block(
-        self, features: Sequence[Float[Tensor, "n _"]], which: Sequence[int]
-    ) -> Float[Tensor, "n C C"]:
+    def _covariance_block(self, features: Features, which: Sequence[int]) -> Float[Tensor, "n C C"]:
         # what the weights leave out of k_c, and Phi_z B^-1 Phi_z^T; L^-1 phi_c begins with zeros, which are skipped
         lower = self.factor.lower
         V = features[0].new_zeros(len(lower), len(which), len(features[0]))
