@@ -190,19 +190,25 @@ class ParameterSpace:
 
     def values(self, x: Float[np.ndarray, " k"]) -> dict[int, dict[str, Tensor]]:
         """Coefficients of the laws that are estimated, by number of the law."""
-        out: dict[int, dict[str, Tensor]] = {}
+        out = {index: dict(named) for index, named in self._stated.items()}
         for own, term in zip(self.split(x)[1], self.terms, strict=True):
-            law = self.model.laws[term.law]
-            named = {name: law.values[name].to(self.model.robot.device) for name in law.coefficients}
-            if isinstance(law, PerJointLaw):  # numbers that are not estimated stay
-                named = {name: value.expand(self.model.robot.nv).clone() for name, value in named.items()}
-            named = out.setdefault(term.law, named)
-            value = torch.as_tensor(term.values(own), device=self.model.robot.device)
+            named, value = out[term.law], torch.as_tensor(term.values(own), device=self.model.robot.device)
             if term.joints is None:
                 named[term.name] = value[0]
             else:
                 places = torch.tensor(term.joints, device=self.model.robot.device)
                 named[term.name] = named[term.name].index_copy(0, places, value)
+        return out
+
+    @cached_property
+    def _stated(self) -> dict[int, dict[str, Tensor]]:
+        """The same before any is estimated; numbers of joints that are not stay."""
+        out, robot = dict[int, dict[str, Tensor]](), self.model.robot
+        for index, law in self._estimated.items():
+            given = law.values
+            named = {name: given[name].to(robot.device) for name in law.coefficients}
+            whole = isinstance(law, PerJointLaw)
+            out[index] = {name: x.expand(robot.nv) if whole else x for name, x in named.items()}
         return out
 
     def model_at(self, x: Float[np.ndarray, " k"]) -> Model:
@@ -270,20 +276,13 @@ class ParameterSpace:
         return total, jacobian
 
     def delivered(
-        self,
-        x: Float[np.ndarray, " k"],
-        state: State,
-        known: Float[np.ndarray, "rows nv"],
-        slopes: Float[np.ndarray, "rows nv t"],
-    ) -> tuple[Float[np.ndarray, "rows nv"], Float[np.ndarray, "rows nv t"]]:
-        """Torques of actuators and their derivatives, by `slopes` of `torque`; those `known` where no gain is free."""
-        values, of_gain, column = self.values(x), np.zeros(slopes.shape[-1], dtype=bool), 0
-        for term in self.terms:
-            if isinstance(law := self.model.laws[term.law], Actuation):
-                known = law.amplitude(law.features(state), values[term.law]).cpu().numpy()
-                of_gain[column : column + len(term.size)] = True
-            column += len(term.size)
-        return known, -slopes * of_gain
+        self, x: Float[np.ndarray, " k"], state: State, known: Float[np.ndarray, "rows nv"]
+    ) -> Float[np.ndarray, "rows nv"]:
+        """Torques of actuators, whose derivatives are minus those of `torque`; those `known` where no gain is free."""
+        for index, law in self._estimated.items():
+            if isinstance(law, Actuation):
+                known = law.amplitude(law.features(state), self.values(x)[index]).cpu().numpy()
+        return known
 
     @cached_property
     def _estimated(self) -> dict[int, Law]:

@@ -25,7 +25,7 @@ from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence.bodies import standard_parameters
 from forcegp.evidence.least_squares import NoiseLevels, orthonormal_columns, without
 from forcegp.evidence.parameter_space import ParameterSpace
-from forcegp.forces import Law, RigidBodies
+from forcegp.forces import Actuation, Law, RigidBodies
 from forcegp.forces.actuation import OBSERVED
 from forcegp.mechanics import ConstrainedDynamics, Contact, Held, State
 from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE
@@ -195,9 +195,11 @@ class RecordedRows:
         own = [each.body for each in space.carried if each.payload is None]
         unloaded = standard_parameters(model.robot).reshape(-1, 10).cpu().numpy()
         self._stated[own] -= unloaded[[space.own.index(body) for body in own]]
-        self._beyond = np.array([not space.model.laws[term.law].in_gear for term in space.terms for _ in term.size])
-        """Of the coordinates of laws: which of them are at the links' side of gears."""
-        self._under_load = np.array([space.model.laws[term.law].under_load for term in space.terms for _ in term.size])
+        laws = [space.model.laws[term.law] for term in space.terms for _ in term.size]
+        self._beyond = np.array([not law.in_gear for law in laws])
+        """Of the coordinates of laws: which of them are at the links' side of gears, and other kinds."""
+        self._under_load = np.array([law.under_load for law in laws])
+        self._gains = np.array([isinstance(law, Actuation) for law in laws])
         self._caches: dict[bool, dict[Any, Any]] = {False: {}, True: {}}
 
     @cached_property
@@ -259,7 +261,7 @@ class RecordedRows:
         if law is not None:
             T = None if law.transmission is None else np.asarray(torch.as_tensor(law.transmission).cpu())
             motor, joint = (partial(_turned, each) for each in (None if T is None else np.linalg.inv(T), T))
-            delivered, delivered_in_x = self.space.delivered(x, self.state, self.delivered, in_x)
+            delivered, of_gains = self.space.delivered(x, self.state, self.delivered), in_x[..., self._gains]
             z, g = motor(joints + torque + delivered), motor(more[0])
             sign = np.sign(z)
             left = 1.0 - g * sign
@@ -270,9 +272,10 @@ class RecordedRows:
 
             response = borne if g.any() else response  # else regressors stay as they are, and their squares with them
             own = self._under_load
+            in_x[..., self._gains] = 0.0  # z has what is delivered in it
             in_x[..., own] += joint((u * sign)[..., None] * motor(more_in_x[0][..., own]))
-            in_x = response(in_x + delivered_in_x)
-            r, in_x = joint(u) - delivered, in_x - delivered_in_x
+            r, in_x = joint(u) - delivered, response(in_x)
+            in_x[..., self._gains] += of_gains
             own = response(regressor[:, :nv])
             regressor = np.concatenate([own, regressor[:, nv:]], axis=1) if self.links else own
         if self.links:
