@@ -149,16 +149,15 @@ class InducingPosterior(LatentPosterior):
     @override
     def _covariance_block(self, features: Features, which: Sequence[int]) -> Float[Tensor, "n C C"]:
         # what the weights leave out of k_c, and Phi_z B^-1 Phi_z^T; L^-1 phi_c begins with zeros, which are skipped
-        lower = self.factor.lower
-        V = features[0].new_zeros(len(lower), len(which), len(features[0]))
-        remainders = []
+        lower, white, out = self.factor.lower, [], features[0].new_empty(len(features[0]), len(which), len(which))
         for k, (c, phi) in enumerate(zip(which, self.columns(features, which), strict=True)):
             first = self.slices[c].start
             right = torch.nn.functional.pad(phi, (0, 0, 0, len(lower) - first - len(phi)))
-            V[first:, k] = torch.linalg.solve_triangular(lower[first:, first:], right, upper=False)
-            remainders.append((self.kernels.dense[c].diagonal(features[k]) - phi.square().sum(0)).clamp_min(0.0))
-        V = V.permute(2, 1, 0)
-        return torch.diag_embed(torch.stack(remainders, dim=-1)) + V @ V.mT
+            white.append(torch.linalg.solve_triangular(lower[first:, first:], right, upper=False))
+            for d, other in enumerate(white):
+                out[:, k, d] = out[:, d, k] = (white[k] * other[len(other) - len(white[k]) :]).sum(0)
+            out[:, k, k] += (self.kernels.dense[c].diagonal(features[k]) - phi.square().sum(0)).clamp_min(0.0)
+        return out
 
     @override
     def function_weights(
