@@ -205,10 +205,9 @@ class ParameterSpace:
         """The same before any is estimated; numbers of joints that are not stay."""
         out, robot = dict[int, dict[str, Tensor]](), self.model.robot
         for index, law in self._estimated.items():
-            given = law.values
-            named = {name: given[name].to(robot.device) for name in law.coefficients}
-            whole = isinstance(law, PerJointLaw)
-            out[index] = {name: x.expand(robot.nv) if whole else x for name, x in named.items()}
+            given, whole = law.values, isinstance(law, PerJointLaw)
+            named = ((name, given[name].to(robot.device)) for name in law.coefficients)
+            out[index] = {name: x.expand(robot.nv) if whole else x for name, x in named}
         return out
 
     def model_at(self, x: Float[np.ndarray, " k"]) -> Model:

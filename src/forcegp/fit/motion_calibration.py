@@ -153,6 +153,5 @@ def _without(posterior: Posterior, rest: Dataset) -> Posterior:
     rest = in_own_air(posterior, rest)
     rows = farthest_rows(rest, len(own)) if len(own) < len(rest) else rest
     given = replace(TrainingData.of(rows, own.q.device, own.sensed), reference=own.reference or own)
-    how = posterior.hyperparameters, posterior.result, posterior.settings, posterior.engine
-    other = posterior.conditioned(posterior.trained, given, *how, near=posterior.latent)
-    return replace(other, target=posterior.target)
+    how = posterior.hyperparameters, posterior.result, posterior.settings, posterior.engine, None, posterior.latent
+    return replace(posterior.conditioned(posterior.trained, given, *how), target=posterior.target)

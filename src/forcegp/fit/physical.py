@@ -69,8 +69,7 @@ def fit_physical(
 ) -> Solution:
     """The open numbers of a model without unknown forces; of several logs payloads are in the first alone.
 
-    The search begins `near` a solution of the same model on other rows, if given; `roughly` ends it sooner, without
-    estimates.
+    The search begins `near` a solution of the same model on other rows; `roughly` ends it sooner, without estimates.
     """
     bodies = any(getattr(law, "learn", ()) or (isinstance(law, Payload) and not law.known) for law in model.laws)
     robot, thick = thickened(model.robot) if bodies else (model.robot, ())

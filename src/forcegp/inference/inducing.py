@@ -90,8 +90,7 @@ class InducingPosterior(LatentPosterior):
                 else:
                     at = z[some[pivoted_cholesky(kernel, z[some], own, points, share)]].detach()
                     lower = factorize(partial(kernel.cross, at, at)).lower.tril()
-                centers.append(at)
-                lowers.append(lower)
+                centers, lowers = [*centers, at], [*lowers, lower]
             size = sum(map(len, lowers))
             bare = cls(kernels, tuple(centers), tuple(lowers), CholeskyFactor(C.new_empty(0, 0)), C.new_empty(0), 0.0)
             pairs = (C[..., :, None] * C[..., None, :]).sum(1)  # C_i^T C_i
