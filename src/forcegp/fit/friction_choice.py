@@ -123,10 +123,9 @@ def choose_friction(
         if strokes is not None and alike:  # gears are alike: what the others remember over may do here
             regression.remember(j, strokes[:, j], [float(np.median(alike))])
             regression.choose(j, parts)
-    chosen = tuple(regression.parts.get(j, ()) for j in range(log.nv))
-    found = chosen, tuple(regression.ratios), tuple(few), regression.sigma
+    found = tuple(regression.parts.get(j, ()) for j in range(log.nv)), tuple(regression.ratios), tuple(few)
     falls = tuple((regression.speed * np.array(FALLS)[regression.fall]).tolist())
-    return FrictionChoice(tuple(log.joint_names), *found, falls, log.transmission)
+    return FrictionChoice(tuple(log.joint_names), *found, regression.sigma, falls, log.transmission)
 
 
 def _precision(model: Model, log: Dataset, noise: Noise | None) -> Float[np.ndarray, "rows nv nv"]:
