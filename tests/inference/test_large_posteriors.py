@@ -48,6 +48,21 @@ def test_inducing_points_everywhere_are_the_exact_posterior(shape):
         assert_close(posterior.one(index, z), expected.one(index, z), rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.parametrize("louder", [4.0, 0.25], ids=["fewer suffice", "more are needed"])
+@torch.no_grad()
+def test_points_at_hand_serve_where_they_suffice(louder):
+    given = made()
+    features, how = new_features(given), {"points": COUNT, "tolerance": 0.05}
+    W, residual, noise = given.data
+    other = Terms(given.features, W, residual, louder * noise)
+    near = InducingPosterior.condition(given.kernels, Terms(given.features, *given.data), **how)
+    again = InducingPosterior.condition(given.kernels, other, **how, near=near)
+    fresh = InducingPosterior.condition(given.kernels, other, **how)
+    assert list(map(len, again.features)) == list(map(len, fresh.features)) != list(map(len, near.features))
+    assert_close(again.mean(features), fresh.mean(features), rtol=1e-6, atol=1e-8)
+    assert_close(again.covariance(features), fresh.covariance(features), rtol=1e-6, atol=1e-8)
+
+
 @torch.no_grad()
 def test_few_weights_know_less_than_all_data():
     given = made()

@@ -235,6 +235,12 @@ class RecordedMotions:
     v: Float[np.ndarray, "motions rows nv"]
     u: Float[np.ndarray, "motions steps nu"]
 
+    @classmethod
+    def joined(cls, each: Sequence["RecordedMotions"]) -> "RecordedMotions":
+        """One after the other, of the same steps; rows are those of their own datasets."""
+        motions = {name: np.concatenate([getattr(one, name) for one in each]) for name in ("q", "v", "u")}
+        return cls(tuple(row for one in each for row in one.rows), each[0].dt, **motions)
+
 
 def require_order_of_time(dataset: Dataset) -> None:
     """Raises InvalidInput for rows out of it."""
@@ -359,18 +365,15 @@ def farthest_point_sampling(
     columns = columns / np.maximum(np.abs(columns).max(axis=1, keepdims=True), 1e-300)  # so that std cannot overflow
     centred, spread = columns - columns.mean(axis=1, keepdims=True), columns.std(axis=1, keepdims=True)
     columns = np.where(spread >= ROUNDING, centred / np.maximum(spread, ROUNDING), 0.0)
-    distance, chosen = np.full(rows, np.inf), np.empty(count, dtype=np.int64)
+    distance, difference, chosen = np.full(rows, np.inf), np.empty_like(columns), np.empty(count, dtype=np.int64)
     chosen[0] = whole_number("start", start, 0, rows - 1, "the last row")
     for position in range(count):
         if position:
             chosen[position] = np.argmax(distance)  # the lowest row number among equals
         row = chosen[position]
         # Differences, not |x|^2 - 2 x.y + |y|^2: a repeated row must have distance exactly 0.
-        squared = np.zeros(rows)
-        for column in columns:
-            difference = column - column[row]
-            squared += difference * difference
-        np.minimum(distance, squared, out=distance)
+        np.subtract(columns, columns[:, row, None], out=difference)
+        np.minimum(distance, np.square(difference, out=difference).sum(axis=0), out=distance)
         distance[row] = -1.0  # never chosen again, not even among repeated rows
     return chosen
 

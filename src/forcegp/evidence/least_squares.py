@@ -5,7 +5,7 @@ covariance diag(sigma_a^2) + H diag(sigma_F^2) H^T. Forces along A^T are integra
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -50,7 +50,7 @@ class NoiseLevels:
         if near is not None:
             x = np.log(np.concatenate([near.acceleration, near.force]) / whole.numpy().ravel()).clip(low, high)
 
-        def at(x: np.ndarray) -> _Point:
+        def at(x: np.ndarray, _: float) -> _Point:
             """With the expected curvature tr(S^-1 dS S^-1 dS') / 2."""
             acceleration, force = whole * torch.as_tensor(x).exp().view_as(whole)
             lower = torch.linalg.cholesky(_covariance(inverse, acceleration, force))
@@ -176,7 +176,7 @@ class Fit:
         """The Jacobian over the noise, without what unknown forces explain."""
         return without(self.jacobian / self.noise[:, None], self.span)
 
-    @property
+    @cached_property
     def information(self) -> Float[np.ndarray, "k k"]:
         """Gauss-Newton curvature of the data, each residual weighted by its noise."""
         weighted = self.white_jacobian.reshape(-1, len(self.x))
@@ -277,7 +277,7 @@ class _Point:
 
 
 def _minimized(
-    point: Callable[[np.ndarray], _Point],
+    point: Callable[[np.ndarray, float], _Point],
     x: np.ndarray,
     bounds: tuple[np.ndarray, np.ndarray],
     longest: Callable[[np.ndarray], np.ndarray] | float,
@@ -290,7 +290,7 @@ def _minimized(
     Coordinates at a bound that the gradient pushes against stay there for a step; steps are clipped to the bounds.
     """
     low, high = bounds
-    here, damping, idle, first = point(x), 1e-4, 0, None
+    here, damping, idle, first = point(x, np.inf), 1e-4, 0, None
     for evaluation in range(1, most + 1):
         damped = here.curvature + damping * np.diag(here.curvature.diagonal() + 1e-12)
         step = step_within(here.gradient, damped, low - here.x, high - here.x)
@@ -299,7 +299,7 @@ def _minimized(
         first = expected if first is None else first
         if abs(expected) <= 1e-3 * content or idle == 2:
             return here.x, evaluation, True, first
-        trial = point(moved(here.x, step))
+        trial = point(moved(here.x, step), here.cost)
         gain = (here.cost - trial.cost) / abs(expected)
         if trial.cost < here.cost:
             idle = idle + 1 if here.cost - trial.cost < content else 0
@@ -325,7 +325,9 @@ def step_within(gradient: np.ndarray, curvature: np.ndarray, least: np.ndarray, 
     return step
 
 
-def _point(at: Residual, prior: Residual, noise: np.ndarray, span: np.ndarray | None, x: np.ndarray) -> _Point:
+def _point(
+    at: Residual, prior: Residual, noise: np.ndarray, span: np.ndarray | None, x: np.ndarray, best: float = np.inf
+) -> _Point:
     bad = _Point(x, np.inf, np.zeros_like(x), np.eye(len(x)))
     with np.errstate(over="ignore", invalid="ignore"):  # a step that went too far is as good as infinitely bad
         try:
@@ -333,13 +335,15 @@ def _point(at: Residual, prior: Residual, noise: np.ndarray, span: np.ndarray | 
         except (np.linalg.LinAlgError, NumericalError):  # a mass matrix that rounding made singular
             return bad
         white = without(r / noise, span)
+        cost = 0.5 * float((white**2).sum() + (prior_r**2).sum())
+        if cost >= best:  # a step that is not taken needs no derivatives
+            return replace(bad, cost=cost)
         if isinstance(jacobian, Chained) and span is None:
             gradient, curvature = jacobian.normal_equations(white, noise)
         else:
             flat = without(np.asarray(jacobian) / noise[:, None], span).reshape(-1, len(x))
             gradient, curvature = flat.T @ white.ravel(), flat.T @ flat
         gradient, curvature = gradient + prior_jacobian.T @ prior_r, curvature + prior_jacobian.T @ prior_jacobian
-        cost = 0.5 * float((white**2).sum() + (prior_r**2).sum())
     if not (np.isfinite(cost) and np.isfinite(curvature).all()):
         return bad
     return _Point(x, cost, gradient, curvature)

@@ -282,11 +282,12 @@ class MarginalLikelihood:
         engine: Engine | None = None,
         *,
         at_parameters: bool = False,
+        near: LatentPosterior | None = None,
     ) -> LatentPosterior:
         """The posterior of latent functions at fixed parameters; kernels that are `at_parameters` are not copied."""
         kernels = kernels if at_parameters else kernels.at(parameters)
         with torch.no_grad():
-            return (engine or Exact()).condition(kernels, self.terms(parameters))
+            return (engine or Exact()).condition(kernels, self.terms(parameters), near)
 
     @property
     def noise(self) -> Noise:

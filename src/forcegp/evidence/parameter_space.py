@@ -29,7 +29,6 @@ SCALES = 1e-4  # half the relative error of a mass that was weighed: of scales, 
 FARTHEST = 25.0  # largest coordinate of a number that is estimated on a log scale about a median: a factor of 7e10
 Coordinates = Float[np.ndarray, " k"]
 Rows = Float[np.ndarray, "rows nv"]
-InLaws = Float[np.ndarray, "rows nv t"]
 """Derivatives in the coordinates of laws."""
 
 
@@ -189,19 +188,24 @@ class ParameterSpace:
 
     def values(self, x: Coordinates) -> dict[int, dict[str, Tensor]]:
         """Coefficients of the laws that are estimated, by number of the law."""
-        out: dict[int, dict[str, Tensor]] = {}
+        out = {index: dict(named) for index, named in self._stated.items()}
         for own, term in zip(self.split(x)[1], self.terms, strict=True):
-            law = self.model.laws[term.law]
-            named = {name: law.values[name].to(self.model.robot.device) for name in law.coefficients}
-            if isinstance(law, PerJointLaw):  # numbers that are not estimated stay
-                named = {name: value.expand(self.model.robot.nv).clone() for name, value in named.items()}
-            named = out.setdefault(term.law, named)
-            value = torch.as_tensor(term.values(own), device=self.model.robot.device)
+            named, value = out[term.law], torch.as_tensor(term.values(own), device=self.model.robot.device)
             if term.joints is None:
                 named[term.name] = value[0]
             else:
                 places = torch.tensor(term.joints, device=self.model.robot.device)
                 named[term.name] = named[term.name].index_copy(0, places, value)
+        return out
+
+    @cached_property
+    def _stated(self) -> dict[int, dict[str, Tensor]]:
+        """The same before any is estimated; numbers of joints that are not stay."""
+        out, robot = dict[int, dict[str, Tensor]](), self.model.robot
+        for index, law in self._estimated.items():
+            given, whole = law.values, isinstance(law, PerJointLaw)
+            named = ((name, given[name].to(robot.device)) for name in law.coefficients)
+            out[index] = {name: x.expand(robot.nv) if whole else x for name, x in named}
         return out
 
     def model_at(self, x: Coordinates) -> Model:
@@ -228,42 +232,47 @@ class ParameterSpace:
         """The law that is estimated and depends on the torque of the actuators."""
         return next((law for law in self._estimated.values() if law.under_load), None)
 
-    def torque(self, x: Coordinates, state: State, a: Rows, cache: dict[Any, Any]) -> tuple[Rows, InLaws]:
+    def torque(
+        self, x: Coordinates, state: State, a: Rows, cache: dict[Any, Any], loads: State | None = None
+    ) -> tuple[Float[np.ndarray, "loads rows nv"], Float[np.ndarray, "loads rows nv t"]]:
         """What the laws add to the torque of a motion, and the derivatives in their coordinates (without bodies).
 
-        `cache` holds features and directions of these states, which no coordinate changes.
+        Of `loads` (2, rows, nv), laws under load see the first; after that comes what the second adds. `cache` holds
+        features and directions of these states, which no coordinate changes.
         """
-        total, jacobian = np.zeros_like(a), np.zeros((*a.shape, self.size - self.bodies.size))
+        total = np.zeros((1 if loads is None else 2, *a.shape))
+        jacobian = np.zeros((*total.shape, self.size - self.bodies.size))
         values, of_terms, column = self.values(x), self.split(x)[1], 0
         for index, law in self._estimated.items():
             terms = [(own, term) for own, term in zip(of_terms, self.terms, strict=True) if term.law == index]
             if (basis := law.inertia_basis(self.model.robot)) is not None:
-                moved = np.tensordot(a, basis.cpu().numpy(), (1, 2)).swapaxes(1, 2)
-                total += moved @ values[index][next(iter(law.coefficients))].cpu().numpy()
-                derivatives = [moved[:, :, list(term.joints or ())] for _, term in terms]
+                if index not in cache or cache[index][0] is not a:
+                    cache[index] = a, np.tensordot(a, basis.cpu().numpy(), (1, 2)).swapaxes(1, 2)
+                moved, own = cache[index][1], values[index][next(iter(law.coefficients))].cpu().numpy()
+                found = [(moved @ own, [moved[:, :, list(term.joints or ())] for _, term in terms])]
             else:
                 if index not in cache:
-                    cache[index] = law.features(law.seen(state)), law.direction(state)
-                force, derivatives = _derivatives(law, values[index], [term for _, term in terms], *cache[index])
-                total -= force
-            for (own, term), derivative in zip(terms, derivatives, strict=True):
+                    seen = law.seen(loads if loads is not None and law.under_load else state)
+                    cache[index] = law.features(seen), law.direction(state)
+                found = _derivatives(law, values[index], [term for _, term in terms], *cache[index])
+            for needed, each in zip(total, found, strict=False):
+                needed += each[0]
+            for place, (own, term) in enumerate(terms):
                 places, width = list(term.joints or ()), len(term.size)
-                if derivative.ndim == 2:  # number j acts on joint j alone
-                    jacobian[:, places, range(column, column + width)] = derivative[:, places] * term.slopes(own)
-                else:
-                    jacobian[..., column : column + width] = derivative * term.slopes(own)
+                for slopes, (_, each) in zip(jacobian, found, strict=False):
+                    if each[place].ndim == 2:  # number j acts on joint j alone
+                        slopes[:, places, range(column, column + width)] = each[place][:, places] * term.slopes(own)
+                    else:
+                        slopes[..., column : column + width] = each[place] * term.slopes(own)
                 column += width
         return total, jacobian
 
-    def delivered(self, x: Coordinates, state: State, known: Rows, slopes: InLaws) -> tuple[Rows, InLaws]:
-        """Torques of actuators and their derivatives, by `slopes` of `torque`; those `known` where no gain is free."""
-        values, of_gain, column = self.values(x), np.zeros(slopes.shape[-1], dtype=bool), 0
-        for term in self.terms:
-            if isinstance(law := self.model.laws[term.law], Actuation):
-                known = law.amplitude(law.features(state), values[term.law]).cpu().numpy()
-                of_gain[column : column + len(term.size)] = True
-            column += len(term.size)
-        return known, -slopes * of_gain
+    def delivered(self, x: Coordinates, state: State, known: Rows) -> Rows:
+        """Torques of actuators, whose derivatives are minus those of `torque`; those `known` where no gain is free."""
+        for index, law in self._estimated.items():
+            if isinstance(law, Actuation):
+                known = law.amplitude(law.features(state), self.values(x)[index]).cpu().numpy()
+        return known
 
     @cached_property
     def _estimated(self) -> dict[int, Law]:
@@ -288,29 +297,30 @@ def force_title(law: Law) -> str:
 
 def _derivatives(
     law: Law, values: Mapping[str, Tensor], terms: Sequence[Term], features: tuple[Tensor, ...], B: Tensor | None
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """The force (rows, nv), and slopes of minus that by entry: (rows, nv, k), or (rows, nv) for joints alone."""
+) -> list[tuple[np.ndarray, list[np.ndarray]]]:
+    """Minus the force (rows, nv), with slopes by entry (rows, nv, k), or (rows, nv); then what another load adds."""
     rows, wanted = features[0].shape[:-1], {term.name for term in terms}
     numbers = {name: x.expand(*rows, *x.shape).clone().requires_grad_(name in wanted) for name, x in values.items()}
+    found = []
     with torch.enable_grad():
         # a number that all directions share has no last dimension to broadcast along
         given = {name: value[..., None] if value.dim() == len(rows) else value for name, value in numbers.items()}
-        amplitude, out = law.amplitude(features, given), []
-        for term in terms:
-            if term.joints is not None:  # amplitude j depends on entry j alone
-                total, number = amplitude.sum(), numbers[term.name]
-                slope = torch.autograd.grad(total, number, retain_graph=True, materialize_grads=True)[0]
-                if B is None:
-                    out.append(-slope.cpu().numpy())
-                    continue
-                each = slope.diag_embed()[..., list(term.joints)]
+        needed = -law.amplitude(features, given)
+        parts = [needed[0], needed[1] - needed[0]] if needed.dim() > len(rows) + 1 else [needed]
+        for part in parts:
+            if terms[0].joints is not None:  # amplitude j depends on entries j alone
+                own = [numbers[term.name] for term in terms]
+                each = torch.autograd.grad(part.sum(), own, retain_graph=True, materialize_grads=True)
+                if B is not None:
+                    each = [x.diag_embed()[..., list(term.joints or ())] for x, term in zip(each, terms, strict=True)]
             else:
-                totals = amplitude.flatten(0, -2).sum(0)
-                parts = [torch.autograd.grad(total, numbers[term.name], retain_graph=True)[0] for total in totals]
-                each = torch.stack(parts, dim=-1)[..., None]
-            out.append(-(each if B is None else B @ each).cpu().numpy())
-    amplitude = amplitude.detach()
-    return (amplitude if B is None else (B @ amplitude[..., None])[..., 0]).cpu().numpy(), out
+                each, totals = [], part.flatten(0, -2).sum(0)
+                for term in terms:
+                    own = [torch.autograd.grad(total, numbers[term.name], retain_graph=True)[0] for total in totals]
+                    each.append(torch.stack(own, dim=-1)[..., None])
+            force = part.detach() if B is None else (B @ part.detach()[..., None])[..., 0]
+            found.append((force.cpu().numpy(), [(x if B is None else B @ x).cpu().numpy() for x in each]))
+    return found
 
 
 def _terms(model: Model, typical: Mapping[str, np.ndarray]) -> list[Term]:

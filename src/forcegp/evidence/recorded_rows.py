@@ -25,7 +25,7 @@ from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence.bodies import standard_parameters
 from forcegp.evidence.least_squares import NoiseLevels, orthonormal_columns, without
 from forcegp.evidence.parameter_space import ParameterSpace
-from forcegp.forces import Law, RigidBodies
+from forcegp.forces import Actuation, Law, RigidBodies
 from forcegp.forces.actuation import OBSERVED
 from forcegp.mechanics import ConstrainedDynamics, Contact, Held, State
 from forcegp.mechanics.gauss_principle import REDUNDANCY_TOLERANCE
@@ -192,9 +192,12 @@ class RecordedRows:
         own = [each.body for each in space.carried if each.payload is None]
         unloaded = standard_parameters(model.robot).reshape(-1, 10).cpu().numpy()
         self._stated[own] -= unloaded[[space.own.index(body) for body in own]]
-        self._beyond = np.array([not space.model.laws[term.law].in_gear for term in space.terms for _ in term.size])
-        """Of the coordinates of laws: which of them are at the links' side of gears."""
-        self._caches: dict[float | None, dict[Any, Any]] = {None: {}, 0.0: {}, 1.0: {}}
+        laws = [space.model.laws[term.law] for term in space.terms for _ in term.size]
+        self._beyond = np.array([not law.in_gear for law in laws])
+        """Of the coordinates of laws: which of them are at the links' side of gears, and other kinds."""
+        self._under_load = np.array([law.under_load for law in laws])
+        self._gains = np.array([isinstance(law, Actuation) for law in laws])
+        self._caches: dict[bool, dict[Any, Any]] = {False: {}, True: {}}
 
     @cached_property
     def _sensing(self) -> tuple[Float[np.ndarray, "rows k nv"], Float[np.ndarray, "rows k"]]:
@@ -218,9 +221,9 @@ class RecordedRows:
         Y = self.kinematics.torque_regressor(torch.as_tensor(a, device=self.kinematics.robot.device)).cpu().numpy()
         fixed = Y.reshape(*a.shape, -1) @ self._stated.ravel() + a @ (self.inertia + self._armature) - self.force
         fixed = fixed - self.at_contacts if given else fixed
-        regressor = Y[:, :, self._carriers] * self._there[:, None]
+        regressor = np.ascontiguousarray(Y[:, self.equations][:, :, self._carriers]) * self._there[:, None]
         beside = (fixed - a @ (self.inertia + self._armature) + self.in_gears)[:, self.links] - self.at_links
-        return Motion(a, regressor[:, self.equations], np.concatenate([fixed, beside], axis=1))
+        return Motion(a, regressor, np.concatenate([fixed, beside], axis=1))
 
     def by_body(self, a: Rows) -> Float[np.ndarray, "rows nv bodies"]:
         """What each body needs, without what is estimated of it."""
@@ -236,39 +239,42 @@ class RecordedRows:
         slopes = standard_of_pseudo_inertia(moved @ pseudo + pseudo @ moved.mT)
         return torch.einsum("nibp,kbp->nibk", Y, slopes).flatten(2).numpy()
 
-    def _terms(self, x: np.ndarray, a: Rows, load: float | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Torque of the laws that are estimated and its derivatives, under the measured load or one of all motors."""
-        state = self.state
-        if load is not None:
-            given, law = torch.full_like(state.v, load), self.space.under_load
-            state = _under_load(state, given if law is None else law.at_joints(given))
-        return self.space.torque(x, state, a, self._caches[load])
+    def _terms(self, x: np.ndarray, a: Rows, loads: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """`ParameterSpace.torque` under the measured load, or under none; then what a load of 1 of all motors adds."""
+        none, law, both = torch.zeros_like(self.state.v), self.space.under_load, None
+        if loads and law is not None:
+            both = _under_load(self.state, torch.stack([none, law.at_joints(none + 1.0)]))
+        state = _under_load(self.state, none) if loads else self.state
+        return self.space.torque(x, state, a, self._caches[loads], both)
 
     def in_torque(self, x: np.ndarray, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray, Response]:
         """Residual (rows, equations), slopes in standard parameters and in x of laws, and du/dz of forces."""
         nv, parameters = motion.a.shape[1], self.space.standard_parameters(x)
         rigid = motion.fixed + motion.regressor.reshape(*motion.fixed.shape, -1) @ parameters.ravel()
         joints, regressor, law = rigid[:, :nv], motion.regressor, self.space.under_load
-        torque, in_x = self._terms(x, motion.a, 0.0)
+        (torque, *more), (in_x, *more_in_x) = self._terms(x, motion.a, True)
         beyond = in_x[:, self.links] * self._beyond
-        if law is None:
-            r, response = joints + torque, lambda values: values
-        else:
-            loaded, loaded_in_x = self._terms(x, motion.a, 1.0)
+        r, response = joints + torque, lambda values: values
+        if law is not None:
             T = None if law.transmission is None else np.asarray(torch.as_tensor(law.transmission).cpu())
             motor, joint = (partial(_turned, each) for each in (None if T is None else np.linalg.inv(T), T))
-            delivered, delivered_in_x = self.space.delivered(x, self.state, self.delivered, in_x)
-            z, g = motor(joints + torque + delivered), motor(loaded - torque)
+            delivered, of_gains = self.space.delivered(x, self.state, self.delivered), in_x[..., self._gains]
+            z, g = motor(joints + torque + delivered), motor(more[0])
             sign = np.sign(z)
             left = 1.0 - g * sign
             u = z / left
 
-            def response(values: np.ndarray) -> np.ndarray:
+            def borne(values: np.ndarray) -> np.ndarray:
                 return joint(motor(values) / left.reshape(*left.shape, *(1,) * (values.ndim - 2)))
 
-            in_x = response(in_x + delivered_in_x + joint((u * sign)[..., None] * motor(loaded_in_x - in_x)))
-            r, in_x = joint(u) - delivered, in_x - delivered_in_x
-            regressor = np.concatenate([response(regressor[:, :nv]), regressor[:, nv:]], axis=1)
+            response = borne if g.any() else response  # else regressors stay as they are, and their squares with them
+            own = self._under_load
+            in_x[..., self._gains] = 0.0  # z has what is delivered in it
+            in_x[..., own] += joint((u * sign)[..., None] * motor(more_in_x[0][..., own]))
+            r, in_x = joint(u) - delivered, response(in_x)
+            in_x[..., self._gains] += of_gains
+            own = response(regressor[:, :nv])
+            regressor = np.concatenate([own, regressor[:, nv:]], axis=1) if self.links else own
         if self.links:
             beside, laws = rigid[:, nv:], self.space.model.laws
             for k, values in self.space.values(x).items():
@@ -285,7 +291,7 @@ class RecordedRows:
         parts = self.kinematics.dynamics_of_bodies(torch.as_tensor(given, device=self.kinematics.robot.device))
         M, bias = (part.cpu().numpy() for part in parts)
         M = M + self.inertia + self.space.added_inertia(x)
-        torque, _ = self._terms(x, np.zeros_like(self.v))
+        [torque], _ = self._terms(x, np.zeros_like(self.v))
         parts = (M, self.held, self.right, np.zeros((*self.right.shape, 3)), self.force - bias - torque)
         mass, A, b, normals, force = map(torch.as_tensor, parts)
         dynamics = ConstrainedDynamics(self.state, mass, A, b, normals, force)
@@ -298,7 +304,7 @@ class RecordedRows:
         dr / dpi = -D (1 - M H) Y. What IMUs measure is affine in a^.
         """
         predicted, M, H = self.acceleration(x)
-        torque, in_x = self._terms(x, predicted)
+        [torque], [in_x] = self._terms(x, predicted)
         r, by, shape = [a - predicted], [H], predicted.shape
         Y = self.moving(predicted).regressor[:, : shape[1]]
         if self.sensed:

@@ -2,7 +2,7 @@
 
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 from typing import Any
 
@@ -123,10 +123,9 @@ def choose_friction(
         if strokes is not None and alike:  # gears are alike: what the others remember over may do here
             regression.remember(j, strokes[:, j], [float(np.median(alike))])
             regression.choose(j, parts)
-    chosen = tuple(regression.parts.get(j, ()) for j in range(log.nv))
-    found = chosen, tuple(regression.ratios), tuple(few), regression.sigma
+    found = tuple(regression.parts.get(j, ()) for j in range(log.nv)), tuple(regression.ratios), tuple(few)
     falls = tuple((regression.speed * np.array(FALLS)[regression.fall]).tolist())
-    return FrictionChoice(tuple(log.joint_names), *found, falls, log.transmission)
+    return FrictionChoice(tuple(log.joint_names), *found, regression.sigma, falls, log.transmission)
 
 
 def _precision(model: Model, log: Dataset, noise: Noise | None) -> Float[np.ndarray, "rows nv nv"]:
@@ -177,7 +176,8 @@ class _Regression:
 
         self.nv, fold = torque.shape[1], _folds(log)
         self.count = int(fold.max()) + 1
-        self.rows = [fold == k for k in range(self.count)]
+        numbers = [np.flatnonzero(fold == k) for k in range(self.count)]  # mostly rows that follow each other
+        self.rows = [slice(at[0], at[-1] + 1) if at[-1] - at[0] < len(at) else at for at in numbers]
         torque, given = motors(torque), motors(state.delivered)
         v = law.turning(state.v).cpu().numpy()
         turned = law.turning(torch.as_tensor(precision, device=state.q.device))
@@ -189,7 +189,7 @@ class _Regression:
         sizes, vectors = np.linalg.eigh(np.tensordot(Y, P @ Y, ((0, 1), (0, 1))))
         kept = sizes > SEEN**2 * sizes.max()
         Y = Y @ (vectors[:, kept] / np.sqrt(sizes[kept] / len(Y)))
-        self.bodies, self.torque = P @ Y, P @ torque[..., None]
+        self.bodies, self.torque = np.ascontiguousarray((P @ Y).swapaxes(0, 1)).swapaxes(0, 1), P @ torque[..., None]
         each = [slice(None)] if self.coupled else range(self.nv)  # rows of joints, where these stand for themselves
         self.inner = np.stack([self._by(Y[:, j], self.bodies[:, j]) for j in each], axis=1)
         self.target = np.stack([self._by(Y[:, j], self.torque[:, j])[..., 0] for j in each], axis=1)
@@ -207,8 +207,8 @@ class _Regression:
 
     def _by(self, left: Float[np.ndarray, "rows *j n"], right: Float[np.ndarray, "rows *j m"]) -> np.ndarray:
         """Products of columns, summed in every stretch: (stretches, n, m)."""
-        flat = [x.reshape(len(x), -1, x.shape[-1]) for x in (left, right)]
-        return np.stack([np.tensordot(flat[0][k], flat[1][k], ((0, 1), (0, 1))) for k in self.rows])
+        flat = [[x[k].reshape(-1, x.shape[-1]) for k in self.rows] for x in (left, right)]
+        return np.stack([one.T @ other for one, other in zip(*flat, strict=True)])
 
     @property
     def sigma(self) -> tuple[float, ...]:
@@ -233,7 +233,7 @@ class _Regression:
 
     def choose(self, j: int, parts: Sequence[str]) -> None:
         """Parts of one joint, those of the others being as they are."""
-        self.beside, self.across = self._beside(j), {}
+        self.beside, self.across, self.left = self._beside(j), {}, cache(partial(self._residuals, j))
         best, here = self._refined(j, ()), ()
         first = best
         both = [("memory", part) for part in ("root", "breakaway")]  # a level that changes with speed hides reversals
@@ -277,10 +277,10 @@ class _Regression:
         The fall is sought at the sign that fits best under the usual one.
         """
         signs, at = [each for each in self.signs[j] if (each > 0.0) == ("memory" in parts)], self.fall[j]
-        sign = min(signs, key=lambda sign: self._residuals(j, parts, (sign, at), False).sum())
+        sign = min(signs, key=lambda sign: self.left(parts, (sign, at), False).sum())
         falls = range(len(FALLS)) if "breakaway" in parts else (at,)
-        best = sign, min(falls, key=lambda fall: self._residuals(j, parts, (sign, fall), False).sum())
-        return best, self._residuals(j, parts, best, True)
+        best = sign, min(falls, key=lambda fall: self.left(parts, (sign, fall), False).sum())
+        return best, self.left(parts, best, True)
 
     def _residuals(self, j: int, parts: tuple[str, ...], sign: tuple[float, int], held_out: bool) -> np.ndarray:
         """Squared residuals in every stretch, by numbers from the other stretches; or their sum, by numbers from all.

@@ -93,7 +93,7 @@ class Unknowns:
                 if bodies.size:
                     Y = dynamics.state.kinematics.torque_regressor(a)[:, :, carriers].cpu().numpy()
                     columns.append(-torch.as_tensor(bodies.chained(numbers[: bodies.size], Y)))
-                _, added = self.space.torque(numbers, dynamics.state, a.cpu().numpy(), {})
+                _, [added] = self.space.torque(numbers, dynamics.state, a.cpu().numpy(), {})
                 columns.append(-torch.as_tensor(added))
                 return Linear(a, a_q, a_v, dynamics.H @ torch.cat(columns, dim=-1))
 

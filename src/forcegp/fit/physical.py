@@ -69,7 +69,7 @@ def fit_physical(
 ) -> Solution:
     """The open numbers of a model without unknown forces; of several logs payloads are in the first alone.
 
-    The search begins `near` a solution of the same model on other rows, if given; `roughly` ends it sooner.
+    The search begins `near` a solution of the same model on other rows; `roughly` ends it sooner, without estimates.
     """
     bodies = any(getattr(law, "learn", ()) or (isinstance(law, Payload) and not law.known) for law in model.laws)
     robot, thick = thickened(model.robot) if bodies else (model.robot, ())
@@ -123,7 +123,8 @@ def fit_physical(
         cause = misfit(found, equations.parts, equations.each(equations.a), *left, fit)
         bodies = list(doubts_of_payloads(space, fit, -np.inf if cause is None else cause[2]))
         doubts += bodies or ([] if cause is None or cause[0] is None else [cause[0]])
-    estimates = _estimates(space, fit, equations, evidence, thick, changes, None if cause is None else cause[1])
+    move = None if cause is None else cause[1]
+    estimates = Estimates() if roughly else _estimates(space, fit, equations, evidence, thick, changes, move)
     doubts += unseen.doubts(model)
     Doubts(doubts).warn(stacklevel=4)
     told = tuple(doubt.to_dict() for doubt in doubts)

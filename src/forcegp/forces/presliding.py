@@ -25,11 +25,14 @@ def after_step(z: PerJoint, step: PerJoint, sigma: Sigma) -> PerJoint:
 def after_strokes(strokes: Float[Tensor, "*batch nv strokes"], sigma: Sigma, start: float = 0.0) -> PerJoint:
     """The state after these displacements (rad or m), the last one first, from `start` on; smooth in sigma.
 
-    `after_step` of one after the other: each leaves its sign times by how much the later ones fall short of hiding it.
+    `after_step` of one after the other: each turn leaves its change of sign times by how far the later strokes hide it.
     """
-    reach = torch.as_tensor(sigma)[..., None] * strokes.abs().cumsum(-1)
-    least = reach.detach().flatten(0, -2)
-    seen = int((least.amin(0) < HIDDEN).sum()) + 1 if len(least) else 1
-    decay = torch.exp(-reach[..., :seen])
-    later = torch.cat((torch.ones_like(decay[..., :1]), decay[..., :-1]), dim=-1)
-    return (strokes[..., :seen].sign() * (later - decay)).sum(-1) + start * decay[..., -1]
+    way, sigma = strokes.abs().cumsum(-1), torch.as_tensor(sigma)
+    reach = sigma.detach()[..., None] * way
+    shape, count = reach.shape[:-1], reach.shape[-1]
+    at = (reach.flatten() < HIDDEN).nonzero()[:, 0]  # a twentieth of all, mostly
+    signs, row = strokes.expand_as(reach).flatten(), at // count
+    later = torch.where(at % count == count - 1, start, signs[(at + 1).clamp_max(len(signs) - 1)].sign())
+    decay = torch.exp(-sigma.expand(shape).flatten()[row] * way.expand_as(reach).flatten()[at])
+    first = strokes[..., 0].sign().expand(shape).flatten()
+    return first.index_add(0, row, (later - signs[at].sign()) * decay).view(shape)

@@ -63,8 +63,8 @@ class Engine(ABC):
         """Memory that conditioning on so many rows takes at least."""
 
     @abstractmethod
-    def condition(self, kernels: LatentKernels, terms: Terms) -> LatentPosterior:
-        """The posterior given the data. Raises NotEnoughMemory beforehand, NumericalError where the engine fails."""
+    def condition(self, kernels: LatentKernels, terms: Terms, near: LatentPosterior | None = None) -> LatentPosterior:
+        """The posterior given the data, sooner with another at hand. Raises NotEnoughMemory, NumericalError."""
 
     def require_memory(self, size: ProblemSize, device: torch.device) -> None:
         """Raise NotEnoughMemory where conditioning needs more memory than is free."""
@@ -87,7 +87,7 @@ class Exact(Engine):
         return 8 * ((size.rows * size.rank) ** 2 + size.latents * size.rows**2)
 
     @override
-    def condition(self, kernels: LatentKernels, terms: Terms) -> LatentPosterior:
+    def condition(self, kernels: LatentKernels, terms: Terms, near: LatentPosterior | None = None) -> LatentPosterior:
         self.require_memory(ProblemSize.of(terms), terms.W.device)
         return ExactPosterior.condition(kernels, terms)
 
@@ -115,9 +115,9 @@ class Inducing(Engine):
         return 8 * (3 * weights**2 + 20_000 * self.points + 12 * size.rows * size.latents * size.outputs)
 
     @override
-    def condition(self, kernels: LatentKernels, terms: Terms) -> LatentPosterior:
+    def condition(self, kernels: LatentKernels, terms: Terms, near: LatentPosterior | None = None) -> LatentPosterior:
         self.require_memory(ProblemSize.of(terms), terms.W.device)
-        return InducingPosterior.condition(kernels, terms, points=self.points, tolerance=self.tolerance)
+        return InducingPosterior.condition(kernels, terms, points=self.points, tolerance=self.tolerance, near=near)
 
 
 ENGINES: dict[str, type[Engine]] = {kind.name: kind for kind in (Exact, Inducing)}

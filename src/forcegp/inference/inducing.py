@@ -16,7 +16,7 @@ from typing_extensions import override
 
 from forcegp.inference.dense_kernels import DenseKernel, LatentKernels
 from forcegp.inference.likelihood import CholeskyFactor, Terms, factorize
-from forcegp.inference.posterior import BLOCK_BYTES, LatentPosterior
+from forcegp.inference.posterior import BLOCK_BYTES, Features, LatentPosterior
 
 ROUNDING = 1e-13  # remainders below this fraction of the largest k(z, z) are rounding
 
@@ -70,9 +70,12 @@ class InducingPosterior(LatentPosterior):
     left_out: float
 
     @classmethod
-    def condition(cls, kernels: LatentKernels, terms: Terms, *, points: int, tolerance: float) -> "InducingPosterior":
+    def condition(
+        cls, kernels: LatentKernels, terms: Terms, *, points: int, tolerance: float, near: LatentPosterior | None = None
+    ) -> "InducingPosterior":
         """On all rows, by at most `points` points per latent; fewer where its share of `tolerance` suffices.
 
+        Points are those of another posterior of the same kernels, where these suffice: to search is half the work.
         Time O(N P^2). Raises NumericalError where the points cannot be factorised.
         """
         with torch.no_grad():
@@ -81,28 +84,44 @@ class InducingPosterior(LatentPosterior):
             relevance, target = C.square().sum(1), (C * deflation.t[..., None]).sum(1)  # of C_i^T t_i
             some = torch.linspace(0, count - 1, min(count, CANDIDATES), dtype=torch.float64).round().long().to(C.device)
             share, centers, lowers = tolerance / max(1, C.shape[-1]) * len(some), [], []
-            for kernel, z, own in zip(kernels.dense, features, relevance[some].mT, strict=True):
-                centers.append(at := z[some[pivoted_cholesky(kernel, z[some], own, points, share)]].detach())
-                lowers.append(factorize(partial(kernel.cross, at, at)).lower.tril())
+            for c, (kernel, z, own) in enumerate(zip(kernels.dense, features, relevance[some].mT, strict=True)):
+                if isinstance(near, cls) and (enough := near._enough(c, z[some], own, points, share)):
+                    at, lower = near.features[c][:enough], near.lowers[c][:enough, :enough]
+                else:
+                    at = z[some[pivoted_cholesky(kernel, z[some], own, points, share)]].detach()
+                    lower = factorize(partial(kernel.cross, at, at)).lower.tril()
+                centers, lowers = [*centers, at], [*lowers, lower]
             size = sum(map(len, lowers))
-            B, right = torch.eye(size, dtype=C.dtype, device=C.device), C.new_zeros(size)
-            bare = cls(kernels, tuple(centers), tuple(lowers), CholeskyFactor(B), right, 0.0)
+            bare = cls(kernels, tuple(centers), tuple(lowers), CholeskyFactor(C.new_empty(0, 0)), C.new_empty(0), 0.0)
             pairs = (C[..., :, None] * C[..., None, :]).sum(1)  # C_i^T C_i
-            left_out, slices = C.new_zeros(()), bare.slices
-            height = max(1, BLOCK_BYTES // (8 * max(1, size)))
-            for start in range(0, count, height):
-                rows = slice(start, start + height)
-                block = [z[rows] for z in features]
-                phi = bare.columns(block)
-                for c, left in enumerate(phi):
-                    remainder = kernels.dense[c].diagonal(block[c]) - left.square().sum(0)
-                    left_out += relevance[rows, c] @ remainder.clamp_min(0.0)
-                    right[slices[c]] += left @ target[rows, c]
-                    for d, other in enumerate(phi[: c + 1]):
-                        B[slices[c], slices[d]] += (left * pairs[rows, c, d]) @ other.mT
-            factor = factorize(B.clone)
+            slices, height = bare.slices, max(1, BLOCK_BYTES // (8 * max(1, size)))
+
+            def sums() -> tuple[Tensor, Tensor, Tensor]:
+                """B, Phi^T of the target, and what the points leave out."""
+                B, right, left_out = torch.eye(size).to(C), C.new_zeros(size), C.new_zeros(())
+                for rows in (slice(start, start + height) for start in range(0, count, height)):
+                    block = [z[rows] for z in features]
+                    phi = bare.columns(block)
+                    for c, left in enumerate(phi):
+                        remainder = kernels.dense[c].diagonal(block[c]) - left.square().sum(0)
+                        left_out += relevance[rows, c] @ remainder.clamp_min(0.0)
+                        right[slices[c]] += left @ target[rows, c]
+                        for d, other in enumerate(phi[: c + 1]):
+                            B[slices[c], slices[d]] += (left * pairs[rows, c, d]) @ other.mT
+                return B, right, left_out
+
+            made = [sums()]
+            _, right, left_out = made[0]
+            factor = factorize(lambda: (made.pop() if made else sums())[0])  # which is overwritten
             mean = factor.solve(right[:, None])[:, 0] if size else right
             return replace(bare, factor=factor, mean_weights=mean, left_out=float(left_out) / max(1, count))
+
+    def _enough(self, c: int, z: Float[Tensor, "N d"], relevance: Float[Tensor, " N"], most: int, share: float) -> int:
+        """How many points of a latent, first ones first, `pivoted_cholesky` would be content with; 0 for not all."""
+        [phi] = self.columns([z], [c])
+        left = (self.kernels.dense[c].diagonal(z) - phi.square().cumsum(0)).clamp_min(0.0) @ relevance
+        reached = (left <= share).nonzero()
+        return 1 + int(reached[0]) if len(reached) else most * (len(left) == most)
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
@@ -110,10 +129,11 @@ class InducingPosterior(LatentPosterior):
         ends = accumulate((len(lower) for lower in self.lowers), initial=0)
         return tuple(slice(start, stop) for start, stop in pairwise(ends))
 
-    def columns(self, features: Sequence[Float[Tensor, "n _"]]) -> list[Float[Tensor, "_ n"]]:
-        """phi_c at points, one column each."""
-        crosses = (k.cross(p, z) for k, p, z in zip(self.kernels.dense, self.features, features, strict=True))
-        return [torch.linalg.solve_triangular(L, K, upper=False) for L, K in zip(self.lowers, crosses, strict=True)]
+    def columns(self, features: Features, which: Sequence[int] | None = None) -> list[Float[Tensor, "_ n"]]:
+        """phi_c at points, one column each; of some latents, or of all."""
+        own = zip(range(len(self.lowers)) if which is None else which, features, strict=True)
+        crosses = ((c, self.kernels.dense[c].cross(self.features[c], z)) for c, z in own)
+        return [torch.linalg.solve_triangular(self.lowers[c], K, upper=False) for c, K in crosses]
 
     def center_weights(self, weights: Float[Tensor, "P S"]) -> list[Float[Tensor, "_ S"]]:
         """Weights w_c of the features phi_c as those of the kernel functions about the points p_c: L_c^-T w_c."""
@@ -126,16 +146,17 @@ class InducingPosterior(LatentPosterior):
         return tuple(w[:, 0] for w in self.center_weights(self.mean_weights[:, None]))
 
     @override
-    def _covariance_block(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
-        # what the weights leave out of k_c, and Phi_z B^-1 Phi_z^T
-        count, latents = len(features[0]), len(self.features)
-        wide = features[0].new_zeros(len(self.mean_weights), latents, count)
-        remainders = []
-        for c, (part, phi) in enumerate(zip(self.slices, self.columns(features), strict=True)):
-            wide[part, c] = phi
-            remainders.append((self.kernels.dense[c].diagonal(features[c]) - phi.square().sum(0)).clamp_min(0.0))
-        V = self.factor.solve_lower(wide.flatten(1)).unflatten(1, (latents, count)).permute(2, 1, 0)
-        return torch.diag_embed(torch.stack(remainders, dim=-1)) + V @ V.mT
+    def _covariance_block(self, features: Features, which: Sequence[int]) -> Float[Tensor, "n C C"]:
+        # what the weights leave out of k_c, and Phi_z B^-1 Phi_z^T; L^-1 phi_c begins with zeros, which are skipped
+        lower, white, out = self.factor.lower, [], features[0].new_empty(len(features[0]), len(which), len(which))
+        for k, (c, phi) in enumerate(zip(which, self.columns(features, which), strict=True)):
+            first = self.slices[c].start
+            right = torch.nn.functional.pad(phi, (0, 0, 0, len(lower) - first - len(phi)))
+            white.append(torch.linalg.solve_triangular(lower[first:, first:], right, upper=False))
+            for d, other in enumerate(white):
+                out[:, k, d] = out[:, d, k] = (white[k] * other[len(other) - len(white[k]) :]).sum(0)
+            out[:, k, k] += (self.kernels.dense[c].diagonal(features[k]) - phi.square().sum(0)).clamp_min(0.0)
+        return out
 
     @override
     def function_weights(

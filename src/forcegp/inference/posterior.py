@@ -25,6 +25,7 @@ from forcegp.inference.likelihood import (
 )
 
 BLOCK_BYTES = 64 * 2**20  # working memory of one block of test points
+Features = Sequence[Float[Tensor, "n _"]]
 
 
 class LatentPosterior(ABC):
@@ -43,7 +44,7 @@ class LatentPosterior(ABC):
         """The weight w_cj of every centre of each latent."""
 
     @abstractmethod
-    def _covariance_block(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
+    def _covariance_block(self, features: Features, which: Sequence[int]) -> Float[Tensor, "n C C"]:
         """`covariance` of points that fit into memory."""
 
     @abstractmethod
@@ -55,11 +56,13 @@ class LatentPosterior(ABC):
         f_s,c(z) = prior function + sum_j k_c(z, z_j) w_s,cj (Matheron's rule; Wilson et al. 2020, eq. 10).
         """
 
-    def covariance(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
-        """Cov(f_c, f_d) at the same point, for n points."""
-        latents, points = len(self.features), len(features[0])
+    def covariance(self, features: Features, which: Sequence[int] | None = None) -> Float[Tensor, "n C C"]:
+        """Cov(f_c, f_d) at the same point, for n points; of some latents, at features of these, or of all."""
+        which, points = range(len(self.features)) if which is None else which, len(features[0])
+        latents = len(which)
         height = max(1, BLOCK_BYTES // max(1, 8 * latents * len(self.factor.lower)))
-        blocks = [self._covariance_block([z[i : i + height] for z in features]) for i in range(0, points, height)]
+        parts = ([z[i : i + height] for z in features] for i in range(0, points, height))
+        blocks = [self._covariance_block(part, which) for part in parts]
         return torch.cat(blocks) if blocks else features[0].new_zeros(0, latents, latents)
 
     def mean(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C"]:
@@ -68,8 +71,7 @@ class LatentPosterior(ABC):
 
     def one(self, index: int, z: Float[Tensor, "n _"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
         """Mean and variance of one latent at points of its own features."""
-        points = [z if c == index else z.new_zeros(len(z), own.shape[-1]) for c, own in enumerate(self.features)]
-        return self._mean_of(index, z), self.covariance(points)[:, index, index]
+        return self._mean_of(index, z), self.covariance([z], [index])[:, 0, 0]
 
     def _mean_of(self, index: int, z: Float[Tensor, "n d"]) -> Float[Tensor, " n"]:
         kernel, centers, weights = self.kernels.dense[index], self.features[index], self.weights[index]
@@ -126,11 +128,12 @@ class ExactPosterior(LatentPosterior):
         return prior - V.mT @ V
 
     @override
-    def _covariance_block(self, features: Sequence[Float[Tensor, "n _"]]) -> Float[Tensor, "n C C"]:
+    def _covariance_block(self, features: Features, which: Sequence[int]) -> Float[Tensor, "n C C"]:
         # k_c(z, z) delta_cd - V_c^T V_d with V_c = L^-1 Cov(data, f_c(z)) (Rasmussen & Williams 2006, eq. 2.26)
-        C = torch.cat([self.data_covariance(index, z) for index, z in enumerate(features)], dim=1)
+        given = list(zip(which, features, strict=True))
+        C = torch.cat([self.data_covariance(c, z) for c, z in given], dim=1)
         V = self.factor.solve_lower(C).unflatten(1, (len(features), -1)).permute(2, 1, 0)
-        prior = torch.stack([k.diagonal(z) for k, z in zip(self.kernels.dense, features, strict=True)], dim=-1)
+        prior = torch.stack([self.kernels.dense[c].diagonal(z) for c, z in given], dim=-1)
         return torch.diag_embed(prior) - V @ V.mT
 
     @override

@@ -303,12 +303,13 @@ class Fitted(Summary):
         settings: Mapping[str, Any],
         engine: Engine | None = None,
         estimates: Estimates | None = None,
+        near: LatentPosterior | None = None,
     ) -> AnyFitted:
-        """The posterior at given hyper-parameters, without a search."""
+        """The posterior at given hyper-parameters, without a search; sooner where another one at these is `near`."""
         likelihood = MarginalLikelihood(model, replace(training, correlated_rows=settings.get("correlated_rows", 1.0)))
         engine = engine or Exact()
         # now: a failure belongs to the fit, not to the first prediction
-        latent = likelihood.condition(likelihood.kernels, hyperparameters, engine)
+        latent = likelihood.condition(likelihood.kernels, hyperparameters, engine, near=near)
         found = dict(hyperparameters), result, dict(settings), latent, engine, estimates or Estimates()
         return cls(model, likelihood, *found)
 

@@ -191,10 +191,9 @@ class HeldOutMotions:
         """
         posterior = in_its_record(posterior, [float(rows.time.min()) for rows, _ in self.stretches])
         pairs = [observing(posterior, rows, whole=True) for rows, _ in self.stretches]
-        starts = [starts for _, starts in self.stretches]
-        each = [recorded_motions(seen, at, self.horizons[-1]) for (_, seen), at in zip(pairs, starts, strict=True)]
-        joined = {name: np.concatenate([getattr(one, name) for one in each]) for name in ("q", "v", "u")}
-        return pairs[0][0], RecordedMotions(tuple(row for at in starts for row in at), each[0].dt, **joined)
+        own = zip(pairs, self.stretches, strict=True)
+        each = [recorded_motions(seen, at, self.horizons[-1]) for (_, seen), (_, at) in own]
+        return pairs[0][0], RecordedMotions.joined(each)
 
 
 def held_out_motions(

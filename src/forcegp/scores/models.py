@@ -203,7 +203,7 @@ def allowing_for_correlation(posterior: Posterior, dataset: Dataset) -> tuple[Po
     if k > 1.0:
         settings = {**posterior.settings, "correlated_rows": k}
         given = posterior.training, posterior.hyperparameters, posterior.result, settings, posterior.engine
-        posterior = posterior.conditioned(posterior.trained, *given, estimates=posterior.estimates)
+        posterior = posterior.conditioned(posterior.trained, *given, posterior.estimates, posterior.latent)
     return posterior, f"errors resemble each other over {k:.0f} rows, which count as one" if k > 1.0 else None
 
 
