@@ -247,6 +247,18 @@ def test_joints_that_move_in_turn_stand_on_no_brakes():
     assert not without_stops(replace(data, u=data.u + dry))[1]
 
 
+@pytest.mark.parametrize(("seconds", "stops"), [(3.0, 1), (1.5, 0)])
+def test_a_long_rest_before_a_motion_that_tells_nothing_of_it_is_left_out(seconds, stops):
+    moves = np.array([1.2, -0.8]) + 0.2 * np.sin(np.arange(1600)[:, None] / 200.0 * [3.0, 5.0])
+    count = int(200 * seconds)
+    rows = np.setdiff1d(np.arange(count + 1600), np.arange(count - 4, count + 4))
+    data = with_motion(two_links(), np.concatenate([np.zeros((count, 2)), moves]), 200.0, 0, 0.0).rows(rows)
+    u = two_links().inverse_dynamics(*map(torch.tensor, (data.q, data.v, data.a))).numpy()
+    before, noise = rows < count, 0.05 * np.random.default_rng(0).normal(size=u.shape)
+    data = replace(data, episode=(~before).astype(int), u=u + noise + 0.5 * before[:, None])
+    assert len(without_stops(data)[1]) == stops
+
+
 def test_friction_that_remembers_is_no_push():
     """About a turn it is far from any that velocities make, for seconds here."""
     data = between_postures(arm_model().robot, 3, 24.0)
