@@ -1,7 +1,5 @@
 """What the fuzzed commands and functions are given where they are given nothing wrong, made once."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
