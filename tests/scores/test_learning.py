@@ -23,11 +23,6 @@ from forcegp.robots import Robot
 from forcegp.scores import models, named_model, summands, usual_forces
 
 
-@pytest.fixture(scope="module")
-def log():
-    return recording(bump, 1)
-
-
 @pytest.fixture
 def bare() -> Model:
     return replace(slide(1.0, 1.0), forces=(Actuation(), RigidBodies()))
