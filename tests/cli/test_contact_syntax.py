@@ -42,7 +42,7 @@ WRONG_FEET += ("FL:ball=.1:flat",)
 @pytest.mark.parametrize(
     ("parse", "given", "message"),
     [
-        *((parse_contact, text, "") for text in WRONG), *((parse_feet, (text,), "") for text in WRONG_FEET),
+        *((parse_contact, text, ".") for text in WRONG), *((parse_feet, (text,), ".") for text in WRONG_FEET),
         (parse_feet, ("FL", "FL@0,0,1"), "twice"),
     ],
 )  # fmt: skip
