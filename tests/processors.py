@@ -8,8 +8,6 @@ Every variant runs, whatever failed before. Results are kept in `.processors/` b
 same command goes on after the last one that ended, and computes anew what changed. A table is printed at the end.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import hashlib

@@ -10,18 +10,7 @@ import sys
 import pytest
 
 from forcegp import atomic_files
-from forcegp.atomic_files import (
-    atomic_file,
-    atomic_folder,
-    read_json,
-    remove_leftovers,
-    require_replaceable,
-    require_unchanged,
-    require_writable,
-    write_digests,
-    write_json,
-    write_text,
-)
+from forcegp.atomic_files import atomic_file, atomic_folder, remove_leftovers, require_writable, write_text
 from forcegp.errors import FileFormatError, InvalidInput
 
 FAILURES = [OSError(errno.ENOSPC, "no space"), KeyboardInterrupt()]
@@ -106,9 +95,9 @@ class TestFiles:
 
 class TestJson:
     def test_what_json_cannot_hold_changes_nothing(self, tmp_path):
-        write_json(tmp_path / "a.json", {"one": 1})
+        atomic_files.write_json(tmp_path / "a.json", {"one": 1})
         with pytest.raises(ValueError, match="not JSON compliant"):
-            write_json(tmp_path / "a.json", {"one": float("nan")})
+            atomic_files.write_json(tmp_path / "a.json", {"one": float("nan")})
         assert json.loads((tmp_path / "a.json").read_text()) == {"one": 1}
         assert len(list(tmp_path.iterdir())) == 1
 
@@ -116,7 +105,7 @@ class TestJson:
     def test_damage_is_named_with_the_remedy(self, tmp_path, text):
         (tmp_path / "a.json").write_bytes(text.encode("utf-8", "surrogateescape"))
         with pytest.raises(FileFormatError, match=r"a\.json is .*damaged.*; write it again\.$"):
-            read_json(tmp_path / "a.json", "write it again")
+            atomic_files.read_json(tmp_path / "a.json", "write it again")
 
     @pytest.mark.parametrize("links", [True, False])
     def test_without_overwrite_a_file_that_appears_meanwhile_stays(self, tmp_path, monkeypatch, links):
@@ -282,13 +271,13 @@ def test_folders_that_others_made_or_wrote_into_are_not_replaced(tmp_path):
     folder = tmp_path / "run"
 
     def asked(overwrite: bool = True, ours: bool = True) -> None:
-        require_replaceable(folder, "forcegp", lambda _: ours, overwrite=overwrite, own=["own.txt"])
+        atomic_files.require_replaceable(folder, "forcegp", lambda _: ours, overwrite=overwrite, own=["own.txt"])
 
     asked(overwrite=False)
     folder.mkdir()
     asked(overwrite=False, ours=False)
     (folder / "model.txt").write_text("one")
-    write_digests(folder)
+    atomic_files.write_digests(folder)
     (folder / "own.txt").write_text("two")
     asked()
     for more, words in (({"ours": False}, "was not written by forcegp"), ({"overwrite": False}, "exists already")):
@@ -301,7 +290,7 @@ def test_folders_that_others_made_or_wrote_into_are_not_replaced(tmp_path):
         asked()
     os.truncate(folder / "model.txt", 1 << 30)
     with pytest.raises(FileFormatError, match="claims 1024 MiB"):
-        require_unchanged(folder, "fit again")
+        atomic_files.require_unchanged(folder, "fit again")
     (folder / "model.txt").write_text("other")
     with pytest.raises(FileFormatError, match=r"damaged: model\.txt is not as it was written; fit again"):
-        require_unchanged(folder, "fit again")
+        atomic_files.require_unchanged(folder, "fit again")

@@ -51,7 +51,7 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def test_the_results_of_real_robots_are_those_of_their_page(repository: Path):
+def test_results_and_torques_of_real_robots_are_those_of_their_page(repository: Path):
     readme = (repository / "README.md").read_text(encoding="utf-8")
     page = (repository / "docs" / "benchmarks" / "real-robots.md").read_text(encoding="utf-8")
     lines = (line.split("|") for line in page.splitlines())
@@ -64,11 +64,6 @@ def test_the_results_of_real_robots_are_those_of_their_page(repository: Path):
             continue
         for model, cell in zip(COLUMNS, shown.split("|"), strict=True):
             assert cell.strip(" *") == rows[model][column].split(",")[2].strip(" *"), (robot, model)
-
-
-def test_torques_of_real_robots_are_those_of_their_page(repository: Path):
-    readme = (repository / "README.md").read_text(encoding="utf-8")
-    page = (repository / "docs" / "benchmarks" / "real-robots.md").read_text(encoding="utf-8")
     (least, learned) = re.findall(r"^\| Stäubli TX40 .*\| ([\d.]+) \| \*\*([\d.]+)\*\* \|$", readme, re.MULTILINE)[0]
     (of_page, ratio) = re.findall(r"^\| Stäubli TX40 \| ([\d.]+) Nm \|[^|]*\| \*\*([\d.]+)", page, re.MULTILINE)[0]
     assert least == of_page

@@ -10,18 +10,7 @@ import pytest
 import torch
 from torch.autograd import forward_ad
 
-from forcegp.codegen.library import (
-    COMMANDS,
-    PACKAGES,
-    code_digest,
-    compile_library,
-    default_folder,
-    load_library,
-    opened_library,
-    own_file,
-    own_folder,
-    require_plain,
-)
+from forcegp.codegen import library
 from forcegp.errors import CompilerError, InvalidInput
 
 SOURCE = "double twice(double x) { return x + x; }"
@@ -30,19 +19,19 @@ SOURCE = "double twice(double x) { return x + x; }"
 def test_a_text_becomes_a_library(tmp_path):
     path = tmp_path / "code.so"
     options = ("-fPIC", "-shared")
-    twice = compile_library(SOURCE, options, path, "twice").twice
+    twice = library.compile_library(SOURCE, options, path, "twice").twice
     twice.restype, twice.argtypes = ctypes.c_double, [ctypes.c_double]
     assert twice(1.25) == 2.5
     with pytest.raises(CompilerError, match=r"the C compiler failed: .*or do without"):
-        compile_library("no program", options, path, "twice")
+        library.compile_library("no program", options, path, "twice")
 
 
 def test_without_a_compiler_the_error_names_those_looked_for(tmp_path, monkeypatch):
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(CompilerError) as raised:
-        compile_library(SOURCE, (), tmp_path / "x.so", "twice")
-    for text in (*COMMANDS, PACKAGES, "CC", "compiled code needs", "or do without"):
+        library.compile_library(SOURCE, (), tmp_path / "x.so", "twice")
+    for text in (*library.COMMANDS, library.PACKAGES, "CC", "compiled code needs", "or do without"):
         assert text in str(raised.value)
     assert list(tmp_path.iterdir()) == []
 
@@ -59,7 +48,7 @@ def test_a_command_that_is_none_is_an_error_with_a_remedy(tmp_path, monkeypatch,
     (tmp_path / "text").chmod(0o700)
     monkeypatch.setenv("CC", command.format(tmp_path))
     with pytest.raises(CompilerError, match=message):
-        compile_library(SOURCE, (), tmp_path / "x.so", "twice")
+        library.compile_library(SOURCE, (), tmp_path / "x.so", "twice")
 
 
 def test_a_compiler_that_hangs_is_given_up(tmp_path, monkeypatch):
@@ -69,19 +58,19 @@ def test_a_compiler_that_hangs_is_given_up(tmp_path, monkeypatch):
     monkeypatch.setenv("CC", str(slow))
     monkeypatch.setattr("forcegp.codegen.library.LONGEST", 0.2)
     with pytest.raises(CompilerError, match=r"compiler failed: .*slow: it did not end within 0\.2 s; name another"):
-        compile_library(SOURCE, (), tmp_path / "x.so", "twice")
+        library.compile_library(SOURCE, (), tmp_path / "x.so", "twice")
 
 
 def test_only_tensors_with_hidden_derivatives_are_refused():
     x = torch.zeros(3, dtype=torch.float64)
-    require_plain([x, x.clone().requires_grad_()], "code", "do without")
+    library.require_plain([x, x.clone().requires_grad_()], "code", "do without")
     with forward_ad.dual_level():
-        require_plain([x], "code", "do without")
+        library.require_plain([x], "code", "do without")
         with pytest.raises(InvalidInput, match="forward-mode"):
-            require_plain([x, forward_ad.make_dual(x, x)], "code", "do without")
+            library.require_plain([x, forward_ad.make_dual(x, x)], "code", "do without")
 
     def through_code(y):
-        require_plain([y], "code", "do without")
+        library.require_plain([y], "code", "do without")
         return y
 
     for transform in (torch.func.vmap, torch.func.jacrev, torch.func.jacfwd):
@@ -91,9 +80,9 @@ def test_only_tensors_with_hidden_derivatives_are_refused():
 
 @pytest.mark.parametrize("kind", [".py", ".c"])
 def test_kept_programs_are_made_again_where_a_text_has_changed(kind, monkeypatch):
-    before, read = code_digest.__wrapped__(), Path.read_bytes
+    before, read = library.code_digest.__wrapped__(), Path.read_bytes
     monkeypatch.setattr(Path, "read_bytes", lambda path: read(path) + (b"/**/" if path.suffix == kind else b""))
-    assert code_digest.__wrapped__() != before
+    assert library.code_digest.__wrapped__() != before
 
 
 def test_a_kept_program_is_loaded_again_unless_others_may_change_it(tmp_path):
@@ -103,18 +92,18 @@ def test_a_kept_program_is_loaded_again_unless_others_may_change_it(tmp_path):
         written.append(lanes)
         return f"int evaluate(void) {{ return {len(written)}; }}"
 
-    found = [load_library("x", key, write, folder=tmp_path / "kept").evaluate() for key in ("a", "a", "b")]
+    found = [library.load_library("x", key, write, folder=tmp_path / "kept").evaluate() for key in ("a", "a", "b")]
     assert found == [1, 1, 2]
     assert len(written) == 2
     for path in (tmp_path / "kept").iterdir():
         assert stat.S_IMODE(path.stat().st_mode) == 0o700
         path.chmod(0o770)
     with pytest.raises(CompilerError, match=r"can be written to by others than you, .*chmod go-w"):
-        load_library("x", "a", write, folder=tmp_path / "kept")
+        library.load_library("x", "a", write, folder=tmp_path / "kept")
     broken = tmp_path / "broken.so"
     broken.write_text("no library")
     with pytest.raises(CompilerError, match=r"cannot be loaded .*delete it, and it is compiled anew"):
-        opened_library(broken)
+        library.opened_library(broken)
 
 
 @pytest.mark.parametrize(
@@ -139,17 +128,17 @@ def test_folders_that_others_may_write_to_are_refused(tmp_path, parent, own, ref
     for path in (folder, link):
         if refused:
             with pytest.raises(CompilerError, match="can be written to by others"):
-                own_folder(path)
+                library.own_folder(path)
         else:
-            assert own_folder(path) == folder.resolve()
+            assert library.own_folder(path) == folder.resolve()
 
 
 def test_folders_are_made_for_the_user_alone_where_they_can_be(tmp_path):
-    folder = own_folder(tmp_path / "new" / "kept")
+    folder = library.own_folder(tmp_path / "new" / "kept")
     assert [stat.S_IMODE(path.stat().st_mode) for path in (folder, folder.parent)] == [0o700, 0o700]
     (tmp_path / "file").touch()
     with pytest.raises(CompilerError, match=r"cannot be made \(File exists\); choose another folder"):
-        own_folder(tmp_path / "file")
+        library.own_folder(tmp_path / "file")
 
 
 @pytest.mark.parametrize(("owner", "refused"), [(os.getuid(), False), (0, False), (os.getuid() + 1, True)])
@@ -157,13 +146,13 @@ def test_what_belongs_to_another_user_is_refused(tmp_path, monkeypatch, owner, r
     monkeypatch.setattr(Path, "stat", lambda _: SimpleNamespace(st_uid=owner, st_mode=0o100700))
     if refused:
         with pytest.raises(CompilerError, match="belongs to another user"):
-            own_file(tmp_path)
+            library.own_file(tmp_path)
     else:
-        own_file(tmp_path)
+        library.own_file(tmp_path)
 
 
 def test_default_folder(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert default_folder() == tmp_path / "forcegp" / "compiled"
+    assert library.default_folder() == tmp_path / "forcegp" / "compiled"
     monkeypatch.delenv("XDG_CACHE_HOME")
-    assert default_folder() == Path.home() / ".cache" / "forcegp" / "compiled"
+    assert library.default_folder() == Path.home() / ".cache" / "forcegp" / "compiled"

@@ -1,7 +1,5 @@
 """Every command that writes, as small as it goes, and what is expected of its output whatever happens meanwhile."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -89,15 +89,6 @@ MISTAKES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_what_is_wrong_with_a_sensor_is_told(mistake):
-    change, level, words = MISTAKES[mistake]
-    _, force, R, _ = recorded()
-    doubt, *others = told(change(force, R))
-    assert (doubt.level, others) == (level, [])
-    assert re.search(words, str(doubt)), str(doubt)
-
-
 def test_a_late_sensor_and_a_weight_that_counts_twice():
     found = told(np.roll(recorded()[1], 5, axis=0))
     assert found[1].about == "sensor delay"
@@ -133,11 +124,13 @@ OF_TOOLS = {
 }
 
 
-@pytest.mark.parametrize("mistake", OF_TOOLS)
-def test_a_tool_shows_what_is_wrong_by_its_motion(mistake):
-    change, level, words = OF_TOOLS[mistake]
-    log, force, R = carrying()
-    doubt, *others = told(change(force, R), log)
+@pytest.mark.parametrize(
+    ("log", "mistake"), [*((recorded, each) for each in MISTAKES), *((carrying, each) for each in OF_TOOLS)]
+)
+def test_what_is_wrong_with_a_sensor_is_told_also_by_the_motion_of_a_tool(log, mistake):
+    change, level, words = (OF_TOOLS if log is carrying else MISTAKES)[mistake]
+    own, force, R, *_ = log()
+    doubt, *others = told(change(force, R), own)
     assert (doubt.level, others) == (level, [])
     assert re.search(words, str(doubt)), str(doubt)
 

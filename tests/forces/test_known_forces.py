@@ -18,7 +18,6 @@ from forcegp.forces.registry import FORCES, force_class
 from forcegp.mechanics import State
 from forcegp.model import Model
 
-JOINTS = ("slide", "spin", "skew", "tilt")
 NUMBERS = [0.5, 1.5, 0.0, 2.0]
 TENSOR = torch.tensor(NUMBERS, dtype=torch.float64)
 TENTHS = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64)

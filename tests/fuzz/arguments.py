@@ -1,7 +1,5 @@
 """Arguments of the public functions: values of another type, shape or size where one or two right ones were."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 from collections.abc import Callable

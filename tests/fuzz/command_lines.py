@@ -1,7 +1,5 @@
 """Command lines: any command with any option, numbers and texts of any kind, files of another kind, bytes as names."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Datasets: HDF5 whose arrays, attributes and texts are others, or whose bytes are damaged."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Logs of every format under `forcegp import`: other columns, types and bytes, objects that would run code."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the fuzzed commands and functions are given where they are given nothing wrong, made once."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,16 +7,8 @@ from typing import Any
 
 from tests.data.samples import dataset, model
 from tests.posterior.arm import URDF, arm_data, arm_model
-from tests.recordings.log_files import (
-    motion,
-    table,
-    write_bag2,
-    write_hdf5,
-    write_matlab5,
-    write_matlab73,
-    write_parquet,
-    write_text,
-)
+from tests.recordings import log_files
+from tests.recordings.log_files import motion, table
 from tests.robots.mjcf_models import OPEN_BARS, QUADROTOR
 
 from forcegp.fit import fit
@@ -68,13 +58,13 @@ def make(folder: Path) -> None:
     (folder / "arm.urdf").write_text(URDF)
     (folder / "pair.urdf").write_text(PAIR)
     rows = motion(60)
-    write_text(folder / "log.csv", table(rows))
+    log_files.write_text(folder / "log.csv", table(rows))
     np.savez(folder / "log.npz", **rows)
-    write_matlab5(folder / "log.mat", rows)
-    write_matlab73(folder / "log73.mat", rows)
-    write_hdf5(folder / "log.h5", rows)
-    write_parquet(folder / "log.parquet", table(rows))
-    next(write_bag2(folder / "bag", rows).glob("*.mcap")).rename(folder / "log.mcap")
+    log_files.write_matlab5(folder / "log.mat", rows)
+    log_files.write_matlab73(folder / "log73.mat", rows)
+    log_files.write_hdf5(folder / "log.h5", rows)
+    log_files.write_parquet(folder / "log.parquet", table(rows))
+    next(log_files.write_bag2(folder / "bag", rows).glob("*.mcap")).rename(folder / "log.mcap")
     INPUTS.folder, INPUTS.data, INPUTS.posterior, INPUTS.free = folder, data, plain, free
     INPUTS.other = dataset()
     INPUTS.moving = simulate_quadrotor(QuadrotorConfig(seconds=0.1))

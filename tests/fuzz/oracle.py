@@ -4,8 +4,6 @@ The seed is that of the day, so that every day tries other cases. `FORCEGP_FUZZ_
 `FORCEGP_FUZZ_CASES=5000` runs so many cases of each target.
 """
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import os

@@ -1,7 +1,5 @@
 """Robot files: changed structure, numbers and bytes, other encodings, entities."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Stored models: documents of any shape, tensors and robots of another kind, with the digests left or rewritten."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

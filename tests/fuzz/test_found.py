@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -84,20 +85,26 @@ def test_names_that_are_no_text_are_refused_in_one_line(place, words):
     assert require_ended_well([*words.split(), *FLAGS * words.startswith("import")], place) == 2
 
 
+@pytest.fixture
+def run(tmp_path):
+    """A stored model to change."""
+    return Path(shutil.copytree(INPUTS.folder / "structured", tmp_path / "run"))
+
+
+def assert_refused(run, message):
+    write_digests(run)
+    with pytest.raises(FileFormatError, match=message):
+        forcegp.load_posterior(run)
+
+
 @pytest.mark.parametrize(
     "content",
     ["[" * 100_000, '{"kind": ' + "9" * 5000 + "}", '{"kind": []}', '{"kind": {}}', '{"kind": "structured-gp"}'],
     ids=["deep", "digits", "list", "object", "no version"],
 )
-def test_documents_of_any_shape_are_refused(tmp_path, content):
-    run = tmp_path / "run"
-    run.mkdir()
-    for name in ("tensors.safetensors", "robot.urdf"):
-        (run / name).write_bytes((INPUTS.folder / "structured" / name).read_bytes())
+def test_documents_of_any_shape_are_refused(run, content):
     (run / "model.json").write_text(content)
-    write_digests(run)
-    with pytest.raises(FileFormatError, match=r"model\.json"):
-        forcegp.load_posterior(run)
+    assert_refused(run, r"model\.json")
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"urdf": ' + "9" * 5000 + "}"], ids=["deep", "digits"])
@@ -114,15 +121,11 @@ def test_systems_of_any_shape_are_refused(text):
     + [{"motion_intervals": {"horizons": [1.0], "rms": [[[1.0]] * 2], "factors": [[[[1.0]] * 2]] * 2}}],
     ids=str,
 )
-def test_settings_of_another_kind_are_refused(tmp_path, stated):
-    run = tmp_path / "run"
-    shutil.copytree(INPUTS.folder / "structured", run)
+def test_settings_of_another_kind_are_refused(run, stated):
     document = json.loads((run / "model.json").read_text())
     document["settings"] |= stated
     (run / "model.json").write_text(json.dumps(document))
-    write_digests(run)
-    with pytest.raises(FileFormatError, match=r"model\.json"):
-        forcegp.load_posterior(run)
+    assert_refused(run, r"model\.json")
 
 
 TENSORS_OF = ("training.q", "training.v", "parameters.noise.log_force")
@@ -131,15 +134,10 @@ CHANGED += [("training.v", "fewer rows"), ("training.u", "huge")]
 
 
 @pytest.mark.parametrize(("name", "how"), CHANGED)
-def test_tensors_of_other_shapes_and_kinds_are_refused(tmp_path, name, how):
-    run = tmp_path / "run"
-    shutil.copytree(INPUTS.folder / "structured", run)
-    file = run / TENSORS
-    tensors = load_file(file)
-    save_file(tensors | {name: CHANGES[how](tensors[name]).contiguous()}, file)
-    write_digests(run)
-    with pytest.raises(FileFormatError, match="fit the model again"):
-        forcegp.load_posterior(run)
+def test_tensors_of_other_shapes_and_kinds_are_refused(run, name, how):
+    tensors = load_file(run / TENSORS)
+    save_file(tensors | {name: CHANGES[how](tensors[name]).contiguous()}, run / TENSORS)
+    assert_refused(run, "fit the model again")
 
 
 # ---------------------------------------------------------------- arguments

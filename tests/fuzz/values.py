@@ -1,7 +1,5 @@
 """Values that nobody expects: numbers, texts, JSON of any shape, and edits of JSON, bytes and XML."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import random

@@ -14,12 +14,6 @@ from forcegp.integration.integrators import VECTORS, find_roots
 from forcegp.model import Model
 from forcegp.robots import Robot
 
-POINT = """<robot name="point"><link name="base"/>
-<link name="mass"><inertial><mass value="2"/>
-<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<joint name="rail" type="prismatic"><parent link="base"/><child link="mass"/><axis xyz="1 0 0"/>
-<limit lower="-9" upper="9" effort="9" velocity="9"/></joint></robot>"""
-
 
 def of_vectors(name):
     return partial(INTEGRATORS[name], VECTORS)

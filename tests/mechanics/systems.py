@@ -3,6 +3,7 @@
 from functools import cache
 
 import torch
+from tests.inference.problems import normal
 from tests.robots.robot_models import FRAMES, MODELS
 
 from forcegp.forces import Actuation, RigidBodies
@@ -49,10 +50,6 @@ def model_with(model: str = "iiwa", kind: str = "one", **options: object) -> Mod
     """Without friction that the URDF may state."""
     forces = (Actuation(), RigidBodies())
     return Model(robot(model), contacts(kind, FRAMES[model]), **{"forces": forces, **options})
-
-
-def normal(*shape: int, seed: int = 0) -> torch.Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def states(nv: int, *batch: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

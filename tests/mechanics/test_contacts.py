@@ -86,30 +86,19 @@ def test_baumgarte_turns_the_distance_into_a_damped_oscillator(surface, omega, z
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("kind", "arguments", "message"),
     [
-        (("tool", (0, 0), FLOOR), r"Contact point is \(0, 0\); give 3 finite numbers"),
-        (("tool", "123", FLOOR), "Contact point is '123'"),
-        ((7, (0, 0, 0), FLOOR), "Contact frame is 7; give the name of a link"),
-        (("tool", (0, 0, 0), lambda p: p[2]), "Contact surface is a function; give a Plane"),
-        (("tool", (0, 0, 0), FLOOR, ""), "Contact switch is ''; give the name of an input"),
+        (Contact, ("tool", (0, 0), FLOOR), r"Contact point is \(0, 0\); give 3 finite numbers"),
+        (Contact, ("tool", "123", FLOOR), "Contact point is '123'"),
+        (Contact, (7, (0, 0, 0), FLOOR), "Contact frame is 7; give the name of a link"),
+        (Contact, ("tool", (0, 0, 0), lambda p: p[2]), "Contact surface is a function; give a Plane"),
+        (Contact, ("tool", (0, 0, 0), FLOOR, ""), "Contact switch is ''; give the name of an input"),
+        (Baumgarte, (-1.0,), "Baumgarte omega is -1.0; it must be a finite number >= 0"),
+        (Baumgarte, ("10",), "Baumgarte omega is '10'"),
+        (Baumgarte, (10.0, -0.1), "Baumgarte zeta is -0.1"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",  # a function's address would differ between processes
 )
-def test_wrong_contacts_are_named(arguments, message):
+def test_wrong_contacts_and_stabilisations_are_named(kind, arguments, message):
     with pytest.raises(InvalidInput, match=message):
-        Contact(*arguments)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((-1.0,), "Baumgarte omega is -1.0; it must be a finite number >= 0"),
-        (("10",), "Baumgarte omega is '10'"),
-        ((10.0, -0.1), "Baumgarte zeta is -0.1"),
-    ],
-    ids=str,
-)
-def test_wrong_stabilisation_is_named(arguments, message):
-    with pytest.raises(InvalidInput, match=message):
-        Baumgarte(*arguments)
+        kind(*arguments)

@@ -4,18 +4,8 @@ from functools import cache
 
 import pytest
 import torch
-from tests.mechanics.systems import (
-    INDEPENDENT,
-    REDUNDANT,
-    assert_close,
-    assert_derivatives,
-    model_with,
-    normal,
-    regular_states,
-    robot,
-    solve_kkt,
-    states,
-)
+from tests.mechanics import systems
+from tests.mechanics.systems import INDEPENDENT, REDUNDANT, assert_close, robot, states
 from tests.robots.robot_models import FRAMES, MODELS
 
 from forcegp.errors import NumericalError
@@ -27,8 +17,8 @@ TOLERANCE, ALL = 1e-10, [*INDEPENDENT, *REDUNDANT]
 
 @cache
 def regular_dynamics(model: str, kind: str):
-    built = model_with(model, kind, baumgarte=Baumgarte(10.0, 1.0))
-    return built.dynamics(*regular_states(built, 20)), normal(20, built.robot.nv, seed=9)
+    built = systems.model_with(model, kind, baumgarte=Baumgarte(10.0, 1.0))
+    return built.dynamics(*systems.regular_states(built, 20)), systems.normal(20, built.robot.nv, seed=9)
 
 
 @pytest.mark.parametrize("kind", ALL)
@@ -40,14 +30,14 @@ class TestAgainstDenseEquations:
 
     def test_acceleration_and_multiplier(self, solved):
         dynamics, Q_U = solved
-        a, multiplier = solve_kkt(dynamics.M, dynamics.Q_K + Q_U, dynamics.A, dynamics.b)
+        a, multiplier = systems.solve_kkt(dynamics.M, dynamics.Q_K + Q_U, dynamics.A, dynamics.b)
         assert_close(dynamics.acceleration(Q_U), a, TOLERANCE)
         assert_close(dynamics.multiplier(Q_U), multiplier, TOLERANCE)
 
     def test_H_and_the_constrained_offset(self, solved):
         """H is the response to unit forces; the constraint force gives the offset when nothing else acts."""
         dynamics, Q_U = solved
-        at_rest, multiplier = solve_kkt(dynamics.M, torch.zeros_like(Q_U), dynamics.A, dynamics.b)
+        at_rest, multiplier = systems.solve_kkt(dynamics.M, torch.zeros_like(Q_U), dynamics.A, dynamics.b)
         assert_close(
             (dynamics.M @ dynamics.constrained_offset[..., None])[..., 0],
             (dynamics.A.mT @ multiplier[..., None])[..., 0],
@@ -55,7 +45,7 @@ class TestAgainstDenseEquations:
         )
         columns = []
         for unit in torch.eye(Q_U.shape[-1], dtype=torch.float64):
-            response, _ = solve_kkt(dynamics.M, unit.expand_as(Q_U), dynamics.A, torch.zeros_like(dynamics.b))
+            response, _ = systems.solve_kkt(dynamics.M, unit.expand_as(Q_U), dynamics.A, torch.zeros_like(dynamics.b))
             columns.append(response)
         assert_close(dynamics.H, torch.stack(columns, dim=-1), TOLERANCE)
         assert_close(dynamics.acceleration_map()(-dynamics.Q_K), at_rest, TOLERANCE)
@@ -89,7 +79,7 @@ class TestAgainstDenseEquations:
         sizes = gradients.norm(dim=-1)
         assert_close(dynamics.off(), torch.stack(values, -1).detach() / sizes, TOLERANCE)
         assert_close(dynamics.contact_force_map()(Q_U), (gradients * multiplier[..., None]).flatten(1), TOLERANCE)
-        frame, measured = dynamics.contacts[0].frame, normal(20, 3)
+        frame, measured = dynamics.contacts[0].frame, systems.normal(20, 3)
         assert_close(dynamics.force_at(frame)(Q_U), (sizes * multiplier).sum(-1, keepdim=True), TOLERANCE)
         along = torch.nn.functional.normalize(gradients.sum(1), dim=-1)
         assert_close(dynamics.as_measured(frame, measured), (along * measured).sum(-1, keepdim=True), TOLERANCE)
@@ -105,16 +95,16 @@ def test_derivatives(model, kind):
 
     Rotor inertia makes the light wrists heavier, so that finite differences keep their digits.
     """
-    built = model_with(model, kind, baumgarte=Baumgarte(2.0, 0.7))
+    built = systems.model_with(model, kind, baumgarte=Baumgarte(2.0, 0.7))
     built = built.with_robot(built.robot.with_armature([0.5] * built.robot.nv))
-    Q_U = normal(built.robot.nv)
+    Q_U = systems.normal(built.robot.nv)
 
     def function(q, v, u):
         dynamics = built.dynamics(q, v, u)
         parts = dynamics.acceleration(Q_U), dynamics.multiplier(Q_U), dynamics.constrained_offset, dynamics.H.sum(-1)
         return torch.cat([part.flatten() for part in parts])
 
-    assert_derivatives(function, *(x[0] for x in regular_states(built, 1)))
+    systems.assert_derivatives(function, *(x[0] for x in systems.regular_states(built, 1)))
 
 
 # ---------------------------------------------------------------- what it refuses

@@ -34,11 +34,6 @@ def call(function, sizes, *arrays) -> tuple[int, list[np.ndarray]]:
 
 
 @pytest.fixture(scope="module")
-def posterior() -> Posterior:
-    return quick_fit(arm_model().with_forces(JointForces()))
-
-
-@pytest.fixture(scope="module")
 def friction() -> Posterior:
     return quick_fit(arm_model().with_forces(JointFriction(), ContactFriction(load=True, expected=0.2)))
 

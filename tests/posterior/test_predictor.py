@@ -8,7 +8,7 @@ from tests.posterior.arm import arm_model, quick_fit
 from torch.autograd import forward_ad
 
 from forcegp.errors import InvalidInput, NumericalError, NumericalWarning
-from forcegp.forces import ContactFriction, JointForces, JointFriction, ToolForces
+from forcegp.forces import ContactFriction, JointFriction, ToolForces
 from forcegp.mechanics import Contact, ImplicitSurface, Plane, Sphere
 from forcegp.posterior import Posterior, Predictor, preparation
 
@@ -23,11 +23,6 @@ CONTACTS = {
     ],
     "redundant": [Contact("hand", TIP, Plane((0.2, 0.0, 1.0), 0.4))] * 2,
 }
-
-
-@pytest.fixture(scope="module")
-def posterior() -> Posterior:
-    return quick_fit(arm_model().with_forces(JointForces()))
 
 
 @pytest.fixture(scope="module")

@@ -10,19 +10,8 @@ import pytest
 import scipy.io
 from numpy.testing import assert_array_equal
 from tests.data.samples import model
-from tests.recordings.log_files import (
-    EPOCH,
-    JOINTS,
-    motion,
-    table,
-    write_bag1,
-    write_bag2,
-    write_hdf5,
-    write_matlab5,
-    write_matlab73,
-    write_parquet,
-    write_text,
-)
+from tests.recordings import log_files
+from tests.recordings.log_files import EPOCH, JOINTS, motion, table
 from tests.recordings.source_conformance import SourceConformance
 
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput
@@ -40,7 +29,7 @@ class Tables(SourceConformance):
 
 class TestCsv(Tables):
     def write(self, folder):
-        return write_text(folder / "log.csv", table(motion()))
+        return log_files.write_text(folder / "log.csv", table(motion()))
 
     def truncated(self, path):
         lines = path.read_text().splitlines()
@@ -51,17 +40,19 @@ class TestCsv(Tables):
 
 class TestCompressedCsv(Tables):
     def write(self, folder):
-        return write_text(folder / "log.csv.gz", table(motion()))
+        return log_files.write_text(folder / "log.csv.gz", table(motion()))
 
 
 class TestBlanksAndComments(TestCsv):
     def write(self, folder):
-        return write_text(folder / "log.txt", table(motion()), delimiter="   ", before="# a robot\n\n# 2 joints\n")
+        return log_files.write_text(
+            folder / "log.txt", table(motion()), delimiter="   ", before="# a robot\n\n# 2 joints\n"
+        )
 
 
 class TestHeaderInComment(TestCsv):
     def write(self, folder):
-        return write_text(folder / "log.dat", table(motion()), delimiter=" ", before="# ")
+        return log_files.write_text(folder / "log.dat", table(motion()), delimiter=" ", before="# ")
 
 
 class TestHeaderless(TestCsv):
@@ -140,32 +131,29 @@ def test_lines_of_other_widths_and_texts_for_numbers_are_left_out_if_asked_for(t
 
 class TestParquet(Tables):
     def write(self, folder):
-        return write_parquet(folder / "log.parquet", table(motion()))
+        return log_files.write_parquet(folder / "log.parquet", table(motion()))
 
 
-class TestParquetOfLists(Tables):
-    def write(self, folder):
-        return write_parquet(folder / "log.parquet", motion())
+class Arrays(Tables):
+    prefix = ""
 
     def expected(self):
-        return arrays("")
+        data = motion()
+        columns = {f"{self.prefix}time": data["time"]}
+        for signal in "qvu":
+            columns |= {f"{self.prefix}{signal}[{index}]": data[signal][:, index] for index in range(2)}
+        return columns
 
 
-def arrays(prefix):
-    data = motion()
-    columns = {f"{prefix}time": data["time"]}
-    for signal in "qvu":
-        columns |= {f"{prefix}{signal}[{index}]": data[signal][:, index] for index in range(2)}
-    return columns
+class TestParquetOfLists(Arrays):
+    def write(self, folder):
+        return log_files.write_parquet(folder / "log.parquet", motion())
 
 
-class TestNumpyArchive(Tables):
+class TestNumpyArchive(Arrays):
     def write(self, folder):
         np.savez(folder / "log.npz", dt=0.1, name="arm", **motion())
         return folder / "log.npz"
-
-    def expected(self):
-        return arrays("")
 
 
 class TestPartOfAnArchive(TestNumpyArchive):
@@ -180,28 +168,23 @@ class TestPartOfAnArchive(TestNumpyArchive):
         return {f"[{index}]": motion()["q"][:, index] for index in range(2)}
 
 
-class TestHDF5(Tables):
+class TestHDF5(Arrays):
+    prefix = "log/"
+
     def write(self, folder):
-        return write_hdf5(folder / "log.h5", motion())
-
-    def expected(self):
-        return arrays("log/")
+        return log_files.write_hdf5(folder / "log.h5", motion())
 
 
-class TestMatlab5(Tables):
+class TestMatlab5(Arrays):
+    prefix = "log/"
+
     def write(self, folder):
-        return write_matlab5(folder / "log.mat", motion())
-
-    def expected(self):
-        return arrays("log/")
+        return log_files.write_matlab5(folder / "log.mat", motion())
 
 
-class TestMatlab73(Tables):
+class TestMatlab73(Arrays):
     def write(self, folder):
-        return write_matlab73(folder / "log.mat", motion())
-
-    def expected(self):
-        return arrays("")
+        return log_files.write_matlab73(folder / "log.mat", motion())
 
 
 def nested(rows=7):
@@ -279,12 +262,12 @@ class Bags(Tables):
 
 class TestRos1Bag(Bags):
     def write(self, folder):
-        return write_bag1(folder / "log.bag", motion())
+        return log_files.write_bag1(folder / "log.bag", motion())
 
 
 class TestRos2Folder(Bags):
     def write(self, folder):
-        return write_bag2(folder / "log", motion())
+        return log_files.write_bag2(folder / "log", motion())
 
     def truncated(self, path):
         return None
@@ -292,7 +275,7 @@ class TestRos2Folder(Bags):
 
 class TestRos2FolderOfSqlite(TestRos2Folder):
     def write(self, folder):
-        return write_bag2(folder / "log", motion(), "sqlite3")
+        return log_files.write_bag2(folder / "log", motion(), "sqlite3")
 
     def truncated(self, path):
         return next(path.glob("*.db3"))
@@ -300,12 +283,12 @@ class TestRos2FolderOfSqlite(TestRos2Folder):
 
 class TestCompressedMcap(TestRos2Folder):
     def write(self, folder):
-        return write_bag2(folder / "log", motion(), compressed="STORAGE")
+        return log_files.write_bag2(folder / "log", motion(), compressed="STORAGE")
 
 
 class TestTopicWithTwoPublishers(TestRos2Folder):
     def write(self, folder):
-        return write_bag2(folder / "log", motion(), gripper=True)
+        return log_files.write_bag2(folder / "log", motion(), gripper=True)
 
     def test_messages_of_the_other_are_counted(self, source):
         source.read(["/joint_states:position.elbow"])
@@ -323,7 +306,7 @@ def test_sensors_of_other_topics_are_vectors_of_their_messages(tmp_path):
     pytest.importorskip("rosbags")
     own = ("/wrench:wrench.force",)
     mapping = ColumnMapping(force={"one": own, "imu:two@0,0,0.1": own}, unit={"imu": ("g",)})
-    log = import_recordings([write_bag2(tmp_path / "log", motion())], mapping, model=model("continuous"))
+    log = import_recordings([log_files.write_bag2(tmp_path / "log", motion())], mapping, model=model("continuous"))
     np.testing.assert_allclose(log.measured["force.one"][7], [7.0, 0.5, -1.0])
     np.testing.assert_allclose(log.measured["imu.two@0,0,0.1"][7], 9.80665 * np.array([7.0, 0.5, -1.0]))
 
@@ -332,13 +315,13 @@ def test_no_thread_of_pyarrow_waits_for_python(tmp_path, monkeypatch):
     """It would crash at the end of Python: in a stream of Python's, or in a handler of rows."""
     own, given = tables.arrow_csv.read_csv, []
     monkeypatch.setattr(tables.arrow_csv, "read_csv", lambda *all: (given.append(all), own(*all))[1])
-    open_source(write_text(tmp_path / "log.csv", table(motion()))).read(["time"])
+    open_source(log_files.write_text(tmp_path / "log.csv", table(motion()))).read(["time"])
     assert [(isinstance(source, pa.NativeFile), reads.use_threads) for source, reads, *_ in given] == [(True, False)]
 
 
 def test_columns_of_several_topics_are_refused(tmp_path):
     pytest.importorskip("rosbags")
-    source = open_source(write_bag2(tmp_path / "log", motion(10)))
+    source = open_source(log_files.write_bag2(tmp_path / "log", motion(10)))
     with pytest.raises(InvalidInput, match="topics /joint_states, /wrench"):
         source.read(["/joint_states:log_time", "/wrench:log_time"])
 
@@ -351,9 +334,9 @@ def test_a_name_of_a_column_that_is_too_long_is_refused(tmp_path):
 
 def test_options_of_other_formats_are_refused(tmp_path):
     with pytest.raises(InvalidInput, match="`headerless` means nothing to"):
-        open_source(write_parquet(tmp_path / "log.parquet", table(motion(10))), headerless=7)
+        open_source(log_files.write_parquet(tmp_path / "log.parquet", table(motion(10))), headerless=7)
     with pytest.raises(InvalidInput, match="means nothing to"):
-        open_source(write_text(tmp_path / "log.csv", table(motion(10))), within="run1")
+        open_source(log_files.write_text(tmp_path / "log.csv", table(motion(10))), within="run1")
 
 
 def test_a_dataset_of_our_own_is_not_a_log(tmp_path):

@@ -55,18 +55,6 @@ def test_slopes_are_those_of_the_columns():
     assert found.weights == {"theta1": 2.0, "theta2": -0.25}
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        *("", "theta1 theta2", "1/theta1", "theta1/0", "theta3", "theta1**1", "0x1", "1j", "`a", "a" + "+a" * 400),
-        *("theta1 +", "__import__('os')", "theta1; 1", "1e999", "abs(a)", "theta1x", "9" * 5000, "(" * 5000),
-    ],
-)
-def test_what_is_no_combination_is_refused(text):
-    with pytest.raises(InvalidInput):
-        parse_expression(text, COLUMNS, "log.csv")
-
-
 @given(st.text(alphabet=string.printable, max_size=30))
 def test_any_text_is_a_combination_or_refused(text):
     try:
@@ -111,12 +99,6 @@ def test_braces_of_a_combination_go_on_together(pattern, texts):
     assert expanded(pattern, JOINTS, {"a-1-1"}) == texts
 
 
-@pytest.mark.parametrize("pattern", ["a{1..}", "a{", "a}", "a{b}", "a{}", "a{1..99999}", "{0..99}{0..99}"])
-def test_patterns_that_mean_nothing(pattern):
-    with pytest.raises(InvalidInput):
-        expanded(pattern, JOINTS)
-
-
 def test_lists_are_split_at_the_commas_that_separate():
     assert listed("q{1,2}, `a,b` - c , x[0]") == ["q{1,2}", "`a,b` - c", "x[0]"]
     with pytest.raises(InvalidInput, match="empty place"):
@@ -136,16 +118,28 @@ def test_units(quantity, name, given, si):
     assert [named_unit("q", each) for each in ("q_deg", "q[1]", "q_m", "q_hand", "mm")] == ["deg", *[None] * 4]
 
 
-@pytest.mark.parametrize(
-    "flags",
-    [
+READERS = {
+    "combination": lambda text: parse_expression(text, COLUMNS, "log.csv"),
+    "pattern": lambda text: expanded(text, JOINTS),
+    "flags": lambda text: mapped(*text.split()),
+}
+MEANINGLESS = {
+    "combination": [
+        *("", "theta1 theta2", "1/theta1", "theta1/0", "theta3", "theta1**1", "0x1", "1j", "`a", "a" + "+a" * 400),
+        *("theta1 +", "__import__('os')", "theta1; 1", "1e999", "abs(a)", "theta1x", "9" * 5000, "(" * 5000),
+    ],
+    "pattern": ["a{1..}", "a{", "a}", "a{b}", "a{}", "a{1..99999}", "{0..99}{0..99}"],
+    "flags": [
         "--unit deg", "--unit q=metres", "--unit x=m", "--sign q=2", "--sign q=0", "--sign q=x", "--headerless seven",
         "--step -1", "--time t --step 1", "--unit q=", "--unit q=deg,q=rad", "--q a,,b",
     ],
-)  # fmt: skip
-def test_flags_that_mean_nothing_are_refused(flags):
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "text"), [(kind, text) for kind, texts in MEANINGLESS.items() for text in texts])
+def test_texts_that_mean_nothing_are_refused(kind, text):
     with pytest.raises(InvalidInput):
-        mapped(*flags.split())
+        READERS[kind](text)
 
 
 def test_short_forms_of_the_command_line():

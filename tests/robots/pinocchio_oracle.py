@@ -1,7 +1,5 @@
 """Pinocchio with forcegp's joint order and one coordinate per joint: the independent answer to compare with."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from tests.inference.problems import normal as random
 from tests.robots.robot_models import TREE
 from tests.robots.test_moving_bases import LIMBS
 
@@ -38,10 +39,6 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def compiled(robot, folder):
     return robot.compile(folder)
-
-
-def random(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -5,14 +5,12 @@ import datetime
 import numpy as np
 import pytest
 import torch
-from tests.data.samples import LINK, TWO_JOINTS, dataset
+from tests.data.samples import dataset
 from tests.posterior.arm import arm_data
 
 from forcegp.errors import DatasetError, ForceGPError, InvalidInput, NumericalError
 from forcegp.fit import fit
 from forcegp.forces import JointForces
-
-TEXT = TWO_JOINTS.format(one=LINK.format("one"), two=LINK.format("two"), elbow="revolute")
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,6 @@
 20 s of an arm with Stribeck friction as log.h5.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -10,14 +10,13 @@ import pytest
 import torch
 from scipy.stats import multivariate_normal, norm
 from tests.posterior.arm import NOISE, arm_data, arm_model
-from tests.scores.friction import fitted, friction_data
 from tests.scores.moving_arm import given_system, moving_arm
 
 from forcegp import Noise, score
 from forcegp.data.views import BLOCK
 from forcegp.errors import InvalidInput
 from forcegp.fit import fit
-from forcegp.forces import ContactFriction, JointFriction, Rotor
+from forcegp.forces import Rotor
 from forcegp.model import Model
 from forcegp.progress import watched
 from forcegp.scores.accuracy import LEVELS, by_stretch, force_errors, mass_matrices, predict_rows, row_scores
@@ -199,16 +198,3 @@ def test_a_joint_that_never_moves_has_no_normalised_error(swinging):
     scores = scored(posterior, dataclasses.replace(swinging, a=a))
     assert [each is None for each in scores.columns("nrmse")] == [False, True, False]
     assert scores.value("nrmse") is not None
-
-
-# ---------------------------------------------------------------- forces by themselves
-
-
-@pytest.fixture(scope="module")
-def data():
-    return friction_data(50, seed=1)
-
-
-@pytest.fixture(scope="module")
-def friction():
-    return fitted(JointFriction(), ContactFriction(kernel="linear"))

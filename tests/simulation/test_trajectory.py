@@ -3,16 +3,8 @@ import pinocchio as pin
 import pytest
 import torch
 
-from forcegp.simulation import KukaSurfaceConfig
-from forcegp.simulation.trajectory import (
-    ArmState,
-    SegmentPath,
-    joint_acceleration,
-    over_table,
-    random_path,
-    slope_of,
-    table_of,
-)
+from forcegp.simulation import KukaSurfaceConfig, trajectory
+from forcegp.simulation.trajectory import ArmState, SegmentPath
 
 MIDDLE = np.array([0.0, 0.5, 0.055])
 
@@ -43,21 +35,21 @@ def test_it_rests_before_after_and_on_a_segment_without_length():
 
 def test_the_tilted_plane_falls_towards_positive_x_by_its_angle():
     config = KukaSurfaceConfig(surface="tilted")
-    np.testing.assert_allclose(slope_of(config), [-np.tan(np.deg2rad(10)), 0.0])
+    np.testing.assert_allclose(trajectory.slope_of(config), [-np.tan(np.deg2rad(10)), 0.0])
     xy = np.random.default_rng(1).uniform((-0.5, 0.4), (0.5, 0.6), (30, 2))
-    points = np.column_stack([xy, MIDDLE[2] + (xy - MIDDLE[:2]) @ slope_of(config)])
-    np.testing.assert_allclose(table_of(config).value(torch.from_numpy(points)), 0.0, atol=1e-13)
+    points = np.column_stack([xy, MIDDLE[2] + (xy - MIDDLE[:2]) @ trajectory.slope_of(config)])
+    np.testing.assert_allclose(trajectory.table_of(config).value(torch.from_numpy(points)), 0.0, atol=1e-13)
 
 
 @pytest.mark.parametrize("kind", ["plane", "tilted"])
 def test_velocity_and_acceleration_of_the_bent_path_are_derivatives(kind):
     config, start = KukaSurfaceConfig(surface=kind), np.array([0.1, 0.5, 0.3])
-    flat = random_path(config, start, 4.0, np.random.default_rng(3))
+    flat = trajectory.random_path(config, start, 4.0, np.random.default_rng(3))
 
     def path(time: np.ndarray):
-        return over_table(config, flat.sample(time))
+        return trajectory.over_table(config, flat.sample(time))
 
-    expected = start + np.array([0.0, 0.0, (start - MIDDLE)[:2] @ slope_of(config)])
+    expected = start + np.array([0.0, 0.0, (start - MIDDLE)[:2] @ trajectory.slope_of(config)])
     np.testing.assert_allclose(path(np.zeros(1))[0][0], expected, atol=1e-14)
     time, step = np.linspace(0, 4, 1001)[1:-1], 1e-6
     before, after = path(time - step), path(time + step)
@@ -80,7 +72,7 @@ def test_the_law_is_the_published_one_with_the_pseudo_inverse():
         position, aim = rng.normal(size=3), tuple(rng.normal(size=(3, 3)))
         present = (values := rng.normal(size=4)) / np.linalg.norm(values)
         state = ArmState(q, v, np.eye(7), np.zeros(7), position, turned(present), J, bias)
-        found = joint_acceleration(KukaSurfaceConfig(), state, aim)
+        found = trajectory.joint_acceleration(KukaSurfaceConfig(), state, aim)
 
         velocity = J @ v
         task = np.concatenate(
