@@ -15,10 +15,10 @@ from tests.robots.robot_models import with_link
 from forcegp.checks import CheckReport, check, quick_check, without_pushes, without_stops
 from forcegp.checks.residuals import pushed_where_they_are
 from forcegp.checks.search import UNKNOWN, _stop, moving
-from forcegp.checks.torques import with_gravity
 from forcegp.data import Dataset, Preparation
 from forcegp.doubts import look
 from forcegp.errors import InvalidInput
+from forcegp.fit.payloads import with_gravity
 from forcegp.forces import Coulomb, Viscous
 from forcegp.mechanics import fixed_point
 from forcegp.model import Model

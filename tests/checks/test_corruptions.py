@@ -259,6 +259,14 @@ def test_a_long_rest_before_a_motion_that_tells_nothing_of_it_is_left_out(second
     assert len(without_stops(data)[1]) == stops
 
 
+@pytest.mark.parametrize(("share", "told"), [(0.8, True), (0.4, False)])
+def test_what_carries_a_sliding_joint_is_told(share, told):
+    data = clean(ROBOTS["crane"](), 1, noise="qvu")
+    carried = share * data.u[:, 0].mean()
+    found = check(replace(data, u=data.u - [carried, 0.0])).doubts.of("offset")
+    assert [x.numbers["offset"] for x in found] == ([pytest.approx(-carried, rel=0.05)] if told else [])
+
+
 def test_friction_that_remembers_is_no_push():
     """About a turn it is far from any that velocities make, for seconds here."""
     data = between_postures(arm_model().robot, 3, 24.0)

@@ -27,6 +27,7 @@ from forcegp.checks.signals import (
     without_registers,
 )
 from forcegp.checks.torque_doubts import elastic_doubts, held_points, torque_doubts
+from forcegp.checks.torques import positive_solution
 from forcegp.data import Dataset
 from forcegp.doubts import LEVELS
 from forcegp.model import Model
@@ -260,6 +261,16 @@ def test_what_every_cause_explains(name):
     explained, doubts = search(inputs)
     more = [*torque_doubts(inputs, explained), *elastic_doubts(inputs, explained.log), *held_points(inputs)]
     assert_unchanged(f"checks/causes {name}", found | numbers([*doubts, *more]), rtol=1e-4)
+
+
+def test_products_that_rounding_makes_singular_have_a_solution():
+    columns = np.random.default_rng(0).normal(size=(50, 3)) @ np.diag([1.0, 1.0, 1e-9])
+    columns[:, 1] = columns[:, 0]
+    both = np.c_[columns, 2.0 * columns[:, 0]]
+    products = both.T @ both - 1e-7 * np.diag([0.0, 50.0, 0.0, 0.0])  # as differences of sums leave them
+    factors, left = positive_solution(products)
+    assert factors[:2].sum() == pytest.approx(2.0, rel=1e-3)
+    assert left < 1e-3 * products[-1, -1]
 
 
 def test_factors_of_torques_are_looked_at_or_wrong():

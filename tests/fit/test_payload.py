@@ -179,15 +179,21 @@ def with_another_center(text):
     return text.replace(link, other)
 
 
-CHANGED = {"gains": str, "lengths": with_longer_forearm, "centres of mass": with_another_center}
-OFF = [("gains", np.full(6, 1.05)), ("gains", ONE), ("lengths", np.ones(6)), ("centres of mass", np.ones(6))]
+CHANGED = {"gains": str, "gravity": str, "lengths": with_longer_forearm, "centres of mass": with_another_center}
+OFF = [
+    ("gains", np.full(6, 1.05)),
+    ("gains", ONE),
+    *((name, np.ones(6)) for name in ("lengths", "centres of mass", "gravity")),
+]
 
 
 @pytest.mark.parametrize(("cause", "off"), OFF)
 def test_causes_that_explain_more_are_named_and_in_the_interval(cause, off):
-    """All torques 5 % off, those of one joint, a forearm that the URDF has too short, and one heavy elsewhere."""
+    """All torques 5 % off, those of one joint, a forearm that the URDF has too short, one heavy elsewhere, a tilt."""
     data = log(CHANGED[cause](loaded()), 1, noise=0.05)
     data = replace(data, u=data.u * off)
+    if cause == "gravity":  # the base is turned by ten degrees about y
+        data = replace(data, model=Model(Robot.from_urdf_text(TEXT, gravity=(1.703, 0.0, -9.661))))
     with pytest.warns(DataWarning, match=CAUSES[cause][1]):
         estimate = Found(data, rows=800)
     [doubt] = [each for each in estimate.posterior.settings["doubts"] if each["numbers"]]
@@ -196,6 +202,7 @@ def test_causes_that_explain_more_are_named_and_in_the_interval(cause, off):
     if cause == "centres of mass":
         found = {name: x for name, x in found.items() if abs(x) > 0.02}
     other = {"lengths": {"wrist_1_joint": 1.1}, "centres of mass": {"elbow_link along x": -0.1}}
+    other["gravity"] = {"x": -0.174, "y": 0.0, "z": -0.015}
     assert found == pytest.approx(gains or other[cause], abs=0.02)
     ends = estimate.intervals
     assert all(low <= true <= high for (low, high), true in zip(ends, [MASS, *CENTER], strict=True))

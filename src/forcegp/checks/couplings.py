@@ -9,8 +9,7 @@ from jaxtyping import Float
 
 from forcegp.checks.causes import NUMBER, Candidate, Cause, changed
 from forcegp.checks.check_input import CheckInput
-from forcegp.checks.torques import Comparison
-from forcegp.data import Dataset
+from forcegp.checks.torques import Change, Comparison
 
 LEAST_SHARE = 0.2  # of the larger weight in a torque, from which on the other joint's is part of it
 STEPS = (0.25, 2.5 * NUMBER), (0.01, 4.5 * NUMBER)  # to which weights are rounded, and what these numbers cost
@@ -36,22 +35,24 @@ def coupled_joints(now: Comparison, inputs: CheckInput, bad: np.ndarray) -> Iter
             how = "the sum of its own and that" if sign > 0.0 else "its own less that"
             what = f"the position of {names[other]} is logged as {how} of {names[one]}, as of a parallelogram, or of a "
             mix = {"q": np.linalg.inv(L), "v": np.linalg.inv(L), "u": L.T}
-            yield _apart(now, f"{what}motor at the base", (one, other), mix, 1.5 * NUMBER)
+            yield from _apart(now, f"{what}motor at the base", (one, other), mix, 1.5 * NUMBER)
         for cost, weights in _weights(now, one, other) if bad[[one, other]].all() else ():
             each = [f"{x[0]:+.3g} of {names[one]} {x[1]:+.3g} of {names[other]}" for x in weights]
             what = f"the torques of {names[one]} and {names[other]} are those of drives that turn both joints, "
             what += f"{each[0]} and {each[1]} of what these need: a differential"
             U = np.eye(now.rows.nv)
             U[np.ix_((one, other), (one, other))] = np.linalg.inv(weights)
-            yield _apart(now, what, (one, other), {"u": U}, cost)
+            yield from _apart(now, what, (one, other), {"u": U}, cost)
 
 
-def _apart(now: Comparison, what: str, joints: tuple[int, int], mix: dict[str, np.ndarray], cost: float) -> Candidate:
-    """The log whose signals are these sums of those of all joints."""
+def _apart(
+    now: Comparison, what: str, joints: tuple[int, int], mix: dict[str, np.ndarray], cost: float
+) -> Iterator[Candidate]:
+    """The log whose signals are these sums of those of all joints, with friction of joints and of drives."""
 
-    def change(rows: Dataset) -> Dataset:
-        every = {**mix, "a": mix["v"]} if "v" in mix else mix
-        return replace(changed()(rows), **{name: getattr(rows, name) @ weights.T for name, weights in every.items()})
+    def changing(*signals: str) -> Change:
+        weights = {"a": mix.get("v"), **mix}
+        return lambda rows: replace(changed()(rows), **{x: getattr(rows, x) @ weights[x].T for x in signals})
 
     names = now.robot.joint_names
     sums = (
@@ -63,7 +64,11 @@ def _apart(now: Comparison, what: str, joints: tuple[int, int], mix: dict[str, n
     do = f"Import sums of columns, as in forcegp import --u 'COLUMN_A + COLUMN_B', so that {'; '.join(sums)}."
     told = {"joints": joints, "correction": {"mix": {name: tuple(x.tolist()) for name, x in mix.items()}}}
     cause = Cause(about="coupled joints", what=what, do=do, cost=cost, number="q" not in mix, **told)
-    return cause, now.after(change) if "q" in mix else now.with_torques(change)
+    if "q" not in mix:
+        yield cause, now.with_torques(changing("u"))
+    else:
+        yield cause, now.after(changing(*"qvau"))
+        yield cause, replace(now.after(changing(*"qva")), drives=np.linalg.inv(mix["q"]))
 
 
 def _weights(now: Comparison, first: int, second: int) -> Iterator[tuple[float, Float[np.ndarray, "2 2"]]]:

@@ -16,10 +16,10 @@ from scipy.optimize import linear_sum_assignment
 from forcegp.checks.causes import NUMBER, SIGN, Candidate, Cause, changed, number
 from forcegp.checks.check_input import DEGREE, CheckInput
 from forcegp.checks.couplings import coupled_joints
-from forcegp.checks.torques import Change, Comparison, needed_torques, solved, with_gravity
+from forcegp.checks.torques import Change, Comparison, needed_torques, solved
 from forcegp.data import Dataset
 from forcegp.doubts import listed
-from forcegp.fit.payloads import with_length
+from forcegp.fit.payloads import with_gravity, with_length
 from forcegp.robots import Robot
 
 MOST_ORDERS = 24  # of legs
@@ -382,7 +382,7 @@ def _parts(
     short = (time - unsure, end) if at > 0.5 else (begin, time + unsure)
     do = "Leave the shorter part out by forcegp import --without {:.2f},{:.2f}, as forcegp auto does.".format(*short)
     when = f" from {time:.4g} s on: it takes up a load" if later else f" until {time:.4g} s: it lets go of a load"
-    yield when, ((share >= at) == later)[:, None, None] * columns, 3.0 * NUMBER, {"do": do, "seconds": short}
+    yield when, ((share >= at) == later)[:, None, None] * columns, 3.5 * NUMBER, {"do": do, "seconds": short}
 
 
 def _gravities(

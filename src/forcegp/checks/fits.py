@@ -188,6 +188,8 @@ class Explanation:
         q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
         with torch.no_grad():
             regressor = robot.kinematics(q, v).torque_regressor(a).flatten(-2).cpu().numpy()
+        if self.log.drives is not None:
+            regressor = np.einsum("rmp,mk->rkp", regressor, np.linalg.inv(self.log.drives))
         left = []
         for k, u in enumerate(rows.u.T):
             columns = np.c_[regressor[:, k], self.log.friction[:, k], np.ones(len(u)), more[:, k]]

@@ -286,5 +286,7 @@ def _where(root: Explanation, joint: int, inputs: CheckInput) -> tuple[str, str,
                     break
             ends = values[order[[max(first - 1, 0), min(last, len(rows) - 1)]]]
             text = f"; {100.0 * share:.0f} % of it at {inputs.names[joint]} for {name} between {ends[0]:.3g} and "
+            edge = name == "q" and (first == 0 or last == len(rows))
+            unit += ", an end of its motion, as of an end stop that gives way" if edge else ""
             best, found = gain, (f"{text}{ends[1]:.3g} {unit}", f"{ends[0]:.2f},{ends[1]:.2f}", left)
     return found

@@ -8,13 +8,14 @@ import torch
 from jaxtyping import Float
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
-from forcegp.checks.fits import EXPLAINED, RARELY
+from forcegp.checks.fits import RARELY
 from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, UNKNOWN, Explanation
-from forcegp.checks.torques import WIDTHS, Comparison, in_motion, stretch, with_gravity
+from forcegp.checks.torques import WIDTHS, Comparison, in_motion, stretch
 from forcegp.data import Dataset, estimate_delay, with_strokes
 from forcegp.data.views import consecutive, rests
 from forcegp.doubts import Doubt, listed, look, ok, wrong
 from forcegp.errors import DatasetError
+from forcegp.fit.payloads import with_gravity
 from forcegp.forces.presliding import after_strokes
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -29,7 +30,8 @@ SPRINGS, DAMPING = tuple(np.geomspace(1.0, 40.0, 24).tolist()), (0.02, 0.1, 0.3)
 BELOW = 1.0 / 3.0  # of a resonance, where a robot is as good as rigid
 MOST_ROWS = 2000  # on which that is judged
 STIFFNESS = 50.0, 200.0, 800.0  # of what friction remembers, over the reciprocal deviation of positions
-SURE, TELLS = 200.0, 30.0  # nats that a stretch of time in which something is touched explains: in all, and of a joint
+SURE, TELLS = 200.0, 30.0
+"""Nats that a stretch of time in which something is touched explains: in all, or one of each row, and of a joint."""
 SEEN, WARMER = 1e-3, 0.1  # share of the largest direction of columns; logarithm of a ratio of friction that is told
 ROUNDS = 2  # in which a push is sought anew, by what the other rows tell
 SHORT = 2.0  # s, of what stays between pushes: up to which filters and splits have no use for it
@@ -44,7 +46,7 @@ def torque_doubts(inputs: CheckInput, found: Explanation) -> list[Doubt]:
 def _offsets(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     """Sliding joints whose mean force is not that of their weight, beyond dry friction."""
     rows, tau = found.log.rows, found.log.tau
-    for joint in np.flatnonzero(~inputs.rotates & (np.ptp(rows.u, axis=0) > 0.0) & (found.rough <= EXPLAINED)):
+    for joint in np.flatnonzero(~inputs.rotates & (np.ptp(rows.u, axis=0) > 0.0)):
         weight, missing = float(tau[:, joint].mean()), float((rows.u - tau)[:, joint].mean())
         spread = float((rows.u - tau)[:, joint].std())  # of dry friction, that of both directions
         if abs(missing) > max(spread, MUCH * abs(weight)):
@@ -66,7 +68,7 @@ def _drift(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     Joints that mostly rest tell nothing: stiction holds any torque.
     """
     rows, robot, count = found.log.rows, found.log.robot, len(found.log.rows)
-    if count < FEWEST_ROWS:
+    if count < FEWEST_ROWS or found.log.drives is not None:  # which are joints once the log is corrected
         return
     q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
     bodies = robot.kinematics(q, v).torque_regressor(a).flatten(-2).cpu().numpy()
@@ -224,7 +226,13 @@ def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         gains = told * (power[0] > power[1])
         joints, smeared = np.flatnonzero(gains > TELLS / (1 + again)), 2.0 / inputs.compared_cutoff
         lasts = rows.time[last - 1] - rows.time[first] > 0.5 * smeared  # longer than what a filter makes of a turn
-        if not (gains.sum() > SURE / (1 + again) and len(joints) > 1 and lasts and first > 0 and last < len(rows)):
+        if not (
+            gains.sum() > min(SURE, len(rows)) / (1 + again)
+            and len(joints) > 1
+            and lasts
+            and first > 0
+            and last < len(rows)
+        ):
             return
     for _ in range(ROUNDS):  # what is touched tells no masses, and hides behind those that fit it as well
         left = found.left_beside(more, (place < first) | (place >= last))[:, joints]

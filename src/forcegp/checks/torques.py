@@ -29,7 +29,8 @@ Change = Callable[[Dataset], Dataset]
 class Comparison:
     """Rows of a log after some `changes`, and the torques that a robot with known laws of joints needs for them.
 
-    `more` is torque that something else needs, a payload for instance; u is that of `shift` seconds later.
+    `more` is torque that something else needs, a payload for instance; u is that of `shift` seconds later. Torques and
+    friction are those of drives, whose positions are `drives` times those of the joints.
     """
 
     robot: Robot
@@ -38,6 +39,7 @@ class Comparison:
     changes: tuple[Change, ...] = ()
     more: np.ndarray | float = 0.0
     shift: float = 0.0
+    drives: np.ndarray | None = None
     given: Dataset
 
     def after(self, change: Change, robot: Robot | None = None) -> "Comparison":
@@ -74,14 +76,15 @@ class Comparison:
     @cached_property
     def tau(self) -> Float[np.ndarray, "rows nv"]:
         """What bodies and laws need [Nm or N]."""
-        return needed_torques(self.robot, self.rows) + _torques_of_laws(self, self.rows) + self.more
+        needed = needed_torques(self.robot, self.rows) + _torques_of_laws(self, self.rows)
+        return (needed if self.drives is None else needed @ np.linalg.inv(self.drives)) + self.more
 
     @cached_property
     def friction(self) -> Float[np.ndarray, "rows nv 5"]:
         """What a rotor, viscous friction and dry friction of three widths need, around their means."""
-        v = self.rows.v
+        a, v = (x if self.drives is None else x @ self.drives.T for x in (self.rows.a, self.rows.v))
         slow = np.sqrt(np.square(v).mean(axis=0)) + 1e-300
-        columns = np.stack([self.rows.a, v, *(np.tanh(v / (width * slow)) for width in WIDTHS)], axis=-1)
+        columns = np.stack([a, v, *(np.tanh(v / (width * slow)) for width in WIDTHS)], axis=-1)
         return columns - columns.mean(axis=0)
 
 
@@ -115,18 +118,14 @@ def positive_solution(products: Float[np.ndarray, "k1 k1"]) -> tuple[Float[np.nd
     size = np.where(size > 0.0, size, 1.0)
     scaled = products / np.outer(size, size)
     normal, right = scaled[:-1, :-1] + RIDGE * np.eye(len(size) - 1), scaled[:-1, -1]
-    triangle = np.linalg.cholesky(normal)
+    try:
+        triangle = np.linalg.cholesky(normal)
+    except np.linalg.LinAlgError:  # of differences of sums, where rounding is more than what is left
+        values, vectors = np.linalg.eigh(normal)
+        triangle = vectors * np.sqrt(np.maximum(values, RIDGE))
     factors, _ = nnls(triangle.T, np.linalg.solve(triangle, right))
     left = scaled[-1, -1] - 2.0 * factors @ right + factors @ scaled[:-1, :-1] @ factors
     return factors / size[:-1] * size[-1], max(float(left), 0.0) * float(size[-1]) ** 2
-
-
-def with_gravity(robot: Robot, gravity: Float[np.ndarray, "3"]) -> Robot:
-    """The same robot under other gravity [m/s^2]."""
-    along = torch.as_tensor(gravity, dtype=robot.tree.gravity.dtype, device=robot.device)
-    fall = torch.zeros_like(robot.tree.fall)
-    fall[:, 3, 0] = along
-    return replace(robot, tree=replace(robot.tree, gravity=along, fall=fall))
 
 
 def torque_noise(robot: Robot, rows: Dataset, noise: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " nv"]:

@@ -26,6 +26,7 @@ def short_name(name: str) -> str:
 
 
 FIRST = {"unknown cause", "joint zero", "gear ratio", "torque constant", "torque unit", "force sensor", "lengths"}
+FIRST |= {"gravity"}
 """Subjects of doubts that change all that follows."""
 TOLD = FIRST | {"stop", "push", "spring", "drift", "elastic joint", "velocity", "sensor delay", "torque sensor", "imu"}
 TOLD |= {"constant channel", "pull", "load", "offset"}
@@ -154,8 +155,9 @@ def is_explained(doubt: Mapping[str, Any], scores: forcegp.scores.Scores, best: 
 
     quantity, left = scores.left(best)
     shares = [left.get(name) for name in doubt["joints"]]
-    everywhere = doubt["about"] == UNKNOWN and not {"seconds", "positions"} & doubt["numbers"].keys()
-    return everywhere and quantity == TORQUE and all(x is not None and x * x <= EXPLAINED for x in shares)
+    everywhere = doubt["about"] == UNKNOWN and "seconds" not in doubt["numbers"]
+    most = EXPLAINED if "positions" in doubt["numbers"] else EXPLAINED**0.5  # a cable is worth a word sooner
+    return everywhere and quantity == TORQUE and all(x is not None and x <= most for x in shares)
 
 
 def left_of_torques(scores: forcegp.scores.Scores, best: str) -> list[tuple[str, str]]:

@@ -117,6 +117,7 @@ def changes_without_rests(
 
 
 CAUSES = {
+    "gravity": (0.3, "gravity of the base plus", ""),
     "gains": (0.2, "torques of the log times", "Check these drives; `gain` among the forces estimates them."),
     "lengths": (0.1, "lengths before the joints times", "Compare the URDF's lengths with the robot."),
     "masses": (0.2, "masses of the links times", "Give a baseline (a log without the payload), or identify all links."),
@@ -124,11 +125,11 @@ CAUSES = {
     "gear ratio": (0.2, "positions and velocities of the log times", "Correct it, as in forcegp import --q 'X * 1.2'."),
     "joint zero": (0.1, "positions of the log plus", "Correct it, or the URDF, as in forcegp import --q 'X + 0.1'."),
 }
-"""Usual deviations of the logarithms of factors (of zeros in rad or m, of centres in m), what they are of, and what to
-do. All factors of a cause are tried, and each alone; of centres those of each link. Of two the first is named, unless
-the other explains a tenth more, or as much by fewer numbers: what it explains less the half of the logarithm of the
-rows for each factor (Schwarz 1978)."""
-ADDED = {"joint zero": " rad", "centres of mass": " m"}
+"""Usual deviations of the logarithms of factors (of zeros in rad or m, of centres in m, of gravity in g), what they are
+of, and what to do. All factors of a cause are tried, and each alone; of centres those of each link. Of two the first is
+named, unless the other explains a tenth more, or as much by fewer numbers: what it explains less the half of the
+logarithm of the rows for each factor (Schwarz 1978)."""
+ADDED = {"joint zero": " rad", "centres of mass": " m", "gravity": " g"}
 ALONE, MOSTLY = {"gear ratio": 0.1, "joint zero": 0.05}, 0.3
 """Of these no two are tried at once, and one is so large at least, and explains this share of what is left."""
 NAMED = 0.5
@@ -138,6 +139,8 @@ STEP = 1e-4
 """Of lengths, ratios and zeros, for derivatives."""
 WRONG = 0.03
 """Logarithm of the largest factor below which a cause is not worth a word."""
+TURNED = 0.15
+"""Of a g: by which one linear step may change the size of gravity that is turned."""
 NO_STEP = 0.8
 """Logarithm of a factor from which on one linear step tells nothing of it."""
 
@@ -177,7 +180,7 @@ def misfit(
         across, every = J.T @ C, np.arange(C.shape[1])
         own, slope = C.T @ C - across.T @ inverse @ across + np.eye(len(every)) / usual**2, C.T @ r
         tried = list[tuple[float, float, np.ndarray, np.ndarray]]()
-        single = every.reshape(-1, 3 if cause == "centres of mass" else 1)
+        single = every.reshape(-1, 3 if cause in ("centres of mass", "gravity") else 1)
         for some in (*([] if moving or cause in (*ALONE, *ADDED) else [every]), *single):
             change = np.zeros(len(every))
             change[some] = -np.linalg.solve(own[np.ix_(some, some)], slope[some])
@@ -193,6 +196,14 @@ def misfit(
         count = int((change != 0.0).sum())
         better = worth > best or (cause not in ALONE and count < fewest[0] and more > fewest[1])
         clearly = instead is not None or (better and more > max(least, MOSTLY * cost * (cause in ALONE)))
+        if cause == "gravity":  # it is turned, and no other
+            down = model.robot.gravity.cpu().numpy() / 9.81
+            size, along = float(np.linalg.norm(down + change)), 9.81 * (down + change)
+            clearly &= abs(size - 1.0) < TURNED
+            do = f"If the base is tilted: forcegp auto --gravity {','.join(f'{x / size:.2f}' for x in along)}."
+        if cause in ALONE:
+            [at] = np.flatnonzero(change)
+            do = do.replace("X * 1.2", f"X * {factors[at]:.3g}").replace("X + 0.1", f"X {change[at]:+.3g}")
         if clearly and off.any() and ALONE.get(cause, 0.0) < abs(change).max() < NO_STEP:
             factors, unit = (change, ADDED[cause]) if cause in ADDED else (factors, "")
             told = ", ".join(f"{factors[k]:.3g}{unit} ({names[k]})" for k in np.flatnonzero(off))
@@ -241,6 +252,14 @@ def _instead(
     return np.where(np.arange(len(change)) == k, change, 0.0), none
 
 
+def with_gravity(robot: Robot, gravity: Float[np.ndarray, "3"]) -> Robot:
+    """The same robot under other gravity [m/s^2]."""
+    along = torch.as_tensor(gravity, dtype=robot.tree.gravity.dtype, device=robot.device)
+    fall = torch.zeros_like(robot.tree.fall)
+    fall[:, 3, 0] = along
+    return replace(robot, tree=replace(robot.tree, gravity=along, fall=fall))
+
+
 def with_length(robot: Robot, body: int, factor: float) -> Robot:
     """The robot with this factor of what leads to the joint of a body."""
     rest = robot.tree.rest.clone()
@@ -272,6 +291,9 @@ def _columns(
     if cause == "centres of mass":
         return [f"{body.child} along {axis}" for body in robot.layout.bodies for axis in "xyz"], rows.by_center(a)
     q, v, at = (torch.as_tensor(np.array(x), device=robot.device) for x in (rows.q, rows.v, a))
+    if cause == "gravity":
+        pulls = [with_gravity(robot, 9.81 * axis).gravity_forces(q).cpu().numpy() for axis in np.eye(3)]
+        return [*"xyz"], np.stack(pulls, axis=-1)
     names, columns = [], []
     for joint, name in enumerate(robot.joint_names if cause in ALONE and robot.space.is_vector_space else ()):
         if cause == "joint zero" and robot.joint(name).type == "prismatic":

@@ -67,7 +67,7 @@ class ImportOptions:
             raise InvalidInput(f"rate is {self.rate!r}; give rows per second, 'auto' or 'log'.")
         if self.start is not None and self.end is not None and not self.start < self.end:
             raise InvalidInput(f"start ({self.start} s) must come before end ({self.end} s).")
-        if len(self.without) % 2 or not (np.diff(self.without) > 0.0).all():
+        if len(self.without) % 2 or (np.diff(self.without) < 0.0).any():
             raise InvalidInput(f"without is {self.without}; give begin and end of each stretch in s, in their order.")
         for name, allowed in (("stance", ("log", "auto")), ("bad_rows", ("refuse", "skip"))):
             if getattr(self, name) not in allowed:
