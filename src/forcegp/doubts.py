@@ -23,7 +23,7 @@ class Doubt:
     level: ok; look, a person should judge; wrong, results would be wrong. about: what was looked at, in few words.
     what: what was seen, with joint, row, time and numbers. do: what to do about it, beside the `command`.
     joints: names of the joints concerned; numbers: the numbers of `what`, for programs.
-    correction: what an import has to state, for `ColumnMapping.corrected_by`: unit, sign and order by signal,
+    correction: what an import has to state, for `ColumnMapping.corrected_by`: unit, sign, order and mix by signal,
     orientation of q and axes of v and a; and of the robot gravity in the axes of its base.
     """
 
