@@ -90,6 +90,7 @@ def test_a_joint_whose_encoder_dithers_by_counts_stands_still_and_is_not_frozen(
     q = 0.3 + 2e-5 * np.repeat(generator.integers(0, counts + 1, 40), 25)
     found = signal_doubts(seen(swing(q=q, v=1e-3 * generator.normal(size=1000), u=generator.normal(size=1000))))
     assert ([(x.about, x.level) for x in found] == [("constant channel", "look")]) == still
+    assert "frozen channel" not in [x.about for x in found]
 
 
 @pytest.mark.parametrize("name", "qvu")

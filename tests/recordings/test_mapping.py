@@ -155,6 +155,10 @@ def test_names_are_guessed_only_where_nothing_else_can_be_meant(tmp_path):
     assert guessed_columns("q", JOINTS, source) == ("q_shoulder", "q_elbow")
     assert guessed_columns("q", ("shoulder_joint", "elbow_joint"), source) == ("q_shoulder", "q_elbow")
     assert guessed_columns("a", JOINTS, source) is None
+    names = [f"{x}_{joint}" for x in ("goal_position", "Present_position", "actual_torque") for joint in JOINTS]
+    present = open_source(write_text(tmp_path / "present.csv", {name: columns["time"] for name in names}))
+    assert guessed_columns("q", JOINTS, present) == ("Present_position_shoulder", "Present_position_elbow")
+    assert guessed_columns("u", JOINTS, present) == ("actual_torque_shoulder", "actual_torque_elbow")
     assert guessed_columns("q", ("shoulder", "wrist"), source) is None
     assert guessed_time(source, []) == "time"
     both = columns | {f"position_{joint}": columns[f"q_{joint}"] for joint in JOINTS} | {"t": columns["time"]}

@@ -206,7 +206,8 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
     log = inputs.log
     values, follows = getattr(log, name)[:, joint], consecutive(log)[:-1]
     held = np.diff(values) == 0
-    if np.ptp(values) == 0.0 or _dithers(log)[joint] or not follows.any() or (name == "u" and held.mean() > HELD_STEPS):
+    rests = np.ptp(log.q[:, joint]) < np.where(log.turns, *STILL)[joint]  # by a controller that holds it, perhaps
+    if np.ptp(values) == 0.0 or rests or not follows.any() or (name == "u" and held.mean() > HELD_STEPS):
         return
     others = np.any([np.diff(getattr(log, other)[:, joint]) != 0 for other in QUANTITY if other != name], axis=0)
     step = float(np.median(np.diff(log.time)[follows]))

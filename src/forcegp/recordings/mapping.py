@@ -21,6 +21,7 @@ UNIT_OF_A_NAME = re.compile(r"[\[(]([^\d\[(][^\[(]*)[\])]$|_([A-Za-z]{2,})$")
 NUMBERED = re.compile(r"(?P<stem>(?P<word>.*?)[\[(_. ]*)(?P<number>\d{1,4})?[\])]?\s*$")
 COMMA = re.compile(r",(?![^{\[]*[}\]])(?=(?:[^`]*`[^`]*`)*[^`]*$)")
 EXAMPLES = {"unit": "q=deg,time=ms", "sign": "u=-1,1", "axes": "v=world,body", "force": "foot=fx,fy,fz"}
+MEASURED = re.compile(r"(?<![A-Za-z])(present|actual|measured|meas|feedback)_(?=[A-Za-z])", re.IGNORECASE)
 BRACES = re.compile(r"\{([^{}]*)\}")
 RANGE = re.compile(r"(\d+)\.\.(\d+)")
 LONGEST_LIST = 4096
@@ -313,7 +314,10 @@ def guessed_columns(signal: str, joints: Sequence[str], source: Source) -> tuple
             for found in named_after(joint).finditer(column):
                 around = column[: found.start()], column[found.end() :]
                 templates.setdefault(around, {})[joint] = column
-    saying = {around: x for around, x in templates.items() if len(x) == len(joints) and _says(signal, around)}
+    whole = {around: x for around, x in templates.items() if len(x) == len(joints)}
+    saying = {around: x for around, x in whole.items() if _says(signal, around)}
+    if not saying:
+        saying = {(a, b): x for (a, b), x in whole.items() if _says(signal, (MEASURED.sub("", a), MEASURED.sub("", b)))}
     depths = [before.partition(":")[2].count(".") for before, _ in saying]  # what a message says itself comes first
     each = zip(saying.values(), depths, strict=True)
     fitting = [tuple(found[joint] for joint in joints) for found, depth in each if depth == min(depths)]
