@@ -202,7 +202,7 @@ def misfit(
             clearly &= abs(size - 1.0) < TURNED
             do = f"If the base is tilted: forcegp auto --gravity {','.join(f'{x / size:.2f}' for x in along)}."
         if cause in ALONE:
-            [at] = np.flatnonzero(change)
+            at = int(np.argmax(abs(change)))
             do = do.replace("X * 1.2", f"X * {factors[at]:.3g}").replace("X + 0.1", f"X {change[at]:+.3g}")
         if clearly and off.any() and ALONE.get(cause, 0.0) < abs(change).max() < NO_STEP:
             factors, unit = (change, ADDED[cause]) if cause in ADDED else (factors, "")
