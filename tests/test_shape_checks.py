@@ -33,7 +33,7 @@ QUICK = OptimizerOptions(iterations=2)
 
 def hopper_data(rows: int) -> Dataset:
     """Of a floating base with two propellers and a foot that is held in every second row: each size is another."""
-    model, generator = hopper("floating"), torch.Generator().manual_seed(0)
+    model, generator = hopper(), torch.Generator().manual_seed(0)
     q = random_positions(model.robot, generator, rows)
     v, u = (torch.randn(rows, size, generator=generator).double() for size in model.sizes[1:])
     u[:, -1] = torch.arange(rows) % 2

@@ -289,7 +289,7 @@ def median_step(recording: Dataset) -> float:
     return float(np.median(pauses)) if pauses.size else float("inf")
 
 
-def stretches_without_gap(recording: Dataset, part: Marked) -> list[Numbered]:
+def stretches_without_gap(recording: Dataset, part: Marked) -> list[Int[np.ndarray, " _"]]:
     """Numbers of rows of a part that follow each other in one episode without a gap."""
     rows = np.flatnonzero(part)
     apart = (np.diff(rows) > 1) | (np.diff(recording.episode[rows]) != 0)
