@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,8 +12,10 @@ from tests.checks.logs import PENDULUM, RATE, arm, clean, column, pendulum
 from tests.robots.robot_models import with_link
 
 from forcegp.checks import CheckReport, check, quick_check, without_pushes, without_stops
+from forcegp.checks.fits import Explanation
 from forcegp.checks.residuals import pushed_where_they_are
 from forcegp.checks.search import UNKNOWN, _stop, moving
+from forcegp.checks.torques import Comparison
 from forcegp.data import Dataset, Preparation
 from forcegp.doubts import look
 from forcegp.errors import InvalidInput
@@ -218,8 +219,9 @@ def test_a_stop_is_a_hundredth_of_the_motion(wide, stops):
     rng, log = np.random.default_rng(0), clean(4, seconds=12.0)
     q, tau = rng.uniform(size=log.q.shape), rng.normal(size=log.u.shape)
     pushed = replace(log, q=q, u=tau + 50.0 * rng.uniform(0.5, 1.0, tau.shape) * (q > 1.0 - wide))
-    held = SimpleNamespace(rows=pushed, tau=tau, friction=np.zeros((*tau.shape, 1)))
-    assert (_stop(SimpleNamespace(log=held), 0) is not None) == stops
+    held = Comparison(robot=log.model.robot, laws=(), rows=pushed, given=pushed)
+    vars(held).update(tau=tau, friction=np.zeros((*tau.shape, 1)))
+    assert (_stop(Explanation(held, np.zeros(log.nv)), 0) is not None) == stops
 
 
 @pytest.mark.parametrize("stops", [True, False])
