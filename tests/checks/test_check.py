@@ -12,9 +12,11 @@ from tests.checks.logs import PENDULUM, RATE, arm, clean, column, pendulum
 from tests.robots.robot_models import with_link
 
 from forcegp.checks import CheckReport, check, quick_check, without_pushes, without_stops
+from forcegp.checks.check_input import CheckInput
 from forcegp.checks.fits import Explanation
 from forcegp.checks.residuals import pushed_where_they_are
-from forcegp.checks.search import UNKNOWN, _stop, moving
+from forcegp.checks.search import UNKNOWN, _stop, moving, search
+from forcegp.checks.torque_doubts import push
 from forcegp.checks.torques import Comparison
 from forcegp.data import Dataset, Preparation
 from forcegp.doubts import look
@@ -186,16 +188,29 @@ def test_a_chirp_across_the_resonance_of_a_gear_is_named(stiffness, at_motor, sh
         assert not found.of(UNKNOWN)
 
 
-def test_the_seconds_of_a_push_are_named_and_left_out():
-    log = clean(4, seconds=12.0)
+def touched_by(log, force):
+    """The log of an arm whose hand bears this force [N] from 4 to 6 s."""
     J = log.model.robot.kinematics(torch.tensor(log.q)).frame_jacobian("hand")[:, :3].numpy()
     there = np.clip(10.0 * np.minimum(log.time - 4.0, 6.0 - log.time), 0.0, 1.0)
-    touched = replace(log, u=log.u - there[:, None] * np.einsum("rij,i->rj", J, [-2.0, 4.0, 1.0]))
+    return replace(log, u=log.u - there[:, None] * np.einsum("rij,i->rj", J, force))
+
+
+def test_of_few_rows_a_push_explains_a_nat_of_each(monkeypatch):
+    monkeypatch.setattr("forcegp.checks.torque_doubts.SURE", np.inf)
+    touched = touched_by(clean(4, seconds=12.0), [-4.0, 8.0, 2.0])
+    inputs = replace(CheckInput.of(touched, touched.model), most_rows=200)
+    [found] = push(search(inputs)[0], inputs)
+    assert found.numbers["seconds"] == pytest.approx([4.0, 6.0], abs=0.3)
+
+
+def test_the_seconds_of_a_push_are_named_and_left_out():
+    log = clean(4, seconds=12.0)
+    touched = touched_by(log, [-2.0, 4.0, 1.0])
     assert not check(log).doubts.of("push")
     doubts = check(touched).doubts
-    [push] = doubts.of("push")
-    assert push.joints == ("pan", "lift")
-    begin, end = push.numbers["seconds"]
+    [found] = doubts.of("push")
+    assert found.joints == ("pan", "lift")
+    begin, end = found.numbers["seconds"]
     assert 3.8 < begin < 4.0
     assert 6.0 < end < 6.2
     kept = without_pushes(touched, doubts)

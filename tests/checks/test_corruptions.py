@@ -27,9 +27,11 @@ from tests.robots.robot_models import loaded, with_link
 
 from forcegp.checks import check, quick_check
 from forcegp.checks.check_input import CheckInput
+from forcegp.checks.couplings import _weights
 from forcegp.checks.explanations import _units
 from forcegp.checks.search import search
 from forcegp.checks.torque_doubts import _remembered, held_points, without_stops
+from forcegp.checks.torques import Comparison
 from forcegp.data import Dataset
 from forcegp.model import Model
 from forcegp.robots import Robot
@@ -257,6 +259,25 @@ def test_a_long_rest_before_a_motion_that_tells_nothing_of_it_is_left_out(second
     before, noise = rows < count, 0.05 * np.random.default_rng(0).normal(size=u.shape)
     data = replace(data, episode=(~before).astype(int), u=u + noise + 0.5 * before[:, None])
     assert len(without_stops(data)[1]) == stops
+
+
+@pytest.mark.parametrize(
+    ("weights", "costs"),
+    [
+        ([[0.75, 0.25], [-0.25, 0.75]], [2.5, 4.5]),  # as gears have them
+        ([[0.8, 0.3], [-0.3, 0.8]], [2.5, 4.5]),
+        ([[1.0, 0.1], [-0.1, 1.0]], []),  # cross-talk of a sensor
+        ([[1.0, 0.94], [0.94, 1.0]], []),  # which cannot be told apart again
+    ],
+)
+def test_torques_of_shared_drives_are_those_of_simple_gears_first(weights, costs):
+    data = clean(two_links(), 1, noise="none")
+    tau = two_links().inverse_dynamics(*map(torch.tensor, (data.q, data.v, data.a))).numpy()
+    rows = replace(data, u=tau @ np.array(weights).T)
+    found = dict(_weights(Comparison(robot=two_links(), laws=(), rows=rows, given=rows), 0, 1))
+    assert [*found] == costs
+    for cost, step in zip(costs, (0.25, 0.01), strict=False):
+        assert found[cost] == pytest.approx(step * np.round(np.array(weights) / step), abs=1e-9)
 
 
 @pytest.mark.parametrize(("share", "told"), [(0.8, True), (0.4, False)])

@@ -208,6 +208,15 @@ def test_causes_that_explain_more_are_named_and_in_the_interval(cause, off):
     assert all(low <= true <= high for (low, high), true in zip(ends, [MASS, *CENTER], strict=True))
 
 
+@pytest.mark.filterwarnings("ignore::forcegp.errors.DataWarning")
+def test_gravity_that_is_larger_is_not_a_base_that_is_tilted():
+    """A fifth more than there is."""
+    data = log(loaded(), 1, noise=0.05)
+    more = 0.2 * Robot.from_urdf_text(loaded()).gravity_forces(torch.tensor(data.q)).numpy()
+    doubts = Found(replace(data, u=data.u + more), rows=800).posterior.settings["doubts"]
+    assert not any("gravity" in each["numbers"] for each in doubts)
+
+
 ENCODERS = ("gear ratio", 1.2, 0.5), ("gear ratio", 1.08, 0.05), ("joint zero", 0.1, 0.5), ("joint zero", 0.04, 0.05)
 
 

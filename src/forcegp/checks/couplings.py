@@ -12,7 +12,7 @@ from forcegp.checks.check_input import CheckInput
 from forcegp.checks.torques import Change, Comparison
 
 LEAST_SHARE = 0.2  # of the larger weight in a torque, from which on the other joint's is part of it
-STEPS = (0.25, 2.5 * NUMBER), (0.01, 4.5 * NUMBER)  # to which weights are rounded, and what these numbers cost
+ROUNDED = (0.25, 2.5 * NUMBER), (0.01, 4.5 * NUMBER)  # to which weights are rounded, and what these numbers cost
 PARALLEL = 0.99  # cosine of the angle between the axes of a parallelogram
 EASILY = 20.0  # condition of the weights up to which torques can be told apart again
 
@@ -78,7 +78,7 @@ def _weights(now: Comparison, first: int, second: int) -> Iterator[tuple[float, 
     columns = np.c_[now.tau[:, pair], friction, np.ones(len(friction))]
     size = np.linalg.norm(columns, axis=0) + 1e-300
     found = np.linalg.lstsq(columns / size, now.rows.u[:, pair], rcond=1e-9)[0][:2].T / size[:2]
-    for step, cost in STEPS:
+    for step, cost in ROUNDED:
         rounded = step * np.round(found / step)
         size = np.abs(rounded)
         if (size.min(axis=1) >= LEAST_SHARE * size.max(axis=1)).any() and np.linalg.cond(rounded) < EASILY:

@@ -29,7 +29,7 @@ DOUBTFUL = 2e-3  # share above which causes are tried
 HELD = 3.0  # of the dry friction and of what remains in motion, from which on no gear holds the joint
 WIDER = 0.0, 0.02, 0.03, 0.05  # of the log: by which its ends are moved, one after the other
 MOSTLY = 0.75  # share of what is left that sits somewhere
-STILL = 0.8  # share of steps without any change, from which on a joint stands still
+UNCHANGED = 0.8  # share of steps without any change of a position, from which on its encoder may be dead
 AT_END = 0.01  # of a joint's motion, within which a stop holds it
 
 
@@ -205,7 +205,7 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     if left <= EXPLAINED:
         ends = [float(x) for x in seconds.split(",")]
         steps = np.diff(inputs.log.q[(inputs.log.time >= ends[0]) & (inputs.log.time <= ends[1])], axis=0)
-        still = inputs.named([k for k in bad.tolist() if (steps[:, k] == 0.0).mean() > STILL])
+        still = inputs.named([k for k in bad.tolist() if (steps[:, k] == 0.0).mean() > UNCHANGED])
         why = f"the position of {listed(still)} stands still, as of a dead encoder or a brake" if still else ""
         where += (
             f", and elsewhere at most {100.0 * left:.2g} % stays: {why or 'a contact, or a load'}, in these seconds"

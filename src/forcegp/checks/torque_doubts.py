@@ -33,8 +33,7 @@ STIFFNESS = 50.0, 200.0, 800.0  # of what friction remembers, over the reciproca
 SURE, TELLS = 200.0, 30.0
 """Nats that a stretch of time in which something is touched explains: in all, or one of each row, and of a joint."""
 SEEN, WARMER = 1e-3, 0.1  # share of the largest direction of columns; logarithm of a ratio of friction that is told
-ROUNDS = 2  # in which a push is sought anew, by what the other rows tell
-SHORT = 2.0  # s, of what stays between pushes: up to which filters and splits have no use for it
+SHORT = 2.0  # s, of what stays between pushes, which filters and splits have no use for; of rests at the ends of a log
 RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
 
 
@@ -234,10 +233,13 @@ def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
             and last < len(rows)
         ):
             return
-    for _ in range(ROUNDS):  # what is touched tells no masses, and hides behind those that fit it as well
+    grown = True
+    while grown:  # what is touched tells no masses, and hides behind those that fit it as well
         left = found.left_beside(more, (place < first) | (place >= last))[:, joints]
         *_, begin, end = max(stretch(np.hstack([ones, -ones, x[:, None]])) for x in left.T)
-        first, last = min(first, begin), max(last, end)
+        wider = min(first, begin), max(last, end)
+        grown = wider != (first, last) and wider[1] - wider[0] <= len(rows) // 2
+        first, last = wider if grown else (first, last)
     begin, end = rows.time[first] - smeared, rows.time[last - 1] + smeared
     times = np.sqrt(power[0] / power[1])[joints].max()
     yield look(

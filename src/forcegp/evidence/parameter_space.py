@@ -15,7 +15,16 @@ from scipy.linalg import block_diag
 from torch import Tensor
 
 from forcegp.errors import InvalidInput
-from forcegp.evidence.bodies import QUANTITIES, Bodies, body_names, body_pseudo_inertias, carrying, with_bodies
+from forcegp.evidence.bodies import (
+    QUANTITIES,
+    Bodies,
+    Coordinates,
+    body_names,
+    body_pseudo_inertias,
+    carrying,
+    with_bodies,
+)  # fmt: skip
+from forcegp.evidence.least_squares import Rows
 from forcegp.forces import Actuation, Body, Law, LogNormal, Normal, Parameter, Payload, RigidBodies
 from forcegp.forces.joint_law import PerJointLaw
 from forcegp.forces.registry import force_name
@@ -27,9 +36,6 @@ LINEAR_SPREAD = 10.0
 """Standard deviation of the weak prior on numbers that are not logarithms, in their sizes: as large as the torques."""
 SCALES = 1e-4  # half the relative error of a mass that was weighed: of scales, far below that of any log
 FARTHEST = 25.0  # largest coordinate of a number that is estimated on a log scale about a median: a factor of 7e10
-Coordinates = Float[np.ndarray, " k"]
-Rows = Float[np.ndarray, "rows nv"]
-"""Derivatives in the coordinates of laws."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from forcegp.data.dataset import FORCE, IMU, TORQUE
 from forcegp.data.imu import specific_force
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence.bodies import standard_parameters
-from forcegp.evidence.least_squares import NoiseLevels, orthonormal_columns, without
+from forcegp.evidence.least_squares import NoiseLevels, Rows, orthonormal_columns, without
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.forces import Actuation, Law, RigidBodies
 from forcegp.forces.actuation import OBSERVED
@@ -34,7 +34,6 @@ from forcegp.robots import Kinematics
 from forcegp.robots.inertia import pseudo_inertia_of_standard, standard_of_pseudo_inertia
 
 Positions = Float[np.ndarray, "rows nq"]
-Rows = Float[np.ndarray, "rows nv"]
 Inputs = Float[np.ndarray, "rows nu"]
 
 
