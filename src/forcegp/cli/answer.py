@@ -1,7 +1,7 @@
 """What `forcegp auto` says of what it found: ten lines, and a verdict."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import forcegp
@@ -91,6 +91,8 @@ def answer_lines(
     (mass, error), causes = values.total_mass, {} if unsettled else other_causes(content["payload"] or {})
     if "gains" in causes:  # what it changes of a payload, it changes of all
         error = math.hypot(error, content["payload"]["parameters"]["payload.mass"]["std"])
+    links, holds = robot.layout.links, (content["payload"] or {}).get("link")
+    loaded = [name for name, each in links.items() if holds in links and each.body == links[holds].body]
     weight = f"{mass:.4g} ± {1.96 * error:.1g} kg, if {drives_of(identified.model)} are right"
     shares = {name: _known(scores, "nrmse", ACCELERATION, name) for name in scores.models}
     errors = "; ".join(
@@ -113,7 +115,7 @@ def answer_lines(
         *of_joints,
         *([("whole mass", weight)] if moving else []),
         ("payload", held),
-        *([("heavy links", heavy)] if (heavy := heavy_links(values, content["payload"])) else []),
+        *([("heavy links", heavy)] if (heavy := heavy_links(values, loaded)) else []),
         *causes.items(),
         ("models", f"error of q{ahead} / nRMSE of the acceleration (1: that of its mean), on unseen time: {errors}"),
         *left_of_torques(scores, best),
@@ -126,12 +128,12 @@ def answer_lines(
 HEAVY, SURELY = 2.5, 1.5  # times a link's mass in the URDF, and of its interval, from which more than the link is in it
 
 
-def heavy_links(values: Mapping[str, Any], payload: Mapping[str, Any] | None) -> str:
-    """Links that the log makes far heavier than the URDF has them, but for one that holds a payload."""
-    holds, found = (payload or {}).get("link"), list[str]()
+def heavy_links(values: Mapping[str, Any], loaded: Collection[str]) -> str:
+    """Links that the log makes far heavier than the URDF has them, but for those of the body that holds a payload."""
+    found = list[str]()
     for name, each in values.items():
         link, dot, what = name.rpartition(".")
-        if dot and what == "mass" and link != holds and each.decided_by == "log" and (each.start or 0.0) > 0.0:
+        if dot and what == "mass" and link not in loaded and each.decided_by == "log" and (each.start or 0.0) > 0.0:
             times, least = each.value / each.start, each.interval[0] / each.start
             found += [f"{link} {each.value:.3g} kg, {times:.2g} times the URDF's"] * (times > HEAVY and least > SURELY)
     return f"{'; '.join(found)}: wrong there, or a balancer, a gas spring or a cable pulls" if found else ""
