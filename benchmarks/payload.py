@@ -2,8 +2,8 @@
 
 Logs are those of `examples/ur5_log.py` (MuJoCo; dry friction, rotors, noise, torques 6 ms late), with columns
 right, 60 s each: one with a payload of .3 to 3 kg within 8 cm of the tool's frame, one without. Both are filtered and
-shifted by `Preparation(cutoff="auto", delay="auto")`; the fit of a `Payload` sees the URDF alone, or the log without
-payload as well. Errors and whether 95 % intervals hold (of the mass and three coordinates), over 20 payloads.
+shifted by `Preparation(cutoff="auto", delay="auto")`. They are fitted as `forcegp payload` does, from the URDF alone or
+with `--baseline`. Errors and whether 95 % intervals hold (of the mass and three coordinates), over 20 payloads.
 
 `forcegp auto` gets the example's log of 80 s as it is, with `--correct`: CPU seconds, and what it names.
 
@@ -28,10 +28,9 @@ import numpy as np
 
 from forcegp import Dataset, Model, Robot
 from forcegp.cli.main import main
+from forcegp.cli.payload import with_payload
 from forcegp.data import Preparation
-from forcegp.evidence import Torques
-from forcegp.fit import fit
-from forcegp.forces import GearFriction, Offset, Payload, Rotor, Viscous
+from forcegp.forces import GearFriction, Offset, Rotor, Viscous
 
 SEEDS, SECONDS = range(1, 21), 60.0
 NUMBERS = ("mass", "center_of_mass.x", "center_of_mass.y", "center_of_mass.z")
@@ -69,9 +68,9 @@ def payloads(ur5: Any) -> dict[str, float]:
         rng = np.random.default_rng(seed)
         mass, center = rng.uniform(0.3, 3.0), rng.uniform(-0.08, 0.08, 3)
         loaded, empty = prepared(ur5, seed, mass, center), prepared(ur5, 100 + seed, 0.0, center)
-        model = loaded.model.with_forces(Viscous(), GearFriction(), Offset(), Rotor(), Payload("tool0"))
+        model = loaded.model.with_forces(Viscous(), GearFriction(), Offset(), Rotor())
         for name, baseline in (("urdf", None), ("baseline", empty)):
-            found = fit(model, loaded, Torques(), baseline=baseline).parameters
+            found = with_payload(model, loaded, "tool0", baseline).parameters
             place = np.array([found[f"payload.{name}"].value for name in NUMBERS[1:]])
             masses[name].append(abs(found["payload.mass"].value / mass - 1.0))
             places[name].append(1e3 * float(np.abs(place - center).max()))
