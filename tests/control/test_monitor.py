@@ -16,6 +16,7 @@ from forcegp import ContactMonitor, Dataset, JointFriction, Model, Robot, Rotor,
 from forcegp.control.monitor import errors_near_rest, link_ends
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.evidence.least_squares import NoiseLevels
+from forcegp.forces import Coulomb
 
 DT = 0.01
 
@@ -116,6 +117,42 @@ def test_a_joint_that_creeps_is_no_contact_where_its_reversals_showed_how_wrong_
     held = ROBOT.inverse_dynamics(*(torch.from_numpy(x) for x in (q, v, 0.0 * v))).numpy() + VISCOUS * v
     assert not observer.run(q, v, held + missed(v)).alarm[200:].any()
     assert observer.run(q, v, held + missed(v) - 8.0).alarm[200:].all()
+
+
+def test_what_one_joint_shows_of_friction_near_rest_counts_for_the_others():
+    free, v = motion(120.0, 1), np.full((600, 2), 0.01)
+    q = np.cumsum(v * DT, axis=0)
+    held = ROBOT.inverse_dynamics(*(torch.from_numpy(x) for x in (q, v, 0.0 * v))).numpy() + VISCOUS * v
+    for shown in (0.0, 1.5):  # Nm of the first joint
+        missed = shown * np.tanh(free[1] / 0.002) * np.exp(-np.abs(free[1]) / 0.05) * [1.0, 0.0]
+        observer = ContactMonitor(TRUE, dt=DT).calibrate([(*free[:2], free[2] + missed)])
+        assert bool(observer.run(q, v, held + np.array([0.0, 1.0])).alarm[200:].all()) == (shown == 0.0)
+
+
+def test_a_torque_that_friction_may_hold_at_first_is_no_contact():
+    level, start = 6.0, np.array([0.75, -0.75])
+    model = TRUE.with_forces(Coulomb(level, sigma=1000.0, memory=True))
+
+    def with_friction(q, v, u, z):
+        """Dahl's friction from z on, in the middle of the steps."""
+        middle, torque = 0.5 * (q[1:] + q[:-1]), u.copy()
+        for k, step in enumerate(np.diff(middle, axis=0, prepend=middle[:1])):
+            z = np.sign(step) + (z - np.sign(step)) * np.exp(-1000.0 * np.abs(step))
+            torque[k] = u[k] + level * z
+        return q, v, torque
+
+    observer = ContactMonitor(model, dt=DT).calibrate([with_friction(*motion(120.0, 1), np.zeros(2))])
+    np.testing.assert_allclose(observer.level, level * np.eye(2))
+    q, v, u = motion(6.0, 3)
+    still = ROBOT.inverse_dynamics(*(torch.from_numpy(x) for x in (q[0], 0.0 * q[0], 0.0 * q[0]))).numpy()
+    rest = np.tile(q[0], (200, 1)), np.zeros((200, 2)), np.tile(still, (200, 1))
+    log = with_friction(*(np.concatenate(each) for each in zip(rest, (q, v, u), strict=True)), start)
+    log[1][:200] += 0.003 * np.random.default_rng(0).standard_normal((200, 2))
+    assert not observer.run(*log).alarm.any()
+    held = np.arange(800)[:, None] >= 500
+    assert observer.run(*log[:2], log[2] - 3.0 * held).alarm[520:].all()  # as soon as it has moved, half of it is one
+    observer.level = 0.0 * observer.level
+    assert observer.run(*log).alarm[:200].any()
 
 
 def test_free_motion_raises_as_many_alarms_as_asked_for():

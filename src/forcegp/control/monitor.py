@@ -25,14 +25,15 @@ Torques = Float[np.ndarray, " rows"]
 Motion = tuple[Any, Any, Any]
 """q, v and u (T, nv) of one recording; u[k] acts from row k to row k + 1."""
 
-Residuals = tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor]
-"""As of `_torques`, filtered (T - 1 - settle, nv); velocities in the middle of all steps; and M a, filtered."""
+Residuals = tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor, Tensor]
+"""As of `_torques`, tau filtered, and M a, filtered, (T - 1 - settle, nv); in the middle of all steps velocities (T - 1,
+nv), and how much of what friction remembers depends on what was before (T - 1, m)."""
 
 BLOCK = 2.0  # seconds of free motion of which the largest distance counts once: what follows upon it resembles it
 LEAST_BLOCKS = 20
 SLOW = tuple(np.geomspace(0.01, 0.5, 8).tolist())
 """Of the root mean square velocity, over what errors of friction near rest may fade: Stribeck's velocity, or a part."""
-MOST_ROWS = 5000  # that these errors are found from: filtered, neighbours tell the same
+MOST_ROWS, LEVEL_ROWS = 5000, 500  # that these errors are found from: filtered, neighbours tell the same; and levels
 PLACES = 5  # points along each link where a contact is tried
 UNSEEN = 1e-6  # of the largest effect of a force on torques: what has less is rounding, as on the axis of a joint
 SAME = 1e-9  # relative; forces that differ by less are as large: one link ends where the next one begins
@@ -71,9 +72,12 @@ class ContactMonitor:
     Mattone 2005), with the covariance S = M D_a M + D_f + D_s of free motion (`calibrate`), to which the spread of
     learned forces adds where `model`, `posterior.predictor()` or a `Model`, has one. D_s are errors of friction near
     rest, of the size s exp(-|v| / v_s), filtered as tau is: reversals show how large they are, and a joint that creeps
-    has them for long. Where M a of a joint goes beyond what free motion has shown, its errors grow in proportion. An
-    alarm is raised where tau^T S^-1 tau exceeds a threshold that free motion reaches as often as stated. Raises
-    InvalidInput for arguments that do not fit and a monitor not calibrated, DatasetError for too short a free motion.
+    has them for long. Relative to its friction, no joint has less of them than joints have on average: the next motion
+    may reverse where free motion did not. What friction remembers from before the first sample is unknown, and counts
+    until the joint has moved. Where M a of a joint goes beyond what free motion has shown, its errors grow in
+    proportion. An alarm is raised where tau^T S^-1 tau exceeds a threshold that free motion reaches as often as stated.
+    Raises InvalidInput for arguments that do not fit and a monitor not calibrated, DatasetError for too short a free
+    motion.
     """
 
     def __init__(self, model: Moving, *, dt: float, bandwidth: float = 2.0) -> None:
@@ -90,11 +94,13 @@ class ContactMonitor:
         self.keep = math.exp(-2.0 * math.pi * bandwidth * dt)
         self.noise: NoiseLevels | None = None
         self.near_rest = np.zeros(self.robot.nv), np.ones(self.robot.nv)
-        """Standard deviations (nv,) of errors of friction at rest [Nm or N], and velocities v_s (nv,)."""
+        """Standard deviations s (nv,) of errors of friction at rest [Nm or N], and velocities v_s (nv,)."""
         self.largest = torch.full((self.robot.nv,), math.inf, dtype=torch.float64)
         """Of |M a| (nv,) in free motion [Nm or N], filtered."""
         self.usual = torch.zeros(self.robot.nv, dtype=torch.float64)
-        """Share of the time (nv,) that joints were near rest in free motion."""
+        """Errors of friction near rest (nv,) in free motion [Nm or N], filtered."""
+        self.level = torch.zeros(self.robot.nv, len(self.known.memory.names), dtype=torch.float64)
+        """Torques (nv, m) of all that friction remembers [Nm or N]."""
         self.ends = link_ends(self.robot)
         self.threshold = math.inf
         self._maxima = (0.0, 1.0)
@@ -102,7 +108,7 @@ class ContactMonitor:
 
     def restart(self) -> None:
         """Forget earlier calls, as at the beginning of a recording."""
-        self._filtered = torch.zeros(3, self.robot.nv, dtype=torch.float64)  # torque, time near rest, and M a
+        self._filtered = torch.zeros(3, self.robot.nv, dtype=torch.float64)  # torque, M a, errors near rest
         self.past = Past(self.known)
         self._before: tuple[Tensor, Tensor, Tensor] | None = None
 
@@ -120,12 +126,12 @@ class ContactMonitor:
             seconds = sum(len(tau) for tau, *_ in found) * self.dt
             seen = f"free motion of {seconds:.3g} s is too short for a threshold"
             raise DatasetError(f"{seen}; give at least {LEAST_BLOCKS * BLOCK:g} s in stretches of {BLOCK:g} s or more.")
-        tau, M = torch.cat([each[0] for each in found]), torch.cat([each[1] for each in found])
-        v, inertial = torch.cat([each[3] for each in found]), torch.cat([each[4] for each in found])
+        tau, M, inertial = map(torch.cat, zip(*((tau, M, inertial) for tau, M, _, inertial, *_ in found), strict=True))
+        v = torch.cat([each[4][settle:] for each in found])
         self.largest = inertial.abs().amax(0).clamp_min(1e-9)  # of a joint that rested, any motion is beyond
         self.noise = NoiseLevels.of(torch.linalg.solve(M, tau[..., None])[..., 0].numpy(), M.numpy())
         speed = np.maximum(v.square().mean(0).sqrt().numpy(), 1e-12)
-        slow = [np.concatenate([self._near_rest(each[3], share * speed)[settle:] for each in found]) for share in SLOW]
+        slow = [np.concatenate([self._near_rest(each[4], share * speed)[settle:] for each in found]) for share in SLOW]
         some = slice(None, None, max(1, len(tau) // MOST_ROWS))
         known = (M[some].square() @ torch.as_tensor(self.noise.acceleration).square()).numpy()
         best = [
@@ -134,8 +140,12 @@ class ContactMonitor:
         ]
         (_, force, at_rest, _), which = np.array(best).T, [each[-1] for each in best]
         self.noise = NoiseLevels(self.noise.acceleration, force)
-        self.near_rest = at_rest, np.take(SLOW, which) * speed
-        self.usual = torch.from_numpy(np.sqrt(np.mean(np.stack(slow)[which, :, range(self.robot.nv)] ** 2, axis=1)))
+        friction, self.level = self._friction(free)
+        shown = friction > UNSEEN * friction.max()
+        share = math.sqrt(float(np.mean(np.square(at_rest[shown] / friction[shown])))) if shown.any() else 0.0
+        fades = np.take(SLOW, which)
+        self.near_rest = np.maximum(at_rest, share * friction), speed * np.maximum(fades, np.exp(np.log(fades).mean()))
+        self.usual = torch.cat([self._errors(each) for each in found]).square().mean(0).sqrt()
         distances = [self._distances(each) for each in found]
         largest = torch.cat([d[: len(d) // block * block].view(-1, block).amax(1) for d in distances])
         self._maxima = gumbel_r.fit(largest.sqrt().numpy())
@@ -150,11 +160,11 @@ class ContactMonitor:
             return self._state(self._filtered[0], self._filtered.new_zeros(()))
         q, v = (0.5 * (old + new) for old, new in zip(before, sample[:2], strict=False))
         a = (sample[1] - before[1]) / self.dt
-        tau, M, extra = self._torques(*(x[None] for x in (q, v, before[2], a)))
-        now = torch.stack([tau[0], torch.exp(-v.abs() / torch.as_tensor(self.near_rest[1])), M[0] @ a])
+        tau, M, extra, unknown = self._torques(*(x[None] for x in (q, v, before[2], a)))
+        now = torch.stack([tau[0], M[0] @ a, self._errors_now(v, unknown[0])])
         self._filtered = self._filtered + (1.0 - self.keep) * (now - self._filtered)
-        torque, slow, inertial = self._filtered
-        return self._state(torque, self._distance(torque[None], self._covariance(M, extra, slow, inertial))[0])
+        torque, inertial, errors = self._filtered
+        return self._state(torque, self._distance(torque[None], self._covariance(M, extra, errors, inertial))[0])
 
     def run(self, q: Any, v: Any, u: Any) -> ContactState:
         """The same of a whole recording (T, nv); nothing is known at its first row."""
@@ -195,7 +205,7 @@ class ContactMonitor:
         noise, (at_rest, fades) = self.calibrated, self.near_rest
         own = {"PERIOD": self.dt, "SHARE": 1.0 - self.keep, "THRESHOLD": self.threshold, "LARGEST": self.largest}
         own |= {"ACCELERATIONS": noise.acceleration, "FORCES": noise.force, "AT_REST": at_rest, "FADES": fades}
-        own |= {"USUAL": self.usual, "ENDS": np.stack([*self.ends.values()]), "PLACES": PLACES}
+        own |= {"USUAL": self.usual, "LEVEL": self.level, "ENDS": np.stack([*self.ends.values()]), "PLACES": PLACES}
         return own | {"UNSEEN": UNSEEN, "SAME": SAME, "EXPLAINED": EXPLAINED}
 
     @property
@@ -205,14 +215,14 @@ class ContactMonitor:
             raise InvalidInput("this monitor is not calibrated: call calibrate([(q, v, u)]) with free motion first.")
         return self.noise
 
-    def _covariance(self, M: Tensor, extra: Tensor | None, slow: Tensor, inertial: Tensor) -> Tensor:
+    def _covariance(self, M: Tensor, extra: Tensor | None, errors: Tensor, inertial: Tensor) -> Tensor:
         """S (..., nv, nv) of filtered torques where the mass matrix is M, with what the posterior leaves open.
 
-        `slow` (..., nv) is how much of the time of the filter joints were near rest, `inertial` (..., nv) M a.
+        `errors` (..., nv) are those near rest, `inertial` (..., nv) M a, both filtered.
         """
         noise = self.calibrated
         acceleration, force = (torch.as_tensor(x).square() for x in (noise.acceleration, noise.force))
-        S = (M * acceleration) @ M + (force + (torch.as_tensor(self.near_rest[0]) * slow).square()).diag_embed()
+        S = (M * acceleration) @ M + (force + errors.square()).diag_embed()
         beyond = (inertial.abs() / self.largest).clamp_min(1.0)
         S = beyond[..., :, None] * S * beyond[..., None, :]
         return S if extra is None else S + extra
@@ -232,10 +242,32 @@ class ContactMonitor:
         """exp(-|v| / fade) (T, nv), filtered as torques are."""
         return self._low_passed(np.exp(-np.abs(v.numpy()) / fade))
 
+    def _friction(self, free: Sequence[Motion]) -> tuple[np.ndarray, Float[Tensor, "nv m"]]:
+        """Root mean squares of modelled friction (nv,), the part that turns with v, and of all that is remembered."""
+        rows = [torch.cat(each) for each in zip(*(self._motion(*motion) for motion in free), strict=True)]
+        q, v, u = (each[:: max(1, len(each) // LEVEL_ROWS)] for each in rows)
+
+        def forces(v: Tensor, z: Tensor) -> Tensor:
+            return joint_forces(self.model, q, v, self.past.beside(u, z) if len(z) else u).Q
+
+        one = torch.eye(self.level.shape[1], dtype=q.dtype)
+        z, none = one.sum(0), forces(v, 0.0 * one.sum(0))
+        level = [(forces(v, each) - none).square().mean(0).sqrt() for each in one]
+        turning = 0.5 * (forces(v, z) - forces(-v, -z))
+        return turning.square().mean(0).sqrt().numpy(), torch.stack(level, 1) if level else self.level
+
+    def _errors_now(self, v: Tensor, unknown: Tensor) -> Tensor:
+        """Of friction near rest (..., nv), and of what it remembers from before the first sample."""
+        at_rest, fades = map(torch.as_tensor, self.near_rest)
+        return at_rest * torch.exp(-v.abs() / fades) + unknown @ self.level.mT
+
+    def _errors(self, found: Residuals) -> Tensor:
+        """The same, filtered as torques are."""
+        return torch.from_numpy(self._low_passed(self._errors_now(*found[4:]).numpy()))[-len(found[0]) :]
+
     def _distances(self, found: Residuals) -> Float[Tensor, " rows"]:
-        tau, M, extra, v, inertial = found
-        slow = torch.from_numpy(self._near_rest(v, self.near_rest[1]))[len(v) - len(tau) :]
-        return self._distance(tau, self._covariance(M, extra, slow, inertial))
+        tau, M, extra, inertial, *_ = found
+        return self._distance(tau, self._covariance(M, extra, self._errors(found), inertial))
 
     def _residuals(self, q: Any, v: Any, u: Any, settle: int = 0) -> Residuals:
         q, v, u = self._motion(q, v, u)
@@ -244,23 +276,25 @@ class ContactMonitor:
         self.past = Past(self.known)
         middle = 0.5 * (q[1:] + q[:-1]), 0.5 * (v[1:] + v[:-1])
         a = (v[1:] - v[:-1]) / self.dt
-        tau, M, extra = self._torques(*middle, u[:-1], a)
+        tau, M, extra, unknown = self._torques(*middle, u[:-1], a)
         both = np.stack([tau.numpy(), (M @ a[..., None])[..., 0].numpy()])
         filtered, inertial = torch.from_numpy(self._low_passed(both, axis=1))
         extra = None if extra is None else extra[settle:]
-        return filtered[settle:], M[settle:], extra, middle[1], inertial[settle:]
+        return filtered[settle:], M[settle:], extra, inertial[settle:], middle[1], unknown
 
     def _low_passed(self, values: np.ndarray, axis: int = 0) -> np.ndarray:
         return lfilter([1.0 - self.keep], [1.0, -self.keep], values, axis=axis)
 
-    def _torques(self, q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """M a - Q_K - Q_U at rows, M, and M Cov(a) M of what the posterior leaves open."""
+    def _torques(self, q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, Tensor, Tensor | None, Tensor]:
+        """M a - Q_K - Q_U at rows, M, M Cov(a) M of what the posterior leaves open, and `Past.open`."""
+        unknown = q.new_zeros(len(q), 0)
         if self.past.memory.names:
-            u = self.past.beside(u, torch.stack([self.past.see(row) for row in q]))
+            seen, unknown = map(torch.stack, zip(*((self.past.see(row), self.past.open) for row in q), strict=True))
+            u = self.past.beside(u, seen)
         at = joint_forces(self.model, q, v, u)
         M = at.M
         extra = M @ self.model(q, v, u)[1] @ M if self.open and isinstance(self.model, Predictor) else None
-        return (M @ a[..., None])[..., 0] - at.Q, M, extra
+        return (M @ a[..., None])[..., 0] - at.Q, M, extra, unknown
 
     @staticmethod
     def _distance(tau: Tensor, S: Tensor) -> Float[Tensor, " rows"]:

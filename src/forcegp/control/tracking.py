@@ -174,8 +174,9 @@ class Past:
         self.forget()
 
     def forget(self) -> None:
-        """Nothing was seen."""
+        """Nothing was seen: `open` (m,) is how much of what is remembered depends on what was before."""
         self.z = torch.zeros(len(self.memory.names), dtype=torch.float64)
+        self.open = torch.ones_like(self.z)
         self._last: Tensor | None = None
 
     def see(self, q: Float[Tensor, " nq"]) -> Float[Tensor, " m"]:
@@ -183,7 +184,8 @@ class Past:
         if self.memory.names and self._last is not None:
             step = self.memory.robot.difference(self._last, q)
             moved = torch.where(step.abs() > self.least, step, 0.0)
-            self.z = self.memory.after(self.z, moved, 0.0)
+            other, self.z = self.z + self.open, self.memory.after(self.z, moved, 0.0)
+            self.open = self.memory.after(other, moved, 0.0) - self.z
             q = self.memory.robot.space.integrate(self._last, moved)
         self._last = q.clone()
         return self.z

@@ -19,6 +19,7 @@ from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.programs import WITH_SLOPES, Programs
 
 STORED = 10  # states of the self-test
+MEMORY_OF_MONITOR = {"REMEMBER": "memory", "UNKNOWN": "unknown"}  # parts of a monitor whose friction remembers
 FILES = ("model.h", "model.hpp", "CMakeLists.txt", "example.c", "self_test.c", "README.txt")
 
 
@@ -128,7 +129,8 @@ class CFiles:
         if (monitor := self.monitor) is None:
             return {"STATE_OF_MONITOR": ""}
         words: dict[str, object] = {"STATE_OF_MONITOR": program["monitor_state"], "LINKS": len(monitor.ends)}
-        words |= {"REMEMBER": program["monitor_memory"] if self.posterior.model.memory.names else ""}
+        remembers = bool(self.posterior.model.memory.names)
+        words |= {name: program[f"monitor_{kind}"] if remembers else "" for name, kind in MEMORY_OF_MONITOR.items()}
         words |= {"OPEN": program["monitor_open"] if "covariance" in self.kinds else ""}
         words["LINK_NAMES"] = ", ".join(f'"{_plain(name).replace(chr(34), chr(39))}"' for name in monitor.ends)
         return words | {word: ", ".join(map(repr, np.ravel(x).tolist())) for word, x in monitor.numbers.items()}

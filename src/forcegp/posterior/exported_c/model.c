@@ -115,15 +115,14 @@ int @NAME@_inverse_dynamics(const double q[@NQ@], const double v[@NV@], const do
 //// monitor
 const char *const @NAME@_links[@LINKS@] = {@LINK_NAMES@};
 
-/* the lower triangle of the covariance of filtered torques in free motion: `slow` is how much of the time joints were
-   near rest, `inertial` M a, filtered, beyond whose largest value errors grow in proportion */
-static void spread_of(const double *mass, const double *slow, const double *inertial, double S[][@NV@]) {
+/* the lower triangle of the covariance of filtered torques in free motion: `errors` are those of friction near rest,
+   `inertial` is M a, beyond whose largest value errors grow in proportion, both filtered */
+static void spread_of(const double *mass, const double *errors, const double *inertial, double S[][@NV@]) {
   enum {N = @NV@};
   static const double accelerations[] = {@ACCELERATIONS@}, forces[] = {@FORCES@};
-  static const double at_rest[] = {@AT_REST@}; /* errors of friction near rest */
   static const double largest[] = {@LARGEST@}; /* |M a| of free motion */
   for (int i = 0; i < N; i++) for (int j = 0; j <= i; j++) {
-    S[i][j] = i == j ? forces[i] * forces[i] + at_rest[i] * at_rest[i] * slow[i] * slow[i] : 0.0;
+    S[i][j] = i == j ? forces[i] * forces[i] + errors[i] * errors[i] : 0.0;
     for (int k = 0; k < N; k++) S[i][j] += mass[N * i + k] * accelerations[k] * accelerations[k] * mass[N * k + j];
     S[i][j] *= fmax(1.0, fabs(inertial[i]) / largest[i]) * fmax(1.0, fabs(inertial[j]) / largest[j]);
   }
@@ -155,7 +154,7 @@ static double whitened(double S[][@NV@], double *y) {
 int @NAME@_monitor_step(@NAME@_monitor_state *state, const double q[@NQ@], const double v[@NV@], const double u[@NV@],
                       double torque[@NV@], double *distance, int *alarm) {
   enum {N = @NV@, NU = @NU@, K = @MEMORY@, AT = @COLUMN@, M = @CONTACTS@};
-  static const double fades[] = {@FADES@}; /* velocities over which errors near rest fade */
+  static const double at_rest[] = {@AT_REST@}, fades[] = {@FADES@}; /* errors near rest, and velocities they fade over */
   double x[@ALL@], y[N + N * NU + N * N + M * N + 2 * M], S[N][N], C[N * N], MC[N * N], d = 0.0;
   const double *mass = y + N + N * NU;
   int found = stored(q, x, N) | stored(v, x + N, N) | stored(u, x + 2 * N, N), begun = state->begun;
@@ -179,9 +178,11 @@ int @NAME@_monitor_step(@NAME@_monitor_state *state, const double q[@NQ@], const
       for (int j = 0; j < N; j++) inertial += mass[N * i + j] * C[j];
       state->torque[i] += @SHARE@ * (inertial - y[i] - state->torque[i]);
       state->inertial[i] += @SHARE@ * (inertial - state->inertial[i]);
-      state->slow[i] += @SHARE@ * (exp(-fabs(x[N + i]) / fades[i]) - state->slow[i]);
+      double error = at_rest[i] * exp(-fabs(x[N + i]) / fades[i]);
+      @UNKNOWN@
+      state->errors[i] += @SHARE@ * (error - state->errors[i]);
     }
-    spread_of(mass, state->slow, state->inertial, S);
+    spread_of(mass, state->errors, state->inertial, S);
     @OPEN@
     factored(S);
     stored(state->torque, C, N);
@@ -281,16 +282,24 @@ int @NAME@_monitor_place(const double q[@NQ@], const double torque[@NV@], @NAME@
 
 //// monitor_memory
 if (state->moved) {
-      double z[2 * N + K + 1], next[K];
+      double z[2 * N + K + 1], next[K], other[K];
       for (int k = 0; k < K; k++) z[k] = state->memory[k];
       for (int i = 0; i < N; i++) { z[K + i] = state->middle[i]; z[K + N + i] = x[i]; }
       z[K + 2 * N] = 0.0;
       remember(tables, 1, z, next);
-      for (int k = 0; k < K; k++) state->memory[k] = next[k];
+      for (int k = 0; k < K; k++) { z[k] += 1.0 - state->known[k]; state->memory[k] = next[k]; }
+      remember(tables, 1, z, other);
+      for (int k = 0; k < K; k++) state->known[k] = 1.0 - (other[k] - next[k]);
     }
     for (int i = 0; i < N; i++) state->middle[i] = x[i];
     state->moved = 1;
     for (int k = 0; k < K; k++) x[2 * N + AT + k] = state->memory[k];
+
+//// monitor_unknown
+for (int k = 0; k < K; k++) { /* of what friction remembers */
+        static const double level[] = {@LEVEL@};
+        error += level[K * i + k] * (1.0 - state->known[k]);
+      }
 
 //// monitor_open
 { /* what the posterior leaves open: M Cov(a) M */
@@ -436,7 +445,8 @@ int @NAME@_step_jacobian(const double q[@NQ@], const double v[@NV@], const doubl
 
 //// monitor_state
 typedef struct { /* of one robot, zeros at first */
-  double q[@NQ@], v[@NV@], u[@NV@], torque[@NV@], slow[@NV@], inertial[@NV@], middle[@NQ@], memory[@MEMORY@ + 1];
+  double q[@NQ@], v[@NV@], u[@NV@], torque[@NV@], errors[@NV@], inertial[@NV@], middle[@NQ@], memory[@MEMORY@ + 1];
+  double known[@MEMORY@ + 1]; /* how much of the memory no longer depends on what was before the first sample */
   int begun, moved;
 } @NAME@_monitor_state;
 
