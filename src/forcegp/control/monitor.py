@@ -26,8 +26,8 @@ Motion = tuple[Any, Any, Any]
 """q, v and u (T, nv) of one recording; u[k] acts from row k to row k + 1."""
 
 Residuals = tuple[Tensor, Tensor, Tensor | None, Tensor, Tensor, Tensor]
-"""As of `_torques`, tau filtered, and M a, filtered, (T - 1 - settle, nv); in the middle of all steps velocities (T - 1,
-nv), and how much of what friction remembers depends on what was before (T - 1, m)."""
+"""As of `_torques`, tau filtered, and M a, filtered, (T - 1 - settle, nv); in the middle of all steps velocities
+(T - 1, nv), and how much of what friction remembers depends on what was before (T - 1, m)."""
 
 BLOCK = 2.0  # seconds of free motion of which the largest distance counts once: what follows upon it resembles it
 LEAST_BLOCKS = 20
