@@ -210,6 +210,12 @@ def mixed(data: Dataset, weights: list[list[float]], signals: str) -> Dataset:
     return replace(data, **{name: getattr(data, name) @ (u if name == "u" else of).T for name in signals})
 
 
+def sticking(data: Dataset, weights: list[list[float]]) -> Dataset:
+    """A differential whose motors have far more dry friction than torque."""
+    moved, v = mixed(data, weights, "u"), data.v @ np.linalg.inv(weights)
+    return replace(moved, u=moved.u + 3.0 * np.std(moved.u, axis=0) * np.tanh(v / 0.05))
+
+
 def gripped(data: Dataset, begin: float) -> Dataset:
     """A load of .6 kg on the last link from some time on."""
     assert data.model is not None
@@ -284,6 +290,7 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "parallelogram, turned": (lambda d: mixed(d, [[1.0, 0.0], [-1.0, 1.0]], "qvau"), "coupled joints"),
     "differential": (lambda d: mixed(d, [[0.5, 0.5], [-0.5, 0.5]], "u"), "coupled joints"),
     "differential of other gears": (lambda d: mixed(d, [[0.8, 0.3], [-0.3, 0.8]], "u"), "coupled joints"),
+    "differential whose motors stick": (lambda d: sticking(d, [[0.5, 0.5], [-0.5, 0.5]]), "coupled joints"),
 }
 
 

@@ -139,9 +139,14 @@ def test_what_cannot_be_is_one_line(folder, forcegp, words, message):
 
 
 def test_causes_of_so_many_factors_that_nobody_can_look_for_them_are_not_in_the_answer():
-    numbers = (*({"gains": dict.fromkeys(joints, 1.1)} for joints in ("abc", "abcd")), {"lengths": {"a": 1.1}})
-    few, many, lengths = ({"about": "payload", "what": "so.", "do": "Look.", "numbers": each} for each in numbers)
-    mass = {"payload.mass": {"value": 0.1, "std": 0.2}}  # none: lengths and masses are not told beside it
-    assert other_causes({"doubts": [few, lengths], "parameters": mass}) == {"gains": "so. Look."}
-    assert other_causes({"doubts": [lengths]}) == {"lengths": "so. Look."}
+    numbers = *({"gains": dict.fromkeys(joints, 1.1)} for joints in ("abc", "abcd")), {"masses": {"a": 1, "b": 2}}
+    few, many, masses = ({"about": "payload", "what": "so.", "do": "Look.", "numbers": each} for each in numbers)
+    mass = {"payload.mass": {"value": 0.1, "std": 0.2}}  # none: of lengths and masses just one is told beside it
+    assert other_causes({"doubts": [few, masses], "parameters": mass}) == {"gains": "so. Look."}
+    one = {**masses, "numbers": {"masses": {"a": 1.1}}}
+    assert (
+        other_causes({"doubts": [masses]})
+        == {"masses": "so. Look."}
+        == other_causes({"doubts": [one], "parameters": mass})
+    )
     assert other_causes({"doubts": [many, {**few, "about": "torque sensor"}]}) == other_causes({}) == {}

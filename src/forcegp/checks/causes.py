@@ -1,5 +1,6 @@
 """What a cause of misfits is: the words of its doubt, its cost, and the log that it would leave."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,6 +13,13 @@ from forcegp.model import Model
 
 SIGN, NUMBER = 0.5, 1.0
 """What a turned sign, or a free number, must gain at least: it is subtracted from the logarithm of what remains."""
+
+
+UNITS = ("m", 1e3), ("k", 1e-3)
+CUSTOMARY = {"Nm": {"Ncm": 100.0, "ozfin": 141.612, "kgfcm": 10.1972, "lbfin": 8.85075}, "N": {"kgf": 0.101972}}
+"""Prefixes of units, and other units of torques and forces: how many are one Nm or N."""
+LIKE, CLOSE = np.log(1.5), 0.07
+"""Of the logarithm of a factor: how far that of a unit may be, and of one that is near others."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,6 +39,21 @@ class Cause:
 
 Candidate = tuple[Cause, Comparison]
 URDF = "Correct the URDF; or let forcegp fit --forces bodies estimate it from this log."
+
+
+def like_units(factor: float, si: Sequence[str]) -> tuple[tuple[str, ...], float]:
+    """The units of torques (Nm, N) times this factor, and what it would be exactly; none, and itself, where it is none.
+
+    `si` are those of the joints.
+    """
+    si = tuple(dict.fromkeys(si))
+    for prefix, size in UNITS:
+        if abs(np.log(factor / size)) < LIKE:
+            return tuple(prefix + unit for unit in si), size
+    for name, size in CUSTOMARY[si[0]].items() if len(si) == 1 else ():
+        if abs(np.log(factor / size)) < CLOSE:
+            return (name,), size
+    return (), factor
 
 
 def number(about: str, what: str, joint: int, value: float, cost: float = NUMBER, **more: Any) -> Cause:

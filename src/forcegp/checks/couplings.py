@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import torch
@@ -13,6 +14,8 @@ from forcegp.checks.torques import Change, Comparison
 
 LEAST_SHARE = 0.2  # of the larger weight in a torque, from which on the other joint's is part of it
 ROUNDED = (0.25, 2.5 * NUMBER), (0.01, 4.5 * NUMBER)  # to which weights are rounded, and what these numbers cost
+HALVES = [0.5 * np.array([[a, s * a], [b, -s * b]]) for a, b, s in product((1.0, -1.0), repeat=3)]
+"""Weights of two drives that turn one joint together and the other against each other, under all signs."""
 PARALLEL = 0.99  # cosine of the angle between the axes of a parallelogram
 EASILY = 20.0  # condition of the weights up to which torques can be told apart again
 
@@ -36,7 +39,8 @@ def coupled_joints(now: Comparison, inputs: CheckInput, bad: np.ndarray) -> Iter
             what = f"the position of {names[other]} is logged as {how} of {names[one]}, as of a parallelogram, or of a "
             mix = {"q": np.linalg.inv(L), "v": np.linalg.inv(L), "u": L.T}
             yield from _apart(now, f"{what}motor at the base", (one, other), mix, 1.5 * NUMBER)
-        for cost, weights in _weights(now, one, other) if bad[[one, other]].all() else ():
+        both = bad[[one, other]].all()
+        for cost, weights in (*_weights(now, one, other), *((1.5 * NUMBER, each) for each in HALVES)) if both else ():
             each = [f"{x[0]:+.3g} of {names[one]} {x[1]:+.3g} of {names[other]}" for x in weights]
             what = f"the torques of {names[one]} and {names[other]} are those of drives that turn both joints, "
             what += f"{each[0]} and {each[1]} of what these need: a differential"
@@ -66,6 +70,9 @@ def _apart(
     cause = Cause(about="coupled joints", what=what, do=do, cost=cost, number="q" not in mix, **told)
     if "q" not in mix:
         yield cause, now.with_torques(changing("u"))
+        of_drives = replace(now.after(changed()), drives=mix["u"].T)
+        vars(of_drives)["tau"] = now.tau @ np.linalg.inv(mix["u"].T)
+        yield cause, of_drives
     else:
         yield cause, now.after(changing(*"qvau"))
         yield cause, replace(now.after(changing(*"qva")), drives=np.linalg.inv(mix["q"]))

@@ -13,8 +13,9 @@ import torch
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
-from forcegp.checks.causes import NUMBER, SIGN, Candidate, Cause, changed, number
+from forcegp.checks.causes import NUMBER, SIGN, Candidate, Cause, changed, like_units, number
 from forcegp.checks.check_input import DEGREE, CheckInput
+from forcegp.checks.cogging import cogging
 from forcegp.checks.couplings import coupled_joints
 from forcegp.checks.torques import Change, Comparison, needed_torques, solved
 from forcegp.data import Dataset
@@ -54,6 +55,7 @@ def candidates(
             yield from coupled_joints(now, inputs, bad & alive)
         yield from _scanned(now, inputs)
     yield from _linear(now, inputs)
+    yield from cogging(now, inputs, bad & alive)
 
 
 def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator[Candidate]:
@@ -61,8 +63,7 @@ def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator
     known = factors[np.isfinite(factors) & (factors > 0.0)]
     if len(known) and known.max() < 2.0 * known.min():
         common = float(np.exp(np.log(known).mean()))
-        less, size = next(((u, s) for u, s in UNITS if abs(np.log(common / s)) < np.log(1.5)), ("", common))
-        unit = tuple(dict.fromkeys(less + si for si in inputs.unit_of_each("u"))) if less else ()
+        unit, size = like_units(common, inputs.unit_of_each("u"))
         looks = f": it looks like {listed(unit)}" if unit else " (or all masses are)"
         cause = Cause(
             about="torque unit",
@@ -107,7 +108,6 @@ def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator
         yield cause, now.after(change)
 
 
-UNITS = ("m", 1e3), ("k", 1e-3)
 SLOWEST, FASTEST = 1.0, 5500.0  # rates of logs [Hz] that need no other unit of time
 
 

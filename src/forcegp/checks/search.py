@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from forcegp.checks.causes import SIGN, changed
+from forcegp.checks.causes import SIGN, UNITS, changed
 from forcegp.checks.check_input import CheckInput
-from forcegp.checks.explanations import UNITS, candidates
+from forcegp.checks.explanations import candidates
 from forcegp.checks.fits import EXPLAINED, FAR, FEWEST_ROWS, MUCH_MORE, NOISE, RESTS, WORSE, Explanation
 from forcegp.checks.residuals import left_by_positions
 from forcegp.checks.torques import LEAST, WIDTHS, Comparison, in_motion, positive_fit, stretch, torque_noise
@@ -44,6 +44,9 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
         grown: list[Explanation] = []
         for now in frontier:
             for cause, log in candidates(now.log, inputs, now.shares > DOUBTFUL, now.factors, not now.causes):
+                before = {k for each in now.causes if "mix" in each.correction for k in each.joints}
+                if "mix" in cause.correction and (now.turned or before & {*cause.joints}):
+                    continue  # sums of torques that were turned before are others, and sums of sums may undo them
                 order = cause.correction.get("order", {}).get("u", range(len(now.chosen)))
                 turned = tuple(k for k, place in enumerate(order) if place in now.turned)
                 made = Explanation(log, root.floor, (*now.causes, cause), turned).with_signs()
@@ -223,7 +226,7 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         if names := inputs.named([k for k, (alone, beside) in fits if beside < EXPLAINED < alone]):
             where += f"; positions alone explain that of {listed(names)}: a cable, a hose, a balancer, or a spring"
             do = "Give the robot what pulls there, or learn it: "
-            do += "forcegp score LOG.h5 --forces identified,gp:joint:inputs=q."
+            do += "forcegp score LOG.h5 --forces identified,gp:joint:inputs=q --out scores."
             numbers["positions"] = names
     yield look(
         about=UNKNOWN,

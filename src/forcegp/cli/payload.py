@@ -33,7 +33,7 @@ MOST_OPEN = 0.3  # of the robot's mass in half an interval, from which on a payl
 FAR = 0.01  # m of half an interval, from which on a coordinate of a centre is shown with it
 MOST_FACTORS = 3  # of one cause that a person can look for
 SETTLED, MOST_ROWS = 0.005, 2_000  # share of a torque that needs no other cause, and rows that tell it
-ROBOTS_OWN = ("lengths", "masses", "centres of mass")  # which bodies that are identified explain as well
+ROBOTS_OWN = ("lengths", "masses", "centres of mass")  # of which bodies that are identified explain several as well
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,12 +206,12 @@ def drives_of(model: forcegp.Model) -> str:
 
 
 def other_causes(payload: Mapping[str, Any]) -> dict[str, str]:
-    """What would explain more than this payload, by cause; beside none, what drives and encoders alone do."""
+    """What would explain more than this payload, by cause; beside none, what one link, drives or encoders do."""
     mass = payload.get("parameters", {}).get("payload.mass", {"value": 1.0, "std": 0.0})
     doubts = [each for each in payload.get("doubts", ()) if each["about"] == "payload"]
     causes = ((cause, len(own), f"{x['what']} {x['do']}") for x in doubts for cause, own in x["numbers"].items())
     return {
         cause: what
         for cause, factors, what in causes
-        if factors <= MOST_FACTORS and (mass["value"] > mass["std"] or cause not in ROBOTS_OWN)
+        if factors <= (MOST_FACTORS if mass["value"] > mass["std"] or cause not in ROBOTS_OWN else 1)
     }

@@ -11,6 +11,7 @@ from scipy.interpolate import CubicSpline
 
 from forcegp.data.dataset import Dataset
 from forcegp.data.filters import LowPass, episodes_in_order
+from forcegp.data.ripple import rate_of_waves, waves
 from forcegp.data.strokes import joint_positions, with_strokes
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.forces.joint_laws import law_columns, usual_columns
@@ -132,18 +133,19 @@ def _estimated(dataset: Dataset, largest: float, cutoff: float | None) -> list[t
     if len(compared) < 10 * BLOCKS:
         seen = f"{len(compared)} rows lie more than {largest} s from the ends of their episodes"
         raise DatasetError(f"{seen}; a delay needs at least {10 * BLOCKS}. Record longer, or give the delay in s.")
-    features = torque_columns(dataset, compared, cutoff)
+    features, positions = torque_columns(dataset, compared, cutoff), joint_positions(dataset)
     profiles = np.full((2, dataset.nv, BLOCKS + 1, len(shifts)), np.nan)  # of all rows, and of all but one block
     for joint in range(dataset.nv):
         splines = [(CubicSpline(dataset.time[own], dataset.u[own, joint]), dataset.time[at]) for own, at in episodes]
         shifted = np.concatenate([spline(at + shifts[:, None]) for spline, at in splines], axis=1)
         spread = np.square(shifted - shifted.mean(axis=1, keepdims=True)).sum(axis=1)
         if spread.min() > 1e-12 * np.square(shifted).sum(axis=1).max():  # else it has no delay
-            for own, columns in zip(profiles, (features[joint][:, :-MEMORIES], features[joint]), strict=True):
-                size = np.linalg.norm(columns, axis=0)
-                used = size > 1e-9 * size.max()
-                basis, values, _ = np.linalg.svd(columns[:, used] / size[used], full_matrices=False)
-                own[joint] = least_squares(basis[:, values > 1e-6 * values[0]], shifted.T)
+            bases = [orthonormal(columns) for columns in (features[joint][:, :-MEMORIES], features[joint])]
+            q = positions[compared, joint]
+            if rate := rate_of_waves(q, shifted[STEPS], bases[1]):
+                bases = [orthonormal(np.c_[basis, waves(q, rate)]) for basis in bases]
+            for own, basis in zip(profiles, bases, strict=True):
+                own[joint] = least_squares(basis, shifted.T)
     return [_from_profiles(each, shifts) for each in profiles]
 
 
@@ -159,6 +161,14 @@ def _from_profiles(profiles: Float[np.ndarray, "nv parts shifts"], shifts: np.nd
     each, std = seconds[:, 0], jackknife(seconds[:, 1:])
     found = Delay(common=float(common[0]), common_std=spread, seconds=each, std=std, remains=remains)
     return found, float(np.exp(likelihoods[0].min() / max(len(finite), 1)))
+
+
+def orthonormal(columns: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows k"]:
+    """A basis of what the columns span, without those that are rounding."""
+    size = np.linalg.norm(columns, axis=0)
+    used = size > 1e-9 * size.max()
+    basis, values, _ = np.linalg.svd(columns[:, used] / size[used], full_matrices=False)
+    return basis[:, values > 1e-6 * values[0]]
 
 
 def least_squares(

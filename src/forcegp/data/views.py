@@ -218,7 +218,8 @@ def past_known(dataset: Dataset, model: Model) -> Marked:
         near = np.abs(dataset.strokes[:, joints]).sum(-1) * sigma < FORGOTTEN
         for episode in dataset.episodes:
             rows = dataset.episode == episode
-            known[rows] &= ~(near[rows] & ~near[rows].all(0)).any(1)
+            begin = np.logical_and.accumulate(near[rows])  # what rests later trembles in many short strokes
+            known[rows] &= ~(begin & ~begin.all(0)).any(1)
     return known
 
 

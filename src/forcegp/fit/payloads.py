@@ -135,6 +135,9 @@ ALONE, MOSTLY = {"gear ratio": 0.1, "joint zero": 0.05}, 0.3
 NAMED = 0.5
 """Share of what is left that gains, lengths, masses and centres explain, to be named: in logs of LuGre gears with
 rough masses, less was another cause than the true one, or none."""
+DECIDED, FAR_BEHIND = 30.0, 3.0
+"""Nats from which on one number of these is named as well, where no other cause has a third of them: of 22 good logs of
+LuGre gears none had more than 8."""
 STEP = 1e-4
 """Of lengths, ratios and zeros, for derivatives."""
 WRONG = 0.03
@@ -216,7 +219,9 @@ def misfit(
                 joints=tuple(np.array(names)[off].tolist()),
                 numbers={cause: {names[k]: float(factors[k]) for k in np.flatnonzero(change)}},
             )
-            named = instead is not None or cause in ALONE or more >= NAMED * cost
+            others = max((option[2] for name, option in options.items() if name != cause), default=0.0)
+            alone = count == 1 and worth >= max(DECIDED, FAR_BEHIND * others)
+            named = instead is not None or cause in ALONE or more >= NAMED * cost or alone
             best, fewest, found = 1.1 * worth, (count, more), (doubt if named else None, move, more)
             if instead is not None:
                 break

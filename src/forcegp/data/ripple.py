@@ -1,0 +1,38 @@
+"""Forces that repeat over equal ways of a joint: magnets of its motor (cogging), or teeth of its gear."""
+
+import numpy as np
+from jaxtyping import Float
+
+FEWEST, FINEST, STEP = 3.0, 300.0, 0.2
+"""Repetitions over the reach of a joint: fewest, most, and steps of what is tried."""
+REPEATS = 0.5
+"""Share of what is left that one wave explains, from which on it is one: of wrong friction it was .26 at most."""
+LITTLE, MOST_ROWS = 0.02, 300
+"""Share that columns leave of a force, below which no wave is sought; and rows that show it."""
+
+
+def rate_of_waves(
+    q: Float[np.ndarray, " rows"], force: Float[np.ndarray, " rows"], basis: Float[np.ndarray, "rows k"]
+) -> float:
+    """The rate [1/rad or 1/m] of a wave over positions that explains most of what orthonormal columns leave of a force.
+
+    It is that of the largest power (Lomb 1976, Scargle 1982); 0 where no wave explains most.
+    """
+    reach, thin = float(np.ptp(q)), -(-len(q) // MOST_ROWS)
+    left = force - basis @ (basis.T @ force)
+    left = left - left.mean()
+    if not reach > 0.0 or not np.square(left).sum() > LITTLE * np.square(force - force.mean()).sum():
+        return 0.0
+    from scipy.signal import lombscargle  # half a second, which only few logs should cost
+
+    best, power = 0.0, 0.0  # of few rows, then closer of all
+    for repetitions, step in ((np.arange(FEWEST, FINEST, STEP), thin), (np.linspace(-STEP, STEP, 41), 1)):
+        rates = best + 2.0 * np.pi / reach * repetitions
+        found = lombscargle(q[::step] - q.mean(), left[::step], rates)
+        best, power = float(rates[int(np.argmax(found))]), float(found.max())
+    return best if 2.0 * power > REPEATS * np.square(left).sum() else 0.0
+
+
+def waves(q: Float[np.ndarray, " rows"], rate: float) -> Float[np.ndarray, "rows 2"]:
+    """Sine and cosine over positions."""
+    return np.stack([np.sin(rate * q), np.cos(rate * q)], axis=1)
