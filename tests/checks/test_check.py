@@ -267,6 +267,14 @@ def test_nothing_is_differentiated_across_postures():
     assert not quick_check(apart.rows(slice(None, None, 7))).of("elastic joint")
 
 
+def test_torques_that_repeat_over_equal_ways_are_named():
+    data = clean(0, noise=0.0)
+    size = 0.5 * np.std(data.u, axis=0)
+    [found] = check(replace(data, u=data.u + size * np.sin(60.0 * data.q))).doubts.of("cogging")
+    np.testing.assert_allclose(found.numbers["way"], 2.0 * np.pi / 60.0, rtol=0.01)
+    np.testing.assert_allclose(found.numbers["size"], size, rtol=0.05)
+
+
 def test_rows_at_rest_show_no_torque():
     """Stiction holds any torque there: a tilt of 25 degrees was no cause that was tried, beside rests of teaching."""
     model, path = arm(), clean(0, noise=0.0)

@@ -26,6 +26,7 @@ from tests.posterior.arm import arm_model
 from tests.robots.robot_models import loaded, with_link
 
 from forcegp.checks import check, quick_check
+from forcegp.checks.causes import CUSTOMARY, like_units
 from forcegp.checks.check_input import CheckInput
 from forcegp.checks.couplings import _weights
 from forcegp.checks.explanations import _units
@@ -34,6 +35,7 @@ from forcegp.checks.torque_doubts import _remembered, held_points, without_stops
 from forcegp.checks.torques import Comparison
 from forcegp.data import Dataset
 from forcegp.model import Model
+from forcegp.recordings.mapping import log_unit
 from forcegp.robots import Robot
 from forcegp.simulation.kuka_surface import kuka_file
 
@@ -103,6 +105,10 @@ def test_two_mistakes_are_both_named():
     assert {each.about for each in found} == {"torque sign", "torque unit"}
     assert found.of("torque sign")[0].joints == ("joint1",)
     assert found.of("torque unit")[0].correction == {"unit": {"u": ("mNm",)}}
+    for each, size in CUSTOMARY["Nm"].items():
+        assert log_unit("u", each).per_si == pytest.approx(size, rel=1e-5)
+        assert like_units(1.06 * size, ("Nm", "Nm"))[0] == (each,)
+        assert like_units(size, ("Nm", "N"))[0] == like_units(109.0, ("Nm",))[0] == ()
     [found] = quick_check(replace(data, u=1e3 * data.u))
     after, before = map(float, re.findall(r"([\d.]+) %", found.what))
     assert after < 0.1 * before  # of the log as it is, without any factor

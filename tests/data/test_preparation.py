@@ -10,6 +10,7 @@ from tests.data.samples import assert_equal, dataset, model
 from tests.posterior.arm import arm_model
 
 from forcegp.data import Dataset, Delay, Preparation, differentiated, estimate_delay, low_pass, motion_spectrum
+from forcegp.data.ripple import rate_of_waves
 from forcegp.data.spectrum import _knee_and_floor
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 
@@ -122,6 +123,20 @@ def test_a_delay_is_used_where_most_joints_show_it_and_it_explains_something(num
     delay = Delay(seconds=each, std=np.array(told.pop("std", np.full(len(each), 1e-4))), **told)
     assert delay.significant == used
     assert words in delay.reason
+
+
+WAVES = [(0.6, 24.0, 0.0), (0.4, 24.0, 0.0), (0.6, 5.0, 0.0), (0.6, 9.8, 0.0), (0.6, 24.0, 5.0), (0.6, 24.0, 9.0)]
+
+
+@pytest.mark.parametrize(("share", "rate", "known"), WAVES)
+def test_a_wave_over_positions_that_is_most_of_what_is_left_is_found(share, rate, known):
+    noise, q = np.random.default_rng(3).standard_normal(2000), np.sin(np.linspace(0.0, 40.0, 2000)) ** 3
+    force = (2.0 * share) ** 0.5 * np.sin(rate * q) + (1.0 - share) ** 0.5 * noise
+    basis = np.linspace(-1.0, 1.0, 2000)[:, None] / np.sqrt(2000 / 3)
+    found = rate_of_waves(q, force + known * np.sqrt(2000) * basis[:, 0], basis)
+    assert found == (pytest.approx(rate, rel=3e-3) if share > 0.5 and rate * 2.0 > 6.0 * np.pi and known < 7.0 else 0.0)
+    log = arm_log(0.0)
+    assert not estimate_delay(replace(log, u=log.u + 0.3 * log.u.std(axis=0) * np.sin(rate * log.q))).significant
 
 
 @pytest.mark.parametrize("delay", [-0.08, 0.12])

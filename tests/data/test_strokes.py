@@ -147,6 +147,10 @@ def test_rows_before_a_joint_has_moved_are_left_out():
     for rows, left_out in ((60 * first, True), (30 * first, False)):
         assert ("rows_before_a_past" in fit(model, log.rows(slice(0, rows)), Torques(), rows=500).settings) is left_out
     assert FORGOTTEN / 500.0 - 0.005 < np.abs(np.diff(q[: first + 1, 1])).sum() < FORGOTTEN / 500.0 + 0.005
+    longer = [np.r_[x, 0.0 * x[:300] + x[-1]] for x in (q, v, a, a)]
+    longer[0][len(q) :, 1] += 1e-4 * np.sin(np.arange(300.0))  # it trembles at rest
+    longer = log_of(*longer, DT * np.arange(len(q) + 300))
+    np.testing.assert_array_equal(past_known(with_strokes(longer), model)[first:], True)
     q[:, 1] = q[0, 1]  # a joint that never moves keeps its rows
     assert past_known(with_strokes(log_of(q, v, a, a, log.time)), model).all()
     assert past_known(log, arm_model(0)).all()

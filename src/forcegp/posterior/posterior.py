@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -52,7 +51,7 @@ from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.preparation import prepared_predictor, rows_for
 from forcegp.posterior.programs import Physics, Programs
 from forcegp.posterior.rollout import Rollout, accelerations, checked_start, flat_feedback, loops_for, moved
-from forcegp.robots.arguments import whole_number
+from forcegp.robots.arguments import real_tensor, whole_number
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -79,8 +78,8 @@ class Posterior(Fitted):
         values that are not finite, and inside `vmap`; NumericalError where the result is not finite.
         """
         require_type("covariance", covariance, bool)
-        memory, width = self.model.memory.names, np.shape(u)[-1:]
-        past = not memory or width != (self.model.sizes[2] - len(memory),)
+        memory, without = self.model.memory.names, (self.model.sizes[2] - len(self.model.memory.names),)
+        past = not memory or real_tensor("u", u, self.model.robot.device).shape[-1:] != without
         predict = self.predict_rows if past else partial(without_past, self)
         if not past:
             what = f"u has no columns {', '.join(memory)}, so that the past of friction counts as unknown"
