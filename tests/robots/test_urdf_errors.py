@@ -198,8 +198,7 @@ def test_massless_links_are_taken_where_what_they_carry_resists():
     turn = '<joint name="{0}" type="continuous"><parent link="{1}"/><child link="{2}"/><axis xyz="{3}"/></joint>'
     turns = turn.format("first", "base", "x", "1 0 0") + turn.format("second", "x", "y", "0 1 0")
     ball = SMALL.replace('<parent link="base"/>', '<parent link="y"/>').replace(
-        "</robot>",
-        f'<link name="x"/><link name="y"/>{turns}</robot>',
+        "</robot>", f'<link name="x"/><link name="y"/>{turns}</robot>'
     )
     robot = Robot.from_urdf_text(ball)
     oracle = Oracle(ball, robot)
