@@ -275,6 +275,16 @@ def test_torques_that_repeat_over_equal_ways_are_named():
     np.testing.assert_allclose(found.numbers["size"], size, rtol=0.05)
 
 
+def test_an_encoder_that_slips_is_named():
+    data = clean(0)
+    steps = np.diff(data.q[900:905, 1])
+    for size, named in ((7.0, True), (4.0, False)):
+        q = data.q + np.outer(np.arange(len(data)) > 902, [0.0, size * np.abs(steps).max(), 0.0])
+        doubts = check(replace(data, q=q, v=np.gradient(q, data.time, axis=0))).doubts
+        assert [each.numbers["jump"] for each in doubts.of("jumps")] == pytest.approx([q[903, 1] - q[902, 1]] * named)
+        assert bool(doubts.of("spike")) != named
+
+
 def test_rows_at_rest_show_no_torque():
     """Stiction holds any torque there: a tilt of 25 degrees was no cause that was tried, beside rests of teaching."""
     model, path = arm(), clean(0, noise=0.0)

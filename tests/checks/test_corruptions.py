@@ -108,7 +108,7 @@ def test_two_mistakes_are_both_named():
     for each, size in CUSTOMARY["Nm"].items():
         assert log_unit("u", each).per_si == pytest.approx(size, rel=1e-5)
         assert like_units(1.06 * size, ("Nm", "Nm"))[0] == (each,)
-        assert like_units(size, ("Nm", "N"))[0] == like_units(109.0, ("Nm",))[0] == ()
+        assert like_units(size, ("Nm", "N"))[0] == like_units(109.0, ("Nm",))[0] == like_units(1.6e3, ("Nm",))[0] == ()
     [found] = quick_check(replace(data, u=1e3 * data.u))
     after, before = map(float, re.findall(r"([\d.]+) %", found.what))
     assert after < 0.1 * before  # of the log as it is, without any factor

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from forcegp.checks.check_input import DEGREE, STEPS, STILL, CheckInput
+from forcegp.checks.slips import slip
 from forcegp.checks.torques import needed_torques
 from forcegp.data import Dataset, differentiate, low_pass, preparation_report
 from forcegp.data.delay import lowest
@@ -131,10 +132,15 @@ def _dropped(inputs: CheckInput) -> Iterator[Doubt]:
         seen = f"{len(rows)} rows ({100.0 * len(rows) / len(every):.2g} %) read exactly 0 between values far from 0"
         remedy = "They were not measured: leave these rows out, and look at the logger."
         if about == "spike":
+            stretches = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+            if slips := [x for k in np.flatnonzero(every.any(axis=0)).tolist() if (x := slip(inputs, k, stretches[0]))]:
+                yield slips[0]
+                continue
             seen = f"{len(rows)} single value{'s' if len(rows) > 1 else ''} far from those just before and after"
             half = 0.5 * float(np.median(np.diff(time)))
-            ends = (f"{time[k] + x:.{FINE - int(np.log10(half))}f}" for k in rows for x in (-half, half))
-            remedy = f"Such a value is wrong: leave it out, by forcegp import --without {','.join(ends)}."
+            edges = (x for each in stretches for x in (time[each[0]] - half, time[each[-1]] + half))
+            ends = ",".join(f"{x:.{FINE - int(np.log10(half))}f}" for x in edges)
+            remedy = f"Such a value is wrong: leave it out, by forcegp import --without {ends}."
         yield wrong(
             about=about,
             what=f"{seen}, in {listed(tuple(EVERY_QUANTITY[name] for name in lost))} of {listed(names)}; the first is "

@@ -201,8 +201,7 @@ def _in_frames(pseudo: np.ndarray, frames: np.ndarray) -> np.ndarray:
     return there @ pseudo @ there.swapaxes(-1, -2)
 
 
-DEFINITE = 1e-9
-"""Matrices whose smallest eigenvalue is this fraction of the largest have factors in spite of rounding."""
+DEFINITE = 1e-9  # matrices whose smallest eigenvalue is this fraction of the largest have factors in spite of rounding
 
 
 def upper_cholesky(matrices: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"]:

@@ -16,8 +16,7 @@ from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, Recorded
 from forcegp.forces import Actuation
 from forcegp.posterior.fitted import STRETCHES
 
-SLIGHT = 0.1
-"""Share of what a joint needs by the start, below which known torques do not tell how much it carries."""
+SLIGHT = 0.1  # share of what a joint needs by the start, below which known torques do not tell how much it carries
 
 
 class Equations:

@@ -26,13 +26,11 @@ from forcegp.model import Model
 from forcegp.noise import Noise
 from forcegp.posterior import Posterior
 
-PARTS = "memory", "factor", "root", "direction", "breakaway"
-"""Of `GearFriction`, and of the law beside it."""
+PARTS = "memory", "factor", "root", "direction", "breakaway"  # of `GearFriction`, and of the law beside it
 BLOCKS = 10  # stretches of the log, each predicted from the others
 CLEARLY, LIKELY = 1.5, 0.5
 """Standard errors over the stretches by which a part must lower the squared residual; and memory, which gears have."""
-LEAST, LITTLE = 0.05, 0.007
-"""Share of it by which a part must do so, and memory."""
+LEAST, LITTLE = 0.05, 0.007  # share of it by which a part must do so, and memory
 FALLS = tuple(np.geomspace(0.04, 0.6, 7).tolist())
 """Of the root mean square velocity, what a breakaway may fall over here; a fit finds the rest."""
 SIGNED = np.array([0, 1, 1, 1, 0, 0] + [1] * len(FALLS), dtype=bool)
@@ -40,12 +38,10 @@ SIGNED = np.array([0, 1, 1, 1, 0, 0] + [1] * len(FALLS), dtype=bool)
 REVERSALS = 2
 """Fewest reversals of a joint that can show memory: held-out stretches decide. With six, half of 48 short logs of LuGre
 friction had none, and .9 of the rest stayed; with two .04, and none of 96 logs without memory was given one."""
-WIDTHS = tuple(np.geomspace(0.003, 1.0, 11).tolist())
-"""Of the smooth sign, over the root mean square velocity."""
+WIDTHS = tuple(np.geomspace(0.003, 1.0, 11).tolist())  # of the smooth sign, over the root mean square velocity
 SEEN, RIDGE = 0.003, 1e-7
 """Of the torque of bodies, the least that counts over the largest; and what is added to the normal equations."""
-MOST_ROWS, MOST_EQUATIONS = 10_000, 70_000
-"""Of the log that are asked, evenly spread: each knows its past."""
+MOST_ROWS, MOST_EQUATIONS = 10_000, 70_000  # of the log that are asked, evenly spread: each knows its past
 FIRST_ROWS = 2000  # of the first fit
 STIFFNESS = tuple(np.geomspace(10.0, 10000.0, 13).tolist())
 """Of the memory, over the reciprocal root mean square position."""

@@ -23,10 +23,8 @@ from forcegp.inference.likelihood import CholeskyFactor, deflated_covariance, fa
 from forcegp.posterior import Posterior
 from forcegp.posterior.fitted import Estimates
 
-MOST_ROUNDS = 10
-"""Searches, each about the numbers of the last one."""
-CHANGE = 0.1
-"""They end where numbers change by fewer of their standard deviations."""
+MOST_ROUNDS = 10  # searches, each about the numbers of the last one
+CHANGE = 0.1  # they end where numbers change by fewer of their standard deviations
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,18 +31,13 @@ from forcegp.posterior.fitted import Estimates
 from forcegp.posterior.rollout import accelerations
 from forcegp.progress import tell
 
-STEP = 0.005
-"""Longest step in s: shorter where the recording has shorter ones, of which several make a step."""
+STEP = 0.005  # longest step in s: shorter where the recording has shorter ones, of which several make a step
 SPEED = 0.02
 """Standard deviation of a window's initial velocity, relative to that of all velocities: it comes from a filter."""
-ITERATIONS, ROUNDS = 12, 8
-"""Most steps for given noise, and times that the noise is estimated anew."""
-CONTENT = 0.1
-"""Nats by which a step must be expected to lower the objective for the search to go on."""
-MOST_DAMPING = 1e6
-"""Beyond it steps are too small to matter."""
-SETTLED = 0.02
-"""Relative change of the noise that ends the rounds."""
+ITERATIONS, ROUNDS = 12, 8  # most steps for given noise, and times that the noise is estimated anew
+CONTENT = 0.1  # nats by which a step must be expected to lower the objective for the search to go on
+MOST_DAMPING = 1e6  # beyond it steps are too small to matter
+SETTLED = 0.02  # relative change of the noise that ends the rounds
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,7 @@ from forcegp.model import Model
 from forcegp.posterior.fitted import STRETCHES
 from forcegp.robots import Robot
 
-FEWEST = 10 * STRETCHES
-"""Rows that a payload needs, but in a log of postures alone."""
+FEWEST = 10 * STRETCHES  # rows that a payload needs, but in a log of postures alone
 
 
 def with_payloads_placed(model: Model, logs: Sequence[Dataset]) -> Model:
@@ -138,14 +137,10 @@ rough masses, less was another cause than the true one, or none."""
 DECIDED, FAR_BEHIND = 30.0, 3.0
 """Nats from which on one number of these is named as well, where no other cause has a third of them: of 22 good logs of
 LuGre gears none had more than 8."""
-STEP = 1e-4
-"""Of lengths, ratios and zeros, for derivatives."""
-WRONG = 0.03
-"""Logarithm of the largest factor below which a cause is not worth a word."""
-TURNED = 0.15
-"""Of a g: by which one linear step may change the size of gravity that is turned."""
-NO_STEP = 0.8
-"""Logarithm of a factor from which on one linear step tells nothing of it."""
+STEP = 1e-4  # of lengths, ratios and zeros, for derivatives
+WRONG = 0.03  # logarithm of the largest factor below which a cause is not worth a word
+TURNED = 0.15  # of a g: by which one linear step may change the size of gravity that is turned
+NO_STEP = 0.8  # logarithm of a factor from which on one linear step tells nothing of it
 
 
 def misfit(

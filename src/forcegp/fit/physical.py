@@ -27,14 +27,11 @@ from forcegp.noise import Noise
 from forcegp.posterior.fitted import Estimates
 from forcegp.progress import tell
 
-ROWS = 5_000
-"""Rows that are used at most, evenly spread: more of a filtered recording add little."""
-EQUATIONS = 40_000
-"""As many rows hold these equations, one per degree of freedom, at most."""
+ROWS = 5_000  # rows that are used at most, evenly spread: more of a filtered recording add little
+EQUATIONS = 40_000  # as many rows hold these equations, one per degree of freedom, at most
 WINDOWED, PER_WINDOW = 2_000, 10
 """Of means over windows so many rows are enough, or so many in each: half a second of a filtered log has few more."""
-REWEIGHTINGS = 2
-"""Searches in which accelerations are weighted by noise of both kinds."""
+REWEIGHTINGS = 2  # searches in which accelerations are weighted by noise of both kinds
 SEARCHES = 20
 """Most searches where forces and accelerations are both noisy, each about the accelerations of the last one."""
 STEPS = 6
@@ -244,8 +241,7 @@ def typical_sizes(model: Model, logs: Sequence[Dataset]) -> dict[str, Float[np.n
     return {"force": torque, "velocity": velocity, "inertia": mass, "position": position}
 
 
-STRETCHES_LEFT_OUT = 4
-"""Stretches of time that logs of fewer than three episodes are cut into."""
+STRETCHES_LEFT_OUT = 4  # stretches of time that logs of fewer than three episodes are cut into
 
 
 def held_out_noise(model: Model, dataset: Dataset, evidence: Torques | Accelerations) -> Noise:

@@ -22,8 +22,7 @@ from forcegp.posterior import Posterior
 from forcegp.robots.arguments import whole_number
 
 FEWEST_INDEPENDENT, TELLING = 10, 100  # rows that noise is learned from, and those that tell it within a tenth
-LEARNING_ROWS = 600
-"""Rows that hyper-parameters are found on where there are more than `MOST_EXACT_ROWS`."""
+LEARNING_ROWS = 600  # rows that hyper-parameters are found on where there are more than `MOST_EXACT_ROWS`
 
 
 def learning_rows(rows: Dataset, learning_points: int | None, *, ordered: bool) -> Dataset:
@@ -121,14 +120,11 @@ def on_all_rows(fitted: Posterior, rows: Dataset, engine: Engine | None, describ
     return posterior
 
 
-ROUNDS = 8
-"""Most fits after the first; measured with dry friction that falls with speed, 3 to 5 are enough."""
+ROUNDS = 8  # most fits after the first; measured with dry friction that falls with speed, 3 to 5 are enough
 SETTLED = 1e-3
 """Relative change of the mixing vectors (root mean square over training rows) below which the loads have settled."""
-NOTICEABLE = 2.0
-"""Nats that rounds differ by without telling anything."""
-PLACES = 60
-"""Velocities at which a curve is tabulated, of those that the data visited."""
+NOTICEABLE = 2.0  # nats that rounds differ by without telling anything
+PLACES = 60  # velocities at which a curve is tabulated, of those that the data visited
 BEYOND = (1.2, 1.5, 2.0, 3.0, 5.0)
 """Multiples of the largest and smallest visited velocity at which it is tabulated as well: continued from the last two
 of `PLACES`, whose difference is noise, it would soon be far from the curve itself.

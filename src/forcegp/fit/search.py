@@ -36,15 +36,13 @@ from forcegp.posterior.fitted import DEVIATIONS
 from forcegp.progress import part
 from forcegp.robots.arguments import whole_number
 
-MOST_RESTARTS = 10_000
-"""So that a slip such as 10**9 is refused: a start takes from tenths of a second to minutes."""
+MOST_RESTARTS = 10_000  # so that a slip such as 10**9 is refused: a start takes from tenths of a second to minutes
 
 
 START_SHARE = 0.1
 """Noise of an acceleration over its spread, from which it is learned; its hyperprior spans a factor of e about that."""
 
-QUIET = 1e-3
-"""Spread of a joint that hardly moves, as a fraction of the largest."""
+QUIET = 1e-3  # spread of a joint that hardly moves, as a fraction of the largest
 
 
 def resolved_noise(noise: Noise | None, rows: Dataset) -> Noise:
@@ -105,15 +103,13 @@ def described_rows(rows: Dataset, dataset: Dataset) -> dict[str, Any]:
     }
 
 
-RESTART_SPREAD = 0.7
-"""Standard deviation of the random factors (natural log) on the start values of restarts from 1 on."""
+RESTART_SPREAD = 0.7  # standard deviation of the random factors (natural log) on the start values of restarts from 1 on
 
 SMOOTHER = 4.0
 """Factor on the length scales of odd restarts: on one seed of the benchmark, without a mean, starts around the moments
 ended at an error of .1266, the smoother one at .109."""
 
-MOST_POINTS_FOR_RESTARTS = 400
-"""Training points up to which several starts are the default."""
+MOST_POINTS_FOR_RESTARTS = 400  # training points up to which several starts are the default
 
 Outcome = TypeVar("Outcome")
 
@@ -274,13 +270,11 @@ def _one_start(
 CONTENT, CONFIDENCE = 0.9, 0.995
 """Share of the states that lie inside their 95 % intervals, in this share of the functions that the data leave open."""
 
-STATES = 24
-"""Training states at which functions and variances are compared."""
+STATES = 24  # training states at which functions and variances are compared
 
 DRAWS = 2000
 
-LARGEST_STEP = 2.0
-"""Most that a parameter is moved by, on its log scale: the spread of the widest prior on one."""
+LARGEST_STEP = 2.0  # most that a parameter is moved by, on its log scale: the spread of the widest prior on one
 
 PROBES, SMALL_STEP = 8, 1e-2
 """Directions, and the step along each, whose change of the gradient gives the diagonal of the Hessian: neighbours, as
@@ -289,8 +283,7 @@ parameters of one kernel are, do not mix."""
 PAIRS, RARE = 4, 0.6
 """Of opposite moves of all hyper-parameters; deviations beyond the mean that 73 % of normal draws do not lose."""
 
-NEGLIGIBLE = 1e-6
-"""Standard deviation, as a fraction of the largest, below which a constraint leaves nothing open."""
+NEGLIGIBLE = 1e-6  # standard deviation, as a fraction of the largest, below which a constraint leaves nothing open
 
 
 def widened(posterior: Posterior) -> Posterior:

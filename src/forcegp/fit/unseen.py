@@ -21,22 +21,18 @@ from forcegp.model import Model
 from forcegp.noise import Noise
 from forcegp.summary import listed
 
-ROWS = 1000
-"""Rows that are looked at, evenly spread."""
+ROWS = 1000  # rows that are looked at, evenly spread
 PUSHED = 0.5
 """Of what a joint without a drive needs for its motion: the force there that nobody measured, from which on something
 pushes it. Friction of a bearing is a few per cent; a hand is more than the weight."""
-ALONE = 0.05
-"""Least share of a joint's force, squared, that contacts leave to be seen; below, they may carry all of it."""
+ALONE = 0.05  # least share of a joint's force, squared, that contacts leave to be seen; below, they may carry all of it
 FLAT = 10.0
 """Of what pushes a joint: its standard deviation. A hand is no white noise about zero: taken for one it pulls contact
 forces towards those without a hand, by as much as other joints leave open (1.77 N for 1.47 on the leg of a Solo)."""
-NONE = 1e-9
-"""Of torques: of joints that nothing pushes, a standard deviation that has a logarithm."""
+NONE = 1e-9  # of torques: of joints that nothing pushes, a standard deviation that has a logarithm
 ROUNDED = 1e-4
 """Of what noise of joint forces makes of accelerations: least noise of these, so that covariances have an inverse."""
-LEARNED = 0.02
-"""Of torques: their noise where a search for it begins, when force sensors show it."""
+LEARNED = 0.02  # of torques: their noise where a search for it begins, when force sensors show it
 OF_TORQUE = 0.2
 """Standard deviation of a torque that nothing shows, in the torque of the log or of its load: gains of drives that
 nobody calibrated, and friction (10 to 16 % and 10 % on that leg, 9.5 % on a UR10e)."""

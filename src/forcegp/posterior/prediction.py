@@ -368,8 +368,7 @@ def joint_forces_given(
     return given(whole, whole.covariance @ H.mT), given(learned, learned.covariance @ H.mT)
 
 
-SHARP = 1e-9
-"""Of what evidence shows of hidden torques, the variance that conditioning on it leaves: rounding."""
+SHARP = 1e-9  # of what evidence shows of hidden torques, the variance that conditioning on it leaves: rounding
 
 
 def hidden_forces(
