@@ -64,6 +64,17 @@ def test_a_decimated_recording_is_divided_at_the_same_moments():
     assert split.test_rows(full)[-1], "rows after the last of the few belong to the last block"
 
 
+@pytest.mark.parametrize(("share", "count"), [(0.4, 5), (0.15, 5), (0.05, 10), (0.95, 10), (0.0, 10), (1.0, 10)])
+def test_both_sides_show_the_motion_of_every_joint(share, count):
+    data = recording(300, 1)
+    held = split_named(data, "blocks:5:3,5")[0].test_rows(data)
+    v = data.v.copy()
+    v[:, 0] = np.sqrt(np.where(held, share / held.sum(), (1.0 - share) / (~held).sum()))
+    split = split_named(dataclasses.replace(data, v=v), "auto")[0]
+    assert len(split.held_out) == 2 * count // 5
+    assert split.name.startswith(f"blocks-{count}-3-5")
+
+
 WRONG = [
     ("episodes:7", r"held-out episodes are \[7\]; name some of \[0, 1, 2\]"),
     ("episodes:0,1,2", "leave one to learn from"), ("episodes:", "give auto, folds, episodes:N"),

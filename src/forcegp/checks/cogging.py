@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from forcegp.checks.causes import NUMBER, Candidate, Cause
+from forcegp.checks.causes import NUMBER, Candidate, number
 from forcegp.checks.check_input import CheckInput
 from forcegp.checks.torques import Comparison, solved
 from forcegp.data.ripple import rate_of_waves, waves
@@ -27,16 +27,8 @@ def cogging(now: Comparison, inputs: CheckInput, bad: np.ndarray) -> Iterator[Ca
         return
     units = inputs.unit_of_each("u"), inputs.unit_of_each("q")
     each = [f"{a:.3g} {units[0][k]} every {w:.3g} {units[1][k]} of {inputs.names[k]}" for k, (a, w) in sizes.items()]
-    yield (
-        Cause(
-            about="cogging",
-            what=f"torques repeat over equal ways: {listed(each)}, as of magnets of a motor, or of teeth of a gear",
-            do="Learn it beside the robot: forcegp score LOG.h5 --forces identified,gp:joint:inputs=q --out scores.",
-            joints=tuple(sizes),
-            numbers={"way": [w for _, w in sizes.values()], "size": [a for a, _ in sizes.values()]},
-            cost=1.5 * NUMBER * len(sizes),
-            number=True,
-            level="look",
-        ),
-        replace(now, more=now.more + more),
-    )
+    text = f"torques repeat over equal ways: {listed(each)}, as of magnets of a motor, or of teeth of a gear"
+    do = "Learn it beside the robot: forcegp score LOG.h5 --forces identified,gp:joint:inputs=q --out scores."
+    size, way = (list(values) for values in zip(*sizes.values(), strict=True))
+    told = {"joints": tuple(sizes), "numbers": {"size": size, "way": way}, "do": do}
+    yield number("cogging", text, 0, 0.0, 1.5 * NUMBER * len(sizes), **told), replace(now, more=now.more + more)

@@ -25,6 +25,8 @@ from forcegp.summary import plain
 
 FORMS, DEFAULT_BLOCKS = "folds, episodes:N,N..., leave-one-out or blocks:N:K,K...", "blocks:5:3,5"
 FOLDS = 4
+COUNTS, SHOWN = (5, 10, 20), 0.1
+"""Of blocks, two of five held out: the fewest that leave this share of every joint's squared velocity on both sides."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,8 @@ MOST = 0.6  # of the rows, from which on an episode is too much to be held out, 
 def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split, ...]:
     """The splits of a text, as `forcegp score --split` takes it: several for leave-one-out, else one.
 
-    auto: a quarter of the episodes, drawn at random; where one is `MOST` of the log, blocks 3 and 5 of five.
+    auto: a quarter of the episodes, drawn at random; where one is `MOST` of the log, blocks 3 and 5 of five, or of each
+        five of more blocks where a joint moves on one side alone.
     folds: the episodes in up to four groups, drawn at random, each held out in turn; with one episode as auto.
     episodes:N,N...: whole episodes.
     leave-one-out: every episode once.
@@ -107,7 +110,7 @@ def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split
     require_type("dataset", dataset, Dataset)
     known = [int(each) for each in dataset.episodes]
     alone = np.unique(dataset.episode, return_counts=True)[1].max() > MOST * len(dataset)
-    kind, *parts = (DEFAULT_BLOCKS if text in ("auto", "folds") and alone else text).split(":")
+    kind, *parts = (_usual_blocks(dataset) if text in ("auto", "folds") and alone else text).split(":")
     try:
         match kind, [[int(word) for word in part.split(",")] for part in parts]:
             case "auto", []:
@@ -129,6 +132,18 @@ def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split
     except ValueError:
         pass  # a text where a number belongs
     raise InvalidInput(f"the split is {text!r}; give auto, {FORMS}, for example {DEFAULT_BLOCKS}.")
+
+
+def _usual_blocks(dataset: Dataset) -> str:
+    """Blocks of which both sides show the motion of every joint that moves."""
+    text, power = DEFAULT_BLOCKS, np.square(dataset.v)
+    for count in COUNTS:
+        held = [number for number in range(1, count + 1) if number % 5 in (3, 0)]
+        shares = power[_blocks_apart(dataset, count, held, 0.0).test_rows(dataset)].sum(0) / power.sum(0).clip(1e-300)
+        text = f"blocks:{count}:{','.join(map(str, held))}"
+        if ((shares >= SHOWN) & (shares <= 1.0 - SHOWN))[power.any(0)].all():
+            return text
+    return text
 
 
 def _require_some(what: str, chosen: Sequence[int], known: Sequence[int]) -> None:
