@@ -32,6 +32,7 @@ MOST_ROWS = 2000  # on which that is judged
 STIFFNESS = 50.0, 200.0, 800.0  # of what friction remembers, over the reciprocal deviation of positions
 SURE, TELLS = 200.0, 30.0
 """Nats that a stretch of time in which something is touched explains: in all, or one of each row, and of a joint."""
+ENDS = 5  # times that the ends of such a stretch are sought anew, as those that are most likely (Page 1954)
 SEEN, WARMER = 1e-3, 0.1  # share of the largest direction of columns; logarithm of a ratio of friction that is told
 SHORT = 2.0  # s, of what stays between pushes, which filters and splits have no use for; of rests at the ends of a log
 RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
@@ -209,43 +210,41 @@ def _delays(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
 def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     """A stretch of time in which several torques are far from any robot of these lengths, unlike before and after."""
     rows, place = found.log.rows, np.arange(len(found.log.rows))
-    ones, more = np.ones((len(rows), 1)), np.ones((*rows.q.shape, 1))
+    ones, smeared = np.ones((len(rows), 1)), 1.5 / inputs.compared_cutoff
     if len(rows) < FEWEST_ROWS:
         return
-    for again in (False, True):  # beside friction that remembers, which looks like a push where a joint hardly moves
-        more = _remembered(found, inputs) if again else more
-        left = found.left_beside(more)
-        alive = [np.hstack([ones, -ones, x[:, None]]) for x in left.T if x.any()]
-        if not alive:
-            return
-        _, _, first, last = max(map(stretch, alive))
+    more = _remembered(found, inputs)  # friction that remembers looks like a push where a joint hardly moves
+    left, tried = found.left_beside(more), list[tuple[float, int, int, np.ndarray, np.ndarray]]()
+    for own in left.T[left.any(axis=0)]:
+        *_, first, last = stretch(np.hstack([ones, -ones, own[:, None]]))
+        # in the middle of the log, and longer than what a filter makes of a turn
+        if first > 0 and last < len(rows) and rows.time[last - 1] - rows.time[first] > smeared:
+            inside = (place >= first) & (place < last)
+            power = np.stack([np.square(left[each]).mean(0) + 1e-300 for each in (inside, ~inside, slice(None))])
+            told = inside.sum() * np.log(power[2] / power[0]) + (~inside).sum() * np.log(power[2] / power[1])
+            gains = told * (power[0] > power[1])
+            tried.append((float(gains.sum()), first, last, gains, np.sqrt(power[0] / power[1])))
+    most, first, last, gains, times = max(tried, key=lambda each: each[0], default=(0.0, 0, 0, ones, ones))
+    joints = np.flatnonzero(gains > TELLS)
+    if most <= min(SURE, len(rows)) or len(joints) < 2:
+        return
+    for _ in range(ENDS):  # what is touched tells no masses, and hides behind those that fit it as well
         inside = (place >= first) & (place < last)
-        power = [np.square(left[each]).mean(0) + 1e-300 for each in (inside, ~inside, slice(None))]
-        told = inside.sum() * np.log(power[2] / power[0]) + (~inside).sum() * np.log(power[2] / power[1])
-        gains = told * (power[0] > power[1])
-        joints, smeared = np.flatnonzero(gains > TELLS / (1 + again)), 2.0 / inputs.compared_cutoff
-        lasts = rows.time[last - 1] - rows.time[first] > 0.5 * smeared  # longer than what a filter makes of a turn
-        if not (
-            gains.sum() > min(SURE, len(rows)) / (1 + again)
-            and len(joints) > 1
-            and lasts
-            and first > 0
-            and last < len(rows)
-        ):
-            return
-    grown = True
-    while grown:  # what is touched tells no masses, and hides behind those that fit it as well
-        left = found.left_beside(more, (place < first) | (place >= last))[:, joints]
-        *_, begin, end = max(stretch(np.hstack([ones, -ones, x[:, None]])) for x in left.T)
-        wider = min(first, begin), max(last, end)
-        grown = wider != (first, last) and wider[1] - wider[0] <= len(rows) // 2
-        first, last = wider if grown else (first, last)
+        left = np.square(found.left_beside(more, ~inside)[:, joints])
+        power = np.stack([left[each].mean(0) + 1e-300 for each in (inside, ~inside)])
+        likely = (left * (1.0 / power[1] - 1.0 / power[0]) - np.log(power[0] / power[1])).sum(axis=1)
+        total = np.append(0.0, np.cumsum(likely))
+        end = int(np.argmax(total - np.minimum.accumulate(total)))
+        begin = int(np.argmin(total[: end + 1]))
+        if (begin, end) == (first, last) or not 1 < end - begin <= len(rows) // 2:
+            break
+        first, last = begin, end
     begin, end = rows.time[first] - smeared, rows.time[last - 1] + smeared
-    times = np.sqrt(power[0] / power[1])[joints].max()
     yield look(
         about="push",
-        what=f"from {begin:.4g} to {end:.4g} s the torques of {listed(inputs.named(joints))} are up to {times:.2g} "
-        "times as far from any masses and friction as elsewhere: a contact, or a load, in these seconds.",
+        what=f"from {begin:.4g} to {end:.4g} s the torques of {listed(inputs.named(joints))} are up to "
+        f"{times[joints].max():.2g} times as far from any masses and friction as elsewhere: a contact, or a load, in "
+        "these seconds.",
         do=f"Leave them out by forcegp import --without {begin:.2f},{end:.2f}, as forcegp auto does.",
         joints=inputs.named(joints),
         numbers={"seconds": [float(begin), float(end)], "gains": gains[joints].tolist()},
