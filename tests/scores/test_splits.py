@@ -64,7 +64,7 @@ def test_a_decimated_recording_is_divided_at_the_same_moments():
     assert split.test_rows(full)[-1], "rows after the last of the few belong to the last block"
 
 
-@pytest.mark.parametrize(("share", "count"), [(0.4, 5), (0.15, 5), (0.05, 10), (0.95, 10), (0.0, 10), (1.0, 10)])
+@pytest.mark.parametrize(("share", "count"), [(0.4, 5), (0.08, 5), (0.03, 10), (0.97, 10), (0.0, 10), (1.0, 10)])
 def test_both_sides_show_the_motion_of_every_joint(share, count):
     data = recording(300, 1)
     held = split_named(data, "blocks:5:3,5")[0].test_rows(data)

@@ -25,7 +25,7 @@ from forcegp.summary import plain
 
 FORMS, DEFAULT_BLOCKS = "folds, episodes:N,N..., leave-one-out or blocks:N:K,K...", "blocks:5:3,5"
 FOLDS = 4
-COUNTS, SHOWN = (5, 10, 20), 0.1
+COUNTS, SHOWN = (5, 10, 20), 0.05
 """Of blocks, two of five held out: the fewest that leave this share of every joint's squared velocity on both sides."""
 
 
