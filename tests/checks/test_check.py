@@ -275,14 +275,17 @@ def test_torques_that_repeat_over_equal_ways_are_named():
     np.testing.assert_allclose(found.numbers["size"], size, rtol=0.05)
 
 
-def test_an_encoder_that_slips_is_named():
-    data = clean(0)
-    steps = np.diff(data.q[900:905, 1])
-    for size, named in ((7.0, True), (4.0, False)):
-        q = data.q + np.outer(np.arange(len(data)) > 902, [0.0, size * np.abs(steps).max(), 0.0])
-        doubts = check(replace(data, q=q, v=np.gradient(q, data.time, axis=0))).doubts
-        assert [each.numbers["jump"] for each in doubts.of("jumps")] == pytest.approx([q[903, 1] - q[902, 1]] * named)
-        assert bool(doubts.of("spike")) != named
+@pytest.mark.parametrize(
+    ("size", "still", "about"), [(0.1, 0, "jumps"), (4e-4, 0, ""), (0.1, 4, "jumps"), (0.1, 6, "frozen")]
+)
+def test_an_encoder_that_slips_or_stops_is_named(size, still, about):
+    data, row = clean(0), np.arange(1400)
+    q = data.q + np.outer(row > 902, [0.0, size, 0.0])
+    q[902 - still : 903, 1] = q[902 - still, 1]
+    for v in (data.v, np.gradient(q, data.time, axis=0)):  # of a channel of its own, or derived
+        found = [x for x in check(replace(data, q=q, v=v)).doubts.at("wrong") if "jump" in x.numbers]
+        assert [x.about.startswith(about) for x in found] == [True] * bool(about)
+        assert [x.numbers["jump"] for x in found] == pytest.approx([q[903, 1] - q[902, 1]] * len(found))
 
 
 def test_rows_at_rest_show_no_torque():

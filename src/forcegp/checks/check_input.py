@@ -210,11 +210,11 @@ def _drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
             lost[start:stop, joint] = True
     if not lost.any() and not (name == "q" and (np.abs(np.diff(values, axis=0)) > np.pi).any()):  # an angle that wraps
         for joint in range(values.shape[1]):
-            lost[_spikes(values[:, joint], follows), joint] = True
+            lost[single_rows(values[:, joint], follows), joint] = True
     return lost
 
 
-def _spikes(x: np.ndarray, follows: np.ndarray) -> np.ndarray:
+def single_rows(x: np.ndarray, follows: np.ndarray) -> np.ndarray:
     """Single rows of a signal that are far from those before and after, unlike all others."""
     off = np.zeros(len(x))
     off[1:-1] = np.where(follows[:-1] & follows[1:], np.abs(x[1:-1] - 0.5 * (x[2:] + x[:-2])), 0.0)

@@ -15,8 +15,8 @@ from scipy.optimize import linear_sum_assignment
 
 from forcegp.checks.causes import NUMBER, SIGN, Candidate, Cause, changed, like_units, number
 from forcegp.checks.check_input import DEGREE, CheckInput
-from forcegp.checks.cogging import cogging
 from forcegp.checks.couplings import coupled_joints
+from forcegp.checks.residuals import cogging
 from forcegp.checks.torques import Change, Comparison, needed_torques, solved
 from forcegp.data import Dataset
 from forcegp.doubts import listed

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from forcegp.checks.check_input import DEGREE, STEPS, STILL, CheckInput
-from forcegp.checks.slips import slip
+from forcegp.checks.slips import slips
 from forcegp.checks.torques import needed_torques
 from forcegp.data import Dataset, differentiate, low_pass, preparation_report
 from forcegp.data.delay import lowest
@@ -33,7 +33,9 @@ def signal_doubts(inputs: CheckInput) -> list[Doubt]:
     """Constant, frozen and clipped channels, angles that jump."""
     joints = range(inputs.log.nv)
     frozen = chain.from_iterable(_frozen(inputs, name, joint) for name in QUANTITY for joint in joints)
-    return [*_jumps(inputs), *_dropped(inputs), *_constant(inputs), *frozen, *_clipped(inputs)]
+    jumps = [*_jumps(inputs), *slips(inputs)]  # of which derivatives have spikes
+    dropped = _dropped(inputs, ("drop-outs",) if jumps else ("drop-outs", "spike"))
+    return [*jumps, *dropped, *_constant(inputs), *frozen, *_clipped(inputs)]
 
 
 FEWEST_VALUES, GAPS = 5, 8  # on either side of a gap, and how many gaps are looked at
@@ -117,10 +119,10 @@ def _jumps(inputs: CheckInput) -> Iterator[Doubt]:
         )
 
 
-def _dropped(inputs: CheckInput) -> Iterator[Doubt]:
+def _dropped(inputs: CheckInput, kinds: Sequence[str]) -> Iterator[Doubt]:
     """Rows of a signal that were lost and read 0, and single ones that are far from those before and after."""
     time = inputs.log.time
-    for about in ("drop-outs", "spike"):
+    for about in kinds:
         lost = dict[str, np.ndarray]()
         for name, rows in inputs.dropped.items():
             own = rows & ((getattr(inputs.log, name)[:, : rows.shape[1]] == 0.0) == (about == "drop-outs"))
@@ -132,13 +134,9 @@ def _dropped(inputs: CheckInput) -> Iterator[Doubt]:
         seen = f"{len(rows)} rows ({100.0 * len(rows) / len(every):.2g} %) read exactly 0 between values far from 0"
         remedy = "They were not measured: leave these rows out, and look at the logger."
         if about == "spike":
-            stretches = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
-            if slips := [x for k in np.flatnonzero(every.any(axis=0)).tolist() if (x := slip(inputs, k, stretches[0]))]:
-                yield slips[0]
-                continue
             seen = f"{len(rows)} single value{'s' if len(rows) > 1 else ''} far from those just before and after"
             half = 0.5 * float(np.median(np.diff(time)))
-            edges = (x for each in stretches for x in (time[each[0]] - half, time[each[-1]] + half))
+            edges = (x for a, b in runs(every.any(axis=1)) for x in (time[a] - half, time[b - 1] + half))
             ends = ",".join(f"{x:.{FINE - int(np.log10(half))}f}" for x in edges)
             remedy = f"Such a value is wrong: leave it out, by forcegp import --without {ends}."
         yield wrong(

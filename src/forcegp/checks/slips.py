@@ -1,31 +1,37 @@
-"""Positions that jump and stay there: an encoder that has slipped, or was set anew."""
+"""Positions that jump: an encoder that has slipped or was set anew, or that stood still before."""
+
+from collections.abc import Iterator
 
 import numpy as np
-from jaxtyping import Int
 
-from forcegp.checks.check_input import STEPS, CheckInput
-from forcegp.data.views import resolution
+from forcegp.checks.check_input import CheckInput, single_rows
+from forcegp.data.views import consecutive
 from forcegp.doubts import Doubt, wrong
 
-FAR = 5.0  # times the other steps around it, from which on one is a slip
+STOOD = 5  # equal positions in front of a jump, from which on the encoder had stopped
 
 
-def slip(inputs: CheckInput, joint: int, rows: Int[np.ndarray, " rows"]) -> Doubt | None:
-    """The step in positions of a joint of which velocities have a spike in these rows; None where there is none."""
-    log, name = inputs.log, inputs.names[joint]
-    around = np.arange(max(rows[0] - 2, 0), min(rows[-1] + 3, len(log)))
-    steps = np.diff(log.q[around, joint])
-    most = int(np.argmax(np.abs(steps)))
-    others = np.abs(np.delete(steps, most)).max(initial=STEPS * resolution(log.q[:, joint]))
-    if abs(steps[most]) < FAR * others:
-        return None
-    begin, at, end = (float(log.time[row]) for row in (0, around[most + 1], -1))
-    short = (at, end) if at - begin > end - at else (begin, at)
-    return wrong(
-        about="jumps",
-        what=f"the position of {name} jumps by {steps[most]:+.3g} {inputs.unit_of_each('q')[joint]} at {at:.3f} s and "
-        "stays there: its encoder has slipped, or was set anew.",
-        do="Leave the shorter part out by forcegp import --without {:.3f},{:.3f}, or correct it.".format(*short),
-        joints=(name,),
-        numbers={"jump": float(steps[most]), "time": at},
-    )
+def slips(inputs: CheckInput) -> Iterator[Doubt]:
+    """Single steps of positions that are far from those just before and after, unlike all others."""
+    log, follows = inputs.log, consecutive(inputs.log)[:-1]
+    for joint, name in enumerate(() if inputs.jumps.any() else inputs.names):
+        steps = np.diff(log.q[:, joint])
+        for row in single_rows(steps, follows[:-1] & follows[1:])[:1].tolist():
+            moved = np.flatnonzero(steps[:row])
+            first = int(moved[-1]) + 1 if len(moved) else 0
+            begin, then, at, end = log.time[[0, first, row + 1, -1]].tolist()
+            size = f"{steps[row]:+.3g} {inputs.unit_of_each('q')[joint]}"
+            stood = row - first >= STOOD
+            seen = f"jumps by {size} at {at:.3f} s and stays there: its encoder has slipped, or was set anew."
+            left_out = (then, at) if stood else (at, end) if at - begin > end - at else (begin, at)
+            if stood:
+                seen = f"stands still from {then:.3f} s on and jumps by {size} at {at:.3f} s: its encoder was dead."
+            yield wrong(
+                about="frozen channel" if stood else "jumps",
+                what=f"the position of {name} {seen}",
+                do="Leave {} out by forcegp import --without {:.3f},{:.3f}{}.".format(
+                    "these rows" if stood else "the shorter part", *left_out, "" if stood else ", or correct it"
+                ),
+                joints=(name,),
+                numbers={"jump": float(steps[row]), "time": at, "still": at - then},
+            )

@@ -217,8 +217,9 @@ def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     left, tried = found.left_beside(more), list[tuple[float, int, int, np.ndarray, np.ndarray]]()
     for own in left.T[left.any(axis=0)]:
         *_, first, last = stretch(np.hstack([ones, -ones, own[:, None]]))
-        # in the middle of the log, and longer than what a filter makes of a turn
-        if first > 0 and last < len(rows) and rows.time[last - 1] - rows.time[first] > smeared:
+        # in the middle of the log, a quarter of it at most, and longer than what a filter makes of a turn
+        short = 4 * (last - first) <= len(rows)
+        if short and first > 0 and last < len(rows) and rows.time[last - 1] - rows.time[first] > smeared:
             inside = (place >= first) & (place < last)
             power = np.stack([np.square(left[each]).mean(0) + 1e-300 for each in (inside, ~inside, slice(None))])
             told = inside.sum() * np.log(power[2] / power[0]) + (~inside).sum() * np.log(power[2] / power[1])
@@ -236,7 +237,7 @@ def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         total = np.append(0.0, np.cumsum(likely))
         end = int(np.argmax(total - np.minimum.accumulate(total)))
         begin = int(np.argmin(total[: end + 1]))
-        if (begin, end) == (first, last) or not 1 < end - begin <= len(rows) // 2:
+        if (begin, end) == (first, last) or not 1 < end - begin <= len(rows) // 4:
             break
         first, last = begin, end
     begin, end = rows.time[first] - smeared, rows.time[last - 1] + smeared

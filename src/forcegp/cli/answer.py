@@ -29,7 +29,7 @@ FIRST = {"unknown cause", "joint zero", "gear ratio", "torque constant", "torque
 FIRST |= {"gravity"}
 """Subjects of doubts that change all that follows."""
 TOLD = FIRST | {"stop", "push", "spring", "drift", "elastic joint", "velocity", "sensor delay", "torque sensor", "imu"}
-TOLD |= {"constant channel", "pull", "load", "offset"}
+TOLD |= {"constant channel", "pull", "load", "offset", "cogging"}
 """Those that the answer repeats, and what is wrong but accepted; of what is right only what a force sensor carries."""
 
 
