@@ -125,7 +125,8 @@ def test_what_one_joint_shows_of_friction_near_rest_counts_for_the_others():
     held = ROBOT.inverse_dynamics(*(torch.from_numpy(x) for x in (q, v, 0.0 * v))).numpy() + VISCOUS * v
     for shown in (0.0, 1.5):  # Nm of the first joint
         missed = shown * np.tanh(free[1] / 0.002) * np.exp(-np.abs(free[1]) / 0.05) * [1.0, 0.0]
-        observer = ContactMonitor(TRUE, dt=DT).calibrate([(*free[:2], free[2] + missed)])
+        model = TRUE.with_forces(Coulomb(1e-3, sigma=1000.0, memory=True))
+        observer = ContactMonitor(model, dt=DT).calibrate([(*free[:2], free[2] + missed)])
         assert bool(observer.run(q, v, held + np.array([0.0, 1.0])).alarm[200:].all()) == (shown == 0.0)
 
 

@@ -72,12 +72,12 @@ class ContactMonitor:
     Mattone 2005), with the covariance S = M D_a M + D_f + D_s of free motion (`calibrate`), to which the spread of
     learned forces adds where `model`, `posterior.predictor()` or a `Model`, has one. D_s are errors of friction near
     rest, of the size s exp(-|v| / v_s), filtered as tau is: reversals show how large they are, and a joint that creeps
-    has them for long. Relative to its friction, no joint has less of them than joints have on average: the next motion
-    may reverse where free motion did not. What friction remembers from before the first sample is unknown, and counts
-    until the joint has moved. Where M a of a joint goes beyond what free motion has shown, its errors grow in
-    proportion. An alarm is raised where tau^T S^-1 tau exceeds a threshold that free motion reaches as often as stated.
-    Raises InvalidInput for arguments that do not fit and a monitor not calibrated, DatasetError for too short a free
-    motion.
+    has them for long. Where friction remembers, no joint has less of them, relative to its friction, than joints have
+    on average, for the next motion may reverse where free motion did not; and what it remembers from before the first
+    sample is unknown until the joint has moved. Where M a of a joint goes beyond what free motion has shown, its errors
+    grow in proportion. An alarm is raised where tau^T S^-1 tau exceeds a threshold that free motion reaches as often as
+    stated. Raises InvalidInput for arguments that do not fit and a monitor not calibrated, DatasetError for too short a
+    free motion.
     """
 
     def __init__(self, model: Moving, *, dt: float, bandwidth: float = 2.0) -> None:
@@ -141,10 +141,11 @@ class ContactMonitor:
         (_, force, at_rest, _), which = np.array(best).T, [each[-1] for each in best]
         self.noise = NoiseLevels(self.noise.acceleration, force)
         friction, self.level = self._friction(free)
-        shown = friction > UNSEEN * friction.max()
+        shown = (friction > UNSEEN * friction.max()) & bool(self.past.memory.names)
         share = math.sqrt(float(np.mean(np.square(at_rest[shown] / friction[shown])))) if shown.any() else 0.0
         fades = np.take(SLOW, which)
-        self.near_rest = np.maximum(at_rest, share * friction), speed * np.maximum(fades, np.exp(np.log(fades).mean()))
+        fades = np.maximum(fades, np.exp(np.log(fades).mean())) if shown.any() else fades
+        self.near_rest = np.maximum(at_rest, share * friction), fades * speed
         self.usual = torch.cat([self._errors(each) for each in found]).square().mean(0).sqrt()
         distances = [self._distances(each) for each in found]
         largest = torch.cat([d[: len(d) // block * block].view(-1, block).amax(1) for d in distances])
