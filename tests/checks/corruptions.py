@@ -291,6 +291,8 @@ CORRUPTIONS: Mapping[str, tuple[Corruption, str]] = {
     "differential": (lambda d: mixed(d, [[0.5, 0.5], [-0.5, 0.5]], "u"), "coupled joints"),
     "differential of other gears": (lambda d: mixed(d, [[0.8, 0.3], [-0.3, 0.8]], "u"), "coupled joints"),
     "differential whose motors stick": (lambda d: sticking(d, [[0.5, 0.5], [-0.5, 0.5]]), "coupled joints"),
+    "a wrist's motors": (lambda d: mixed(d, [[1.0, 1.0], [1.0, -1.0]], "qvau"), "coupled joints"),
+    "a slow clock": (lambda d: replace(d, time=1.12 * d.time), "clock"),
 }
 
 

@@ -214,10 +214,22 @@ def test_the_seconds_of_a_push_are_named_and_left_out():
     assert 3.8 < begin < 4.0
     assert 6.0 < end < 6.2
     kept = without_pushes(touched, doubts)
-    assert (len(kept.episodes), round(len(kept), -2)) == (2, 1900)
+    assert (len(kept.episodes), len(kept)) == (2, pytest.approx(1950, abs=10))
     for end, episodes in ((9.0, 2), (10.5, 1)):  # with 3 s and 1.5 s of the log behind it
         found = [look(about="push", what="", numbers={"seconds": [4.0, end]})]
         assert len(without_pushes(touched, found).episodes) == episodes
+
+
+@pytest.mark.parametrize(("at", "left_out"), [(8.0, (8.0, 12.0)), (3.0, (0.0, 3.0))])
+def test_a_torque_that_is_zeroed_anew_is_named_and_the_shorter_part_left_out(at, left_out):
+    log = clean(4, seconds=12.0)
+    doubts = check(column(log, "u", 1, lambda u: u + 0.5 * (log.time > at))).doubts
+    [found] = doubts.of("offset")
+    assert (found.joints, found.numbers["offset"]) == (("lift",), pytest.approx(0.5, rel=0.05))
+    assert found.numbers["seconds"] == pytest.approx(left_out, abs=0.2)
+    assert len(without_pushes(log, doubts)) == pytest.approx(len(log) * (1.0 - np.ptp(left_out) / 12.0), abs=40)
+    both = replace(log, u=log.u + 0.5 * (log.time > at)[:, None])
+    assert not check(both).doubts.of("offset")
 
 
 def test_a_joint_that_stands_still_while_its_torque_goes_on_has_a_dead_encoder():

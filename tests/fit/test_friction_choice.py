@@ -13,7 +13,8 @@ from tests.posterior.arm import arm_model
 from forcegp import Torques, fit, score
 from forcegp.data import Dataset
 from forcegp.evidence import motion_residuals
-from forcegp.fit.friction_choice import WIDTHS, _precision, _Regression, choose_friction, friction_in_words
+from forcegp.fit.friction_choice import WIDTHS, _precision, _Regression, choose_friction
+from forcegp.fit.friction_in_words import friction_in_words
 from forcegp.fit.transmission_choice import SHARE, _clearly
 from forcegp.forces import Actuation, Coulomb, DirectionalFriction, GearFriction, JointFriction, Rotor, Viscous
 from forcegp.inference import OptimizerOptions
@@ -72,24 +73,37 @@ def test_all_points_are_all_rows_whose_past_is_known():
     assert 150 < len(fit(model, log, points=len(log), restarts=1, options=options).training) < len(log)
 
 
+def test_what_is_told_of_a_curve_is_the_line_nearest_to_it():
+    log = log_with(lambda v, rigid: LEVEL * (1.0 + np.sqrt(np.abs(v))) * sign(v))
+    words, slopes = friction_in_words(parts_of(log)[0].model, log, "Nm")
+    told = map(float, words.split(" Nm")[0].split(", "))
+    for dry, slope, v, level in zip(told, slopes.values(), abs(log.v.T), LEVEL, strict=True):
+        v = v[v > 0.1 * np.sqrt(np.square(v).mean())]
+        assert (slope, dry) == pytest.approx(np.polyfit(v, level * (1.0 + np.sqrt(v)), 1), rel=0.03)
+    assert "near rest" not in words
+
+
 COUPLED = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 1.0]])
+WRIST = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0], [0.0, -1.0, 1.0]])
 
 
-@pytest.mark.parametrize("T", [np.eye(3), COUPLED], ids=["joints", "motors"])
+@pytest.mark.parametrize("T", [np.eye(3), COUPLED, WRIST], ids=["joints", "motors", "differential"])
 def test_motors_that_turn_with_two_joints_are_found(T):
     log = log_with(lambda v, rigid: (LEVEL * sign(v @ T.T) + 0.2 * (v @ T.T)) @ T)
     posterior, found = parts_of(log, Rotor())
-    assert found.get("transmission") == (None if T is not COUPLED else T.tolist())
+    coupled = np.count_nonzero(T) - 3
+    assert found.get("transmission") == (T.tolist() if coupled else None)
     laws = {type(law): law for law in posterior.model.laws}
     for kind in (Viscous, GearFriction, Rotor):
         given = laws[kind].transmission
         np.testing.assert_array_equal(np.eye(3) if given is None else given, T)
     np.testing.assert_allclose(laws[GearFriction].values["level"], LEVEL, rtol=0.1)
     np.testing.assert_allclose(laws[Viscous].values["damping"], 0.2, rtol=0.2)
-    words = friction_in_words(posterior.model, log, "Nm")
-    assert ("the motor of bend turns with -1 lift +1 bend" in words) == (T is COUPLED)
-    assert words.count("the motor of") == (T is COUPLED)
-    [first, *_] = friction_in_words(posterior.model, log, "Nm", {log.joint_names[1]}).split(" Nm")
+    words, slopes = friction_in_words(posterior.model, log, "Nm")
+    assert list(slopes.values()) == pytest.approx(3 * [0.2], rel=0.2)
+    assert ("the motor of bend turns with -1 lift +1 bend" in words) == bool(coupled)
+    assert words.count("the motor of") == coupled
+    [first, *_] = friction_in_words(posterior.model, log, "Nm", {log.joint_names[1]})[0].split(" Nm")
     assert first.split(", ")[1] == "–" != first.split(", ")[0]
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from forcegp.checks.torques import Change, Comparison
 from forcegp.data import Dataset
+from forcegp.data.units import UNITS
 from forcegp.doubts import Level
 from forcegp.model import Model
 
@@ -15,9 +16,7 @@ SIGN, NUMBER = 0.5, 1.0
 """What a turned sign, or a free number, must gain at least: it is subtracted from the logarithm of what remains."""
 
 
-UNITS = ("m", 1e3), ("k", 1e-3)
-CUSTOMARY = {"Nm": {"Ncm": 100.0, "ozfin": 141.612, "kgfcm": 10.1972, "lbfin": 8.85075}, "N": {"kgf": 0.101972}}
-"""Prefixes of units, and other units of torques and forces: how many are one Nm or N."""
+PREFIXES = ("m", 1e3), ("k", 1e-3)
 LIKE, CLOSE = np.log(1.5), 0.07
 """Of the logarithm of a factor: how far that of a unit may be, and of one that is near others."""
 
@@ -47,12 +46,12 @@ def like_units(factor: float, si: Sequence[str]) -> tuple[tuple[str, ...], float
     `si` are those of the joints.
     """
     si = tuple(dict.fromkeys(si))
-    for prefix, size in UNITS:
+    for prefix, size in PREFIXES:
         if abs(np.log(factor / size)) < LIKE:
             return tuple(prefix + unit for unit in si), size
-    for name, size in CUSTOMARY[si[0]].items() if len(si) == 1 else ():
-        if abs(np.log(factor / size)) < CLOSE:
-            return (name,), size
+    for unit in UNITS["u"].values():
+        if si == (unit.si,) and unit.per_si != 1.0 and abs(np.log(factor / unit.per_si)) < CLOSE:
+            return (unit.name,), unit.per_si
     return (), factor
 
 

@@ -8,20 +8,22 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from forcegp.checks.causes import NUMBER, Candidate, Cause, changed
+from forcegp.checks.causes import NUMBER, Candidate, Cause, changed, number
 from forcegp.checks.check_input import CheckInput
 from forcegp.checks.torques import Change, Comparison
+from forcegp.doubts import listed
 
 LEAST_SHARE = 0.2  # of the larger weight in a torque, from which on the other joint's is part of it
 ROUNDED = (0.25, 2.5 * NUMBER), (0.01, 4.5 * NUMBER)  # to which weights are rounded, and what these numbers cost
 HALVES = [0.5 * np.array([[a, s * a], [b, -s * b]]) for a, b, s in product((1.0, -1.0), repeat=3)]
 """Weights of two drives that turn one joint together and the other against each other, under all signs."""
+OWN = 5.0  # factor either way up to which two torques are those of their joints, and friction alone that of drives
 PARALLEL = 0.99  # cosine of the angle between the axes of a parallelogram
 EASILY = 20.0  # condition of the weights up to which torques can be told apart again
 
 
-def coupled_joints(now: Comparison, inputs: CheckInput, bad: np.ndarray) -> Iterator[Candidate]:
-    """A joint logged as its own and the one before it, or two torques that drives share; `bad` (nv,) fit badly.
+def coupled_joints(now: Comparison, inputs: CheckInput, bad: np.ndarray, first: bool) -> Iterator[Candidate]:
+    """A joint logged as its own and the one before it, or signals that drives share; `bad` (nv,) fit badly.
 
     With p = L q of a log, power is the same where the joints' torques are L' times those logged.
     """
@@ -39,14 +41,34 @@ def coupled_joints(now: Comparison, inputs: CheckInput, bad: np.ndarray) -> Iter
             what = f"the position of {names[other]} is logged as {how} of {names[one]}, as of a parallelogram, or of a "
             mix = {"q": np.linalg.inv(L), "v": np.linalg.inv(L), "u": L.T}
             yield from _apart(now, f"{what}motor at the base", (one, other), mix, 1.5 * NUMBER)
-        both = bad[[one, other]].all()
-        for cost, weights in (*_weights(now, one, other), *((1.5 * NUMBER, each) for each in HALVES)) if both else ():
+        both, place = bad[[one, other]].all(), np.ix_((one, other), (one, other))
+        found = _needed(now, [one, other]) if both else np.zeros((2, 2))
+        for cost, weights in (*_rounded(found), *((1.5 * NUMBER, each) for each in HALVES)) if both else ():
             each = [f"{x[0]:+.3g} of {names[one]} {x[1]:+.3g} of {names[other]}" for x in weights]
             what = f"the torques of {names[one]} and {names[other]} are those of drives that turn both joints, "
             what += f"{each[0]} and {each[1]} of what these need: a differential"
             U = np.eye(now.rows.nv)
-            U[np.ix_((one, other), (one, other))] = np.linalg.inv(weights)
+            U[place] = np.linalg.inv(weights)
             yield from _apart(now, what, (one, other), {"u": U}, cost)
+        for weights in HALVES if both and first else ():
+            D, U = np.eye(now.rows.nv), np.eye(now.rows.nv)
+            D[place], U[place] = weights.T, np.linalg.inv(weights)
+            what = f"all signals of {names[one]} and {names[other]} are those of motors that turn both: a differential"
+            yield from _apart(now, what, (one, other), {"q": D, "v": D, "u": U}, 1.5 * NUMBER)
+        if now.drives is None and found.diagonal().min() > 1.0 / OWN and found.diagonal().max() < OWN:
+            D = np.eye(now.rows.nv)
+            D[place] = np.linalg.inv(HALVES[0])
+            yield _sticking(now, inputs, (one, other), D)
+
+
+def _sticking(now: Comparison, inputs: CheckInput, joints: tuple[int, int], drives: np.ndarray) -> Candidate:
+    """Torques of joints whose friction is that of these drives."""
+    names = listed(inputs.named(joints))
+    what = f"friction of {names} is that of drives that turn with their sum and their difference: a differential"
+    do = "forcegp auto and forcegp fit --forces gear choose such motors."
+    cause = number("coupled joints", what, joints[0], 0.0, 1.5 * NUMBER, joints=joints, do=do, numbers={})
+    at_drives = now.after(lambda rows: replace(changed()(rows), u=rows.u @ np.linalg.inv(drives)))
+    return cause, replace(at_drives, drives=drives)
 
 
 def _apart(
@@ -74,17 +96,23 @@ def _apart(
         vars(of_drives)["tau"] = now.tau @ np.linalg.inv(mix["u"].T)
         yield cause, of_drives
     else:
-        yield cause, now.after(changing(*"qvau"))
-        yield cause, replace(now.after(changing(*"qva")), drives=np.linalg.inv(mix["q"]))
+        of_joints = now.after(changing(*"qvau"))
+        yield cause, of_joints
+        of_drives = replace(now.after(changing(*"qva")), drives=np.linalg.inv(mix["q"]))
+        vars(of_drives)["tau"] = of_joints.tau @ mix["q"]
+        yield cause, of_drives
 
 
-def _weights(now: Comparison, first: int, second: int) -> Iterator[tuple[float, Float[np.ndarray, "2 2"]]]:
-    """Weights of what two joints need in each of their torques, and their cost; none where each has its own."""
-    pair = [first, second]
+def _needed(now: Comparison, pair: list[int]) -> Float[np.ndarray, "2 2"]:
+    """Weights of what two joints need in each of their torques, beside friction of both."""
     friction = np.concatenate([now.friction[:, k] for k in pair], axis=-1)
     columns = np.c_[now.tau[:, pair], friction, np.ones(len(friction))]
     size = np.linalg.norm(columns, axis=0) + 1e-300
-    found = np.linalg.lstsq(columns / size, now.rows.u[:, pair], rcond=1e-9)[0][:2].T / size[:2]
+    return np.linalg.lstsq(columns / size, now.rows.u[:, pair], rcond=1e-9)[0][:2].T / size[:2]
+
+
+def _rounded(found: Float[np.ndarray, "2 2"]) -> Iterator[tuple[float, Float[np.ndarray, "2 2"]]]:
+    """Weights of torques that share what joints need, and their cost; none where each has its own."""
     for step, cost in ROUNDED:
         rounded = step * np.round(found / step)
         size = np.abs(rounded)

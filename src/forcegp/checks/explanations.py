@@ -52,7 +52,7 @@ def candidates(
         if first or now.rows.nv <= ALL_TRIED:
             yield from _orders(now, inputs, alive)
             yield from _motions(now, inputs, bad & alive)
-            yield from coupled_joints(now, inputs, bad & alive)
+            yield from coupled_joints(now, inputs, bad & alive, first)
         yield from _scanned(now, inputs)
     yield from _linear(now, inputs)
     yield from cogging(now, inputs, bad & alive)

@@ -12,7 +12,7 @@ from forcegp.checks.check_input import QUICK_ROWS, STILL, CheckInput
 from forcegp.checks.moving_base import base_doubts, carried_doubts, stance_doubts, unmeasured_base_doubts
 from forcegp.checks.search import UNKNOWN, Explanation, search
 from forcegp.checks.signals import motion_doubts, sampling_doubts, signal_doubts, target_doubts, without_registers
-from forcegp.checks.torque_doubts import TOUCHES, elastic_doubts, held_points, push, torque_doubts, without_stops
+from forcegp.checks.torque_doubts import TOUCHES, elastic_doubts, held_points, jump, push, torque_doubts, without_stops
 from forcegp.checks.torques import in_motion
 from forcegp.data import Dataset, contact_doubts
 from forcegp.data.configurations import as_vectors
@@ -27,7 +27,7 @@ from forcegp.robots import Robot
 from forcegp.summary import Summary, plain
 
 BEFORE_A_FIT = frozenset(
-    ("contact", "velocity", "acceleration", "delay", "torque unit", "torque constant", "masses", "lengths",
+    ("contact", "velocity", "clock", "acceleration", "delay", "torque unit", "torque constant", "masses", "lengths",
      "joint zero", "gear ratio", "gravity", "stop", "load")
 )  # fmt: skip
 """Subjects that a fit reports also where a person should judge."""
@@ -143,14 +143,18 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
             if not heard or heard[-1].about != UNKNOWN:
                 found, said = sharp, heard
         hidden = said[-1].about == UNKNOWN if said else inputs.sharper is not None  # a filter may hide a resonance
-        if hidden and inputs.most_rows != QUICK_ROWS:
+        thorough = inputs.most_rows != QUICK_ROWS
+        if hidden and thorough:
             elastic = elastic_doubts(inputs, found.log)
             if said and elastic:  # below the resonance other causes are sought
                 with contextlib.suppress(DatasetError):  # too short for that
                     inputs = inputs.below(elastic[0].numbers["cutoff"])
                     found, said = search(inputs)
             said = [*elastic, *said]
-        if inputs.most_rows != QUICK_ROWS and not any(each.about == UNKNOWN or each.level == "wrong" for each in said):
+        thorough &= not {"jumps", "frozen channel"} & {each.about for each in doubts}  # torques are off there, too
+        if thorough and (jumps := list(jump(found, inputs))):
+            said = [*(x for x in said if x.about != UNKNOWN or x.joints != jumps[0].joints), *jumps]
+        elif thorough and not any(each.about == UNKNOWN or each.level == "wrong" for each in said):
             said = [*said, *push(found, inputs)]
         if not moved or {"degrees", "turns", "time unit"} & {doubt.about for doubt in said}:  # torques follow
             said = [doubt for doubt in said if doubt.about not in ("torque unit", "torque constant")]

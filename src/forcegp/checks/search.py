@@ -1,12 +1,13 @@
 """One search over all causes: which of them, one after the other, leave of the torques what a good log leaves."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Bool
 
-from forcegp.checks.causes import SIGN, UNITS, changed
+from forcegp.checks.causes import CLOSE, PREFIXES, SIGN, changed, like_units
 from forcegp.checks.check_input import CheckInput
 from forcegp.checks.explanations import candidates
 from forcegp.checks.fits import EXPLAINED, FAR, FEWEST_ROWS, MUCH_MORE, NOISE, RESTS, WORSE, Explanation
@@ -161,14 +162,16 @@ def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -
     # far less than bodies need is wrong, whatever rotors and friction may hide of it
     factors = np.where(best.shares > WORSE, best._fits[1][np.arange(len(best.chosen)), best.chosen % 2], best.factors)
     off = np.flatnonzero((best.chosen >= 2) & np.isfinite(factors))
+    like: Sequence[str] = ()
     if not explained:
         off = off[(best.exact[off] <= EXPLAINED) & (best.shares[off] > RESTS)]
+        off, like = (off, like) if len(off) > 1 else _alike(best, inputs)
     if len(off) < (1 if explained else 2):
         return
-    less = next((u for u, s in UNITS if all(1.0 / LOADED < abs(x) / s < LOADED for x in factors[off])), "")
-    units = [less + si for si in inputs.unit_of_each("u")]
+    less = next((u for u, s in PREFIXES if all(1.0 / LOADED < abs(x) / s < LOADED for x in factors[off])), "")
+    units = like or [less + si for si in inputs.unit_of_each("u")]
     unit = units[0] if len({*units}) == 1 else ",".join(units)
-    loaded = f"With a load it may be in {unit}: forcegp import --unit u={unit}. " if less else ""
+    loaded = f"With a load it may be in {unit}: forcegp import --unit u={unit}. " if less or like else ""
     joints, factors, errors = inputs.named(off), factors[off], [*map(best.error_of_factor, off.tolist())]
     each = ", ".join(f"{name} {x:.4g} ± {error:.1g}" for name, x, error in zip(joints, factors, errors, strict=True))
     yield Doubt(
@@ -181,6 +184,18 @@ def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -
         joints=joints,
         numbers={"factor": dict(zip(joints, factors.tolist(), strict=True)), "error_95": errors},
     )
+
+
+def _alike(root: Explanation, inputs: CheckInput) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Joints whose factors, such as they are known beside friction, are those of one other unit; and this unit."""
+    off = np.flatnonzero(np.isfinite(root.factors))
+    factors, errors = root.factors[off], np.array([root.error_of_factor(k) for k in off.tolist()])
+    if len(off) < 2 or not (factors > 0.0).all():
+        return off[:0], ()
+    sure = float(factors[np.argmin(errors / factors)])
+    unit, size = like_units(sure, inputs.unit_of_each("u"))
+    alike = (np.abs(factors - size) <= errors + CLOSE * size).all() and errors.min() < CLOSE * size
+    return (off, unit) if unit and alike and not 1.0 / FAR < sure < FAR else (off[:0], ())
 
 
 def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
@@ -253,17 +268,23 @@ def _stop(root: Explanation, joint: int) -> float | None:
 
 
 def _sticks(root: Explanation, joint: int) -> bool:
-    """Whether in motion nothing stays of a torque, and near rest no more than `HELD` times what dry friction holds."""
+    """Whether in motion nothing stays of a torque, and near rest no more than dry friction holds."""
+    rows, held, moves = root.log.rows, held_at_rest(root, joint), in_motion(root.log.rows)[:, joint]
+    moving = replace(root, log=replace(root.log, rows=rows.rows(np.flatnonzero(moves))))
+    return bool(held.any() and held[~moves].all() and moving.rough[joint] <= EXPLAINED)
+
+
+def held_at_rest(root: Explanation, joint: int) -> Bool[np.ndarray, " rows"]:
+    """Rows near rest in which no more stays of a torque than `HELD` times what dry friction holds."""
     rows, tau, friction = root.log.rows, root.log.tau[:, joint], root.log.friction[:, joint]
     moves, u, ones = in_motion(rows)[:, joint], rows.u[:, joint], np.ones(len(tau))
-    if moves.sum() < FEWEST_ROWS or moves.all():
-        return False
-    moving = replace(root, log=replace(root.log, rows=rows.rows(np.flatnonzero(moves))))
+    if moves.sum() < FEWEST_ROWS:
+        return np.zeros(len(tau), dtype=bool)
     columns = np.c_[tau, friction, ones, -ones]
     number, _ = positive_fit(columns[moves], u[moves])
     left = np.abs(u - columns @ number)
     holds = number[-2 - len(WIDTHS) : -2].sum() + np.sqrt(np.square(left[moves]).mean())
-    return bool(moving.rough[joint] <= EXPLAINED and left[~moves].max() <= HELD * holds)
+    return ~moves & (left <= HELD * holds)
 
 
 def _where(root: Explanation, joint: int, inputs: CheckInput) -> tuple[str, str, float]:

@@ -403,7 +403,7 @@ def _differences(
         guess, unit = usual.get(known if name == "v" else 0.0, ("", None))
         if kind:
             groups.setdefault((kind, known, guess, unit), []).append(joint)
-    what, units = EVERY_QUANTITY[name], {x: inputs.stated_units(x) for x in "qv"}
+    units = {x: inputs.stated_units(x) for x in "qv"}
     for (_, known, _, unit), joints in groups.items():
         if unit and (len(joints) == len(fits) or all(abs(abs(fits[k][0]) / known - 1.0) < SURE for k in joints)):
             signal, word = ("q", "deg") if known == DEGREE else ("v", unit)
@@ -413,7 +413,8 @@ def _differences(
     other = {x: tuple(own) for x, own in units.items() if own != inputs.stated_units(x)}
     for (kind, _, guess, unit), joints in groups.items():
         factor, shift, unexplained = fits[joints[0]]
-        named, every = inputs.named(joints), len(joints) == len(of) > 2
+        factors = [fits[joint][0] for joint in joints]
+        named, every, what = inputs.named(joints), len(joints) == len(of) > 2, EVERY_QUANTITY[name]
         one = f"the {what} of {'all joints' if every else listed(named)} is"
         guess = unit if unit and inputs.stated_units("q")[joints[0]] != inputs.unit_of_each("q")[joints[0]] else guess
         level: Level = "wrong"
@@ -428,11 +429,13 @@ def _differences(
             level = "wrong" if abs(factor - 1.0) > 4 * CLOSE else "look"
             seen = f"{one} {factor:.4g} times d{source}/dt{guess and f': {name} looks like {guess}'}."
             remedy = f"Convert {name} or {source} to SI units, or remove the gear ratio."
+            if name == "v" and not guess and len(joints) == len(of) > 1 and max(factors) - min(factors) < SURE:
+                remedy = f"All joints share it: divide the time by it, if a clock or a rate is wrong. {remedy}"
+                what = "clock" if level == "look" else what
         else:
             level, size = "look", f"{1e3 * abs(shift):.1f} ms {'later' if shift > 0 else 'earlier'}"
             seen = f"{one} logged {size} than d{source}/dt: {abs(shift) / step:.1f} time steps."
             remedy = f"The robot filtered it: compute {name} from positions (forcegp import --cutoff auto)."
-        factors = [fits[joint][0] for joint in joints]
         if max(factors) - min(factors) >= CLOSE * abs(factor):
             seen += f" Factors: {', '.join(f'{each:.3g}' for each in factors)}."
         correction: dict[str, Any] = {"unit": other} if unit and other else {}

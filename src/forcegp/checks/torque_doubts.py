@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
 from forcegp.checks.fits import RARELY
-from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, UNKNOWN, Explanation
+from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, UNKNOWN, Explanation, held_at_rest
 from forcegp.checks.torques import WIDTHS, Comparison, in_motion, stretch
 from forcegp.data import Dataset, estimate_delay, with_strokes
 from forcegp.data.views import consecutive, rests
@@ -30,8 +30,9 @@ SPRINGS, DAMPING = tuple(np.geomspace(1.0, 40.0, 24).tolist()), (0.02, 0.1, 0.3)
 BELOW = 1.0 / 3.0  # of a resonance, where a robot is as good as rigid
 MOST_ROWS = 2000  # on which that is judged
 STIFFNESS = 50.0, 200.0, 800.0  # of what friction remembers, over the reciprocal deviation of positions
-SURE, TELLS = 200.0, 30.0
+SURE, TELLS = 150.0, 30.0
 """Nats that a stretch of time in which something is touched explains: in all, or one of each row, and of a joint."""
+BRIEF = 0.05  # of the rows, for which a torque is another
 ENDS = 5  # times that the ends of such a stretch are sought anew, as those that are most likely (Page 1954)
 SEEN, WARMER = 1e-3, 0.1  # share of the largest direction of columns; logarithm of a ratio of friction that is told
 SHORT = 2.0  # s, of what stays between pushes, which filters and splits have no use for; of rests at the ends of a log
@@ -214,7 +215,14 @@ def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     if len(rows) < FEWEST_ROWS:
         return
     more = _remembered(found, inputs)  # friction that remembers looks like a push where a joint hardly moves
-    left, tried = found.left_beside(more), list[tuple[float, int, int, np.ndarray, np.ndarray]]()
+    held = np.stack([held_at_rest(found, joint) for joint in range(rows.nv)], axis=1)
+
+    def left_of(told: np.ndarray | None = None) -> np.ndarray:
+        left = found.left_beside(more, told)
+        others = np.square(left).mean(axis=0, where=~held | held.all(axis=0))
+        return np.where(held, np.sqrt(others), left)  # stiction holds anything: such rows tell neither for nor against
+
+    left, tried = left_of(), list[tuple[float, int, int, np.ndarray, np.ndarray]]()
     for own in left.T[left.any(axis=0)]:
         *_, first, last = stretch(np.hstack([ones, -ones, own[:, None]]))
         # in the middle of the log, a quarter of it at most, and longer than what a filter makes of a turn
@@ -231,11 +239,11 @@ def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         return
     for _ in range(ENDS):  # what is touched tells no masses, and hides behind those that fit it as well
         inside = (place >= first) & (place < last)
-        left = np.square(found.left_beside(more, ~inside)[:, joints])
+        left = np.square(left_of(~inside)[:, joints])
         power = np.stack([left[each].mean(0) + 1e-300 for each in (inside, ~inside)])
-        likely = (left * (1.0 / power[1] - 1.0 / power[0]) - np.log(power[0] / power[1])).sum(axis=1)
-        total = np.append(0.0, np.cumsum(likely))
-        end = int(np.argmax(total - np.minimum.accumulate(total)))
+        likely = left * (1.0 / power[1] - 1.0 / power[0]) - np.log(power[0] / power[1])
+        total = np.append(0.0, np.cumsum((likely * ~held[:, joints]).sum(axis=1)))
+        end = len(rows) - int(np.argmax((total - np.minimum.accumulate(total))[::-1]))  # the last, after rows at rest
         begin = int(np.argmin(total[: end + 1]))
         if (begin, end) == (first, last) or not 1 < end - begin <= len(rows) // 4:
             break
@@ -249,6 +257,36 @@ def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         do=f"Leave them out by forcegp import --without {begin:.2f},{end:.2f}, as forcegp auto does.",
         joints=inputs.named(joints),
         numbers={"seconds": [float(begin), float(end)], "gains": gains[joints].tolist()},
+    )
+
+
+def jump(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
+    """The torque of one joint that is another by a constant from some time on, beside any masses and friction."""
+    rows, place = found.log.rows, np.arange(len(found.log.rows))[:, None]
+    if len(rows) < FEWEST_ROWS or len(rows.episodes) > 1:
+        return
+    left = found.left_beside(more := _remembered(found, inputs))
+    after = np.cumsum(left[::-1], axis=0)[::-1]  # of all rows from each on
+    begins = np.argmax(np.square(after) / np.maximum(place * (1.0 - place / len(rows)), BRIEF * len(rows)), axis=0)
+    step = place >= begins
+    beside = found.left_beside(np.concatenate([more, step[..., None]], axis=-1))
+    powers = [np.square(x).sum(axis=0) + 1e-300 for x in (left, beside)]
+    nats = 0.5 * len(rows) * np.log(powers[0] / powers[1])
+    joint = int(np.argmax(nats))
+    if nats[joint] <= SURE or (np.delete(nats, joint) > TELLS).any():  # a load that is let go shows in several joints
+        return
+    size = float((powers[0] - powers[1])[joint] / (left * step).sum(axis=0)[joint])
+    name, first, smeared = inputs.names[joint], int(begins[joint]), 1.5 / inputs.compared_cutoff
+    time = rows.time[first]
+    begin, end = inputs.log.time[[0, -1]]
+    begin, end = (begin, time + smeared) if 2 * first < len(rows) else (time - smeared, end)
+    yield look(
+        about="offset",
+        what=f"the torque of {name} is {size:+.3g} {inputs.unit_of_each('u')[joint]} from what it was before, from "
+        f"{time:.4g} s on: its sensor or amplifier has another zero there.",
+        do=f"Leave the shorter part out by forcegp import --without {begin:.2f},{end:.2f}, as forcegp auto does.",
+        joints=(name,),
+        numbers={"offset": size, "seconds": [float(begin), float(end)], "nats": float(nats[joint])},
     )
 
 
@@ -358,7 +396,9 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
 
 def without_pushes(log: Dataset, doubts: Sequence[Doubt]) -> Dataset:
     """The log without the seconds of pushes and loads; of several episodes, whose times repeat, as it is."""
-    seen = [doubt for doubt in doubts if doubt.about in ("push", "load", UNKNOWN) and "seconds" in doubt.numbers]
+    seen = [
+        doubt for doubt in doubts if doubt.about in ("push", "load", "offset", UNKNOWN) and "seconds" in doubt.numbers
+    ]
     spans = [doubt.numbers["seconds"] for doubt in seen if len(log.episodes) == 1]
     touched = [np.flatnonzero((log.time >= begin) & (log.time <= end)) for begin, end in spans]
     if not touched:

@@ -26,7 +26,7 @@ def short_name(name: str) -> str:
 
 
 FIRST = {"unknown cause", "joint zero", "gear ratio", "torque constant", "torque unit", "force sensor", "lengths"}
-FIRST |= {"gravity"}
+FIRST |= {"gravity", "clock"}
 """Subjects of doubts that change all that follows."""
 TOLD = FIRST | {"stop", "push", "spring", "drift", "elastic joint", "velocity", "sensor delay", "torque sensor", "imu"}
 TOLD |= {"constant channel", "pull", "load", "offset", "cogging"}
@@ -43,7 +43,7 @@ def answer_lines(
     still: Sequence[str],
 ) -> list[tuple[str, str]]:
     """What was found, in ten lines."""
-    from forcegp.fit.friction_choice import friction_in_words  # PyTorch is not needed for a page of help
+    from forcegp.fit.friction_in_words import friction_in_words  # PyTorch is not needed for a page of help
 
     values, robot, best = identified.estimates, identified.model.robot, scores.recommended
     assert best is not None, "a model was scored"
@@ -76,15 +76,18 @@ def answer_lines(
     def but_for(names: Sequence[str]) -> str:
         return f"; of {', '.join(names)} not known from this log" if names else ""
 
-    def each(field: str, unit: str) -> str:
+    def each(field: str, unit: str, lines: Mapping[str, float] = {}) -> str:
         own = {name: values[f"{field}.{name}"] for name in joints}
-        lost = [name for name, value in own.items() if name in still or value.interval[0] <= 0.0]
-        told = ", ".join("–" if x in lost else f"{own[x].value:.3g}" for x in own) + f" {unit}{but_for(lost)}"
+        lost = [x for x, value in own.items() if x in still or lines.get(x, value.interval[0]) <= 0.0]
+        numbers = {name: lines.get(name, value.value) for name, value in own.items()}
+        told = ", ".join("–" if x in lost else f"{numbers[x]:.3g}" for x in own) + f" {unit}{but_for(lost)}"
         return told if len(lost) < len(own) else "not known from this log"
 
+    dry, lines = friction_in_words(identified.model, recording, force, still) if joints else ("", {})
+    bent = {name for name in joints if f"gear.root.{name}" in values}
     of_joints = [
-        ("dry friction", friction_in_words(identified.model, recording, force, still) + but_for(still)),
-        ("viscous", each("viscous", f"{force} per {q}/s")),
+        ("dry friction", dry + but_for(still)),
+        ("viscous", each("viscous", f"{force} per {q}/s", {x: lines[x] for x in bent})),
         ("rotors", each("rotor", inertia)),
         *(("springs", each(x, f"{force} per {q}")) for x in ["spring.stiffness"] if f"{x}.{joints[0]}" in values),
     ] if joints else []  # fmt: skip

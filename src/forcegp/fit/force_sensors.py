@@ -21,6 +21,7 @@ from jaxtyping import Float
 from forcegp.data import Dataset
 from forcegp.data.dataset import FORCE, IMU
 from forcegp.data.imu import SECONDS, SHIFTS, expected, late_doubts, short_means
+from forcegp.data.units import UNITS
 from forcegp.data.views import tensors
 from forcegp.doubts import Doubt, look, ok, wrong
 from forcegp.evidence import torque_regressor
@@ -37,7 +38,7 @@ _EVERY = [np.eye(3)[list(k)] * signs for k in permutations(range(3)) for signs i
 NAME = compile(r"[\w.\[\]/]+")  # of a column that stands alone
 Shown = Callable[..., Float[np.ndarray, "windows k"]]
 Leaves = Callable[[np.ndarray], float]
-UNITS = {"kN": 1e3, "mN": 1e-3, "kgf": 9.80665, "lbf": 4.4482216152605}  # N
+IN_N = {name: 1.0 / unit.per_si for name, unit in UNITS["force"].items() if name != "N"}
 AXES = sorted(_EVERY, key=lambda Q: (abs(np.trace(Q)) < 3.0, -np.trace(Q), -np.linalg.det(Q)))
 """As it is, turned altogether, other axes; then those that are no rotation."""
 TARE = "Tare it; or take it off the columns, as in forcegp import --force 'FRAME=FX-1.2,FY,FZ'."
@@ -114,7 +115,7 @@ def _fitted(x: Float[np.ndarray, " rows"], y: Float[np.ndarray, " rows"]) -> tup
 
 def _unit_of(factor: float) -> str:
     """The unit in which values times this factor are N; empty for none."""
-    return next((name for name, size in UNITS.items() if factor > 0.0 and abs(np.log(factor / size)) < NEAR), "")
+    return next((name for name, size in IN_N.items() if factor > 0.0 and abs(np.log(factor / size)) < NEAR), "")
 
 
 def _vector(values: Iterable[float], form: str = ".3g") -> str:
@@ -207,7 +208,7 @@ def _of_tool(dataset: Dataset, model: Model, sensor: _Sensor, beside_file: Shown
         fits, turned = f"what {mass:.3g} {where} need there", "that is, give the columns with a minus."
         return sensor.in_other_axes(fits, along, Q, turned, **known), measured, None
     if left < OTHER * as_stated and (unit := _unit_of(factor)):
-        kind, says = look, f"carries {mass * UNITS[unit]:.3g} {where} if it is in {unit}, as torques need it"
+        kind, says = look, f"carries {mass * IN_N[unit]:.3g} {where} if it is in {unit}, as torques need it"
         do = f"State its unit: forcegp import --unit force={unit}."
     elif left < FOLLOWS:
         says = f"{says}, and torques need {factor:.3g} times that"

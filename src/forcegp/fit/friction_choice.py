@@ -1,6 +1,6 @@
 """Which parts of gear friction a log shows, joint by joint, by stretches held out: memory, load, speed, breakaway."""
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import pairwise
@@ -416,31 +416,3 @@ def _with_transmission(model: Model, transmission: Any) -> Model:
         for force in model.forces
     )
     return model if transmission is None else replace(model, forces=tuple(forces))
-
-
-def friction_in_words(model: Model, log: Dataset, unit: str, still: Container[str] = ()) -> str:
-    """Dry friction at the speed and load of the log (root mean squares), near rest, and its memory; not of `still`."""
-    [law] = [law for law in model.laws if isinstance(law, DryFriction)]
-    state = law.seen(model.state(*tensors(with_memory(log, model), model.robot.device)[:3]))
-    v, load = (x.square().mean(0).sqrt() for x in (state.v, state.delivered))
-    numbers = (law.level_at((speed, load), law.values).expand(v.shape) for speed in (v, 0.0 * v))
-    joints = [log.joint_names.index(name) for name in model.robot.single_joint_names]
-    moving, rest = (each[joints] for each in numbers)
-
-    def listed(numbers: Tensor, names: Iterable[str] = model.robot.single_joint_names) -> str:
-        each = zip(names, numbers.tolist(), strict=True)
-        return ", ".join("–" if name in still else f"{number:.3g}" for name, number in each)
-
-    text = f"{listed(moving)} {unit}"
-    text += f", near rest {listed(rest)}" if bool((rest != moving).any()) else ""
-    for name, row in zip(log.joint_names, law.turning(torch.eye(log.nv).to(v)).mT.tolist(), strict=True):
-        terms = [f"{x:+.3g} {other}" for other, x in zip(log.joint_names, row, strict=True) if x]
-        text += f"; the motor of {name} turns with {' '.join(terms)}" if len(terms) > 1 else ""
-    if not (remember := law.memory_joints(model.robot)):
-        return text
-    slides = {model.robot.joint(log.joint_names[j]).type == "prismatic" for j in remember}
-    length = " or ".join(("mrad", "mm")[slide] for slide in sorted(slides))
-    ways = 1e3 / law.values["sigma"].expand(v.shape)[remember]
-    names = [log.joint_names[j] for j in remember]
-    who = "all joints" if len(remember) == len(joints) else ", ".join(names)
-    return f"{text}; {who} remember reversals, over {listed(ways, names)} {length}"

@@ -91,8 +91,9 @@ def _candidates(model: Model, T: Float[np.ndarray, "nv nv"]) -> Iterator[tuple[n
     pairs = {(drive.joint, drives[parent].joint) for drive, parent in bodies if parent >= 0}
     for a, b in sorted(pairs | {pair[::-1] for pair in pairs}):
         if a != b and slides[a] is not None and slides[a] == slides[b] and T[a, b] == 0.0:
-            for sign in (1.0, -1.0):
-                new = T + sign * np.outer(np.eye(nv)[a], np.eye(nv)[b])
+            unit = np.outer(np.eye(nv)[a], np.eye(nv)[b])
+            for more in (unit, -unit, *([unit - unit.T] if T[b, a] == 0.0 else [])):  # the last is a differential
+                new = T + more
                 if np.linalg.matrix_rank(new) == nv:
                     yield new, [a, b]
     for force in model.laws:
@@ -106,6 +107,7 @@ def _candidates(model: Model, T: Float[np.ndarray, "nv nv"]) -> Iterator[tuple[n
 
 
 def _clearly(without: Float[np.ndarray, "stretches nv"], best: np.ndarray, joints: list[int]) -> bool:
-    gain = (without - best).sum(1)
-    least = max(ERRORS * np.sqrt(len(gain)) * gain.std(ddof=1), SHARE * without[:, joints].sum())
-    return bool(gain.sum() > least)
+    """By ratios of each stretch: in absolute numbers those of fast motion would decide alone."""
+    gains = np.log(without[:, joints].sum(1) + 1e-300) - np.log(best[:, joints].sum(1) + 1e-300)
+    surely = gains.mean() > ERRORS * gains.std(ddof=1) / np.sqrt(len(gains))
+    return bool(surely and (without - best).sum() > SHARE * without[:, joints].sum())

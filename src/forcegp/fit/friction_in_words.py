@@ -1,0 +1,62 @@
+"""Friction as users state it: dry, near rest, and viscous, of the curve that a fit found."""
+
+from collections.abc import Container, Iterable
+
+import torch
+from torch import Tensor
+
+from forcegp.data import Dataset, with_memory
+from forcegp.data.views import tensors
+from forcegp.forces import DryFriction, Viscous
+from forcegp.model import Model
+
+SLIDES = 0.1  # of the root mean square speed: below it friction sticks, or turns
+RISES = 1.01  # times dry friction, from which that near rest is another
+
+
+def friction_in_words(
+    model: Model, log: Dataset, unit: str, still: Container[str] = ()
+) -> tuple[str, dict[str, float]]:
+    """Dry friction, that near rest, its memory; and the slope of each joint: of the line nearest to the fitted curve.
+
+    A root of the speed shares slope and level with viscous and dry friction, whose own numbers are then neither. The
+    line is that of the log's speeds beyond `SLIDES` of their root mean square, at that of the load; not of `still`.
+    """
+    [law], [viscous] = (
+        [x for x in model.laws if isinstance(x, DryFriction)],
+        [x for x in model.laws if isinstance(x, Viscous)],
+    )
+    state = law.seen(model.state(*tensors(with_memory(log, model), model.robot.device)[:3]))
+    v, load = state.v.abs(), state.delivered.square().mean(0).sqrt()
+    level = law.level_at((v, load), law.values)
+    slides = v > SLIDES * v.square().mean(0).sqrt()
+    count = slides.sum(0).clamp_min(1)
+    mean = (slides * v).sum(0) / count
+    from_mean = slides * (v - mean)
+    slope = (from_mean * level).sum(0) / from_mean.square().sum(0).clamp_min(1e-300)
+    dry = (slides * level).sum(0) / count - slope * mean
+    joints = [log.joint_names.index(name) for name in model.robot.single_joint_names]
+    at_rest = law.level_at((0.0 * mean, load), law.values).expand(log.nv)
+    moving, rest = (each[joints] for each in (dry, torch.maximum(dry, at_rest)))
+    slopes = dict(
+        zip(model.robot.single_joint_names, (slope + viscous.values["damping"])[joints].tolist(), strict=True)
+    )
+
+    def listed(numbers: Tensor, names: Iterable[str] = model.robot.single_joint_names) -> str:
+        each = zip(names, numbers.tolist(), strict=True)
+        return ", ".join("–" if name in still else f"{number:.3g}" for name, number in each)
+
+    text = f"{listed(moving)} {unit}"
+    text += f", near rest {listed(rest)}" if bool((rest > RISES * moving).any()) else ""
+    for name, row in zip(log.joint_names, law.turning(torch.eye(log.nv).to(v)).mT.tolist(), strict=True):
+        terms = [f"{x:+.3g} {other}" for other, x in zip(log.joint_names, row, strict=True) if x]
+        text += f"; the motor of {name} turns with {' '.join(terms)}" if len(terms) > 1 else ""
+    if not (remember := law.memory_joints(model.robot)):
+        return text, slopes
+    slide_types = {model.robot.joint(log.joint_names[j]).type == "prismatic" for j in remember}
+    length = " or ".join(("mrad", "mm")[slide] for slide in sorted(slide_types))
+    ways = 1e3 / law.values["sigma"].expand(log.nv)[remember]
+    names = [log.joint_names[j] for j in remember]
+    who = "all joints" if len(remember) == len(joints) else ", ".join(names)
+    text += f"; {who} remember reversals, over {listed(ways, names)} {length}"
+    return text, slopes
