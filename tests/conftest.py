@@ -32,7 +32,6 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 
 @pytest.fixture(scope="session")
 def repository() -> Path:
-    """The root of this checkout."""
     return REPOSITORY
 
 

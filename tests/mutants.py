@@ -91,7 +91,6 @@ def noticed(package: str, folder: Path) -> bool:
 
 
 def main() -> int:
-    """Draw, run, and print what survives."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("packages", nargs="*", metavar="PACKAGE", help="draws from these only (default: from all)")
     parser.add_argument("--count", type=int, default=60, help="mutants (default: 60)")

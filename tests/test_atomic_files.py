@@ -35,7 +35,6 @@ def mode(path) -> int:
 
 @pytest.fixture
 def umask():
-    """Set a umask for one test."""
     before = os.umask(0o022)
     yield os.umask
     os.umask(before)
@@ -48,7 +47,6 @@ def make_folder(path, **files: str) -> None:
 
 
 def break_renames_to(monkeypatch, target, error) -> None:
-    """Let renames to `target` fail, once."""
     left = [error]
     for name in ("rename", "replace"):
         own = getattr(os, name)

@@ -19,7 +19,6 @@ def data():
 
 @pytest.fixture(scope="module")
 def shown(data):
-    """One value of every kind, by name."""
     quick = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
     posterior = fit(data.model.with_forces(JointForces()), data, **quick)
     in_air = arm_model(0, forces=(Actuation(), RigidBodies(), Viscous()), baumgarte=None)

@@ -196,7 +196,6 @@ def _beside(target: Path) -> Iterator[Path]:
 
 
 def _remove_if_left(entry: Path) -> None:
-    """Delete a hidden folder, unless the process that made it lives."""
     from filelock import FileLock, Timeout
 
     lock = FileLock(entry / LOCK)

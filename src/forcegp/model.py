@@ -89,9 +89,7 @@ class Model(Summary):
 
         All laws of dry friction are of one part: that of the robot's file goes where another one is added.
         """
-        added = tuple(
-            each for several in forces for each in (several if isinstance(several, tuple | list) else (several,))
-        )
+        added = tuple(each for some in forces for each in (some if isinstance(some, tuple | list) else (some,)))
         how = {"matrix": self.actuation.matrix, "names": self.actuation.names}
         added = tuple(replace(x, **how) if isinstance(x, Actuation) and x.matrix is None else x for x in added)
         laws = [force for force in added if isinstance(force, Law)]
@@ -263,12 +261,10 @@ class Model(Summary):
 
     @cached_property
     def _u_is_delivered(self) -> bool:
-        """Whether u is the force of every joint, and nothing else."""
         own = self.actuation
         return own.is_exact and own.matrix is None and len(self.inputs) == len(own.names)
 
     def _delivered(self, state: State) -> Tensor:
-        """Joint forces of all actuators."""
         pushing = (force.delivered(state) for force in self.laws if isinstance(force, Thrusters))
         return sum(pushing, self.actuation.delivered(state))
 
@@ -373,9 +369,7 @@ class Model(Summary):
     def from_dict(cls, stored: Mapping[str, Any]) -> "Model":
         """The model that `to_dict` stored. Raises FileFormatError for anything else."""
         if stored.get("format") != FORMAT_VERSION:
-            raise FileFormatError(
-                f"stored model has format {stored.get('format')!r}; this forcegp reads {FORMAT_VERSION}"
-            )
+            raise FileFormatError(f"stored model has format {stored.get('format')!r}; forcegp reads {FORMAT_VERSION}")
         try:
             for key, kind in STORED_PARTS.items():
                 if not isinstance(stored[key], kind):

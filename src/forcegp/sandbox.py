@@ -174,7 +174,6 @@ def _without_appearance(mujoco: Any, spec: Any) -> list[str]:
 
 
 def _has_mass(mujoco: Any, spec: Any, geom: Any) -> bool:
-    """Whether the mass of a body contains that of this shape."""
     compiler, kinds = spec.compiler, mujoco.mjtInertiaFromGeom
     given = compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_AUTO and geom.parent.explicitinertial
     low, high = compiler.inertiagrouprange

@@ -18,5 +18,4 @@ class Tool:
         return data.oMf[model.getFrameId(self.contact.frame)].act(np.array(self.contact.point))
 
     def speed(self, q: np.ndarray, v: np.ndarray, step: float = 1e-6) -> float:
-        """By central differences along v."""
         return float(np.linalg.norm(self.position(q + step * v) - self.position(q - step * v)) / (2.0 * step))

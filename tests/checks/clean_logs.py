@@ -64,7 +64,6 @@ def free_log(seed: int) -> Dataset:
 
 
 def clean_logs(seed: int) -> Iterator[tuple[str, Dataset]]:
-    """One log of every kind."""
     for name, robot in ROBOTS.items():
         yield name, clean(robot(), seed, noise=("a", "qvu", "none")[seed % 3])
         yield f"{name} rests", rests(robot(), seed)

@@ -114,7 +114,6 @@ def on_a_line(seed: int, *, rate: float = 250.0, seconds: float = 8, noise: floa
 
 
 def at(data: Dataset, names: str, sign: list[float]) -> Dataset:
-    """Signals times one factor per joint."""
     return replace(data, **{name: getattr(data, name) * np.array(sign) for name in names})
 
 
@@ -125,7 +124,6 @@ def degrees(data: Dataset) -> list[float]:
 
 
 def late(data: Dataset, names: str, seconds: float) -> Dataset:
-    """Signals of all joints, logged late."""
     moved = {
         name: np.stack([np.interp(data.time - seconds, data.time, x) for x in getattr(data, name).T], axis=1)
         for name in names

@@ -51,7 +51,6 @@ def clean(seed: int, model: Model | None = None, *, seconds: float = 7.0, noise:
 
 
 def column(data: Dataset, name: str, joint: int, change: Callable[[np.ndarray], np.ndarray]) -> Dataset:
-    """With one column changed."""
     values = getattr(data, name).copy()
     values[:, joint] = change(values[:, joint])
     return replace(data, **{name: values})

@@ -85,7 +85,6 @@ def test_noise_of_the_acceleration_is_no_cause():
 
 
 def said(data):
-    """What is not ok, worst first."""
     return [each for each in check(data).doubts if each.level != "ok"]
 
 

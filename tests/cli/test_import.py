@@ -16,7 +16,6 @@ ARM = model("continuous").robot.urdf_text
 
 @pytest.fixture
 def folder(tmp_path):
-    """With the robot of the logs."""
     (tmp_path / "arm.urdf").write_text(ARM)
     return tmp_path
 

@@ -70,7 +70,6 @@ def hidden(folder: Path) -> list[Path]:
 
 
 def refused(words: list[str], capfd) -> str:
-    """The one line of a refused command."""
     capfd.readouterr()
     assert main(words) == 2, capfd.readouterr().err
     told = capfd.readouterr()

@@ -41,7 +41,6 @@ def controller(predictor, **changes):
 
 
 def prepared(control):
-    """The controller with a first plan."""
     for _ in range(20):
         control.plan = control.improved(control.plan, torch.ones(1), torch.zeros(1))
     return control

@@ -62,7 +62,6 @@ def tumbling(
 
 
 def jumbled(log: Dataset) -> Dataset:
-    """Random signs of the quaternions."""
     q, turn = log.q.copy(), slice(3, 7)
     q[:, turn] *= np.random.default_rng(0).choice([-1.0, 1.0], len(q))[:, None]
     return replace(log, q=q)

@@ -67,7 +67,6 @@ def make_inputs(folder: Path, forcegp) -> None:
 
 
 def start(line: list[str], folder: Path) -> subprocess.Popen[str]:
-    """The command as a process of its own."""
     command = [sys.executable, "-m", "forcegp", *line]
     streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
     return subprocess.Popen(command, cwd=folder, env={**os.environ, "COLUMNS": "100"}, text=True, **streams)

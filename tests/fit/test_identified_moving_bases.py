@@ -42,7 +42,6 @@ def identified(log, model=None, laws=(), evidence=None, strength=1.0, **options)
 
 
 def parameters_of(posterior):
-    """Standard parameters of every body."""
     return standard_parameters(posterior.model.robot).numpy()
 
 

@@ -29,7 +29,6 @@ def slide(viscous: float, coulomb: float) -> Model:
 
 
 def line(v: float) -> float:
-    """Friction that the laws describe [N]."""
     return 3.0 * v + 4.0 * np.tanh(v / 0.02)
 
 

@@ -38,7 +38,6 @@ def identified(data: Dataset, model: Model, *laws, evidence=None, strength: floa
 
 
 def missing(posterior, data: Dataset) -> np.ndarray:
-    """What the torques of a log lack."""
     return motion_residuals(data, posterior.model)[0]
 
 

@@ -71,7 +71,6 @@ FORMULAS = {
 
 
 def at_motors(transmission):
-    """Makes rotors with this transmission."""
     return partial(Rotor, transmission=transmission)
 
 

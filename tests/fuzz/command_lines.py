@@ -78,7 +78,6 @@ def lines(draw: st.DrawFn) -> Line:
 
 
 def words_of(case: Line) -> list[str]:
-    """The words after `forcegp`."""
     line = list(words(MOVING[case.moving] if case.moving else VALID[case.command]))
     for where, how, option, value in case.edits:
         place = where % len(line)
@@ -113,7 +112,6 @@ def check_words(case: Line, folder: Path) -> None:
 
 
 def check(case: Line, folder: Path) -> None:
-    """The whole command."""
     line = words_of(case)
     if line[0] in ("simulate", "demo") and line[0] == case.command:
         line = [word for word in line if word not in LARGE] + ["--none-such", "1"]  # a run takes seconds to hours

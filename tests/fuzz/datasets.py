@@ -78,7 +78,6 @@ CASES = st.builds(
 
 
 def write(case: DataFile, path: Path) -> Path:
-    """The changed dataset."""
     shutil.copyfile(INPUTS.folder / case.base, path)
     with h5py.File(path, "r+") as file:
         for change in case.changes:

@@ -88,7 +88,6 @@ CASES = st.one_of(
 
 
 def check(case: Log, folder: Path) -> None:
-    """`forcegp import` of the changed log."""
     (folder / "pair.urdf").write_text(PAIR)
     path, change = folder / case.base, case.change
     source = INPUTS.folder / case.base

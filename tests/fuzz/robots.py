@@ -60,14 +60,12 @@ NEW = st.builds(
 
 
 def write(case: RobotFile, path: Path) -> None:
-    """The robot file."""
     (path.parent / "secret.txt").write_text(SECRET)
     content = PROLOGUES[case.prologue] + edited_xml(ROBOTS[case.robot], case.edits).encode("utf-8", "replace")
     path.write_bytes(content if case.damage is None else damaged(content, case.damage))
 
 
 def check(case: RobotFile, folder: Path) -> None:
-    """Refused, or a robot with numbers."""
     path = folder / ("arm.xml" if case.robot.startswith("mjcf") else "arm.urdf")
     write(case, path)
     try:

@@ -87,7 +87,6 @@ def test_names_that_are_no_text_are_refused_in_one_line(place, words):
 
 @pytest.fixture
 def run(tmp_path):
-    """A stored model to change."""
     return Path(shutil.copytree(INPUTS.folder / "structured", tmp_path / "run"))
 
 

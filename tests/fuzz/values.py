@@ -96,7 +96,6 @@ DAMAGE = st.builds(
 
 
 def damaged(content: bytes, damage: Damage) -> bytes:
-    """The content after the damage."""
     generator = random.Random(damage.seed)
     place = generator.randrange(len(content) + 1)
     count = generator.choice((1, 4, 40, 1000))
@@ -198,7 +197,6 @@ PROLOGUES = {
 
 
 def edited_xml(text: str, edits: list[XmlEdit]) -> str:
-    """The text after these edits."""
     root = ET.fromstring(text)
     for edit in edits:
         elements = list(root.iter())

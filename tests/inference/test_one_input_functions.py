@@ -53,7 +53,6 @@ def points(centers: torch.Tensor) -> torch.Tensor:
 
 
 def close(found: torch.Tensor, expected: torch.Tensor, relative: float) -> None:
-    """Relative to the largest value."""
     torch.testing.assert_close(found, expected, rtol=0.0, atol=relative * float(expected.abs().max()))
 
 

@@ -17,7 +17,6 @@ def folder_of_work(_):
 
 
 def slow_first(index):
-    """The first argument ends last."""
     time.sleep(0.2 if index == 0 else 0.0)
     return index
 
@@ -31,7 +30,6 @@ def wait_for_the_gate(gate, index):
 
 
 def sleep_long(file):
-    """An hour; the file names the process."""
     if file is not None:
         Path(file).write_text(str(os.getpid()))
         time.sleep(3600)

@@ -10,7 +10,6 @@ from forcegp.posterior import Posterior
 
 @pytest.fixture(scope="module")
 def states() -> tuple[torch.Tensor, ...]:
-    """q, v and u of five states."""
     data = arm_data(5, 1)
     return tuple(torch.tensor(x) for x in (data.q, data.v, data.u))
 

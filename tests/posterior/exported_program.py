@@ -12,7 +12,6 @@ PLAIN_AND_SANITIZED = pytest.mark.parametrize("options", [("-O1",), pytest.param
 
 
 def compiled(folder: Path, *files: str, optimized: int = 0) -> ctypes.CDLL:
-    """The files as a library."""
     built(folder, *files, "-shared", "-fPIC", f"-O{optimized}", out="lib.so")
     return ctypes.CDLL(str(folder / "lib.so"))
 

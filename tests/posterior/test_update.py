@@ -19,7 +19,6 @@ QUICK = OptimizerOptions(iterations=8)
 
 
 def learned(data, first=12, model=None, **how):
-    """From the first rows."""
     model = model or data.model.with_forces(JointForces())
     return fit(model, data.rows(slice(0, first)), restarts=1, options=QUICK, **how)
 

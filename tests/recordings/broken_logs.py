@@ -30,7 +30,6 @@ LINK = """<link name="{name}_link"><inertial><origin xyz="0 0 -0.1"/><mass value
 
 
 def urdf(*joints: str) -> str:
-    """A chain of links of 1 kg."""
     parents = ["base", *(f"{joint}_link" for joint in joints)]
     links = [LINK.format(name=joint, parent=parent) for joint, parent in zip(joints, parents, strict=False)]
     return URDF.format(links="\n".join(links))

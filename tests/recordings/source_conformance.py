@@ -30,12 +30,10 @@ class SourceConformance(ABC):
     @pytest.fixture(scope="class")
     @classmethod
     def path(cls, tmp_path_factory) -> Path:
-        """Nobody changes this one."""
         return cls().write(tmp_path_factory.mktemp("log"))
 
     @pytest.fixture
     def own_path(self, path: Path, tmp_path: Path) -> Path:
-        """A copy to damage."""
         made = tmp_path / path.name
         return Path(shutil.copytree(path, made) if path.is_dir() else shutil.copy(path, made))
 

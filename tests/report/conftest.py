@@ -31,7 +31,6 @@ def on_plane():
 
 @pytest.fixture(scope="session")
 def page(swinging, friction):
-    """A page about the pendulum."""
     scores = score(friction, swinging)
     best = scores_sentence(scores)
     return model_page(friction, swinging, title="pendulum", best=best, tables=[scores_table(scores)])

@@ -20,7 +20,6 @@ CHAIN = (FOLDER / "chain.urdf").read_text(encoding="utf-8")
 
 
 def iiwa() -> str:
-    """The KUKA LBR iiwa with meshes."""
     return kuka_file().read_text(encoding="utf-8")
 
 

@@ -19,7 +19,6 @@ BODY = '<inertial><mass value="{}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz
 
 
 def limbs(*names: str, root: str = "trunk", mass: float = 5.0, robot: str = "r", joint: str = "joint_{}") -> str:
-    """A body with a limb for every name."""
     parts = [f'<robot name="{robot}"><link name="{root}">{BODY.format(mass)}</link>']
     for name in names:
         ends = f'<parent link="{root}"/><child link="{name}"/>'

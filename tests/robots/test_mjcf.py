@@ -21,7 +21,6 @@ FOLLOWERS = {"gripper": {"right": ("left", -1.5, np.radians(10) + 0.02)}}
 
 
 def read(text, **options):
-    """The robot, without its warning."""
     with warnings.catch_warnings(action="ignore", category=RobotFileWarning):
         return Robot.from_mjcf_text(text, **options)
 

@@ -128,7 +128,6 @@ def known(swinging):
 
 
 def off(data) -> np.ndarray:
-    """Errors of its accelerations."""
     robot = given_system().robot
     states = zip(*map(torch.tensor, (data.q, data.v)), data.u, strict=True)
     forces = [(robot.mass_matrix(q).numpy(), u - robot.bias_forces(q, v).numpy()) for q, v, u in states]

@@ -1,7 +1,7 @@
 """The log as every check sees it: mended, at even times, filtered, and as it is compared with the robot."""
 
 import contextlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,6 +13,7 @@ from forcegp.data import Dataset, Preparation, preparation_report, resample, uni
 from forcegp.data.dataset import ROTATION, TRANSLATION
 from forcegp.data.spectrum import FEWEST_ROWS, HIGHEST, motion_spectrum
 from forcegp.data.views import consecutive, move_on, resolution, runs, white_noise, whole_windows, window_means
+from forcegp.doubts import Doubt, wrong
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.forces import JointLaw
 from forcegp.model import Model
@@ -29,6 +30,7 @@ DEGREE = np.pi / 180.0
 FEW_JOINTS = 3  # of more joints, half as many rows
 STRETCHES, STRETCH_ROWS = 3, 400  # of a log that are looked at before a fit, where it is longer
 SMOOTH_SECONDS, SMOOTH_ROWS = 0.03, 15  # of the running mean before a fit: SciPy's filters take half a second to import
+STOOD = 5  # equal positions in front of a jump, from which on the encoder had stopped
 JUMP = 10.0  # steps that nine of ten rows stay below, by which a signal that is not measured jumps to 0
 LEAST_JUMP = 0.02  # and by more than this share of its range
 FEWEST_DROPS = 2
@@ -248,7 +250,6 @@ def _smoothed(dataset: Dataset) -> tuple[Dataset, int]:
 
 
 def _even(dataset: Dataset, jumps: np.ndarray) -> Dataset:
-    """Stretches without gaps, each an episode, at even times."""
     pieces: list[np.ndarray] = []
     for number in dataset.episodes:
         rows = np.flatnonzero(dataset.episode == number)
@@ -270,3 +271,29 @@ def _even(dataset: Dataset, jumps: np.ndarray) -> Dataset:
     if jumps.any():
         return even  # a spline through a jump would be of no use, and nothing is differentiated then
     return resample(even, float(np.median(np.concatenate([np.diff(dataset.time[piece]) for piece in pieces]))))
+
+
+def slips(inputs: CheckInput) -> Iterator[Doubt]:
+    """Single steps of positions that are far from those just before and after, unlike all others."""
+    log, follows = inputs.log, consecutive(inputs.log)[:-1]
+    for joint, name in enumerate(() if inputs.jumps.any() else inputs.names):
+        steps = np.diff(log.q[:, joint])
+        for row in single_rows(steps, follows[:-1] & follows[1:])[:1].tolist():
+            moved = np.flatnonzero(steps[:row])
+            first = int(moved[-1]) + 1 if len(moved) else 0
+            begin, then, at, end = log.time[[0, first, row + 1, -1]].tolist()
+            size = f"{steps[row]:+.3g} {inputs.unit_of_each('q')[joint]}"
+            stood = row - first >= STOOD
+            seen = f"jumps by {size} at {at:.3f} s and stays there: its encoder has slipped, or was set anew."
+            left_out = (then, at) if stood else (at, end) if at - begin > end - at else (begin, at)
+            if stood:
+                seen = f"stands still from {then:.3f} s on and jumps by {size} at {at:.3f} s: its encoder was dead."
+            yield wrong(
+                about="frozen channel" if stood else "jumps",
+                what=f"the position of {name} {seen}",
+                do="Leave {} out by forcegp import --without {:.3f},{:.3f}{}.".format(
+                    "these rows" if stood else "the shorter part", *left_out, "" if stood else ", or correct it"
+                ),
+                joints=(name,),
+                numbers={"jump": float(steps[row]), "time": at, "still": at - then},
+            )

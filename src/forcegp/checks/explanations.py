@@ -173,7 +173,6 @@ def _usual_orders(robot: Robot) -> list[np.ndarray]:
 
 
 def _motions(now: Comparison, inputs: CheckInput, bad: np.ndarray) -> Iterator[Candidate]:
-    """A joint in the other direction; two exchanged."""
     nv, remedy = len(inputs.names), "Turn the joint's axis in the URDF."
     joints = [k for k in range(nv) if nv <= ALL_TRIED or bad[k]]
     for joint in joints:
@@ -342,9 +341,7 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         if not 0.0 < size < np.inf or pull @ down > np.cos(ASIDE) * size * np.linalg.norm(down):
             continue  # the latter is a payload
         force, place = (", ".join(f"{x:.3g}" for x in values) for values in (pull, 1e3 * at))
-        text = (
-            f"the torques fit a constant force of ({force}) N at ({place}) mm of {joint.child}, as of a hose or a cable"
-        )
+        text = f"torques fit a constant force of ({force}) N at ({place}) mm of {joint.child}, as of a hose or a cable"
         told = {"do": PULLED, "numbers": {"force": pull.tolist(), "point": at.tolist(), "link": joint.child}}
         more = now.more + columns[..., :3] @ pull
         yield number("pull", text, drive.joint, 0.0, 3.0 * NUMBER, **told), replace(now, more=more)

@@ -212,9 +212,7 @@ class Explanation:
 
     def stands(self, root: "Explanation") -> bool:
         """Whether all joints are left with what a good log leaves; with rough masses, if mistakes were corrected."""
-        far = {
-            *np.flatnonzero((self.chosen >= 2) & (np.abs(np.log(np.abs(self.factors) + 1e-300)) > np.log(MUCH_MORE)))
-        }
+        far = {*np.flatnonzero((self.chosen >= 2) & (abs(np.log(np.abs(self.factors) + 1e-300)) > np.log(MUCH_MORE)))}
         if far & {*self.turned, *(k for cause in self.causes for k in cause.joints)}:
             return False  # nothing else is known of a torque in unknown units
         if self.good.all():

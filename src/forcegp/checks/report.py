@@ -225,9 +225,7 @@ def excitation_doubts(inputs: CheckInput) -> Iterator[Doubt]:
     for name, own in zip(inputs.names, map(np.flatnonzero, moves.T), strict=True):
         if name not in still and len(own) and own[-1] - own[0] < BRIEF * count:
             begin, end = inputs.prepared.time[own[[0, -1]]].tolist()
-            what = (
-                f"{name} moves only from {begin:.1f} to {end:.1f} s: no other time tells whether its friction is right."
-            )
+            what = f"{name} moves only from {begin:.1f} to {end:.1f} s: no other time tells if its friction is right."
             do = "Move it in other parts of the log, too."
             yield look(about="excitation", what=what, do=do, joints=(name,), numbers={"seconds": [begin, end]})
 

@@ -169,20 +169,22 @@ def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -
     if len(off) < (1 if explained else 2):
         return
     less = next((u for u, s in PREFIXES if all(1.0 / LOADED < abs(x) / s < LOADED for x in factors[off])), "")
-    units = like or [less + si for si in inputs.unit_of_each("u")]
+    units = [less + si for si in inputs.unit_of_each("u")]
     unit = units[0] if len({*units}) == 1 else ",".join(units)
-    loaded = f"With a load it may be in {unit}: forcegp import --unit u={unit}. " if less or like else ""
+    loaded = f"With a load it may be in {unit}: forcegp import --unit u={unit}. " if less and not like else ""
     joints, factors, errors = inputs.named(off), factors[off], [*map(best.error_of_factor, off.tolist())]
     each = ", ".join(f"{name} {x:.4g} ± {error:.1g}" for name, x, error in zip(joints, factors, errors, strict=True))
     yield Doubt(
         level="wrong" if not explained or factors.min() < 1.0 / FAR or factors.max() > MUCH_MORE else "look",
         about="torque constant" if len(off) == 1 else "torque unit",
-        what=f"the measured torque is a multiple of what the motion needs, if masses are right: {each}.",
+        what=f"the measured torque is a multiple of what the motion needs, if masses are right: {each}"
+        f"{f': it looks like {listed(like)}' if like else ''}.",
         do=f"{loaded}Such factors point to torque before the gears (multiply by the gear ratio), motor current "
         "(multiply by the torque constant), a missing rotor inertia, or wrong masses; compare with the data sheet, or "
         "let forcegp payload --forces gain,viscous,gear,offset,rotor estimate the constants of all joints.",
         joints=joints,
         numbers={"factor": dict(zip(joints, factors.tolist(), strict=True)), "error_95": errors},
+        correction={"unit": {"u": like}} if like else {},
     )
 
 
@@ -225,9 +227,7 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         steps = np.diff(inputs.log.q[(inputs.log.time >= ends[0]) & (inputs.log.time <= ends[1])], axis=0)
         still = inputs.named([k for k in bad.tolist() if (steps[:, k] == 0.0).mean() > UNCHANGED])
         why = f"the position of {listed(still)} stands still, as of a dead encoder or a brake" if still else ""
-        where += (
-            f", and elsewhere at most {100.0 * left:.2g} % stays: {why or 'a contact, or a load'}, in these seconds"
-        )
+        where += f", elsewhere at most {100.0 * left:.2g} % stays: {why or 'a contact, or a load'}, in these seconds"
         numbers |= {"seconds": ends, **({"stands": still} if still else {})}
         do = f"Leave them out by forcegp import --without {seconds}, as forcegp auto does."
     elif stops := {k: end for k in bad.tolist() if (end := _stop(root, k)) is not None}:

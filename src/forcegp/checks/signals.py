@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from forcegp.checks.check_input import DEGREE, STEPS, STILL, CheckInput
-from forcegp.checks.slips import slips
+from forcegp.checks.check_input import DEGREE, STEPS, STILL, CheckInput, slips
 from forcegp.checks.torques import needed_torques
 from forcegp.data import Dataset, differentiate, low_pass, preparation_report
 from forcegp.data.delay import lowest
@@ -190,7 +189,6 @@ def _driven(inputs: CheckInput, dead: np.ndarray) -> bool:
 
 
 def _still(log: Dataset, name: str) -> np.ndarray:
-    """Which joints' signal never changes, up to rounding."""
     values = getattr(log, name)
     return np.ptp(values, axis=0) <= ROUNDING * np.abs(values).max(initial=0.0)
 
@@ -199,7 +197,6 @@ COUNTS = 5.5  # steps of an encoder between which a joint that stands still may 
 
 
 def _dithers(log: Dataset) -> np.ndarray:
-    """Which joints stand still but for counts of their encoder."""
     spans = np.ptp(log.q, axis=0)
     counts = [span and span / resolution(x) for span, x in zip(spans, log.q.T, strict=True)]
     return (spans > 0.0) & (spans < np.where(log.turns, *STILL)) & (np.array(counts) < COUNTS)

@@ -95,9 +95,7 @@ def _drift(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         changed = {k: x for k, x in changed.items() if told[k] < np.log(MUCH) and abs(np.log(x)) > WARMER}
     if changed:
         each = ", ".join(f"{name} {ratio:.2g}" for name, ratio in changed.items())
-        what = (
-            f"friction changes with time, with temperature perhaps: at the end it is so many times the first: {each}."
-        )
+        what = f"friction changes, perhaps with temperature: at the end it is so many times the first: {each}."
         do = "Record the warm robot; updates of a posterior follow the level of friction."
         yield look(about="drift", what=what, do=do, joints=tuple(changed), numbers={"ratio": changed})
 
@@ -125,7 +123,7 @@ def elastic_doubts(inputs: CheckInput, log: Comparison) -> list[Doubt]:
         bends[own] = np.gradient(slopes[own], rows.time[own], axis=0)
     some = slice(None, None, max(1, len(rows) // MOST_ROWS))
     passed = {(f, d): _behind_spring(log.tau, rows, f, d)[some] for f in SPRINGS for d in DAMPING}
-    smooth = [_behind_spring(log.tau, rows, f, both_ways=True)[some] for f in SPRINGS]  # of less noise, and rigid
+    smooth = [_behind_spring(log.tau, rows, f, twice=True)[some] for f in SPRINGS]  # of less noise, and rigid
     tau, slopes, bends, friction, every = log.tau[some], slopes[some], bends[some], log.friction[some], rows.u[some]
     fitted = np.arange(len(tau)) * BLOCKS // len(tau) % 2 == 0
 
@@ -168,11 +166,11 @@ def elastic_doubts(inputs: CheckInput, log: Comparison) -> list[Doubt]:
 
 
 def _behind_spring(
-    tau: np.ndarray, rows: Dataset, hertz: float, damping: float = 0.7, both_ways: bool = False
+    tau: np.ndarray, rows: Dataset, hertz: float, damping: float = 0.7, twice: bool = False
 ) -> np.ndarray:
     """What reaches the motor of the torque that its motion asks for: x'' + 2 d w x' + w^2 x = w^2 tau, by Tustin.
 
-    `both_ways` it is no spring, but a filter without delay.
+    `twice` it is no spring, but a filter without delay.
     """
     from scipy.signal import bilinear, filtfilt, lfilter, lfilter_zi  # half a second, which only few logs should cost
 
@@ -181,7 +179,7 @@ def _behind_spring(
     b, a = bilinear([w * w], [1.0, 2.0 * damping * w, w * w], rate)
     for own in (rows.episode == number for number in rows.episodes):
         x, start = tau[own], lfilter_zi(b, a)[:, None] * tau[own][:1]
-        passed[own] = filtfilt(b, a, x, axis=0) if both_ways else lfilter(b, a, x, axis=0, zi=start)[0]
+        passed[own] = filtfilt(b, a, x, axis=0) if twice else lfilter(b, a, x, axis=0, zi=start)[0]
     return passed
 
 
@@ -252,8 +250,7 @@ def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     yield look(
         about="push",
         what=f"from {begin:.4g} to {end:.4g} s the torques of {listed(inputs.named(joints))} are up to "
-        f"{times[joints].max():.2g} times as far from any masses and friction as elsewhere: a contact, or a load, in "
-        "these seconds.",
+        f"{times[joints].max():.2g} times as far from any masses and friction as elsewhere: a contact or a load.",
         do=f"Leave them out by forcegp import --without {begin:.2f},{end:.2f}, as forcegp auto does.",
         joints=inputs.named(joints),
         numbers={"seconds": [float(begin), float(end)], "gains": gains[joints].tolist()},
@@ -358,9 +355,7 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
     ends = [np.flatnonzero(log.episode == log.episode[rest[0]])[[0, -1]] for rest in found]
     long = (np.ptp(log.time[rest]) > SHORT for rest in found)
     outer = [np.abs(x[[0, -1]] - y).min() < FEWEST_ROWS and z for x, y, z in zip(found, ends, long, strict=True)]
-    idle = np.isin(
-        still, np.concatenate([still[:0], *(rest for rest, at_end in zip(found, outer, strict=True) if at_end)])
-    )
+    idle = np.isin(still, np.concatenate([still[:0], *(x for x, at_end in zip(found, outer, strict=True) if at_end)]))
     each = zip(rows.u.T, rows.v.T, rows.a.T, in_motion(rows).T, strict=True)
     for k, (u, v, a, moves) in enumerate(each):
         slow = np.sqrt(np.square(v).mean()) + 1e-300
@@ -396,9 +391,7 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
 
 def without_pushes(log: Dataset, doubts: Sequence[Doubt]) -> Dataset:
     """The log without the seconds of pushes and loads; of several episodes, whose times repeat, as it is."""
-    seen = [
-        doubt for doubt in doubts if doubt.about in ("push", "load", "offset", UNKNOWN) and "seconds" in doubt.numbers
-    ]
+    seen = [each for each in doubts if each.about in ("push", "load", "offset", UNKNOWN) and "seconds" in each.numbers]
     spans = [doubt.numbers["seconds"] for doubt in seen if len(log.episodes) == 1]
     touched = [np.flatnonzero((log.time >= begin) & (log.time <= end)) for begin, end in spans]
     if not touched:

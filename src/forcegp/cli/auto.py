@@ -168,7 +168,6 @@ class Auto(Command):
     def _imported(
         self, terminal: Terminal, model: forcegp.Model, mapping: forcegp.recordings.ColumnMapping
     ) -> tuple[forcegp.Dataset, dict[str, Any], forcegp.recordings.ColumnMapping, list[Doubt], RobotOptions]:
-        """The dataset behind all corrections that its own evidence asks for, and the mistakes that these correct."""
         mistakes, robot = list[Doubt](), self.robot
         for _ in range(MOST_CORRECTIONS):
             try:
@@ -209,7 +208,6 @@ class Auto(Command):
     def _prepared_rows(
         self, terminal: Terminal, raw: forcegp.Dataset, open_switches: bool, report: forcegp.checks.CheckReport
     ) -> tuple[forcegp.Dataset, forcegp.Dataset]:
-        """Rows to learn from, and the same at the full rate."""
         wanted, elastic = self.filter.preparation(), report.doubts.of("elastic joint")
         if wanted.cutoff == "auto" and wanted.differentiate == "q" and report.inputs.prepared is not None:
             found = forcegp.data.preparation_report(report.inputs.prepared.metadata)  # not to be sought again
@@ -263,7 +261,6 @@ class Auto(Command):
         answer: list[tuple[str, str]],
         scores: forcegp.scores.Scores,
     ) -> None:
-        """The page to send around."""
         posterior, recording = forcegp.posterior.observing(posterior, recording)
         command = dict(answer)["record next"].partition(" (")[0]
         following = [("Record the most informative motion:", command)] if command.startswith("forcegp") else []

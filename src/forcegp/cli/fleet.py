@@ -107,9 +107,7 @@ def command_of(words: Sequence[str]) -> Command:
         return parsed(words)
     own, common = _split([word for word in words[1:] if word not in SWITCHES], (FLAG, "--out", "--jobs"))
     if not (own.get("--out") and own.get(FLAG)):
-        raise InvalidInput(
-            f"{FLAG} LIST needs --out FOLDER, which gets a folder for each log. See forcegp {name} --help."
-        )
+        raise InvalidInput(f"{FLAG} LIST needs --out FOLDER, a folder for each log. See forcegp {name} --help.")
     jobs = own.get("--jobs", "1")
     if not jobs.isdigit() or jobs == "0":
         raise InvalidInput(f"--jobs is {jobs}; give the number of logs at once, at least 1.")

@@ -273,7 +273,6 @@ class Import(Command):
 
 
 def _imported(terminal: Terminal, out: Path, done: Mapping[str, Any]) -> str:
-    """What was guessed, repaired and left out, as notes, and what came out."""
     for found in done["guessed"]:
         terminal.note(f"found by name: {found}")
     for each in done["recordings"]:
@@ -353,7 +352,6 @@ class Check(Command):
 
 
 def _shown(terminal: Terminal, data: Path, report: forcegp.checks.CheckReport) -> list[Any]:
-    """One paragraph per doubt, worst first, and the numbers of every joint."""
     from rich.text import Text
 
     content = report.to_dict()

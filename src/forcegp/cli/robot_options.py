@@ -118,9 +118,7 @@ class RobotOptions(RobotFileOptions):
                 raise OSError(f"it {why}")
             return forcegp.Model.from_json(path.read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError) as error:
-            raise FileFormatError(
-                f"{path}: cannot be read ({error}); give a folder that `forcegp fit` wrote."
-            ) from None
+            raise FileFormatError(f"{path}: cannot be read ({error}); give a folder of `forcegp fit`.") from None
 
 
 def identified_system(model: forcegp.Model) -> forcegp.Model:
@@ -146,7 +144,6 @@ def require_same_joints(posterior: forcegp.posterior.Posterior, dataset: forcegp
 
 
 def _named(words: Sequence[str], option: str, syntax: str) -> dict[str, float]:
-    """Words NAME=NUMBER as a mapping, each name once."""
     out: dict[str, float] = {}
     for word in words:
         name, _, text = word.rpartition("=")

@@ -80,9 +80,7 @@ class Score(Command):
         if data.is_dir():
             raise InvalidInput(f"{data} is a folder; give a dataset (.h5) last.")
         if fits and self.out is None:
-            raise InvalidInput(
-                "models are fitted, which takes time; give --out FOLDER, where all that is done is kept."
-            )
+            raise InvalidInput("models are fitted, which takes time; give --out FOLDER, where all of it is kept.")
         start, raw = time.monotonic(), forcegp.Dataset.load(data)
         models: dict[str, Any] = {}
         for path in runs:
@@ -150,7 +148,6 @@ class Score(Command):
         scores: forcegp.scores.Scores,
         content: Mapping[str, Any],
     ) -> None:
-        """What is shown and written of a single model."""
         name = next(iter(scores.models))
         title = f"{scores.models[name]['summary']}; {len(rows)} rows of {self.paths[-1]}"
         if self.out is not None:

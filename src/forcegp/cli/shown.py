@@ -91,7 +91,6 @@ def _content(robot: forcegp.Robot) -> dict[str, Any]:
 
 
 def _shown(robot: forcegp.Robot, content: Mapping[str, Any]) -> list[Any]:
-    """The tree and the table of joints."""
     from rich.text import Text
     from rich.tree import Tree
 

@@ -94,7 +94,6 @@ class Simulate(Command):
         }
 
     def _config(self) -> dict[str, Any]:
-        """The fields of the scenario's configuration that the options set."""
         names = "seconds", "seed", "noise", "joint_friction", "wind"
         fields = {name: value for name in names if (value := getattr(self, name)) is not None}
         own = {"kuka-surface": (*OF_THE_TOOL, "joint_friction"), "quadrotor": ("wind",)}

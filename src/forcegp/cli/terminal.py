@@ -168,7 +168,6 @@ class Terminal:
                 yield
 
     def _lines(self, what: str) -> Listener:
-        """Lines such as `simulating: 40 %`, at most one every few seconds."""
         reported = time.monotonic()
         if self.names_stages:
             self.note(f"{what} ...")

@@ -34,7 +34,6 @@ def filled(text: str, words: Mapping[str, object]) -> str:
 
 
 def _horner(coefficients: list[float], variable: str) -> str:
-    """A polynomial, the highest power first."""
     text = f"R({coefficients[0].hex()})"
     for value in coefficients[1:]:
         text = f"({text} * {variable} + {value.hex()})"

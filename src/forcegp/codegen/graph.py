@@ -122,7 +122,6 @@ class Graph:
         return sorted(wanted)
 
     def _simplified(self, operation: str, operands: tuple[int, ...], known: Sequence[float | None]) -> int | None:
-        """A node that is equal whatever the inputs are, or None."""
         x = operands[0]
         if operation == "negate":
             inner = self.nodes[x]

@@ -27,9 +27,7 @@ from forcegp.errors import CompilerError, InvalidInput
 
 VARIABLE = "CC"
 COMMANDS = ("cc", "gcc", "clang")
-PACKAGES = (
-    "Debian, Ubuntu: apt install gcc; Fedora: dnf install gcc; macOS: xcode-select --install; conda: conda install gcc"
-)
+PACKAGES = "Debian: apt install gcc; Fedora: dnf install gcc; macOS: xcode-select --install; conda: conda install gcc"
 LONGEST = 600.0  # seconds after which a compiler hangs: our longest program takes it a fiftieth of that
 WITHOUT = "or do without it: a robot itself, predictor(compile=False), export_c(unchecked=True)"
 ELSEWHERE = "choose another folder (the environment variable XDG_CACHE_HOME, robot.compile(folder=...))"

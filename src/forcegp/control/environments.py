@@ -122,7 +122,6 @@ class RobotVectorEnv(VectorEnv):
         return np.concatenate([self.q, self.v], axis=1).clip(self._low, self._high)
 
     def _beyond(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Which robots have left the limits of their joints."""
         x = np.concatenate([q, v], axis=1)
         return np.any((x < self._low) | (x > self._high), axis=1)
 

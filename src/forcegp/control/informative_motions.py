@@ -233,7 +233,6 @@ def far_apart(q: Any, v: Any, u: Any, count: int) -> np.ndarray:
 
 
 def _between(samples: Float[np.ndarray, "n k"]) -> Float[np.ndarray, " k"]:
-    """How far a smooth quantity may go beyond its samples."""
     return np.abs(np.diff(samples, 2, axis=0)).max(0) / 8.0
 
 

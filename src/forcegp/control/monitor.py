@@ -263,7 +263,6 @@ class ContactMonitor:
         return at_rest * torch.exp(-v.abs() / fades) + unknown @ self.level.mT
 
     def _errors(self, found: Residuals) -> Tensor:
-        """The same, filtered as torques are."""
         return torch.from_numpy(self._low_passed(self._errors_now(*found[4:]).numpy()))[-len(found[0]) :]
 
     def _distances(self, found: Residuals) -> Float[Tensor, " rows"]:

@@ -73,7 +73,6 @@ class MujocoForces:
 
 
 def _joints(model: Any, names: tuple[str, ...]) -> list[tuple[int, int]]:
-    """The places in qpos and qvel of every joint."""
     places = []
     for name in names:
         number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)

@@ -58,7 +58,6 @@ def fixed_text(text: Any) -> np.ndarray:
 
 
 def _attribute(file: h5py.File, name: str) -> Any:
-    """Number or text; None for texts that no file of ours holds."""
     if name not in file.attrs or file.attrs.get_id(name).dtype.hasobject:
         return None
     value = file.attrs[name]

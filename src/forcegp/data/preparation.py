@@ -160,7 +160,6 @@ def _cutoff(dataset: Dataset, source: Literal["q", "v"]) -> tuple[float | None, 
 
 
 def _filtered(chosen: Preparation, dataset: Dataset) -> Dataset:
-    """Filtered, differentiated and shifted, with all its rows."""
     if chosen.cutoff is not None:
         if postures(dataset) is not None:
             # A filter lets joints creep while they rest, by more than friction remembers. In motion without rests

@@ -166,7 +166,6 @@ class _Forces:
 
 
 def _mean_winds(forces: _Forces, own: np.ndarray, count: int, step: float) -> np.ndarray | None:
-    """The mean wind (episodes, 3), or None where it is not to be found."""
     wind = _first_winds(forces, own, count)
     damping, best, solution = 1e-3, np.inf, wind
     normal, right = np.zeros((3 * count, 3 * count)), np.zeros(3 * count)

@@ -190,13 +190,11 @@ class Bodies:
         return pseudo.reshape(*pseudo.shape[:-2], 16) @ self._to_standard.T
 
     def _congruent(self, inner: np.ndarray) -> np.ndarray:
-        """V inner V^T for (n, ..., 4, 4)."""
         V = self.factors.reshape(len(self.factors), *(1 for _ in range(inner.ndim - 3)), 4, 4)
         return V @ inner @ V.swapaxes(-1, -2)
 
 
 def _in_frames(pseudo: np.ndarray, frames: np.ndarray) -> np.ndarray:
-    """Pseudo-inertias in axes with these poses."""
     there = np.linalg.inv(frames)
     return there @ pseudo @ there.swapaxes(-1, -2)
 

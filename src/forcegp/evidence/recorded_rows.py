@@ -92,12 +92,10 @@ Response = Callable[[Float[np.ndarray, "rows nv *k"]], Float[np.ndarray, "rows n
 
 
 def _turned(T: Float[np.ndarray, "nv nv"] | None, values: Float[np.ndarray, "rows nv *k"]) -> np.ndarray:
-    """T^T times every row."""
     return values if T is None else np.einsum("kj,nk...->nj...", T, values)
 
 
 def _under_load(state: State, load: Tensor) -> State:
-    """The state with actuators that deliver these joint forces."""
     return replace(state, delivered_by=lambda _: load)
 
 

@@ -85,7 +85,6 @@ class Equations:
         return mean(residual), Chained(self._regressor, slopes, mean(np.concatenate(in_terms)))
 
     def _moving(self, a: Float[np.ndarray, " nv"]) -> list[Motion]:
-        """All rows with these accelerations."""
         return [part.moving(a + 0.0 * part.v) for part in self.parts]
 
     def _inertia(self, x: np.ndarray, joint: int, motions: Sequence[Sequence[Motion]]) -> np.ndarray:

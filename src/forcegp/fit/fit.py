@@ -158,9 +158,7 @@ def fit(
         posterior = _of_numbers(model, logs, rest, rows, seed)
     else:
         if baseline is not None:
-            raise InvalidInput(
-                "a baseline is for payloads, without unknown functions; leave these out, or the baseline."
-            )
+            raise InvalidInput("a baseline is for payloads, without unknown functions; leave these or it out.")
         search = Search(checked_jobs(jobs), restarts, seed, options, start)
         posterior = _Functions(model, search, engine, learning_points, unseen).fitted(dataset, points)
     if choice is not None:
@@ -227,7 +225,6 @@ def _checked(model: Model, dataset: Dataset, evidence: Any, refinement: Motions 
 
 
 def _of_numbers(model: Model, logs: Sequence[Dataset], evidence: Any, rows: int | None, seed: int) -> Posterior:
-    """Laws and bodies alone, from all rows."""
     if rows is not None:
         whole_number("rows", rows, 1)
     refuse_what_has_no_answer(model)
@@ -327,15 +324,12 @@ class _Functions:
         return replace(posterior, estimates=estimates).with_settings(rounds=rounds)
 
     def _beside_numbers(self, rows: Dataset, dataset: Dataset, space: ParameterSpace, x: np.ndarray) -> Posterior:
-        """One search with the numbers about x free."""
         here = replace(space.model_at(x), noise=self.model.noise)
         return replace(self, model=here)._search(
             with_memory(rows, here), dataset, lambda given: with_free_numbers(given, space, x)
         )
 
     def _with_loads(self, rows: Dataset, dataset: Dataset) -> Posterior:
-        """One search, or more under the normal force that friction changes."""
-
         def again(forces: UnknownForces, last: Posterior) -> Posterior:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DataWarning)  # the first fit gave it, of the same rows

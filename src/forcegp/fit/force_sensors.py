@@ -222,7 +222,6 @@ def _of_tool(dataset: Dataset, model: Model, sensor: _Sensor, beside_file: Shown
 
 
 def _of_torques(sensor: _Sensor, J: np.ndarray, needed: np.ndarray, unexplained: Shown) -> Found:
-    """Any other, beside torques."""
     y, x, R = unexplained(needed)[:, 0], unexplained(J @ sensor.F[..., None])[:, 0], sensor.R
     left, least, along, Q = sensor.read(J, unexplained, lambda each: _fitted(each, y)[0])
     numbers, needs = dict[str, Any](left=left, factor=_fitted(x, y)[1]), "what torques and motion need there"

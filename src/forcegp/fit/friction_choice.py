@@ -152,7 +152,6 @@ def _folds(log: Dataset) -> np.ndarray:
 
 
 def _bordered(A: np.ndarray, across: np.ndarray, inner: np.ndarray) -> Float[np.ndarray, "k n n"]:
-    """The symmetric matrices [A, across; across^T, inner]."""
     rows = (A, across), (across.swapaxes(1, 2), inner)
     return np.concatenate([np.concatenate(row, axis=2) for row in rows], axis=1)
 
@@ -217,7 +216,6 @@ class _Regression:
         self.signs[j] |= {sigma: self._sums(j, sigma) for sigma in stiffness}
 
     def _columns(self, j: int, at: float) -> Float[np.ndarray, "rows k"]:
-        """Of a joint, under a sign."""
         v = self.v[:, j]
         s = after_strokes(self.past[j], torch.tensor(at)).numpy() if at > 0.0 else np.tanh(v / (-at * self.speed[j]))
         return self.shapes[:, j] * np.where(SIGNED, s[:, None], 1.0)
@@ -312,12 +310,10 @@ class _Regression:
         return out
 
     def _places(self, parts: tuple[str, ...], fall: int) -> Int[np.ndarray, " k"]:
-        """Columns that these parts need."""
         breaks = ("breakaway" in parts and each == fall for each in range(len(FALLS)))
         return np.flatnonzero([True, True, *(part in parts for part in PARTS[1:-1]), True, *breaks])
 
     def _open(self, j: int, parts: tuple[str, ...], sign: tuple[float, int]) -> Sums:
-        """Of the columns of a joint that these parts need."""
         (across, inner, right), open_ = self.signs[j][sign[0]], self._places(parts, sign[1])
         return across[..., open_], inner[:, open_][..., open_], right[:, open_]
 

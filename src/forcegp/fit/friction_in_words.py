@@ -35,14 +35,13 @@ def friction_in_words(
     from_mean = slides * (v - mean)
     slope = (from_mean * level).sum(0) / from_mean.square().sum(0).clamp_min(1e-300)
     dry = (slides * level).sum(0) / count - slope * mean
-    joints = [log.joint_names.index(name) for name in model.robot.single_joint_names]
+    names = model.robot.single_joint_names
+    joints = [log.joint_names.index(name) for name in names]
     at_rest = law.level_at((0.0 * mean, load), law.values).expand(log.nv)
     moving, rest = (each[joints] for each in (dry, torch.maximum(dry, at_rest)))
-    slopes = dict(
-        zip(model.robot.single_joint_names, (slope + viscous.values["damping"])[joints].tolist(), strict=True)
-    )
+    slopes = dict(zip(names, (slope + viscous.values["damping"])[joints].tolist(), strict=True))
 
-    def listed(numbers: Tensor, names: Iterable[str] = model.robot.single_joint_names) -> str:
+    def listed(numbers: Tensor, names: Iterable[str] = names) -> str:
         each = zip(names, numbers.tolist(), strict=True)
         return ", ".join("–" if name in still else f"{number:.3g}" for name, number in each)
 
@@ -51,12 +50,10 @@ def friction_in_words(
     for name, row in zip(log.joint_names, law.turning(torch.eye(log.nv).to(v)).mT.tolist(), strict=True):
         terms = [f"{x:+.3g} {other}" for other, x in zip(log.joint_names, row, strict=True) if x]
         text += f"; the motor of {name} turns with {' '.join(terms)}" if len(terms) > 1 else ""
-    if not (remember := law.memory_joints(model.robot)):
-        return text, slopes
-    slide_types = {model.robot.joint(log.joint_names[j]).type == "prismatic" for j in remember}
-    length = " or ".join(("mrad", "mm")[slide] for slide in sorted(slide_types))
-    ways = 1e3 / law.values["sigma"].expand(log.nv)[remember]
-    names = [log.joint_names[j] for j in remember]
-    who = "all joints" if len(remember) == len(joints) else ", ".join(names)
-    text += f"; {who} remember reversals, over {listed(ways, names)} {length}"
+    if remember := law.memory_joints(model.robot):
+        own = [log.joint_names[j] for j in remember]
+        length = " or ".join(sorted({"mm" if model.robot.joint(x).type == "prismatic" else "mrad" for x in own})[::-1])
+        who = "all joints" if len(own) == len(joints) else ", ".join(own)
+        ways = 1e3 / law.values["sigma"].expand(log.nv)[remember]
+        text += f"; {who} remember reversals, over {listed(ways, own)} {length}"
     return text, slopes

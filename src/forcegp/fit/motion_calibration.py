@@ -112,7 +112,6 @@ def _left_out(
 
 
 def _records(dataset: Dataset, seconds: float) -> int:
-    """Episodes that last so long."""
     return sum(_lasts(dataset, dataset.episode == episode, seconds) for episode in dataset.episodes)
 
 

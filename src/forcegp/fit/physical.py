@@ -164,9 +164,7 @@ def _with_noise_in_both(
     while True:
         number += 1
         levels = equations.levels(x, noise, least, rough)
-        likely = [
-            part.likely(x, motion, levels) for part, motion in zip(equations.parts, equations.measured, strict=True)
-        ]
+        likely = [part.likely(x, m, levels) for part, m in zip(equations.parts, equations.measured, strict=True)]
         if not rough:
             noise, least = levels, levels.scaled(LEAST) if least is None else least
         # its whitening holds levels of noise and weights, without forces of contacts
@@ -190,7 +188,6 @@ def _estimates(
     changes: np.ndarray | None,
     move: np.ndarray | None,
 ) -> Estimates:
-    """The numbers at the end of the search."""
     white = np.concatenate([fit.white_jacobian, fit.white[..., None]], axis=-1)
     columns = np.arange(white.shape[1])  # equations of a row: of joints, and of sensors
     prior = space.prior(fit.x)[1]
@@ -270,7 +267,6 @@ def held_out_noise(model: Model, dataset: Dataset, evidence: Torques | Accelerat
 
 
 def _left_out(dataset: Dataset) -> list[np.ndarray]:
-    """Row numbers of each stretch."""
     if len(dataset.episodes) >= 3:
         return [np.flatnonzero(dataset.episode == number) for number in dataset.episodes]
     if len(dataset) < 2 * STRETCHES_LEFT_OUT:

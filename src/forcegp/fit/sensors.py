@@ -71,9 +71,7 @@ def with_sensors(dataset: Dataset, model: Model, rest: Evidence, sensors: Sequen
             elif said := forces.get(name.removeprefix(FORCE)):
                 raise InvalidInput(str(said))
             elif isinstance(rest, Accelerations) and model.is_open and not model.unknown_forces:
-                raise InvalidInput(
-                    "force sensors teach numbers beside torques, not beside accelerations; give Torques()."
-                )
+                raise InvalidInput("force sensors teach numbers beside torques, not accelerations; give Torques().")
             elif model.unknown_forces and not at:
                 raise InvalidInput(
                     f"a force was measured at {name.removeprefix(FORCE)!r}, where the model has no contact; give it "

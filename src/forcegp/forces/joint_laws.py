@@ -277,11 +277,11 @@ class Rotor(JointLaw):
         return T[:, :, None] * T[:, None, :]
 
 
-Values = Float[np.ndarray, "rows nv"]
+Rows = Float[np.ndarray, "rows nv"]
 Inputs = Float[np.ndarray, "rows nu"]
 
 
-def law_columns(laws: Iterable[Law], robot: Robot, q: np.ndarray, v: Values, u: Inputs, a: Values) -> list[Values]:
+def law_columns(laws: Iterable[Law], robot: Robot, q: np.ndarray, v: Rows, u: Inputs, a: Rows) -> list[Rows]:
     """The torque [Nm or N] that each law of joints needs at these states, of numbers that it is given.
 
     Laws without numbers count as 1: of a law that is linear in its first coefficient the column is the regressor. Dry
@@ -301,9 +301,7 @@ def law_columns(laws: Iterable[Law], robot: Robot, q: np.ndarray, v: Values, u: 
     return out
 
 
-def usual_columns(
-    robot: Robot, q: np.ndarray, v: Values, u: Values, a: Values, widths: Iterable[float]
-) -> list[Values]:
+def usual_columns(robot: Robot, q: np.ndarray, v: Rows, u: Rows, a: Rows, widths: Iterable[float]) -> list[Rows]:
     """Of a rotor, viscous friction, dry friction of several widths, and an offset.
 
     Widths are relative to the root mean square velocity; several of them together are nearly any curve of friction.

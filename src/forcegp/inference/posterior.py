@@ -87,7 +87,6 @@ class LatentPosterior(ABC):
 
     @cached_property
     def _totals(self) -> tuple[float, ...]:
-        """The sums of the weights, correctly rounded."""
         return tuple(math.fsum(weights.tolist()) for weights in self.weights)
 
 

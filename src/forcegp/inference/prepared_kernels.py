@@ -182,9 +182,7 @@ class KernelSum:
         words["SUMS"] = [f"s{k} += w{owner[k]} * {as_real(node)};" for k, node in enumerate(made) if owner]
         words["ENDS"] = [f"f[{k}] = {total.format(k)};" for k in range(len(made))]
         stored = enumerate(zip(made, self.level, strict=False))
-        words["KEPT"] = [
-            f"STORE(k + {g * BLOCK} + j - first, {as_real(x)} + {level.hex()});" for g, (x, level) in stored
-        ]
+        words["KEPT"] = [f"STORE(k + {g * BLOCK} + j - first, {as_real(x)} + {c.hex()});" for g, (x, c) in stored]
         words |= {word: "\n".join(lines) for word, lines in words.items() if isinstance(lines, list)}
         return filled(sections(__name__, "kernel_loop.c")["kept" if keep else "summed"], words)
 

@@ -44,8 +44,6 @@ class Surface(ABC):
 
 
 class _Flat(Surface):
-    """A surface with the same unit normal everywhere."""
-
     normal: Vector
 
     @override

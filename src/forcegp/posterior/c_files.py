@@ -125,7 +125,6 @@ class CFiles:
             (folder / file.replace("model", self.name)).write_text(text, encoding="ascii")
 
     def _of_monitor(self, program: Mapping[str, str]) -> dict[str, object]:
-        """What stands for a calibrated monitor of contacts."""
         if (monitor := self.monitor) is None:
             return {"STATE_OF_MONITOR": ""}
         words: dict[str, object] = {"STATE_OF_MONITOR": program["monitor_state"], "LINKS": len(monitor.ends)}
@@ -136,7 +135,6 @@ class CFiles:
         return words | {word: ", ".join(map(repr, np.ravel(x).tolist())) for word, x in monitor.numbers.items()}
 
     def _program(self) -> Iterator[str]:
-        """Tables and static functions."""
         names, code = [], self.code
         wanted = {"covariance": "mean_and_terms"} if "covariance" in self.kinds else {}
         slopes = self.jacobian or (self.dt is not None and self.integrator == "implicit-midpoint")
@@ -189,7 +187,6 @@ class CFiles:
         return "\n".join(f"   {_plain(line)}" for line in [*lines, said])
 
     def _stored(self, checks: Sequence[Check]) -> tuple[str, str]:
-        """Arrays and calls of the self-test."""
         arrays, calls = [], []
         for check in checks:
             rows = [k for k in range(min(len(check.states), 100)) if k not in check.left_out]

@@ -149,7 +149,6 @@ def _function(casadi: Any, name: str, graph: Graph, nodes: Sequence[int], sizes:
 
 
 def _latents(casadi: Any, code: Programs, x: Sequence[Any]) -> list[Any]:
-    """E f of every process in the order of their numbers."""
     graph, found = Graph(sum(code.sizes)), {}
     at = code.traced
     copied = Copier(graph, at.graph, dict(zip(at.graph.inputs, graph.inputs, strict=False)))

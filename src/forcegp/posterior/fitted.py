@@ -254,7 +254,6 @@ class MotionIntervals:
 
 
 def _between(at: np.ndarray, ends: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values (H, nv) at times, linear between 0 and the horizons."""
     return np.stack([np.interp(at, ends, [0.0, *each]) for each in values.T], axis=-1)
 
 

@@ -133,7 +133,6 @@ class Posterior(Fitted):
         return found if left is None else left if found is None else left + found
 
     def _unseen(self, multiplier: Gaussian, dynamics: ConstrainedDynamics) -> Tensor:
-        """What `Prediction.unseen` documents."""
         left, matrix = self._hidden(dynamics), dynamics.multiplier_map().matrix
         if left is None:
             return torch.zeros_like(multiplier.mean)
@@ -141,7 +140,6 @@ class Posterior(Fitted):
         return own / multiplier.variance.clamp_min(torch.finfo(own.dtype).tiny)
 
     def _hidden(self, dynamics: ConstrainedDynamics) -> Tensor | None:
-        """The covariance of joint forces that contacts hid from the log."""
         hidden = self.settings.get("hidden_force")
         if hidden is None or not dynamics.A.shape[-2]:
             return None

@@ -233,7 +233,6 @@ class Predictor(Summary):
             output[bad] = rows
 
     def _by_torch(self, kind: str, states: Sequence[Tensor]) -> list[Tensor]:
-        """What the program gives."""
         with torch.no_grad():
             parts = [self._block_by_torch(kind, part) for part in _blocks(states)]
         return [_finished(rows, False).flatten(1) for rows in zip(*parts, strict=True)]
@@ -258,7 +257,6 @@ class Predictor(Summary):
         return a, torch.cat([in_q @ self.space.tangent(states[0]), rest], dim=-1)
 
     def _with_covariance(self, q: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and covariance by torch."""
         posterior, prior = self.posterior, self.posterior.trained.unknown
         dynamics = posterior.dynamics(q, v, u)
         latents = posterior.latents(dynamics, self.compressed is None)

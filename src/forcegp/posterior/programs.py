@@ -178,7 +178,6 @@ class Programs:
 
     @cached_property
     def _latents(self) -> list[int]:
-        """All processes in the order of the sums."""
         return [c for part in self.sums for c in part.latents]
 
     def program(self, kind: str) -> Program:
@@ -228,7 +227,6 @@ class Programs:
         return all(program.graph.value(node) is not None for node in slopes)
 
     def _terms(self, graph: Graph, copied: Copier, features: list[list[int]], rows: list[list[int]]) -> list[int]:
-        """What the C function of a covariance takes of these rows of mixing."""
         terms = copied([row[c] for row in rows for c in self._latents])
         terms += [node for part, z in zip(self.sums, features, strict=True) for node in part.variance(graph, z)]
         return terms + [node for part, z in zip(self.sums, features, strict=True) for node in part.given(graph, z)]

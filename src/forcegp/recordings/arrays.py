@@ -77,7 +77,6 @@ class ArrayFile(Source):
 
     @cached_property
     def _places(self) -> dict[str, tuple[str, int | None]]:
-        """Column -> (full name of its array, column in it)."""
         places: dict[str, tuple[str, int | None]] = {}
         for full, (shape, _) in self.arrays.items():
             name = full
@@ -241,7 +240,6 @@ def json_arrays(path: Path) -> Arrays:
 
 
 def _lists(content: Any) -> Arrays:
-    """The arrays of numbers in mappings and lists."""
     found = {name.lstrip(SEPARATOR): values for name, values in _numbers(content, "")}
     return {name: (values.shape, lambda values=values: values) for name, values in found.items()}
 

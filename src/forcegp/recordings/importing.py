@@ -124,7 +124,6 @@ def import_recordings(
 
 
 def _sources(paths: Sequence[Path], mapping: ColumnMapping) -> list[tuple[str, Source]]:
-    """Label and table of every recording."""
     widths = mapping.headerless
     if len(widths) not in (0, 1, len(paths)):
         raise InvalidInput(f"headerless has {len(widths)} numbers for {len(paths)} files; give one, or one per file.")
@@ -268,7 +267,6 @@ def open_source(path: Path, *, headerless: int | None = None, within: str | None
 
 
 def _kind(path: Path) -> str:
-    """The extension without .gz, or "ros2"."""
     if path.is_dir():
         if (path / "metadata.yaml").is_file() or any(path.glob("*.mcap")):
             return "ros2"

@@ -261,7 +261,6 @@ def _shown(value: float) -> str:
 
 
 def _episodes(column: np.ndarray, source: Source) -> Int[np.ndarray, "n 2"]:
-    """Number and first row of every episode."""
     numbers = np.asarray(column, dtype=np.float64)
     odd = ~np.isfinite(numbers) | (numbers != np.round(numbers))
     if odd.any():

@@ -251,7 +251,6 @@ def guessed_pose(parts: Sequence[str], source: Source) -> tuple[str, ...] | None
 
 
 def _joints(mapping: ColumnMapping, robot: Robot) -> tuple[str, ...]:
-    """Joints of one degree of freedom, in the order of the log."""
     given = {"orientation": mapping.orientation, "axes": mapping.axes.keys() - {"force"}, "ned": mapping.ned}
     stated = [name for name, value in given.items() if value]
     if stated and robot.space.is_vector_space:
@@ -324,10 +323,8 @@ def _signals(
         seen = f"{signal} has {len(expressions)} columns for {len(names)} {what} ({', '.join(names) or 'none'})"
         raise InvalidInput(f"{seen}; {remedy}")
     units = [{named_unit(signal, name, source.units) for name in x.weights} for x in expressions]
-    named = [
-        next(iter(u)) if len(u) == 1 and not x.has_numbers else None for u, x in zip(units, expressions, strict=True)
-    ]
-    named = [x or columns[name] or "1" for x, name in zip(named, names, strict=True)]
+    known = (None if len(u) != 1 or x.has_numbers else [*u] for u, x in zip(units, expressions, strict=True))
+    named = [(x[0] if x else None) or columns[name] or "1" for x, name in zip(known, names, strict=True)]
     given = [log_unit(signal, name) for name in mapping.unit.get(signal, named)]
     signs, driven = mapping.sign.get(signal, (1.0,)), sum(signal != "u" or columns[name] != "1" for name in names)
     if driven < len(names) and len(signs) in (1, driven):  # they do not change a switch that stands behind actuators

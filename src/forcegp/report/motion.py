@@ -156,7 +156,6 @@ def learned_forces(posterior: Posterior, dynamics: ConstrainedDynamics) -> list[
 
 
 def _place(term: Unknown, dynamics: ConstrainedDynamics) -> torch.Tensor:
-    """World position (rows, 3) of the point at which a prior's force acts."""
     frame = term.link(dynamics.state.robot) if isinstance(term, AerodynamicForce) else getattr(term, "frame", None)
     if frame is None:
         return dynamics.contacts[getattr(term, "contact", 0)].position(dynamics.state.kinematics)
@@ -164,7 +163,6 @@ def _place(term: Unknown, dynamics: ConstrainedDynamics) -> torch.Tensor:
 
 
 def _at_joints(dynamics: ConstrainedDynamics, title: str, mean: torch.Tensor, std: torch.Tensor | None) -> Arrows:
-    """Forces of joints along their axes, from their origins."""
     robot, starts, axes = dynamics.state.robot, [], []
     for joint in robot.joints:
         pose = dynamics.state.kinematics.frame_pose(joint.child)

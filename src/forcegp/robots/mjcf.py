@@ -183,7 +183,6 @@ class MjcfWriter:
         self._body(joint.child, pose, joints, depth)
 
     def _rigid(self, link: str) -> dict[str, np.ndarray]:
-        """The links that move together, with their poses in the first one."""
         found = {link: np.eye(4)}
         for name in (names := [link]):
             for joint in self.children[name]:
@@ -206,7 +205,6 @@ def _inertial(mass: float, center: np.ndarray, inertia: np.ndarray) -> str:
 
 
 def _jointed(joint: Joint, pose: np.ndarray) -> str:
-    """One <joint>, in the frame of its body."""
     given = {"armature": joint.armature, "damping": joint.damping, "frictionloss": joint.friction}
     parts = [f'{key}="{value!r}"' for key, value in given.items() if value]
     if joint.lower < joint.upper and not math.isinf(joint.upper - joint.lower):
@@ -221,7 +219,6 @@ def _jointed(joint: Joint, pose: np.ndarray) -> str:
 
 
 def _placed(pose: np.ndarray) -> str:
-    """Attributes pos and quat, where they are not the default."""
     quaternion = np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)
     position = f' pos="{numbers(pose[:3, 3])}"' if pose[:3, 3].any() else ""
     return position + ("" if np.array_equal(pose[:3, :3], np.eye(3)) else f' quat="{numbers(quaternion)}"')

@@ -86,7 +86,6 @@ class CompiledModel:
 
     @staticmethod
     def _named(name: str, taken: set[str]) -> str:
-        """The name, or one with a number where it is taken."""
         found, number = name, 1
         while found in taken:
             number += 1
@@ -113,7 +112,6 @@ class CompiledModel:
         self.elements.append(f'  <joint name={quoteattr(name)} type="{kind}">{inside}</joint>')
 
     def _body(self, body: int) -> None:
-        """The chain of joints of one body, and its link."""
         model, name = self.model, self.bodies[body]
         upper = self.bodies[model.body_parentid[body]]
         at = self._pose(model.body_pos[body], model.body_quat[body])
@@ -146,7 +144,6 @@ class CompiledModel:
         return inertial_element(model.body_mass[body], pose[:3, 3], inertia)
 
     def _parts(self, joint: int, kind: str) -> str:
-        """Axis, limits, damping, friction, rotor and coupling of one joint."""
         model, dof = self.model, self.model.jnt_dofadr[joint]
         parts = []
         if kind in ("revolute", "prismatic"):
@@ -169,7 +166,6 @@ class CompiledModel:
         return "".join(parts)
 
     def _actuators_of(self, joint: int) -> list[int]:
-        """Those that act on one joint by a constant ratio."""
         kinds = self.mujoco.mjtTrn
         direct = (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT))
         acts = np.isin(self.model.actuator_trntype, direct) & (self.model.actuator_trnid[:, 0] == joint)
@@ -191,7 +187,6 @@ class CompiledModel:
         return float(total) if actuators else np.inf
 
     def _is_motor(self, actuator: int) -> bool:
-        """Whether its force is its input times a constant."""
         model = self.model
         kinds = (model.actuator_gaintype[actuator], model.actuator_biastype[actuator], model.actuator_dyntype[actuator])
         return not any(kinds)
@@ -233,7 +228,6 @@ class CompiledModel:
         return tuple(found) if needed else ()
 
     def _couple(self) -> None:
-        """Linear couplings of two joints, and joints that one holds."""
         model, kinds = self.model, self.mujoco.mjtEq
         for k in range(model.neq):
             if model.eq_type[k] != kinds.mjEQ_JOINT or not model.eq_active0[k]:
@@ -254,7 +248,6 @@ class CompiledModel:
         return self.model.equality(k).name or f"equality {k}"
 
     def _is_sprung(self, joint: int) -> bool:
-        """Whether it has a linear spring, and one coordinate of its own."""
         model = self.model
         linear = model.jnt_stiffness[joint] and not _any(model, "jnt_stiffnesspoly", joint)
         return bool(linear) and model.jnt_type[joint] >= 2 and joint not in self.couplings
@@ -276,7 +269,6 @@ class CompiledModel:
         self.problems.note(f"left out: {what}", where)
 
     def _note_losses(self, motors: bool) -> None:
-        """Note what acts on the joints in MuJoCo and not here, and how often."""
         model, joints, kinds = self.model, range(self.model.njnt), self.mujoco.mjtEq
         known = [int(kind) for kind in (kinds.mjEQ_JOINT, kinds.mjEQ_CONNECT, kinds.mjEQ_WELD)]
         driving = {k for joint in joints if model.jnt_type[joint] >= 2 for k in self._actuators_of(joint)}

@@ -120,7 +120,6 @@ def _document(text: str) -> Any:
 
 
 def _found(document: Any, kind: str, name: str, source: str) -> Any:
-    """One of the elements directly in the root. Raises UnknownName."""
     for element in document.documentElement.childNodes:
         if element.nodeName == kind and element.getAttribute("name") == name:
             return element

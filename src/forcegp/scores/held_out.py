@@ -155,7 +155,6 @@ def _require_some(what: str, chosen: Sequence[int], known: Sequence[int]) -> Non
 
 
 def _episodes_apart(known: Sequence[int], episodes: Sequence[int]) -> Split:
-    """Whole episodes."""
     _require_some("episodes", episodes, known)
     sides = [listed([*map(str, each)]) for each in ([number for number in known if number not in episodes], episodes)]
     words = "trained on whole episodes ({}), tested on others ({})".format(*sides)

@@ -352,7 +352,6 @@ def kind_of(model: Model, identified: bool = False) -> Kind:
 
 
 def _parts(name: str) -> tuple[tuple[str, ...], tuple[Evidence, ...], tuple[Evidence, ...], str]:
-    """Forces, evidence of motions, other evidence, and that as text."""
     forces, _, text = name.partition(EVIDENCE)
     words = summands(text) if text else ()
     try:

@@ -134,7 +134,6 @@ def overall(scores: Scores) -> tuple[list[str], list[list[str]]]:
 
 
 def _cell(value: Mapping[str, Any] | float | None, score: str, digits: int) -> str:
-    """A median with its range, or one number; of a coverage in percent."""
     if value is None or not score.startswith("coverage"):
         return formatted(value, digits)
     if isinstance(value, Mapping):
@@ -143,7 +142,6 @@ def _cell(value: Mapping[str, Any] | float | None, score: str, digits: int) -> s
 
 
 def _lost(scores: Scores, model: str, quantity: str) -> str:
-    """How many motions had diverged by then."""
     if not quantity.startswith("position"):
         return ""
     moved = [run["motions"] for run in scores.finished(model)]

@@ -181,8 +181,7 @@ def normal_force_figure(posterior: Posterior, dataset: Dataset, *, start: float 
     """
     if not posterior.model.contacts:
         raise InvalidInput(
-            f"a model of {posterior.description} has no normal force to show; give one with contacts that predicts "
-            "forces."
+            f"a model of {posterior.description} has no normal force to show; give one whose contacts predict forces."
         )
     rows, contacts = style.window(dataset, start, seconds), posterior.model.contacts
     figure = style.new_figure(8.0, 1.2 + 2.4 * len(contacts))
