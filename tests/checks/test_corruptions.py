@@ -28,7 +28,7 @@ from tests.robots.robot_models import loaded, with_link
 from forcegp.checks import check, quick_check
 from forcegp.checks.causes import like_units
 from forcegp.checks.check_input import CheckInput
-from forcegp.checks.couplings import _weights
+from forcegp.checks.couplings import _needed, _rounded
 from forcegp.checks.explanations import _units
 from forcegp.checks.search import search
 from forcegp.checks.torque_doubts import _remembered, held_points, without_stops
@@ -277,7 +277,7 @@ def test_torques_of_shared_drives_are_those_of_simple_gears_first(weights, costs
     data = clean(two_links(), 1, noise="none")
     tau = two_links().inverse_dynamics(*map(torch.tensor, (data.q, data.v, data.a))).numpy()
     rows = replace(data, u=tau @ np.array(weights).T)
-    found = dict(_weights(Comparison(robot=two_links(), laws=(), rows=rows, given=rows), 0, 1))
+    found = dict(_rounded(_needed(Comparison(robot=two_links(), laws=(), rows=rows, given=rows), [0, 1])))
     assert [*found] == costs
     for cost, step in zip(costs, (0.25, 0.01), strict=False):
         assert found[cost] == pytest.approx(step * np.round(np.array(weights) / step), abs=1e-9)
@@ -295,6 +295,9 @@ def test_friction_that_remembers_is_no_push():
     """About a turn it is far from any that velocities make, for seconds here."""
     data = between_postures(arm_model().robot, 3, 24.0)
     assert not check(data).doubts.of("push")
+    stuck = between_postures(arm_model().robot, 5, 24.0)  # from 8 to 10 s two joints rest, and gears hold up to .9 Nm
+    bump = 0.9 * np.sqrt(np.sin(0.5 * np.pi * (stuck.time - 8.0)).clip(0.0)) * (abs(stuck.time - 9.0) < 1.0)
+    assert not check(replace(stuck, u=stuck.u + np.outer(bump, [1.0, 0.0, -1.0]))).doubts.of("push")
     inputs = CheckInput.of(data, data.model)
     found = search(inputs)[0]
     again = _remembered(found, inputs.below(3.0))  # which has other rows

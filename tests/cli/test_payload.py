@@ -10,7 +10,7 @@ import pytest
 from tests.fit.test_payload import CENTER, MASS, TEXT, Found, loaded, log
 from tests.goldens.compare import assert_unchanged
 
-from forcegp import Dataset, Payload, Robot
+from forcegp import Dataset, Model, Payload, Robot
 from forcegp.cli.payload import other_causes, payload_text, without_explained
 from forcegp.doubts import Doubts, look, wrong
 
@@ -32,8 +32,10 @@ def test_what_is_hardly_known_of_a_payload_is_said(half, far, told):
         )
         for name, (value, error) in numbers.items()
     }
-    robot = SimpleNamespace(mass=5.0, base="fixed", layout=SimpleNamespace(groups=()))
-    model = SimpleNamespace(laws=[Payload("hand", 0.5)], robot=robot)
+    hand = '<link name="hand"><inertial><mass value="5"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    joint = '<joint name="j" type="continuous"><parent link="base"/><child link="hand"/></joint>'
+    robot = Robot.from_urdf_text(f'<robot name="r"><link name="base"/>{hand}</inertial></link>{joint}</robot>')
+    model = Model(robot, (), (Payload("hand", 0.5),))
     assert payload_text(SimpleNamespace(estimates=each, model=model)) == told
 
 

@@ -1,7 +1,6 @@
 """Names, units, combinations and flags: what is understood, and what is refused."""
 
 import string
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -174,8 +173,10 @@ def test_names_are_guessed_only_where_nothing_else_can_be_meant(tmp_path):
     assert guessed_time(source, []) == "__time"
     for signal, text in (text.split(":") for text in COUNTED):
         names, found = (part.split() for part in text.split(">"))
-        assert counted_columns(signal, 2, SimpleNamespace(columns=names.copy)) == (tuple(found) or None)
-    assert counted_columns("q", 1, SimpleNamespace(columns=lambda: ("q", "q_des"))) == ("q",)
+        counted = open_source(write_text(tmp_path / "counted.csv", dict.fromkeys(names, columns["time"])))
+        assert counted_columns(signal, 2, counted) == (tuple(found) or None)
+    one = open_source(write_text(tmp_path / "one.csv", dict.fromkeys(("q", "q_des"), columns["time"])))
+    assert counted_columns("q", 1, one) == ("q",)
 
 
 COUNTED = (
