@@ -52,7 +52,7 @@ class Noise:
     def parameters(self, nv: int, device: torch.device | None = None) -> dict[str, Float[Tensor, "nv"]]:
         """Logarithms of deviations by joint. InvalidInput for a wrong number, and where only a dataset has it."""
         if self.acceleration is None:
-            raise InvalidInput("Noise(None) takes the noise of the acceleration from the dataset; give a number here.")
+            raise InvalidInput("Noise(None) takes noise of accelerations from the dataset of a fit; give a number.")
         named = {ACCELERATION: self.acceleration, FORCE: self.force, PUSHES: self.pushes}
         named = {name: value for name, value in named.items() if value is not None}
         out = {}

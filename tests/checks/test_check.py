@@ -285,6 +285,11 @@ def test_torques_that_repeat_over_equal_ways_are_named():
     [found] = check(replace(data, u=data.u + size * np.sin(60.0 * data.q))).doubts.of("cogging")
     np.testing.assert_allclose(found.numbers["way"], 2.0 * np.pi / 60.0, rtol=0.01)
     np.testing.assert_allclose(found.numbers["size"], size, rtol=0.05)
+    of_one = 0.6 * size[1] * np.sin(60.0 * data.q[:, 1])  # beside something else that no cause explains
+    rest = 0.36 * size[1] * np.sin(7.0 * data.time)
+    [found] = check(column(data, "u", 1, lambda u: u + of_one + rest)).doubts.of("cogging")
+    assert found.joints == ("lift",)
+    assert found.numbers["size"] == pytest.approx([0.6 * size[1]], rel=0.1)
 
 
 @pytest.mark.parametrize(

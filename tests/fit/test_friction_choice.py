@@ -103,7 +103,7 @@ def test_motors_that_turn_with_two_joints_are_found(T):
     assert list(slopes.values()) == pytest.approx(3 * [0.2], rel=0.2)
     assert ("the motor of bend turns with -1 lift +1 bend" in words) == bool(coupled)
     assert words.count("the motor of") == coupled
-    [first, *_] = friction_in_words(posterior.model, log, "Nm", {log.joint_names[1]})[0].split(" Nm")
+    [first, *_] = friction_in_words(posterior.model, log, "Nm", log.joint_names[1:2])[0].split(" Nm")
     assert first.split(", ")[1] == "–" != first.split(", ")[0]
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from forcegp.checks.causes import NUMBER, Candidate, number
 from forcegp.checks.check_input import CheckInput
-from forcegp.checks.torques import Comparison, solved
+from forcegp.checks.torques import Comparison, in_motion, solved
 from forcegp.data import Dataset
 from forcegp.data.ripple import rate_of_waves, waves
 from forcegp.doubts import listed
@@ -37,8 +37,9 @@ def cogging(now: Comparison, inputs: CheckInput, bad: np.ndarray) -> Iterator[Ca
     """One wave over the position of every joint that fits badly, where it explains most of what is left."""
     rows, more, sizes = now.rows, np.zeros_like(now.rows.u), dict[int, tuple[float, float]]()
     for joint in np.flatnonzero(bad).tolist():
-        q, basis = rows.q[:, joint], np.linalg.qr(now.friction[:, joint])[0]
-        if rate := rate_of_waves(q, rows.u[:, joint] - now.tau[:, joint], basis):
+        q, moves = rows.q[:, joint], in_motion(rows)[:, joint]  # a few places of rest would fit a fine wave
+        basis = np.linalg.qr(now.friction[moves, joint])[0]
+        if rate := rate_of_waves(q[moves], (rows.u - now.tau)[moves, joint], basis):
             columns = waves(q, rate)[:, None] * (np.arange(rows.nv) == joint)[:, None]
             found = solved(now, columns)
             if found is not None:

@@ -11,7 +11,7 @@ from forcegp.checks.causes import CLOSE, PREFIXES, SIGN, changed, like_units
 from forcegp.checks.check_input import CheckInput
 from forcegp.checks.explanations import candidates
 from forcegp.checks.fits import EXPLAINED, FAR, FEWEST_ROWS, MUCH_MORE, NOISE, RESTS, WORSE, Explanation
-from forcegp.checks.residuals import left_by_positions
+from forcegp.checks.residuals import cogging, left_by_positions
 from forcegp.checks.torques import LEAST, WIDTHS, Comparison, in_motion, positive_fit, stretch, torque_noise
 from forcegp.data import Dataset
 from forcegp.data.views import white_noise
@@ -69,6 +69,9 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
     if sure:
         factor = np.where(np.isin(np.arange(len(root.floor)), sure), -1.0, 1.0)
         root = replace(root, log=root.log.after(changed("u", factor=factor)), turned=tuple(sure))
+    for cause, log in () if sure else cogging(root.log, inputs, root.shares > DOUBTFUL):  # of one joint, too
+        if (best := Explanation(log, root.floor, (cause,))).shares[[*cause.joints]].max() <= EXPLAINED:
+            return best, list(_said(best, root, inputs))
     said = [*_signs(root, inputs), *_factors(root, inputs, explained=False), *_unknown(root, inputs)]
     if said and not sure and (turned := _all_turned(root, inputs)):
         return turned
@@ -283,8 +286,7 @@ def held_at_rest(root: Explanation, joint: int) -> Bool[np.ndarray, " rows"]:
     columns = np.c_[tau, friction, ones, -ones]
     number, _ = positive_fit(columns[moves], u[moves])
     left = np.abs(u - columns @ number)
-    holds = number[-2 - len(WIDTHS) : -2].sum() + np.sqrt(np.square(left[moves]).mean())
-    return ~moves & (left <= HELD * holds)
+    return ~moves & (left <= HELD * (number[-2 - len(WIDTHS) : -2].sum() + np.sqrt(np.square(left[moves]).mean())))
 
 
 def _where(root: Explanation, joint: int, inputs: CheckInput) -> tuple[str, str, float]:

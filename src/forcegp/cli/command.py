@@ -201,7 +201,7 @@ class Command(ABC):
             there = Path(os.path.realpath(other))
             same = there == here or (here.exists() and here.samefile(there))  # also by a hard link
             if same or (self.replaces and there.is_relative_to(here)):
-                raise InvalidInput(f"{path} would be written over {other}, which is read; choose another name.")
+                raise InvalidInput(f"{path} would be written over {other}, which this command reads; choose another.")
 
     @property
     def output(self) -> Path | None:

@@ -38,7 +38,9 @@ def parse_arguments(words: Sequence[str]) -> Command:
 
 OK, INTERNAL_ERROR, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 _REMEDIES = dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "; free some space, or write elsewhere.")
-_REMEDIES |= dict.fromkeys((errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR), "; write where you may.")
+_REMEDIES |= dict.fromkeys(
+    (errno.EROFS, errno.EACCES, errno.EPERM, errno.ENOTDIR), "; write to a folder where you may."
+)
 _REMEDIES[errno.EEXIST] = ", where a folder is needed: a file, or a link to nothing; remove it, or write elsewhere."
 """What to do about an OSError, by its number."""
 

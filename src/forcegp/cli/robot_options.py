@@ -118,7 +118,7 @@ class RobotOptions(RobotFileOptions):
                 raise OSError(f"it {why}")
             return forcegp.Model.from_json(path.read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError) as error:
-            raise FileFormatError(f"{path}: cannot be read ({error}); give a folder of `forcegp fit`.") from None
+            raise FileFormatError(f"{path} cannot be read ({error}); give a folder that `forcegp fit` wrote.") from None
 
 
 def identified_system(model: forcegp.Model) -> forcegp.Model:

@@ -1,6 +1,6 @@
 """Friction as users state it: dry, near rest, and viscous, of the curve that a fit found."""
 
-from collections.abc import Container, Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -14,9 +14,7 @@ SLIDES = 0.1  # of the root mean square speed: below it friction sticks, or turn
 RISES = 1.01  # times dry friction, from which that near rest is another
 
 
-def friction_in_words(
-    model: Model, log: Dataset, unit: str, still: Container[str] = ()
-) -> tuple[str, dict[str, float]]:
+def friction_in_words(model: Model, log: Dataset, unit: str, still: Sequence[str] = ()) -> tuple[str, dict[str, float]]:
     """Dry friction, that near rest, its memory; and the slope of each joint: of the line nearest to the fitted curve.
 
     A root of the speed shares slope and level with viscous and dry friction, whose own numbers are then neither. The

@@ -301,7 +301,7 @@ def law_columns(laws: Iterable[Law], robot: Robot, q: np.ndarray, v: Rows, u: In
     return out
 
 
-def usual_columns(robot: Robot, q: np.ndarray, v: Rows, u: Rows, a: Rows, widths: Iterable[float]) -> list[Rows]:
+def usual_columns(robot: Robot, q: np.ndarray, v: Rows, u: Inputs, a: Rows, widths: Iterable[float]) -> list[Rows]:
     """Of a rotor, viscous friction, dry friction of several widths, and an offset.
 
     Widths are relative to the root mean square velocity; several of them together are nearly any curve of friction.
