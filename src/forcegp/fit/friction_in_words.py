@@ -18,15 +18,13 @@ def friction_in_words(model: Model, log: Dataset, unit: str, still: Sequence[str
     """Dry friction, that near rest, its memory; and the slope of each joint: of the line nearest to the fitted curve.
 
     A root of the speed shares slope and level with viscous and dry friction, whose own numbers are then neither. The
-    line is that of the log's speeds beyond `SLIDES` of their root mean square, at that of the load; not of `still`.
+    line is that of the log's speeds beyond `SLIDES` of their root mean square, at that of the load, beside a breakaway.
     """
-    [law], [viscous] = (
-        [x for x in model.laws if isinstance(x, DryFriction)],
-        [x for x in model.laws if isinstance(x, Viscous)],
-    )
+    [law] = [x for x in model.laws if isinstance(x, DryFriction)]
+    [viscous] = [x for x in model.laws if isinstance(x, Viscous)]
     state = law.seen(model.state(*tensors(with_memory(log, model), model.robot.device)[:3]))
     v, load = state.v.abs(), state.delivered.square().mean(0).sqrt()
-    level = law.level_at((v, load), law.values)
+    level = law.level_at((v, load), {name: x for name, x in law.values.items() if name != "breakaway"})
     slides = v > SLIDES * v.square().mean(0).sqrt()
     count = slides.sum(0).clamp_min(1)
     mean = (slides * v).sum(0) / count
