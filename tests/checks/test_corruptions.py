@@ -283,6 +283,14 @@ def test_torques_of_shared_drives_are_those_of_simple_gears_first(weights, costs
         assert found[cost] == pytest.approx(step * np.round(np.array(weights) / step), abs=1e-9)
 
 
+def test_friction_of_motors_that_turn_two_joints_is_told_and_not_corrected():
+    data, turn = clean(two_links(), 1, noise="qvu"), np.array([[1.0, 1.0], [1.0, -1.0]])
+    rubs = 0.5 * np.std(data.u, axis=0) * np.tanh(data.v @ turn.T / 0.05)
+    [found] = check(replace(data, u=data.u + rubs @ turn)).doubts.of("coupled joints")
+    assert (found.level, found.joints, found.correction) == ("look", ("joint1", "joint2"), {})
+    assert found.what.startswith("friction of joint1 and joint2")
+
+
 @pytest.mark.parametrize(("share", "told"), [(0.8, True), (0.4, False)])
 def test_what_carries_a_sliding_joint_is_told(share, told):
     data = clean(ROBOTS["crane"](), 1, noise="qvu")
