@@ -152,7 +152,8 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
                     found, said = search(inputs)
             said = [*elastic, *said]
         thorough &= not {"jumps", "frozen channel"} & {each.about for each in doubts}  # torques are off there, too
-        if thorough and (jumps := list(jump(found, inputs))):
+        open_ = {x.about for x in said} <= {UNKNOWN, "dry friction"}
+        if thorough and open_ and (jumps := list(jump(found, inputs))):
             said = [*(x for x in said if x.about != UNKNOWN or x.joints != jumps[0].joints), *jumps]
         elif thorough and not any(each.about == UNKNOWN or each.level == "wrong" for each in said):
             said = [*said, *push(found, inputs)]

@@ -123,7 +123,7 @@ def elastic_doubts(inputs: CheckInput, log: Comparison) -> list[Doubt]:
         bends[own] = np.gradient(slopes[own], rows.time[own], axis=0)
     some = slice(None, None, max(1, len(rows) // MOST_ROWS))
     passed = {(f, d): _behind_spring(log.tau, rows, f, d)[some] for f in SPRINGS for d in DAMPING}
-    smooth = [_behind_spring(log.tau, rows, f, twice=True)[some] for f in SPRINGS]  # of less noise, and rigid
+    smooth = [_behind_spring(log.tau, rows, f, both_ways=True)[some] for f in SPRINGS]  # of less noise, and rigid
     tau, slopes, bends, friction, every = log.tau[some], slopes[some], bends[some], log.friction[some], rows.u[some]
     fitted = np.arange(len(tau)) * BLOCKS // len(tau) % 2 == 0
 
@@ -166,11 +166,11 @@ def elastic_doubts(inputs: CheckInput, log: Comparison) -> list[Doubt]:
 
 
 def _behind_spring(
-    tau: np.ndarray, rows: Dataset, hertz: float, damping: float = 0.7, twice: bool = False
+    tau: np.ndarray, rows: Dataset, hertz: float, damping: float = 0.7, both_ways: bool = False
 ) -> np.ndarray:
     """What reaches the motor of the torque that its motion asks for: x'' + 2 d w x' + w^2 x = w^2 tau, by Tustin.
 
-    `twice` it is no spring, but a filter without delay.
+    `both_ways` it is no spring, but a filter without delay.
     """
     from scipy.signal import bilinear, filtfilt, lfilter, lfilter_zi  # half a second, which only few logs should cost
 
@@ -179,7 +179,7 @@ def _behind_spring(
     b, a = bilinear([w * w], [1.0, 2.0 * damping * w, w * w], rate)
     for own in (rows.episode == number for number in rows.episodes):
         x, start = tau[own], lfilter_zi(b, a)[:, None] * tau[own][:1]
-        passed[own] = filtfilt(b, a, x, axis=0) if twice else lfilter(b, a, x, axis=0, zi=start)[0]
+        passed[own] = filtfilt(b, a, x, axis=0) if both_ways else lfilter(b, a, x, axis=0, zi=start)[0]
     return passed
 
 
@@ -280,7 +280,7 @@ def jump(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     yield look(
         about="offset",
         what=f"the torque of {name} is {size:+.3g} {inputs.unit_of_each('u')[joint]} from what it was before, from "
-        f"{time:.4g} s on: its sensor or amplifier has another zero there.",
+        f"{time:.4g} s on: its sensor or amplifier has another zero there{'' if inputs.rotates[joint] else ', or a load'}.",
         do=f"Leave the shorter part out by forcegp import --without {begin:.2f},{end:.2f}, as forcegp auto does.",
         joints=(name,),
         numbers={"offset": size, "seconds": [float(begin), float(end)], "nats": float(nats[joint])},

@@ -158,7 +158,7 @@ def fit(
         posterior = _of_numbers(model, logs, rest, rows, seed)
     else:
         if baseline is not None:
-            raise InvalidInput("a baseline is for payloads, without unknown functions; leave these or it out.")
+            raise InvalidInput("a baseline is for payloads, without unknown functions; leave one of them out.")
         search = Search(checked_jobs(jobs), restarts, seed, options, start)
         posterior = _Functions(model, search, engine, learning_points, unseen).fitted(dataset, points)
     if choice is not None:
