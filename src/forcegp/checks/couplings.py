@@ -17,7 +17,7 @@ LEAST_SHARE = 0.2  # of the larger weight in a torque, from which on the other j
 ROUNDED = (0.25, 2.5 * NUMBER), (0.01, 4.5 * NUMBER)  # to which weights are rounded, and what these numbers cost
 HALVES = [0.5 * np.array([[a, s * a], [b, -s * b]]) for a, b, s in product((1.0, -1.0), repeat=3)]
 """Weights of two drives that turn one joint together and the other against each other, under all signs."""
-OWN = 5.0  # factor either way up to which two torques are those of their joints, and friction alone that of drives
+OWN, ALIKE = 5.0, 0.5  # factor of the torque of a joint up to which it is its own; of the larger torque of two
 PARALLEL = 0.99  # cosine of the angle between the axes of a parallelogram
 EASILY = 20.0  # condition of the weights up to which torques can be told apart again
 
@@ -55,7 +55,8 @@ def coupled_joints(now: Comparison, inputs: CheckInput, bad: np.ndarray, first: 
             D[place], U[place] = weights.T, np.linalg.inv(weights)
             what = f"all signals of {names[one]} and {names[other]} are those of motors that turn both: a differential"
             yield from _apart(now, what, (one, other), {"q": D, "v": D, "u": U}, 1.5 * NUMBER)
-        if now.drives is None and found.diagonal().min() > 1.0 / OWN and found.diagonal().max() < OWN:
+        sizes, own = now.rows.u[:, [one, other]].std(axis=0), found.diagonal()  # in sums a large one hides the other
+        if now.drives is None and 1.0 / OWN < own.min() <= own.max() < OWN and sizes.min() > ALIKE * sizes.max():
             D = np.eye(now.rows.nv)
             D[place] = np.linalg.inv(HALVES[0])
             yield _sticking(now, inputs, (one, other), D)

@@ -280,7 +280,7 @@ def jump(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     yield look(
         about="offset",
         what=f"the torque of {name} is {size:+.3g} {inputs.unit_of_each('u')[joint]} from what it was before, from "
-        f"{time:.4g} s on: its sensor or amplifier has another zero there{'' if inputs.rotates[joint] else ', or a load'}.",
+        f"{time:.4g} s on: its sensor or amplifier has another zero{'' if inputs.rotates[joint] else ', or a load'}.",
         do=f"Leave the shorter part out by forcegp import --without {begin:.2f},{end:.2f}, as forcegp auto does.",
         joints=(name,),
         numbers={"offset": size, "seconds": [float(begin), float(end)], "nats": float(nats[joint])},
