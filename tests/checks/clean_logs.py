@@ -41,7 +41,6 @@ def rests(robot: Robot, seed: int, noise: float = 0.05, jitter: float = 0.0) -> 
 
 
 def one_rests(robot: Robot, seed: int) -> Dataset:
-    """The second joint is held all the time."""
     return with_motion(robot, clean(robot, seed).q * np.array([1.0, 0.0]) + np.array([0.0, 0.3]), 250.0, seed)
 
 

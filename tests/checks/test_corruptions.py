@@ -152,6 +152,8 @@ def test_what_no_cause_explains_is_said_with_its_place_and_without_a_remedy():
     left_out = found[0].do.partition("--without ")[2].split(",")[:2]
     np.testing.assert_allclose(np.array(left_out, float), [3.25, 4.75], atol=0.1)
     assert not found[0].correction
+    late = check(replace(data, u=data.u + np.outer(np.roll(pushed, 650), [0.0, 1.0]))).doubts.of("unknown cause")
+    assert late[0].numbers["seconds"][1] == pytest.approx(data.time[-1], abs=0.01)  # what is left is too short
     for joint in (0, 1):  # that of the first, which gravity pulls the other way, looks like another sign
         stiff = 2.0 * np.std(data.u[:, joint]) / np.std(data.q[:, joint])
         [spring] = said(replace(data, u=data.u + stiff * data.q * np.eye(2)[joint]))

@@ -37,7 +37,6 @@ MODEL = Model(Robot.from_urdf_text(PENDULUM, locked={"elbow": 0.0}))
 
 
 def swing(rate=100.0, rows=1000, **columns) -> Dataset:
-    """q = sin 2t; the given columns instead."""
     time = np.arange(rows) / rate
     waves = {"q": np.sin(2.0 * time), "v": 2.0 * np.cos(2.0 * time), "a": -4.0 * np.sin(2.0 * time)}
     made = waves | {"u": np.cos(3.0 * time + 1.0)}

@@ -15,7 +15,6 @@ FEW = ("--seconds", 2, "--tries", 3, "--limits", "velocity=1.5,acceleration=9,9,
 
 @pytest.fixture(scope="module")
 def folder(forcegp, tmp_path_factory):
-    """A robot, a log, and a model of friction."""
     place = tmp_path_factory.mktemp("excite")
     (place / "arm.urdf").write_text(URDF)
     arm_data(40, 0, arm_model(0)).save(place / "arm.h5")

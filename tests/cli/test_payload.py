@@ -53,7 +53,6 @@ def test_a_payload_takes_back_factors_of_joints_that_it_explains(carried, noise)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A log with the payload, and one without."""
     place = tmp_path_factory.mktemp("payload")
     log(loaded(), 1, noise=0.02).save(place / "loaded.h5")
     log(TEXT, 2, noise=0.02).save(place / "empty.h5")

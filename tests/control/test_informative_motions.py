@@ -23,7 +23,6 @@ def fitted(prior, model=FREE, rows=12):
 
 @pytest.fixture(scope="module")
 def posterior():
-    """Friction of three joints from 12 rows."""
     return fitted(JointFriction())
 
 

@@ -295,5 +295,5 @@ def slips(inputs: CheckInput) -> Iterator[Doubt]:
                     "these rows" if stood else "the shorter part", *left_out, "" if stood else ", or correct it"
                 ),
                 joints=(name,),
-                numbers={"jump": float(steps[row]), "time": at, "still": at - then},
+                numbers={"jump": float(steps[row]), "time": at, "stood": at - then},
             )

@@ -31,6 +31,7 @@ HELD = 3.0  # of the dry friction and of what remains in motion, from which on n
 WIDER = 0.0, 0.02, 0.03, 0.05  # of the log: by which its ends are moved, one after the other
 MOSTLY = 0.75  # share of what is left that sits somewhere
 UNCHANGED = 0.8  # share of steps without any change of a position, from which on its encoder may be dead
+SHORT = 2.0  # s, of what stays between pushes, which filters and splits have no use for; of rests at the ends of a log
 AT_END = 0.01  # of a joint's motion, within which a stop holds it
 
 
@@ -311,6 +312,8 @@ def _where(root: Explanation, joint: int, inputs: CheckInput) -> tuple[str, str,
                 if left <= EXPLAINED:
                     break
             ends = values[order[[max(first - 1, 0), min(last, len(rows) - 1)]]]
+            if name == "time":  # what is left at an end of the log is too short for filters
+                ends = np.where(np.abs(ends - inputs.log.time[[0, -1]]) < SHORT, inputs.log.time[[0, -1]], ends)
             text = f"; {100.0 * share:.0f} % of it at {inputs.names[joint]} for {name} between {ends[0]:.3g} and "
             edge = name == "q" and (first == 0 or last == len(rows))
             unit += ", an end of its motion, as of an end stop that gives way" if edge else ""

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
 from forcegp.checks.fits import RARELY
-from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, UNKNOWN, Explanation, held_at_rest
+from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, SHORT, UNKNOWN, Explanation, held_at_rest
 from forcegp.checks.torques import WIDTHS, Comparison, in_motion, stretch
 from forcegp.data import Dataset, estimate_delay, with_strokes
 from forcegp.data.views import consecutive, rests
@@ -35,7 +35,6 @@ SURE, TELLS = 150.0, 30.0
 BRIEF = 0.05  # of the rows, for which a torque is another
 ENDS = 5  # times that the ends of such a stretch are sought anew, as those that are most likely (Page 1954)
 SEEN, WARMER = 1e-3, 0.1  # share of the largest direction of columns; logarithm of a ratio of friction that is told
-SHORT = 2.0  # s, of what stays between pushes, which filters and splits have no use for; of rests at the ends of a log
 RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
 
 
@@ -390,9 +389,9 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
 
 
 def without_pushes(log: Dataset, doubts: Sequence[Doubt]) -> Dataset:
-    """The log without the seconds of pushes and loads; of several episodes, whose times repeat, as it is."""
+    """The log without the seconds of pushes and loads; where times of episodes repeat, as it is."""
     seen = [each for each in doubts if each.about in ("push", "load", "offset", UNKNOWN) and "seconds" in each.numbers]
-    spans = [doubt.numbers["seconds"] for doubt in seen if len(log.episodes) == 1]
+    spans = [each.numbers["seconds"] for each in seen if (np.diff(log.time) > 0.0).all()]
     touched = [np.flatnonzero((log.time >= begin) & (log.time <= end)) for begin, end in spans]
     if not touched:
         return log
