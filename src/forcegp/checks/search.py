@@ -226,7 +226,7 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     shares = ", ".join(f"{inputs.names[k]} {100.0 * root.rough[k]:.0f} %" for k in bad)
     numbers: dict[str, object] = {"unexplained": root.rough[bad].tolist(), "rows": len(rows)}
     do = "Look at these joints there: contacts, brakes, cables, another robot, or a channel that is not a torque."
-    if left <= EXPLAINED:
+    if left <= min(EXPLAINED, (1.0 - MOSTLY) * root.rough.max()):  # far less than there
         ends = [float(x) for x in seconds.split(",")]
         steps = np.diff(inputs.log.q[(inputs.log.time >= ends[0]) & (inputs.log.time <= ends[1])], axis=0)
         still = inputs.named([k for k in bad.tolist() if (steps[:, k] == 0.0).mean() > UNCHANGED])
