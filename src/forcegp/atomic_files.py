@@ -195,7 +195,7 @@ def _beside(target: Path) -> Iterator[Path]:
             shutil.rmtree(hidden, ignore_errors=True)
 
 
-def _remove_if_left(entry: Path) -> None:
+def _remove_if_left(entry: Path) -> None:  # unless the process that made it lives
     from filelock import FileLock, Timeout
 
     lock = FileLock(entry / LOCK)

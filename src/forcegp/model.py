@@ -260,7 +260,7 @@ class Model(Summary):
         return State(q, v, u, robot, self.inputs, by)
 
     @cached_property
-    def _u_is_delivered(self) -> bool:
+    def _u_is_delivered(self) -> bool:  # u is the force of every joint, and nothing else
         own = self.actuation
         return own.is_exact and own.matrix is None and len(self.inputs) == len(own.names)
 

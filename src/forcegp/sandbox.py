@@ -173,7 +173,7 @@ def _without_appearance(mujoco: Any, spec: Any) -> list[str]:
     return list(dict.fromkeys(bodies))
 
 
-def _has_mass(mujoco: Any, spec: Any, geom: Any) -> bool:
+def _has_mass(mujoco: Any, spec: Any, geom: Any) -> bool:  # that of a body contains that of this shape
     compiler, kinds = spec.compiler, mujoco.mjtInertiaFromGeom
     given = compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_AUTO and geom.parent.explicitinertial
     low, high = compiler.inertiagrouprange

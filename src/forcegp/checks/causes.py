@@ -16,7 +16,7 @@ SIGN, NUMBER = 0.5, 1.0
 """What a turned sign, or a free number, must gain at least: it is subtracted from the logarithm of what remains."""
 
 
-PREFIXES = ("m", 1e3), ("k", 1e-3)
+PREFIXES = ("m", 1e3), ("k", 1e-3)  # of units of torques: how many are one Nm or N
 LIKE, CLOSE = np.log(1.5), 0.07
 """Of the logarithm of a factor: how far that of a unit may be, and of one that is near others."""
 

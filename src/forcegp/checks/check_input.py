@@ -249,7 +249,7 @@ def _smoothed(dataset: Dataset) -> tuple[Dataset, int]:
     return replace(dataset.rows(inside + width // 2), **means, noise_std=None, truth={}), width
 
 
-def _even(dataset: Dataset, jumps: np.ndarray) -> Dataset:
+def _even(dataset: Dataset, jumps: np.ndarray) -> Dataset:  # stretches without gaps, each an episode
     pieces: list[np.ndarray] = []
     for number in dataset.episodes:
         rows = np.flatnonzero(dataset.episode == number)

@@ -188,7 +188,7 @@ def _driven(inputs: CheckInput, dead: np.ndarray) -> bool:
     return bool((size > PASSIVE * np.std(needed - fixed, axis=0)).any())
 
 
-def _still(log: Dataset, name: str) -> np.ndarray:
+def _still(log: Dataset, name: str) -> np.ndarray:  # up to rounding
     values = getattr(log, name)
     return np.ptp(values, axis=0) <= ROUNDING * np.abs(values).max(initial=0.0)
 
@@ -196,7 +196,7 @@ def _still(log: Dataset, name: str) -> np.ndarray:
 COUNTS = 5.5  # steps of an encoder between which a joint that stands still may go to and fro
 
 
-def _dithers(log: Dataset) -> np.ndarray:
+def _dithers(log: Dataset) -> np.ndarray:  # joints that stand still but for counts of their encoder
     spans = np.ptp(log.q, axis=0)
     counts = [span and span / resolution(x) for span, x in zip(spans, log.q.T, strict=True)]
     return (spans > 0.0) & (spans < np.where(log.turns, *STILL)) & (np.array(counts) < COUNTS)

@@ -207,7 +207,7 @@ class Auto(Command):
 
     def _prepared_rows(
         self, terminal: Terminal, raw: forcegp.Dataset, open_switches: bool, report: forcegp.checks.CheckReport
-    ) -> tuple[forcegp.Dataset, forcegp.Dataset]:
+    ) -> tuple[forcegp.Dataset, forcegp.Dataset]:  # to learn from, and the same at the full rate
         wanted, elastic = self.filter.preparation(), report.doubts.of("elastic joint")
         if wanted.cutoff == "auto" and wanted.differentiate == "q" and report.inputs.prepared is not None:
             found = forcegp.data.preparation_report(report.inputs.prepared.metadata)  # not to be sought again

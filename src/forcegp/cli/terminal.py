@@ -167,7 +167,7 @@ class Terminal:
             with watched(report):
                 yield
 
-    def _lines(self, what: str) -> Listener:
+    def _lines(self, what: str) -> Listener:  # at most one every few seconds
         reported = time.monotonic()
         if self.names_stages:
             self.note(f"{what} ...")

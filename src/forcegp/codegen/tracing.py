@@ -340,7 +340,7 @@ def _root(graph: Graph, total: int) -> int:
     return graph.apply("choose", positive, graph.apply("sqrt", graph.apply("choose", positive, total, ONE)), ZERO)
 
 
-def _distances(graph: Graph, x: Any, y: Any, order: float = 2.0, mode: Any = None) -> _Numbers:
+def _distances(graph: Graph, x: Any, y: Any, order: float = 2.0, mode: Any = None) -> _Numbers:  # cdist of order 2
     if order != 2.0:
         raise InvalidInput(f"compiled code holds distances of order 2 only, not {order}; give compile=False.")
     left, right = _numbers(graph, x).nodes.tolist(), _numbers(graph, y).nodes.tolist()
@@ -352,7 +352,7 @@ def _distances(graph: Graph, x: Any, y: Any, order: float = 2.0, mode: Any = Non
     return _Numbers(torch.tensor([[one(a, b) for b in right] for a in left], dtype=torch.long))
 
 
-def _product(graph: Graph, x: Any, y: Any) -> _Numbers:
+def _product(graph: Graph, x: Any, y: Any) -> _Numbers:  # mm and bmm
     left, right = _numbers(graph, x).nodes, _numbers(graph, y).nodes
     shape = (*left.shape[:-1], right.shape[-1])
     count = math.prod(left.shape[:-2])

@@ -262,7 +262,7 @@ class ContactMonitor:
         at_rest, fades = map(torch.as_tensor, self.near_rest)
         return at_rest * torch.exp(-v.abs() / fades) + unknown @ self.level.mT
 
-    def _errors(self, found: Residuals) -> Tensor:
+    def _errors(self, found: Residuals) -> Tensor:  # filtered as torques are
         return torch.from_numpy(self._low_passed(self._errors_now(*found[4:]).numpy()))[-len(found[0]) :]
 
     def _distances(self, found: Residuals) -> Float[Tensor, " rows"]:

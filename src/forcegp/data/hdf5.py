@@ -57,7 +57,7 @@ def fixed_text(text: Any) -> np.ndarray:
     return raw.astype(h5py.string_dtype("utf-8", max(raw.dtype.itemsize, 1)))
 
 
-def _attribute(file: h5py.File, name: str) -> Any:
+def _attribute(file: h5py.File, name: str) -> Any:  # number or text; None for texts that no file of ours holds
     if name not in file.attrs or file.attrs.get_id(name).dtype.hasobject:
         return None
     value = file.attrs[name]

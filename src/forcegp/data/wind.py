@@ -165,7 +165,7 @@ class _Forces:
         return self.wrench - explained(wind), np.stack([*slope, np.zeros_like(slope[0])], axis=-1)
 
 
-def _mean_winds(forces: _Forces, own: np.ndarray, count: int, step: float) -> np.ndarray | None:
+def _mean_winds(forces: _Forces, own: np.ndarray, count: int, step: float) -> np.ndarray | None:  # (episodes, 3)
     wind = _first_winds(forces, own, count)
     damping, best, solution = 1e-3, np.inf, wind
     normal, right = np.zeros((3 * count, 3 * count)), np.zeros(3 * count)

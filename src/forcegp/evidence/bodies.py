@@ -189,7 +189,7 @@ class Bodies:
     def _standard(self, pseudo: np.ndarray) -> np.ndarray:
         return pseudo.reshape(*pseudo.shape[:-2], 16) @ self._to_standard.T
 
-    def _congruent(self, inner: np.ndarray) -> np.ndarray:
+    def _congruent(self, inner: np.ndarray) -> np.ndarray:  # V inner V^T for (n, ..., 4, 4)
         V = self.factors.reshape(len(self.factors), *(1 for _ in range(inner.ndim - 3)), 4, 4)
         return V @ inner @ V.swapaxes(-1, -2)
 

@@ -95,7 +95,7 @@ def _turned(T: Float[np.ndarray, "nv nv"] | None, values: Float[np.ndarray, "row
     return values if T is None else np.einsum("kj,nk...->nj...", T, values)
 
 
-def _under_load(state: State, load: Tensor) -> State:
+def _under_load(state: State, load: Tensor) -> State:  # with actuators that deliver these joint forces
     return replace(state, delivered_by=lambda _: load)
 
 

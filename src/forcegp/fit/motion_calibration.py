@@ -111,7 +111,7 @@ def _left_out(
     yield from [(found[0][0], RecordedMotions.joined([x for _, x in found]))] if alike else found
 
 
-def _records(dataset: Dataset, seconds: float) -> int:
+def _records(dataset: Dataset, seconds: float) -> int:  # episodes that last so long
     return sum(_lasts(dataset, dataset.episode == episode, seconds) for episode in dataset.episodes)
 
 

@@ -86,7 +86,7 @@ class LatentPosterior(ABC):
         return torch.cat(blocks) if blocks else z.new_zeros(0)
 
     @cached_property
-    def _totals(self) -> tuple[float, ...]:
+    def _totals(self) -> tuple[float, ...]:  # of the weights, correctly rounded
         return tuple(math.fsum(weights.tolist()) for weights in self.weights)
 
 

@@ -43,7 +43,7 @@ class Surface(ABC):
         return torch.func.vmap(function)(flat).reshape(*p.shape[:-1], *trailing)
 
 
-class _Flat(Surface):
+class _Flat(Surface):  # the same unit normal everywhere
     normal: Vector
 
     @override

@@ -232,7 +232,7 @@ class Predictor(Summary):
         for output, rows in zip(outputs, self._by_torch(kind, [x[bad] for x in states]), strict=True):
             output[bad] = rows
 
-    def _by_torch(self, kind: str, states: Sequence[Tensor]) -> list[Tensor]:
+    def _by_torch(self, kind: str, states: Sequence[Tensor]) -> list[Tensor]:  # what the program gives
         with torch.no_grad():
             parts = [self._block_by_torch(kind, part) for part in _blocks(states)]
         return [_finished(rows, False).flatten(1) for rows in zip(*parts, strict=True)]

@@ -76,7 +76,7 @@ class ArrayFile(Source):
         return sorted(found, key=lambda name: [x.zfill(20) for x in re.findall(r"\d+|\D", name)])
 
     @cached_property
-    def _places(self) -> dict[str, tuple[str, int | None]]:
+    def _places(self) -> dict[str, tuple[str, int | None]]:  # column -> (full name of its array, column in it)
         places: dict[str, tuple[str, int | None]] = {}
         for full, (shape, _) in self.arrays.items():
             name = full

@@ -266,7 +266,7 @@ def open_source(path: Path, *, headerless: int | None = None, within: str | None
     return RosBag(path) if kind == "ros2" else TABLES[kind](path)
 
 
-def _kind(path: Path) -> str:
+def _kind(path: Path) -> str:  # the extension without .gz, or "ros2"
     if path.is_dir():
         if (path / "metadata.yaml").is_file() or any(path.glob("*.mcap")):
             return "ros2"

@@ -182,7 +182,7 @@ class MjcfWriter:
             raise RobotModelError(f"{seen}, which MuJoCo does not take; move its origin there.")
         self._body(joint.child, pose, joints, depth)
 
-    def _rigid(self, link: str) -> dict[str, np.ndarray]:
+    def _rigid(self, link: str) -> dict[str, np.ndarray]:  # links that move together, with poses in the first one
         found = {link: np.eye(4)}
         for name in (names := [link]):
             for joint in self.children[name]:
@@ -218,7 +218,7 @@ def _jointed(joint: Joint, pose: np.ndarray) -> str:
     return " ".join([f'<joint name={quoteattr(joint.name)} type="{KINDS[joint.type]}"', *parts]) + "/>"
 
 
-def _placed(pose: np.ndarray) -> str:
+def _placed(pose: np.ndarray) -> str:  # attributes pos and quat, where they are not the default
     quaternion = np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)
     position = f' pos="{numbers(pose[:3, 3])}"' if pose[:3, 3].any() else ""
     return position + ("" if np.array_equal(pose[:3, :3], np.eye(3)) else f' quat="{numbers(quaternion)}"')

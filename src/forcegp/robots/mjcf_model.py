@@ -85,7 +85,7 @@ class CompiledModel:
         return Translation(text, gravity, locked, loops, motors, springs)
 
     @staticmethod
-    def _named(name: str, taken: set[str]) -> str:
+    def _named(name: str, taken: set[str]) -> str:  # or one with a number where it is taken
         found, number = name, 1
         while found in taken:
             number += 1
@@ -165,7 +165,7 @@ class CompiledModel:
             parts.append(ratio.replace("<mimic", f"<mimic joint={quoteattr(self.joints[driver])}"))
         return "".join(parts)
 
-    def _actuators_of(self, joint: int) -> list[int]:
+    def _actuators_of(self, joint: int) -> list[int]:  # that act on one joint by a constant ratio
         kinds = self.mujoco.mjtTrn
         direct = (int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT))
         acts = np.isin(self.model.actuator_trntype, direct) & (self.model.actuator_trnid[:, 0] == joint)
@@ -186,7 +186,7 @@ class CompiledModel:
             total += force * abs(model.actuator_gear[k][0])
         return float(total) if actuators else np.inf
 
-    def _is_motor(self, actuator: int) -> bool:
+    def _is_motor(self, actuator: int) -> bool:  # its force is its input times a constant
         model = self.model
         kinds = (model.actuator_gaintype[actuator], model.actuator_biastype[actuator], model.actuator_dyntype[actuator])
         return not any(kinds)
@@ -227,7 +227,7 @@ class CompiledModel:
             found.append(Motor(self._named(name, taken), column, link, wrench))
         return tuple(found) if needed else ()
 
-    def _couple(self) -> None:
+    def _couple(self) -> None:  # linear couplings of two joints, and joints that one holds
         model, kinds = self.model, self.mujoco.mjtEq
         for k in range(model.neq):
             if model.eq_type[k] != kinds.mjEQ_JOINT or not model.eq_active0[k]:
@@ -247,7 +247,7 @@ class CompiledModel:
     def _equality(self, k: int) -> str:
         return self.model.equality(k).name or f"equality {k}"
 
-    def _is_sprung(self, joint: int) -> bool:
+    def _is_sprung(self, joint: int) -> bool:  # a linear spring, and one coordinate of its own
         model = self.model
         linear = model.jnt_stiffness[joint] and not _any(model, "jnt_stiffnesspoly", joint)
         return bool(linear) and model.jnt_type[joint] >= 2 and joint not in self.couplings
@@ -268,7 +268,7 @@ class CompiledModel:
     def _lose(self, what: str, where: str) -> None:
         self.problems.note(f"left out: {what}", where)
 
-    def _note_losses(self, motors: bool) -> None:
+    def _note_losses(self, motors: bool) -> None:  # what acts on the joints in MuJoCo and not here, and how often
         model, joints, kinds = self.model, range(self.model.njnt), self.mujoco.mjtEq
         known = [int(kind) for kind in (kinds.mjEQ_JOINT, kinds.mjEQ_CONNECT, kinds.mjEQ_WELD)]
         driving = {k for joint in joints if model.jnt_type[joint] >= 2 for k in self._actuators_of(joint)}

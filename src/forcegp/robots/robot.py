@@ -198,7 +198,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         """The robot as plain JSON values."""
         return {"urdf": self.urdf_text, "gravity": self.gravity.tolist(), "locked": self.locked, "base": self.base}
 
-    def _limp(self) -> set[int]:
+    def _limp(self) -> set[int]:  # coordinates that nothing resists at a position without symmetry
         step = torch.linspace(0.3, 1.1, self.nv, dtype=torch.float64).sin()
         M = self.mass_matrix(self.space.integrate(self.space.neutral(), step))
         own = M.diagonal()

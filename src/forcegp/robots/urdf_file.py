@@ -119,7 +119,7 @@ def _document(text: str) -> Any:
     return minidom.parseString(with_prefixes(text))
 
 
-def _found(document: Any, kind: str, name: str, source: str) -> Any:
+def _found(document: Any, kind: str, name: str, source: str) -> Any:  # directly in the root; raises UnknownName
     for element in document.documentElement.childNodes:
         if element.nodeName == kind and element.getAttribute("name") == name:
             return element

@@ -141,7 +141,7 @@ def _cell(value: Mapping[str, Any] | float | None, score: str, digits: int) -> s
     return f"{number(100.0 * value, digits)} %"
 
 
-def _lost(scores: Scores, model: str, quantity: str) -> str:
+def _lost(scores: Scores, model: str, quantity: str) -> str:  # motions that had diverged by then
     if not quantity.startswith("position"):
         return ""
     moved = [run["motions"] for run in scores.finished(model)]
