@@ -313,7 +313,8 @@ def _where(root: Explanation, joint: int, inputs: CheckInput) -> tuple[str, str,
                     break
             ends = values[order[[max(first - 1, 0), min(last, len(rows) - 1)]]]
             if name == "time":  # what is left at an end of the log is too short for filters
-                ends = np.where(np.abs(ends - inputs.log.time[[0, -1]]) < SHORT, inputs.log.time[[0, -1]], ends)
+                outer = np.array([inputs.log.time.min(), inputs.log.time.max()])  # times of episodes may begin anew
+                ends = np.where(np.abs(ends - outer) < SHORT, outer, ends)
             text = f"; {100.0 * share:.0f} % of it at {inputs.names[joint]} for {name} between {ends[0]:.3g} and "
             edge = name == "q" and (first == 0 or last == len(rows))
             unit += ", an end of its motion, as of an end stop that gives way" if edge else ""

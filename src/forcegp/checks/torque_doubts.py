@@ -272,10 +272,9 @@ def jump(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     if nats[joint] <= SURE or (np.delete(nats, joint) > TELLS).any():  # a load that is let go shows in several joints
         return
     size = float((powers[0] - powers[1])[joint] / (left * step).sum(axis=0)[joint])
-    name, first, smeared = inputs.names[joint], int(begins[joint]), 1.5 / inputs.compared_cutoff
-    time = rows.time[first]
+    name, time, smeared = inputs.names[joint], rows.time[begins[joint]], 1.5 / inputs.compared_cutoff
     begin, end = inputs.log.time[[0, -1]]
-    begin, end = (begin, time + smeared) if 2 * first < len(rows) else (time - smeared, end)
+    begin, end = (begin, time + smeared) if 2 * begins[joint] < len(rows) else (time - smeared, end)
     yield look(
         about="offset",
         what=f"the torque of {name} is {size:+.3g} {inputs.unit_of_each('u')[joint]} from what it was before, from "
