@@ -343,8 +343,10 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         force, place = (", ".join(f"{x:.3g}" for x in values) for values in (pull, 1e3 * at))
         text = f"torques fit a constant force of ({force}) N at ({place}) mm of {joint.child}, as of a hose or a cable"
         told = {"do": PULLED, "numbers": {"force": pull.tolist(), "point": at.tolist(), "link": joint.child}}
-        more = now.more + columns[..., :3] @ pull
-        yield number("pull", text, drive.joint, 0.0, 3.0 * NUMBER, **told), replace(now, more=more)
+        added = columns[..., :3] @ pull
+        after, before = _left_of(now, np.stack([now.rows.u, now.tau + added, now.tau]), np.eye(2))
+        if after < before:  # the steps may lead astray
+            yield number("pull", text, drive.joint, 0.0, 3.0 * NUMBER, **told), replace(now, more=now.more + added)
     for joint in range(rows.nv):
         only = (rows.q - rows.q.mean(axis=0)) * (np.arange(rows.nv) == joint)
         found = solved(now, only[..., None])
