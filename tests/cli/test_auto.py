@@ -261,3 +261,7 @@ def test_accelerations_are_learned_from_where_torques_make_them_predictable():
     wrist = arm.a + np.array([0.0, 0.0, 100.0]) * normal(size=off.shape)
     assert last(0.15 * off, wrist) == "identified@torques:both"
     assert last(30.0 * normal(size=off.shape)) == "identified+gp:joint-friction"
+    ways = arm.q - arm.q.mean(axis=0)
+    alone, both = (0.2 * u.std(axis=0) * x / x.std(axis=0) * [1, 0, 0] for x in (ways**3, ways * ways[:, [1, 2, 0]]))
+    assert last(alone) == "identified+gp:joint-position", "which explain what accelerations would be asked for"
+    assert last(both) == last(alone + both, still=("elbow",)) == "identified+gp:joint:inputs=q"

@@ -9,6 +9,7 @@ from tests.posterior.arm import NOISE, arm_data, arm_model
 from forcegp.errors import InvalidInput
 from forcegp.evidence import Accelerations
 from forcegp.fit import held_out_noise
+from forcegp.fit.physical import _left_out
 from forcegp.forces import Coulomb, RigidBodies, Viscous
 
 LAWS = Viscous(), Coulomb()
@@ -39,6 +40,9 @@ def test_episodes_are_left_out_whole():
     one = held_out_noise(model, rows, Accelerations())
     three = held_out_noise(model, replace(rows, episode=np.repeat([3, 1, 2], 40)), Accelerations())
     assert not np.array_equal(one.acceleration, three.acceleration)
+    left = [_left_out(replace(rows, episode=np.arange(120) // length)) for length in (24, 10)]
+    assert [len(each) for each in left] == [5, 6]
+    assert np.unique(left[1][1] // 10).tolist() == [1, 7], "of twelve pieces two at once"
 
 
 def test_refusals():

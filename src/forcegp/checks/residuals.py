@@ -20,15 +20,17 @@ ASKED = 0.6  # of what is left of a torque, below which a function of position l
 LEAST = 1e-3  # of the torque's own power, which is worth another law
 
 
-def pushed_where_they_are(rows: Dataset, model: Model) -> tuple[str, ...]:
-    """Joints whose torque the model misses by a function of their position, as of springs and cables."""
+def pushed_where_they_are(rows: Dataset, model: Model, *, by_all: bool = False) -> tuple[str, ...]:
+    """Joints whose torque the model misses by a function of their position, as of springs; `by_all` of every one."""
     left, found = motion_residuals(rows, model)[0], list[str]()
     for name, q, u, missed in zip(rows.joint_names, rows.q.T, rows.u.T, (left - left.mean(axis=0)).T, strict=False):
         knots = np.unique(np.quantile(q, np.linspace(0.0, 1.0, KNOTS)))
         hats = np.stack([np.interp(q, knots, each) for each in np.eye(len(knots))], axis=1)
         power = float(np.square(missed).sum())
-        enough = power > LEAST * len(u) * float(u.var()) > 0.0  # passive joints have rounding
-        if enough and _left(hats, missed) < ASKED * power:
+        if not power > LEAST * len(u) * float(u.var()) > 0.0:  # passive joints have rounding
+            continue
+        stays = left_by_positions(rows.q, hats[:, :0], missed)[1] * power if by_all else _left(hats, missed)
+        if stays < ASKED * power:
             found.append(name)
     return tuple(found)
 

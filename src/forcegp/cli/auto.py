@@ -309,15 +309,23 @@ def default_models(
     """What is compared: what thrusters fly through shows in no regression, so it is learned on the robot as given.
 
     Accelerations are learned from as well where torques predict them by half, unlike of light or still joints, and
-    leave more than `EXPLAINED` of the torque of a joint; beside torques where they predict most joints alone.
+    leave more than `EXPLAINED` of the torque of a joint; beside torques where they predict most joints alone. What is
+    left by positions is learned of that of each joint, or of all.
     """
+    from forcegp.checks.residuals import pushed_where_they_are  # PyTorch is not needed for a page of help
+
     friction = bool(model.robot.single_joint_names)
     if forcegp.data.thruster_columns(model):
         return "given", "identified", "gp:joint-friction+gp:aerodynamic" if friction else "gp:aerodynamic"
     models = ["given", "identified", *(["identified+gp:joint-friction"] if friction else [])]
-    if model.robot.space.is_vector_space and not model.contacts and not still:
-        rows = replace(rows, measured={})  # identified without them
+    if not model.robot.space.is_vector_space or model.contacts:
+        return tuple(models)
+    rows = replace(rows, measured={})  # identified without them
+    own, pulled = ({*pushed_where_they_are(rows, identified.model, by_all=by_all)} for by_all in (False, True))
+    models += ["identified+gp:joint:inputs=q"] if pulled - own else ["identified+gp:joint-position"] * bool(own)
+    if not still:
         left, missed = (x.std(axis=0) for x in forcegp.evidence.motion_residuals(rows, identified.model))
-        share, some = (missed < USABLE * rows.a.std(axis=0)).mean(), (left > EXPLAINED * rows.u.std(axis=0)).any()
+        share, much = (missed < USABLE * rows.a.std(axis=0)).mean(), left > EXPLAINED * rows.u.std(axis=0)
+        some = not own | pulled >= {name for name, one in zip(rows.joint_names, much, strict=True) if one}
         models += [f"identified@{'accelerations' if share == 1.0 else 'torques:both'}"] if share > 0.5 and some else []
     return tuple(models)

@@ -29,6 +29,8 @@ from forcegp.progress import tell
 
 ROWS = 5_000  # rows that are used at most, evenly spread: more of a filtered recording add little
 EQUATIONS = 40_000  # as many rows hold these equations, one per degree of freedom, at most
+ROUGH_EQUATIONS = 7_000
+"""Of acceleration, which take three times as long as those of torque, where a search begins or ends roughly."""
 WINDOWED, PER_WINDOW = 2_000, 10
 """Of means over windows so many rows are enough, or so many in each: half a second of a filtered log has few more."""
 REWEIGHTINGS = 2  # searches in which accelerations are weighted by noise of both kinds
@@ -78,6 +80,10 @@ def fit_physical(
     model = with_payloads_placed(model, logs)
     if robot.space.is_vector_space and evidence.of_torque and not evidence.noisy_in_both:
         logs = [one_row_per_rest(log) for log in logs]
+    some = ROUGH_EQUATIONS // robot.nv
+    if rows is None and not evidence.of_torque and max(map(len, logs)) > some:
+        rows = some if roughly else None
+        near = near or (None if roughly else fit_physical(model, logs, evidence, some, roughly=True))
     logs = [log.rows(evenly(log, most if rows is None else rows)) for log in logs]
     typical = typical_sizes(model, logs) if near is None else near.typical
     space = ParameterSpace(model, typical)
@@ -239,6 +245,7 @@ def typical_sizes(model: Model, logs: Sequence[Dataset]) -> dict[str, Float[np.n
 
 
 STRETCHES_LEFT_OUT = 4  # stretches of time that logs of fewer than three episodes are cut into
+EPISODES_LEFT_OUT = 6  # groups of episodes, at most: a log that rests cut into pieces has dozens
 
 
 def held_out_noise(model: Model, dataset: Dataset, evidence: Torques | Accelerations) -> Noise:
@@ -246,7 +253,7 @@ def held_out_noise(model: Model, dataset: Dataset, evidence: Torques | Accelerat
 
     Residuals of the rows that parameters were fitted to are too small for others, so every stretch is predicted by a
     model identified from the rest (block cross-validation; Burman, Chow & Nolan 1994): episodes, where there are three
-    or more, else `STRETCHES_LEFT_OUT` stretches of time. Raises InvalidInput for too few rows.
+    or more, `EPISODES_LEFT_OUT` groups at most, else `STRETCHES_LEFT_OUT` stretches of time. Raises InvalidInput for too few rows.
     """
     require_type("model", model, Model)
     dataset = with_memory(require_type("dataset", dataset, Dataset), model)
@@ -267,8 +274,9 @@ def held_out_noise(model: Model, dataset: Dataset, evidence: Torques | Accelerat
 
 
 def _left_out(dataset: Dataset) -> list[np.ndarray]:
-    if len(dataset.episodes) >= 3:
-        return [np.flatnonzero(dataset.episode == number) for number in dataset.episodes]
+    if len(known := np.array(dataset.episodes)) >= 3:
+        groups = [known[k::EPISODES_LEFT_OUT] for k in range(min(EPISODES_LEFT_OUT, len(known)))]
+        return [np.flatnonzero(np.isin(dataset.episode, group)) for group in groups]
     if len(dataset) < 2 * STRETCHES_LEFT_OUT:
         raise InvalidInput(f"the log has {len(dataset)} rows; held-out noise needs {2 * STRETCHES_LEFT_OUT} or more.")
     return np.array_split(np.lexsort((dataset.time, dataset.episode)), STRETCHES_LEFT_OUT)

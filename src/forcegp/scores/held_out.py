@@ -24,7 +24,7 @@ from forcegp.scores.accuracy import Table
 from forcegp.summary import plain
 
 FORMS, DEFAULT_BLOCKS = "folds, episodes:N,N..., leave-one-out or blocks:N:K,K...", "blocks:5:3,5"
-FOLDS = 4
+FOLDS, MANY = 4, 8  # groups of episodes; and episodes, beyond which two of these groups show as much
 COUNTS, SHOWN = (5, 10, 20), 0.05
 """Of blocks, two of five held out: the fewest that leave this share of every joint's squared velocity on both sides."""
 
@@ -100,7 +100,8 @@ def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split
 
     auto: a quarter of the episodes, drawn at random; where one is `MOST` of the log, blocks 3 and 5 of five, or of each
         five of more blocks where a joint moves on one side alone.
-    folds: the episodes in up to four groups, drawn at random, each held out in turn; with one episode as auto.
+    folds: the episodes in up to four groups, drawn at random, each held out in turn; of more than `MANY` two groups,
+        of one as auto.
     episodes:N,N...: whole episodes.
     leave-one-out: every episode once.
     blocks:N:K,K...: every episode is cut into N blocks of equal duration; those of these numbers, from 1, are held out,
@@ -118,7 +119,8 @@ def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split
                 return (_episodes_apart(known, sorted(drawn.tolist())),)
             case "folds", []:
                 groups = np.array_split(np.random.default_rng(0).permutation(known), min(FOLDS, len(known)))
-                return tuple(_episodes_apart(known, sorted(group.tolist())) for group in groups)
+                held = groups if len(known) <= MANY else groups[:2]
+                return tuple(_episodes_apart(known, sorted(group.tolist())) for group in held)
             case "leave-one-out", []:
                 return tuple(_episodes_apart(known, [number]) for number in known)
             case "episodes", [chosen]:
