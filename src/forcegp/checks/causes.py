@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -61,12 +62,15 @@ def number(about: str, what: str, joint: int, value: float, cost: float = NUMBER
     return Cause(about=about, what=what, cost=cost, number=True, **told)
 
 
+_alone = lru_cache(maxsize=4)(Model)  # of a robot: one check asks for it thousands of times
+
+
 def changed(signals: str = "", order: np.ndarray | None = None, factor: np.ndarray | float = 1.0) -> Change:
     """Signals of every joint from another column, times a factor; without forces, truth and metadata."""
 
     def change(dataset: Dataset) -> Dataset:
         places = np.arange(dataset.nv) if order is None else order
         columns = {name: getattr(dataset, name)[:, places] * factor for name in signals}
-        return replace(dataset, **columns, model=Model(dataset.model.robot), noise_std=None, truth={}, metadata={})
+        return replace(dataset, **columns, model=_alone(dataset.model.robot), noise_std=None, truth={}, metadata={})
 
     return change
