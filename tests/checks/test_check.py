@@ -52,13 +52,13 @@ def test_velocities_are_compared_of_joints_that_move(share, level):
     assert check(data).doubts.of("velocity").level == level
 
 
-def stopped(torque):
+def stopped(torque, at=700):
     """A motion that rests in the middle, on torques that lack so much [Nm] of what the posture needs."""
-    data, rows = clean(4, arm()), np.r_[:700, np.repeat(700, 200), 700:1400]
-    still, time = slice(700, 900), np.arange(len(rows)) / RATE
+    data, rows = clean(4, arm()), np.r_[:at, np.repeat(at, 200), at:1400]
+    still, time = slice(at, at + 200), np.arange(len(rows)) / RATE
     moved = {name: getattr(data, name)[rows] for name in "qvua"}
     moved["v"][still], moved["a"][still] = 0.0, 0.0
-    hold = data.model.robot.gravity_forces(torch.tensor(data.q[700])).numpy()
+    hold = data.model.robot.gravity_forces(torch.tensor(data.q[at])).numpy()
     moved["u"][still] = hold - torque + 0.03 * np.random.default_rng(0).normal(size=(200, 3))
     return Dataset(**moved, time=time, model=data.model)
 
@@ -75,6 +75,13 @@ def test_a_rest_on_brakes_is_left_out(lacking):
         assert len(kept.episodes) == 2
         assert np.abs(kept.v).max(axis=1).min() > 0.0
         assert len(without_stops(data.rows(slice(680, None)))[0].episodes) == 1  # 20 rows before it teach nothing
+
+
+def test_a_rest_at_an_end_of_its_motion_presses_on_a_stop():
+    data = stopped(np.array([0.0, 6.0, 0.0]), int(np.argmax(clean(4, arm()).q[:, 1])))
+    kept, [doubt] = without_stops(data)
+    assert "lift is held at an end of its motion" in doubt.what
+    assert data.q[:, 1].max() - kept.q[:, 1].max() == pytest.approx(0.1 * np.ptp(data.q[:, 1]), rel=0.2)
 
 
 def test_a_prepared_log_is_not_filtered_twice():
@@ -242,14 +249,17 @@ def test_a_joint_that_stands_still_while_its_torque_goes_on_has_a_dead_encoder()
     assert found.numbers["stands"] == ("lift",)
 
 
-@pytest.mark.parametrize(("wide", "stops"), [(0.009, True), (0.015, False)])
-def test_a_stop_is_a_hundredth_of_the_motion(wide, stops):
-    rng, log = np.random.default_rng(0), clean(4, seconds=12.0)
+@pytest.mark.parametrize(
+    ("wide", "stops", "rows"), [(0.009, 0.01, 1200), (0.045, 0.05, 1200), (0.06, None, 1200), (0.045, 0.05, 160)]
+)
+def test_a_stop_is_a_twentieth_of_the_motion_at_most(wide, stops, rows):
+    rng, log = np.random.default_rng(0), clean(4, seconds=12.0).rows(slice(rows))
     q, tau = rng.uniform(size=log.q.shape), rng.normal(size=log.u.shape)
     pushed = replace(log, q=q, u=tau + 50.0 * rng.uniform(0.5, 1.0, tau.shape) * (q > 1.0 - wide))
     held = Comparison(robot=log.model.robot, laws=(), rows=pushed, given=pushed)
     vars(held).update(tau=tau, friction=np.zeros((*tau.shape, 1)))
-    assert (_stop(Explanation(held, np.zeros(log.nv)), 0) is not None) == stops
+    found = _stop(Explanation(held, np.zeros(log.nv)), 0)
+    assert found == stops if found is None else found == pytest.approx((1.0, stops), abs=1e-2)
 
 
 @pytest.mark.parametrize("stops", [True, False])
@@ -264,6 +274,9 @@ def test_an_end_stop_is_told_by_where_it_holds_a_joint(stops):
     )
     [doubt] = check(log).doubts.of(UNKNOWN)
     assert doubt.numbers.get("stops", {}) == ({log.joint_names[1]: pytest.approx(end, abs=1e-2)} if stops else {})
+    if stops:
+        assert len(doubt.numbers["seconds"]) > 2
+        assert without_pushes(log, [doubt]).q[:, 1].max() < end
 
 
 def test_currents_are_in_a_wrong_unit_although_rotors_and_friction_explain_them():

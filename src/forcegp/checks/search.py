@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from jaxtyping import Bool
@@ -14,7 +15,7 @@ from forcegp.checks.fits import EXPLAINED, FAR, FEWEST_ROWS, MUCH_MORE, NOISE, R
 from forcegp.checks.residuals import cogging, left_by_positions
 from forcegp.checks.torques import LEAST, WIDTHS, Comparison, in_motion, positive_fit, stretch, torque_noise
 from forcegp.data import Dataset
-from forcegp.data.views import white_noise
+from forcegp.data.views import runs, white_noise
 from forcegp.doubts import Doubt, listed, look, wrong
 from forcegp.evidence import Torques, motion_residuals
 from forcegp.fit import fit
@@ -32,7 +33,7 @@ WIDER = 0.0, 0.02, 0.03, 0.05  # of the log: by which its ends are moved, one af
 MOSTLY = 0.75  # share of what is left that sits somewhere
 UNCHANGED = 0.8  # share of steps without any change of a position, from which on its encoder may be dead
 SHORT = 2.0  # s, of what stays between pushes, which filters and splits have no use for; of rests at the ends of a log
-AT_END = 0.01  # of a joint's motion, within which a stop holds it
+AT_END, STOPPED = (0.01, 0.02, 0.05), 5  # of a joint's motion, within which a stop holds it; rows there, at least
 
 
 def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
@@ -226,7 +227,21 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     shares = ", ".join(f"{inputs.names[k]} {100.0 * root.rough[k]:.0f} %" for k in bad)
     numbers: dict[str, object] = {"unexplained": root.rough[bad].tolist(), "rows": len(rows)}
     do = "Look at these joints there: contacts, brakes, cables, another robot, or a channel that is not a torque."
-    if left <= min(EXPLAINED, (1.0 - MOSTLY) * root.rough.max()):  # far less than there
+    if stops := {k: end for k in bad.tolist() if (end := _stop(root, k)) is not None}:
+        units = inputs.unit_of_each("q")
+        each = ", ".join(f"{inputs.names[k]} at {end:.3g} {units[k]}" for k, (end, _) in stops.items())
+        where = f"; next to nothing stays but at an end of the joint's motion ({each}): an end stop, or a contact"
+        numbers["stops"] = {inputs.names[k]: end for k, (end, _) in stops.items()}
+        time, smeared, q = inputs.log.time, 1.5 / inputs.compared_cutoff, inputs.log.q
+        there = np.any([np.abs(q[:, k] - end) <= wide for k, (end, wide) in stops.items()], axis=0)
+        near = time[runs(there)[:, 0], None] - smeared, time[runs(there)[:, 1] - 1, None] + smeared
+        ends = np.concatenate(near, axis=1)
+        apart = np.insert(ends[1:, 0] - ends[:-1, 1] > SHORT, 0, True)  # what stays between them is of no use
+        ends = np.stack([ends[apart, 0], np.maximum.reduceat(ends[:, 1], np.flatnonzero(apart))], axis=1)
+        numbers["seconds"] = ends.ravel().tolist()
+        seconds = ",".join(f"{each:.2f}" for each in ends.ravel())
+        do = f"Leave them out by forcegp import --without {seconds}, as forcegp auto does."
+    elif left <= min(EXPLAINED, (1.0 - MOSTLY) * root.rough.max()):  # far less than there
         ends = [float(x) for x in seconds.split(",")]
         steps = np.diff(inputs.log.q[(inputs.log.time >= ends[0]) & (inputs.log.time <= ends[1])], axis=0)
         still = inputs.named([k for k in bad.tolist() if (steps[:, k] == 0.0).mean() > UNCHANGED])
@@ -234,12 +249,6 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         where += f", elsewhere at most {100.0 * left:.2g} % stays: {why or 'a contact, or a load'}, in these seconds"
         numbers |= {"seconds": ends, **({"stands": still} if still else {})}
         do = f"Leave them out by forcegp import --without {seconds}, as forcegp auto does."
-    elif stops := {k: end for k in bad.tolist() if (end := _stop(root, k)) is not None}:
-        units = inputs.unit_of_each("q")
-        each = ", ".join(f"{inputs.names[k]} at {end:.3g} {units[k]}" for k, end in stops.items())
-        where += f"; next to nothing stays but at an end of the joint's motion ({each}): an end stop, or a contact"
-        do = "Leave these rows out by forcegp import --without, or record motion that ends before."
-        numbers["stops"] = {inputs.names[k]: end for k, end in stops.items()}
     else:
         fits = ((k, left_by_positions(rows.q, np.c_[tau[:, k], friction[:, k]], rows.u[:, k])) for k in bad.tolist())
         if names := inputs.named([k for k, (alone, beside) in fits if beside < EXPLAINED < alone]):
@@ -257,17 +266,17 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     )
 
 
-def _stop(root: Explanation, joint: int) -> float | None:
-    """The end of a joint's motion at which alone something is left of its torque; None where there is none."""
+def _stop(root: Explanation, joint: int) -> tuple[float, float] | None:
+    """The end of a joint's motion, and how wide, at which alone something is left of its torque; None where none is."""
     rows, ones = root.log.rows, np.ones((len(root.log.rows), 1))
     q, u = rows.q[:, joint], rows.u[:, joint]
     columns = np.c_[root.log.tau[:, joint], root.log.friction[:, joint], ones, -ones]
-    for end in (float(q.min()), float(q.max())):
-        there = np.abs(q - end) <= AT_END * np.ptp(q)
-        if FEWEST_ROWS <= there.sum() < 0.5 * len(q):
+    for wide, end in product(AT_END, (float(q.min()), float(q.max()))):
+        there = np.abs(q - end) <= wide * np.ptp(q)
+        if STOPPED <= there.sum() < 0.5 * len(q):
             left = np.square(u - columns @ positive_fit(columns[~there], u[~there])[0])
             if left[~there].sum() <= (1.0 - MOSTLY) * left.sum() and left[~there].mean() <= EXPLAINED**2 * u.var():
-                return end
+                return end, wide * float(np.ptp(q))
     return None
 
 

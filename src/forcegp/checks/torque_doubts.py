@@ -35,6 +35,7 @@ SURE, TELLS = 150.0, 30.0
 BRIEF = 0.05  # of the rows, for which a torque is another
 ENDS = 5  # times that the ends of such a stretch are sought anew, as those that are most likely (Page 1954)
 SEEN, WARMER = 1e-3, 0.1  # share of the largest direction of columns; logarithm of a ratio of friction that is told
+PRESSED = 0.1  # of a joint's motion, of which an end stop may hold it
 RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
 
 
@@ -346,7 +347,8 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
     if not found or sum(map(len, found)) > len(log) // 2:
         return log, []
     still = np.unique(np.concatenate(found))
-    inputs, at, held = CheckInput.quick(_cut(log, still), model), log.rows(still), np.zeros(len(still), bool)
+    inputs, at = CheckInput.quick(_cut(log, still), model), log.rows(still)
+    held = np.zeros(at.v.shape, dtype=bool)
     compared = inputs.mended if inputs.compared is None else inputs.compared
     rows = replace(inputs, compared=compared, most_rows=1000).rows()
     columns, standing = _needs(inputs.robot, rows), _needs(inputs.robot, at)
@@ -354,7 +356,10 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
     long = (np.ptp(log.time[rest]) > SHORT for rest in found)
     outer = [np.abs(x[[0, -1]] - y).min() < FEWEST_ROWS and z for x, y, z in zip(found, ends, long, strict=True)]
     idle = np.isin(still, np.concatenate([still[:0], *(x for x, at_end in zip(found, outer, strict=True) if at_end)]))
-    each = zip(rows.u.T, rows.v.T, rows.a.T, in_motion(rows).T, strict=True)
+    each, places = (
+        zip(rows.u.T, rows.v.T, rows.a.T, in_motion(rows).T, strict=True),
+        [np.searchsorted(still, x) for x in found],
+    )
     for k, (u, v, a, moves) in enumerate(each):
         slow = np.sqrt(np.square(v).mean()) + 1e-300
         dry = np.stack([np.tanh(v / (width * slow)) for width in WIDTHS], axis=1)
@@ -368,19 +373,33 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
         far = np.square(standing[:, k] / size[:count] @ inverse[:count]).sum(axis=1)  # a posture unlike those of motion
         most = np.abs(dry @ number[-len(WIDTHS) :]).max() + np.std((u - both @ number)[slides])
         unsure = np.where(idle, 1.0, np.sqrt(1.0 + far))  # but before and behind all motion, of which none is lost
-        held |= np.abs(at.u[:, k] - standing[:, k] @ number[:count]) > HELD * most * unsure
-    stops = [each for each in found if held[np.isin(still, each)].mean() > 0.5]
+        held[:, k] = np.abs(at.u[:, k] - standing[:, k] @ number[:count]) > HELD * most * unsure
+        for rest in places:  # in one posture, where stiction of both ways changes less
+            u = at.u[rest, k]
+            ends = np.median(u[:FEWEST_ROWS]), np.median(u[-FEWEST_ROWS:])
+            held[rest, k] |= (np.abs(np.subtract.outer(u, ends)) > HELD * most).any(axis=1)
+    stops = [each for each, rest in zip(found, places, strict=True) if held[rest].any(axis=1).mean() > 0.5]
     if not stops:
         return log, []
     out = np.unique(np.concatenate(stops))
+    why = "brakes hold the robot, its drives are off, or they bear what stiction holds"
+    for k in np.flatnonzero((alone := held[np.isin(still, out)].mean(axis=0) > 0.5) & (alone.sum() == 1)):
+        for end in (log.q[:, k].min(), log.q[:, k].max()):
+            there = np.abs(log.q[:, k] - end) <= PRESSED * np.ptp(log.q[:, k])
+            if there[out].all():
+                out = np.union1d(out, np.flatnonzero(there))
+                why = f"{inputs.names[k]} is held at an end of its motion, {end:.3g} {inputs.unit_of_each('q')[k]}, as "
+                why += "by an end stop or a contact; all rows near that end are left out"
     pieces = np.split(kept := np.setdiff1d(np.arange(len(log)), out), np.flatnonzero(np.diff(kept) > 1) + 1)
     out = np.unique(np.concatenate([out, *(each for each in pieces if len(each) < FEWEST_ROWS)]))  # none to learn from
-    spans = [log.time[each[[0, -1]]].tolist() for each in np.split(out, np.flatnonzero(np.diff(out) > 1) + 1)]
+    spans, rested = (
+        [log.time[each[[0, -1]]].tolist() for each in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)]
+        for rows in (out, np.unique(np.concatenate(stops)))
+    )
     doubt = look(
         about="stop",
-        what=f"all joints stand still from {', '.join(f'{x:.4g} to {y:.4g}' for x, y in spans)} s, and their torques "
-        "are not those that this posture needs by what the motion tells: brakes hold the robot, its drives are off, or "
-        "they bear what stiction holds.",
+        what=f"all joints stand still from {', '.join(f'{x:.4g} to {y:.4g}' for x, y in rested)} s, and their torques "
+        f"are not those that this posture needs by what the motion tells: {why}.",
         do="These rows are left out of all checks, and of forcegp auto; of other fits leave them out yourself.",
         numbers={"seconds": spans},
     )
@@ -390,8 +409,8 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
 def without_pushes(log: Dataset, doubts: Sequence[Doubt]) -> Dataset:
     """The log without the seconds of pushes and loads; where times of episodes repeat, as it is."""
     seen = [each for each in doubts if each.about in ("push", "load", "offset", UNKNOWN) and "seconds" in each.numbers]
-    spans = [each.numbers["seconds"] for each in seen if (np.diff(log.time) > 0.0).all()]
-    touched = [np.flatnonzero((log.time >= begin) & (log.time <= end)) for begin, end in spans]
+    spans = np.array([x for each in seen if (np.diff(log.time) > 0.0).all() for x in each.numbers["seconds"]])
+    touched = [np.flatnonzero((log.time >= begin) & (log.time <= end)) for begin, end in spans.reshape(-1, 2)]
     if not touched:
         return log
     left = _cut(log, np.concatenate(touched))
