@@ -16,7 +16,8 @@ def rate_of_waves(
 ) -> float:
     """The rate [1/rad or 1/m] of a wave over positions that explains most of what orthonormal columns leave of a force.
 
-    It is that of the largest power (Lomb 1976, Scargle 1982); 0 where no wave explains most.
+    It is that of the largest power (Lomb 1976, Scargle 1982); 0 where no wave explains most, and what the best of so
+    many would of noise: twice the logarithm of their number over that of the rows.
     """
     reach, thin = float(np.ptp(q)), -(-len(q) // MOST_ROWS)
     left = force - basis @ (basis.T @ force)
@@ -25,12 +26,13 @@ def rate_of_waves(
         return 0.0
     from scipy.signal import lombscargle  # half a second, which only few logs should cost
 
-    best, power = 0.0, 0.0  # of few rows, then closer of all
-    for repetitions, step in ((np.arange(FEWEST, FINEST, STEP), thin), (np.linspace(-STEP, STEP, 41), 1)):
+    best, power, tried = 0.0, 0.0, np.arange(FEWEST, FINEST, STEP)  # of few rows, then closer of all
+    by_chance = 2.0 * np.log(len(tried)) / len(q)
+    for repetitions, step in ((tried, thin), (np.linspace(-STEP, STEP, 41), 1)):
         rates = best + 2.0 * np.pi / reach * repetitions
         found = lombscargle(q[::step] - q.mean(), left[::step], rates)
         best, power = float(rates[int(np.argmax(found))]), float(found.max())
-    return best if 2.0 * power > REPEATS * np.square(left).sum() else 0.0
+    return best if 2.0 * power > (REPEATS + by_chance) * np.square(left).sum() else 0.0
 
 
 def waves(q: Float[np.ndarray, " rows"], rate: float) -> Float[np.ndarray, "rows 2"]:

@@ -126,8 +126,8 @@ CAUSES = {
 }
 """Usual deviations of the logarithms of factors (of zeros in rad or m, of centres in m, of gravity in g), what they are
 of, and what to do. All factors of a cause are tried, and each alone; of centres those of each link. Of two the first is
-named, unless the other explains a tenth more, or as much by fewer numbers: what it explains less the half of the
-logarithm of the rows for each factor (Schwarz 1978)."""
+named, unless the other explains a tenth more, or as much by fewer numbers, or more: what it explains less the half of
+the logarithm of the rows for each factor (Schwarz 1978)."""
 ADDED = {"joint zero": " rad", "centres of mass": " m", "gravity": " g"}
 ALONE, MOSTLY = {"gear ratio": 0.1, "joint zero": 0.05}, 0.3
 """Of these no two are tried at once, and one is so large at least, and explains this share of what is left."""
@@ -192,7 +192,8 @@ def misfit(
         change, move = instead or changes
         off, factors = abs(change) > WRONG, np.exp(change) if instead is None else 1.0 + change
         count = int((change != 0.0).sum())
-        better = worth > best or (cause not in ALONE and count < fewest[0] and more > fewest[1])
+        fewer = cause not in ALONE and count < fewest[0]
+        better = worth > best or (fewer and (more > fewest[1] or 1.1 * worth > best))
         clearly = instead is not None or (better and more > max(least, MOSTLY * cost * (cause in ALONE)))
         if cause == "gravity":  # it is turned, and no other
             down = model.robot.gravity.cpu().numpy() / 9.81
