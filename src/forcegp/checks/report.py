@@ -10,7 +10,7 @@ import numpy as np
 
 from forcegp.checks.check_input import QUICK_ROWS, STILL, CheckInput
 from forcegp.checks.moving_base import base_doubts, carried_doubts, stance_doubts, unmeasured_base_doubts
-from forcegp.checks.search import UNKNOWN, Explanation, search
+from forcegp.checks.search import SHORT, UNKNOWN, Explanation, search
 from forcegp.checks.signals import motion_doubts, sampling_doubts, signal_doubts, target_doubts, without_registers
 from forcegp.checks.torque_doubts import TOUCHES, elastic_doubts, held_points, jump, push, torque_doubts, without_stops
 from forcegp.checks.torques import in_motion
@@ -159,7 +159,10 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
             said = [*said, *push(found, inputs)]
         if not moved or {"degrees", "turns", "time unit"} & {doubt.about for doubt in said}:  # torques follow
             said = [doubt for doubt in said if doubt.about not in ("torque unit", "torque constant")]
-        doubts, comparison = [*doubts, *said, *torque_doubts(inputs, found)], found
+        more, begin = torque_doubts(inputs, found), float(inputs.log.time.min())
+        if Doubts(more).of("drift"):  # of gears that are cold at first
+            said = [x for x in said if x.about != "push" or x.numbers["seconds"][0] > begin + SHORT]
+        doubts, comparison = [*doubts, *said, *more], found
     return doubts, comparison
 
 

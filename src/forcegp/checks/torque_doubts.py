@@ -373,11 +373,14 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
         far = np.square(standing[:, k] / size[:count] @ inverse[:count]).sum(axis=1)  # a posture unlike those of motion
         most = np.abs(dry @ number[-len(WIDTHS) :]).max() + np.std((u - both @ number)[slides])
         unsure = np.where(idle, 1.0, np.sqrt(1.0 + far))  # but before and behind all motion, of which none is lost
-        held[:, k] = np.abs(at.u[:, k] - standing[:, k] @ number[:count]) > HELD * most * unsure
-        for rest in places:  # in one posture, where stiction of both ways changes less
-            u = at.u[rest, k]
+        away = np.abs(at.u[:, k] - standing[:, k] @ number[:count]) / (most * unsure)
+        usual = float(np.median([np.median(away[rest]) for rest in places]))  # of filters, and of motors that hold on
+        held[:, k] = away > HELD * (max(usual, 1.0) if usual < HELD else 1.0)
+        for rest in places:  # in one posture, once it has settled, where stiction of both ways changes less
+            settled = rest[min(len(rest) // 5, 2 * FEWEST_ROWS) :]
+            u = at.u[settled, k]
             ends = np.median(u[:FEWEST_ROWS]), np.median(u[-FEWEST_ROWS:])
-            held[rest, k] |= (np.abs(np.subtract.outer(u, ends)) > HELD * most).any(axis=1)
+            held[settled, k] |= (np.abs(np.subtract.outer(u, ends)) > HELD * most).any(axis=1)
     stops = [each for each, rest in zip(found, places, strict=True) if held[rest].any(axis=1).mean() > 0.5]
     if not stops:
         return log, []
