@@ -234,10 +234,9 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         numbers["stops"] = {inputs.names[k]: end for k, (end, _) in stops.items()}
         time, smeared, q = inputs.log.time, 1.5 / inputs.compared_cutoff, inputs.log.q
         there = np.any([np.abs(q[:, k] - end) <= wide for k, (end, wide) in stops.items()], axis=0)
-        near = time[runs(there)[:, 0], None] - smeared, time[runs(there)[:, 1] - 1, None] + smeared
-        ends = np.concatenate(near, axis=1)
-        apart = np.insert(ends[1:, 0] - ends[:-1, 1] > SHORT, 0, True)  # what stays between them is of no use
-        ends = np.stack([ends[apart, 0], np.maximum.reduceat(ends[:, 1], np.flatnonzero(apart))], axis=1)
+        begin, end = time[runs(there) - np.array([0, 1])].T + np.array([[-smeared], [smeared]])
+        apart = np.insert(begin[1:] - end[:-1] > SHORT, 0, True)  # what stays between them is of no use
+        ends = np.stack([begin[apart], np.maximum.reduceat(end, np.flatnonzero(apart))], axis=1)
         numbers["seconds"] = ends.ravel().tolist()
         seconds = ",".join(f"{each:.2f}" for each in ends.ravel())
         do = f"Leave them out by forcegp import --without {seconds}, as forcegp auto does."

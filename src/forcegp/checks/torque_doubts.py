@@ -356,11 +356,8 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
     long = (np.ptp(log.time[rest]) > SHORT for rest in found)
     outer = [np.abs(x[[0, -1]] - y).min() < FEWEST_ROWS and z for x, y, z in zip(found, ends, long, strict=True)]
     idle = np.isin(still, np.concatenate([still[:0], *(x for x, at_end in zip(found, outer, strict=True) if at_end)]))
-    each, places = (
-        zip(rows.u.T, rows.v.T, rows.a.T, in_motion(rows).T, strict=True),
-        [np.searchsorted(still, x) for x in found],
-    )
-    for k, (u, v, a, moves) in enumerate(each):
+    places = [np.searchsorted(still, x) for x in found]
+    for k, (u, v, a, moves) in enumerate(zip(rows.u.T, rows.v.T, rows.a.T, in_motion(rows).T, strict=True)):
         slow = np.sqrt(np.square(v).mean()) + 1e-300
         dry = np.stack([np.tanh(v / (width * slow)) for width in WIDTHS], axis=1)
         both = np.c_[columns[:, k], a, v, dry]
@@ -395,10 +392,8 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
                 why += "by an end stop or a contact; all rows near that end are left out"
     pieces = np.split(kept := np.setdiff1d(np.arange(len(log)), out), np.flatnonzero(np.diff(kept) > 1) + 1)
     out = np.unique(np.concatenate([out, *(each for each in pieces if len(each) < FEWEST_ROWS)]))  # none to learn from
-    spans, rested = (
-        [log.time[each[[0, -1]]].tolist() for each in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)]
-        for rows in (out, np.unique(np.concatenate(stops)))
-    )
+    apart = (np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) for rows in (out, np.unique(np.concatenate(stops))))
+    spans, rested = ([log.time[each[[0, -1]]].tolist() for each in some] for some in apart)
     doubt = look(
         about="stop",
         what=f"all joints stand still from {', '.join(f'{x:.4g} to {y:.4g}' for x, y in rested)} s, and their torques "

@@ -20,16 +20,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
 import forcegp.data
-from forcegp.atomic_files import (
-    SUMS,
-    atomic_folder,
-    read_json,
-    require_replaceable,
-    require_writable,
-    unreadable,
-    write_digests,
-    write_json,
-)
+from forcegp import atomic_files
 from forcegp.cli.terminal import Terminal
 from forcegp.errors import FileFormatError, InvalidInput
 
@@ -187,7 +178,7 @@ class Command(ABC):
                 for path in given if isinstance(given, tuple) else () if given is None else (given,):
                     if not mark.is_there(path):
                         raise FileFormatError(f"{path}{mark.refusal}")
-                    if why := unreadable(path, math.inf):
+                    if why := atomic_files.unreadable(path, math.inf):
                         raise FileFormatError(f"{path} {why}; give a regular file.")
                     inputs.append(path)
         path = self.output
@@ -261,13 +252,13 @@ class Command(ABC):
     def require_free(self, path: Path | None) -> None:
         """Refuse what exists, but empty folders, and with --overwrite what only this command wrote."""
         if path is not None:
-            require_replaceable(path, f"`{self.kind}`", self.wrote, overwrite=self.overwrite)
-            require_writable(path)
+            atomic_files.require_replaceable(path, f"`{self.kind}`", self.wrote, overwrite=self.overwrite)
+            atomic_files.require_writable(path)
 
     def wrote(self, folder: Path) -> bool:
         """Whether this command wrote a folder. Raises FileFormatError for a config.json that is none."""
         there = (folder / CONFIG).exists()
-        return there and read_json(folder / CONFIG, "choose another name").get("kind") == self.kind
+        return there and atomic_files.read_json(folder / CONFIG, "choose another name").get("kind") == self.kind
 
     def require_free_file(
         self, path: Path | None, own: Callable[[Path], bool] | None = None, what: str = "a dataset of forcegp"
@@ -285,21 +276,23 @@ class Command(ABC):
             raise InvalidInput(f"the folder {path.parent} does not exist; create it first.")
         if path.exists() and path.stat().st_size and not (own or forcegp.data.is_dataset)(path):
             raise InvalidInput(f"{path} is not {what}, so it is not overwritten; choose another name.")
-        require_writable(path)
+        atomic_files.require_writable(path)
 
     @contextlib.contextmanager
     def folder(self, path: Path, content: Mapping[str, Any]) -> Iterator[Path]:
         """A new folder, there once all is in it, with a config.json of this content, and digests of all files."""
-        with atomic_folder(path) as folder:
+        with atomic_files.atomic_folder(path) as folder:
             folder.mkdir()
             yield folder
             present = (file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
             from importlib.metadata import version  # 30 ms that --help and errors do without
 
             versions = {"python": platform.python_version()} | {name: version(name) for name in LIBRARIES}
-            files = sorted({CONFIG, SUMS, *present})
-            write_json(folder / CONFIG, {"kind": self.kind, **content, "versions": versions, "files": files})
-            write_digests(folder)
+            files = sorted({CONFIG, atomic_files.SUMS, *present})
+            atomic_files.write_json(
+                folder / CONFIG, {"kind": self.kind, **content, "versions": versions, "files": files}
+            )
+            atomic_files.write_digests(folder)
             self.require_free(path)
 
     @abstractmethod

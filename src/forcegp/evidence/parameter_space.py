@@ -15,15 +15,7 @@ from scipy.linalg import block_diag
 from torch import Tensor
 
 from forcegp.errors import InvalidInput
-from forcegp.evidence.bodies import (
-    QUANTITIES,
-    Bodies,
-    Coordinates,
-    body_names,
-    body_pseudo_inertias,
-    carrying,
-    with_bodies,
-)  # fmt: skip
+from forcegp.evidence import bodies
 from forcegp.evidence.least_squares import Rows
 from forcegp.forces import Actuation, Body, Law, LogNormal, Normal, Parameter, Payload, RigidBodies
 from forcegp.forces.joint_law import PerJointLaw
@@ -56,11 +48,11 @@ class Term:
     high: Float[np.ndarray, " k"]
     logarithm: bool
 
-    def values(self, x: Coordinates) -> Float[np.ndarray, " k"]:
+    def values(self, x: bodies.Coordinates) -> Float[np.ndarray, " k"]:
         """In SI units."""
         return self.size * (np.exp(x) if self.logarithm else x)
 
-    def slopes(self, x: Coordinates) -> Float[np.ndarray, " k"]:
+    def slopes(self, x: bodies.Coordinates) -> Float[np.ndarray, " k"]:
         """Derivatives of the values in x."""
         return self.values(x) if self.logarithm else self.size
 
@@ -90,9 +82,9 @@ class ParameterSpace:
 
     def __init__(self, model: Model, typical: Mapping[str, Float[np.ndarray, " nv"]]) -> None:
         self.model, self.typical = model, typical
-        self.own = carrying(model.robot)
+        self.own = bodies.carrying(model.robot)
         self.carried = tuple(_carried(model))
-        self.bodies = Bodies([each.reference for each in self.carried], [each.prior for each in self.carried])
+        self.bodies = bodies.Bodies([each.reference for each in self.carried], [each.prior for each in self.carried])
         self.terms = tuple(_terms(model, typical))
 
     @property
@@ -100,13 +92,13 @@ class ParameterSpace:
         """Number of coordinates."""
         return self.bodies.size + sum(len(term.size) for term in self.terms)
 
-    def split(self, x: Coordinates) -> tuple[np.ndarray, list[np.ndarray]]:
+    def split(self, x: bodies.Coordinates) -> tuple[np.ndarray, list[np.ndarray]]:
         """Coordinates of bodies, and of each term."""
         of_bodies, rest = x[: self.bodies.size], x[self.bodies.size :]
         return of_bodies, np.split(rest, np.cumsum([len(term.size) for term in self.terms])[:-1]) if self.terms else []
 
     @property
-    def start(self) -> Coordinates:
+    def start(self) -> bodies.Coordinates:
         """Where the search begins."""
         return np.concatenate([np.zeros(self.bodies.size), *(term.start for term in self.terms)])
 
@@ -117,7 +109,7 @@ class ParameterSpace:
         least, most = (term.low for term in self.terms), (term.high for term in self.terms)
         return np.concatenate([-free, *least]), np.concatenate([free, *most])
 
-    def longest_steps(self, x: Coordinates) -> Coordinates:
+    def longest_steps(self, x: bodies.Coordinates) -> bodies.Coordinates:
         """Most that a coordinate should change at once: infinite for those that the torque is linear in.
 
         What lies off the diagonal of a body's factor may double: a light one may be far away, or have its mass there.
@@ -126,7 +118,7 @@ class ParameterSpace:
         off = np.abs(x[: self.bodies.size].reshape(-1, 10)) * (np.arange(10) > 3)
         return np.concatenate([np.maximum(1.0, off).ravel(), *each])
 
-    def prior(self, x: Coordinates) -> tuple[Float[np.ndarray, " entries"], Float[np.ndarray, "entries k"]]:
+    def prior(self, x: bodies.Coordinates) -> tuple[Float[np.ndarray, " entries"], Float[np.ndarray, "entries k"]]:
         """Distance from the prior in its standard deviations, and its Jacobian."""
         of_bodies, of_terms = self.split(x)
         distance, jacobian = self.bodies.distance(of_bodies)
@@ -137,7 +129,7 @@ class ParameterSpace:
         slopes = [1.0 / term.spread for term in self.terms]
         return np.concatenate([distance, *values]), block_diag(jacobian, np.diag(np.concatenate([[], *slopes])))
 
-    def moved(self, x: Coordinates, step: Coordinates) -> Coordinates:
+    def moved(self, x: bodies.Coordinates, step: bodies.Coordinates) -> bodies.Coordinates:
         """x + step to first order, along which parameters of bodies are straight (`Bodies.moved`)."""
         count = self.bodies.size
         return np.concatenate([self.bodies.moved(x[:count], step[:count]), x[count:] + step[count:]])
@@ -150,7 +142,9 @@ class ParameterSpace:
         stated = np.concatenate([np.zeros(self.bodies.size), *(term.center for term in self.terms)])
         robot, starts, out = self.model.robot, iter(self.numbers(stated).tolist()), list[Parameter]()
         for each in self.carried:
-            out += [Parameter(f"{each.name}.{name}", unit, next(starts), each.prior) for name, unit in QUANTITIES]
+            out += [
+                Parameter(f"{each.name}.{name}", unit, next(starts), each.prior) for name, unit in bodies.QUANTITIES
+            ]
         for term in self.terms:
             law = self.model.laws[term.law]
             own = force_title(law)
@@ -164,7 +158,7 @@ class ParameterSpace:
                 out.append(Parameter(name, unit, next(starts), kind(float(center), float(spread))))
         return tuple(out)
 
-    def numbers(self, x: Coordinates) -> Float[np.ndarray, " n"]:
+    def numbers(self, x: bodies.Coordinates) -> Float[np.ndarray, " n"]:
         """What people read: mass, center and inertia of bodies, then coefficients, in SI units; whole rotors."""
         of_bodies, of_terms = self.split(x)
         values = [self.bodies.numbers(of_bodies, self._frames)]
@@ -175,7 +169,7 @@ class ParameterSpace:
             values.append(value)
         return np.concatenate(values)
 
-    def number_slopes(self, x: Coordinates) -> Float[np.ndarray, "n k"]:
+    def number_slopes(self, x: bodies.Coordinates) -> Float[np.ndarray, "n k"]:
         """Derivatives of the numbers in the coordinates."""
         of_bodies, of_terms = self.split(x)
         slopes = [term.slopes(own) for own, term in zip(of_terms, self.terms, strict=True)]
@@ -188,11 +182,11 @@ class ParameterSpace:
 
     # --- what the model is at x
 
-    def standard_parameters(self, x: Coordinates) -> Float[np.ndarray, "n 10"]:
+    def standard_parameters(self, x: bodies.Coordinates) -> Float[np.ndarray, "n 10"]:
         """Of the bodies that are estimated."""
         return self.bodies.parameters(x[: self.bodies.size])
 
-    def values(self, x: Coordinates) -> dict[int, dict[str, Tensor]]:
+    def values(self, x: bodies.Coordinates) -> dict[int, dict[str, Tensor]]:
         """Coefficients of the laws that are estimated, by number of the law."""
         out = {index: dict(named) for index, named in self._stated.items()}
         for own, term in zip(self.split(x)[1], self.terms, strict=True):
@@ -214,14 +208,14 @@ class ParameterSpace:
             out[index] = {name: x.expand(robot.nv) if whole else x for name, x in named}
         return out
 
-    def model_at(self, x: Coordinates) -> Model:
+    def model_at(self, x: bodies.Coordinates) -> Model:
         """The model with the numbers of these coordinates, all of them known. Raises NonPhysicalInertia."""
         values, robot = self.values(x), self.model.robot
         pseudo, laws = self.bodies.pseudo_inertias(x[: self.bodies.size]), list[Any](self.model.laws)
         for index, named in values.items():
             laws[index] = laws[index].with_values(named)
         if wanted := {each.body: pseudo[k] for k, each in enumerate(self.carried) if each.payload is None}:
-            robot = with_bodies(robot, wanted)
+            robot = bodies.with_bodies(robot, wanted)
         for each, J in zip(self.carried, pseudo, strict=True):
             if each.payload is not None and each.offset is not None:
                 there, law = np.linalg.inv(each.offset), laws[each.payload]
@@ -239,7 +233,7 @@ class ParameterSpace:
         return next((law for law in self._estimated.values() if law.under_load), None)
 
     def torque(
-        self, x: Coordinates, state: State, a: Rows, cache: dict[Any, Any], loads: State | None = None
+        self, x: bodies.Coordinates, state: State, a: Rows, cache: dict[Any, Any], loads: State | None = None
     ) -> tuple[Float[np.ndarray, "loads rows nv"], Float[np.ndarray, "loads rows nv t"]]:
         """What the laws add to the torque of a motion, and the derivatives in their coordinates (without bodies).
 
@@ -273,7 +267,7 @@ class ParameterSpace:
                 column += width
         return total, jacobian
 
-    def delivered(self, x: Coordinates, state: State, known: Rows) -> Rows:
+    def delivered(self, x: bodies.Coordinates, state: State, known: Rows) -> Rows:
         """Torques of actuators, whose derivatives are minus those of `torque`; those `known` where no gain is free."""
         for index, law in self._estimated.items():
             if isinstance(law, Actuation):
@@ -284,7 +278,7 @@ class ParameterSpace:
     def _estimated(self) -> dict[int, Law]:
         return {index: self.model.laws[index] for index in dict.fromkeys(term.law for term in self.terms)}
 
-    def added_inertia(self, x: Coordinates) -> Float[np.ndarray, "nv nv"]:
+    def added_inertia(self, x: bodies.Coordinates) -> Float[np.ndarray, "nv nv"]:
         """What the rotors that are estimated add to the mass matrix."""
         values, total = self.values(x), np.zeros((self.model.robot.nv,) * 2)
         for index, law in self._estimated.items():
@@ -382,11 +376,11 @@ def _terms(model: Model, typical: Mapping[str, np.ndarray]) -> list[Term]:
 
 def _carried(model: Model) -> list[Carried]:
     robot, layout = model.robot, model.robot.layout
-    own, out = carrying(robot), []
-    named = dict(zip(own, body_names(robot), strict=True))
+    own, out = bodies.carrying(robot), []
+    named = dict(zip(own, bodies.body_names(robot), strict=True))
     for index, law in enumerate(model.laws):
         if isinstance(law, RigidBodies):
-            references = dict(zip(own, body_pseudo_inertias(robot).cpu().numpy(), strict=True))
+            references = dict(zip(own, bodies.body_pseudo_inertias(robot).cpu().numpy(), strict=True))
             for body, prior in law.bodies(own, robot).items():
                 if body not in references:
                     raise InvalidInput(f"the body of joint {layout.bodies[body].name!r} has no mass; give it one.")

@@ -17,14 +17,7 @@ from forcegp.errors import DataWarning, InvalidInput, require_type, usable_argum
 from forcegp.evidence import Evidence, Motions, Sensor, Torques, TrainingData
 from forcegp.evidence.likelihood import MarginalLikelihood, check_distance, problem_size
 from forcegp.evidence.parameter_space import ParameterSpace
-from forcegp.fit.doubts import (
-    check_forces,
-    doubts_of_past,
-    doubts_of_reversals,
-    refuse_what_has_no_answer,
-    warn_of_contacts,
-    without_idle_offsets,
-)
+from forcegp.fit import doubts as checked
 from forcegp.fit.friction_choice import with_friction_chosen
 from forcegp.fit.joint import CHANGE, MOST_ROUNDS, FreeNumbers, estimates_beside, numbers_beside, with_free_numbers
 from forcegp.fit.motion_fit import refine_on_motions
@@ -134,11 +127,11 @@ def fit(
     everything = points is not None and points == len(dataset)
     dataset = _checked(model, dataset, rest, refinement)
     dataset, model = with_sensors(dataset, model, rest, sensors)
-    model = without_idle_offsets(model, dataset)
+    model = checked.without_idle_offsets(model, dataset)
     model, choice = (model, None) if isinstance(start, Posterior) else with_friction_chosen(model, dataset, rest)
     dataset = dataset if choice is None else with_memory(dataset, model)
     known = past_known(dataset, model)
-    doubts = list(doubts_of_past(model, dataset, known))
+    doubts = list(checked.doubts_of_past(model, dataset, known))
     known = known | (known.mean() < 1.0 - LEFT_OUT)
     points = int(known.sum()) if everything else points  # all of them are all that are left
     dataset = dataset if known.all() else dataset.rows(np.flatnonzero(known))
@@ -169,7 +162,7 @@ def fit(
         posterior = posterior.with_settings(**unseen.stated)
     if refinement is not None:
         posterior = refine_on_motions(posterior, decided(dataset), refinement.seconds, refinement.bodies, model)
-    Doubts([*doubts, *doubts_of_reversals(posterior.model, dataset)]).warn(stacklevel=3)
+    Doubts([*doubts, *checked.doubts_of_reversals(posterior.model, dataset)]).warn(stacklevel=3)
     return with_drift(posterior, dataset)
 
 
@@ -227,7 +220,7 @@ def _checked(model: Model, dataset: Dataset, evidence: Any, refinement: Motions 
 def _of_numbers(model: Model, logs: Sequence[Dataset], evidence: Any, rows: int | None, seed: int) -> Posterior:
     if rows is not None:
         whole_number("rows", rows, 1)
-    refuse_what_has_no_answer(model)
+    checked.refuse_what_has_no_answer(model)
     found = fit_physical(model, logs, evidence, rows)
     trained = replace(found.model, noise=found.noise)
     training = TrainingData.of(found.rows, model.robot.device)
@@ -283,7 +276,7 @@ class _Functions:
         described = described_rows(all_rows, dataset)
         own = replace(self, search=replace(self.search, start=self._continuation(rows, dataset)))
         fitted = widened(own._with_numbers(rows, dataset))
-        warn_of_contacts(self.model, dataset)  # last: what refuses the rows comes first
+        checked.warn_of_contacts(self.model, dataset)  # last: what refuses the rows comes first
         return on_all_rows(fitted, with_memory(all_rows, fitted.model), chosen, described)
 
     def _continuation(self, rows: Dataset, dataset: Dataset) -> Mapping[str, Tensor] | None:
@@ -306,7 +299,7 @@ class _Functions:
         """Searches for functions with numbers of laws and bodies free, where these are open."""
         if not self.model.is_open:
             return self._with_loads(rows, dataset)
-        refuse_what_has_no_answer(self.model)
+        checked.refuse_what_has_no_answer(self.model)
         space = ParameterSpace(with_payloads_placed(self.model, [dataset]), typical_sizes(self.model, [rows]))
         x = space.start
         again, found, change, rounds = self, None, np.inf, 0
@@ -350,7 +343,7 @@ class _Functions:
         likelihood = MarginalLikelihood(model, training)
         model.check_states(training.q, training.v, training.u)
         check_distance(model, training)
-        check_forces(likelihood)
+        checked.check_forces(likelihood)
         require_memory_to_learn(likelihood)
         described = described_rows(rows, dataset) | {"noise": noise.to_dict()}
         learned_noise, fixed = likelihood.split_noise

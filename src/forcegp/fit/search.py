@@ -16,17 +16,10 @@ from jaxtyping import Float
 from scipy.linalg import hadamard
 from torch import Tensor
 
+from forcegp import inference
 from forcegp.data import Dataset
 from forcegp.errors import DataWarning, FitError, InvalidInput, NumericalError, require_type, usable_arguments
 from forcegp.forces.kernels import LOG_VARIANCE_SPREAD, register_log_normal_prior
-from forcegp.inference import (
-    LatentKernels,
-    LatentPosterior,
-    OptimizationResult,
-    OptimizerOptions,
-    best_of,
-    minimize_objective,
-)
 from forcegp.inference.memory import blas_threads
 from forcegp.inference.posterior import ExactPosterior
 from forcegp.noise import STATED, Noise
@@ -117,14 +110,14 @@ Outcome = TypeVar("Outcome")
 AT_ONCE = 2
 """Starts at once, behind which later ones are dropped: one poor one costs 22 nats (docs/explanation/solvers.md)."""
 
-SMALL = OptimizerOptions(slow=0.02, patience=100)
+SMALL = inference.OptimizerOptions(slow=0.02, patience=100)
 """The search on so few rows: to hundredths of a nat, which no prediction shows."""
 
-LARGE = OptimizerOptions(tolerance=1e-6, slow=3.0)
+LARGE = inference.OptimizerOptions(tolerance=1e-6, slow=3.0)
 """On more rows, where an evaluation takes seconds, and three nats of hundreds change nothing that is predicted."""
 
 
-def default_options(points: int) -> OptimizerOptions:
+def default_options(points: int) -> inference.OptimizerOptions:
     """The search where none is given."""
     return LARGE if points > MOST_POINTS_FOR_RESTARTS else SMALL
 
@@ -162,9 +155,9 @@ def run_restarts(search: Callable[..., Outcome], restarts: int, patience: int, j
     return outcomes
 
 
-def best_value(found: Sequence[OptimizationResult | FitError]) -> float:
+def best_value(found: Sequence[inference.OptimizationResult | FitError]) -> float:
     """The lowest objective that was found; infinite where there is none."""
-    return min((each.value for each in found if isinstance(each, OptimizationResult)), default=math.inf)
+    return min((each.value for each in found if isinstance(each, inference.OptimizationResult)), default=math.inf)
 
 
 Starts = Callable[[int], Mapping[str, Tensor]]
@@ -176,7 +169,7 @@ class FitObjective:
     """The objective of the free hyper-parameters, with their priors; a class so that processes can receive it."""
 
     likelihood: Any  # a MarginalLikelihood, or one of another model: (kernels, parameters) -> nats, with its `training`
-    kernels: LatentKernels
+    kernels: inference.LatentKernels
     noise: Noise
     fixed: Mapping[str, Tensor]
 
@@ -189,7 +182,7 @@ class FitObjective:
         return self.kernels.log_prior(parameters) + self.noise.log_prior(parameters)
 
 
-def with_variance_priors(kernels: LatentKernels) -> LatentKernels:
+def with_variance_priors(kernels: inference.LatentKernels) -> inference.LatentKernels:
     """A copy of which every output scale carries the prior log variance ~ N(log of its present value, 2^2).
 
     The likelihood is flat below the noise: a variance could run off to zero, with too small standard errors.
@@ -208,7 +201,7 @@ class Search:
     jobs: Jobs
     restarts: int | None
     seed: int
-    options: OptimizerOptions | None
+    options: inference.OptimizerOptions | None
     start: Mapping[str, Tensor] | None
 
     @usable_arguments("fit")
@@ -217,9 +210,9 @@ class Search:
         whole_number("restarts", restarts, 1, MOST_RESTARTS, "the most that one search runs")
         whole_number("seed", self.seed, 0)
         if self.options is not None:
-            require_type("options", self.options, OptimizerOptions)
+            require_type("options", self.options, inference.OptimizerOptions)
 
-    def resolved(self, rows: int) -> tuple[int, OptimizerOptions]:
+    def resolved(self, rows: int) -> tuple[int, inference.OptimizerOptions]:
         """Restarts and options for so many rows."""
         usual = 4 if rows <= MOST_POINTS_FOR_RESTARTS else 1
         return usual if self.restarts is None else self.restarts, self.options or default_options(rows)
@@ -228,13 +221,13 @@ class Search:
         """Start `index`: 0 is the moments, with what `start` gives in their place, others lie around the moments."""
         return partial(started, moments, first_start(moments, self.start or {}, fixed), self.seed)
 
-    def best(self, objective: FitObjective, starts: Starts) -> tuple[OptimizationResult, dict[str, Any]]:
+    def best(self, objective: FitObjective, starts: Starts) -> tuple[inference.OptimizationResult, dict[str, Any]]:
         """The best of all starts with the work of all, and its settings. Raises FitError where none could begin."""
         restarts, options = self.resolved(len(objective.likelihood.training))
         one = partial(_one_start, objective, starts, options, restarts)
         with blas_threads(objective.likelihood.training.q.numel()):
             results = run_restarts(one, restarts, options.patience, self.jobs)
-        usable = [result for result in results if isinstance(result, OptimizationResult)]
+        usable = [result for result in results if isinstance(result, inference.OptimizationResult)]
         if not usable:
             causes = "; ".join(f"restart {k}: {error}" for k, error in enumerate(results))
             raise FitError(f"none of {restarts} restarts could be evaluated ({causes})")
@@ -244,25 +237,29 @@ class Search:
             "warm_start": self.start is not None,
             "seed": self.seed,
             "optimizer": asdict(options),
-            "restart_objective": [each.value if isinstance(each, OptimizationResult) else None for each in results],
-            "restart_status": [each.status if isinstance(each, OptimizationResult) else str(each) for each in results],
+            "restart_objective": [
+                each.value if isinstance(each, inference.OptimizationResult) else None for each in results
+            ],
+            "restart_status": [
+                each.status if isinstance(each, inference.OptimizationResult) else str(each) for each in results
+            ],
         }
-        return replace(best_of(usable), **work), settings
+        return replace(inference.best_of(usable), **work), settings
 
 
 def _one_start(
     objective: FitObjective,
     starts: Starts,
-    options: OptimizerOptions,
+    options: inference.OptimizerOptions,
     restarts: int,
     index: int,
-    before: Sequence[OptimizationResult | FitError],
-) -> OptimizationResult | FitError:
+    before: Sequence[inference.OptimizationResult | FitError],
+) -> inference.OptimizationResult | FitError:
     """Where the search from start `index` ended, or why it could not begin."""
     name = f"start {index + 1} of {restarts}, " if restarts > 1 else ""
     try:
         with part(index, restarts, name):
-            return minimize_objective(objective, starts(index), options, best_value(before))
+            return inference.minimize_objective(objective, starts(index), options, best_value(before))
     except FitError as error:
         return error
 
@@ -375,7 +372,7 @@ class _States:
         rise = torch.stack(more).mean(0)[open_ones] / variance[open_ones]
         return math.sqrt(max(1.0, 1.0 + float(rise.mean())))
 
-    def _without_own(self, latent: LatentPosterior) -> tuple[Float[Tensor, "n nv"], Float[Tensor, "n nv"]]:
+    def _without_own(self, latent: inference.LatentPosterior) -> tuple[Float[Tensor, "n nv"], Float[Tensor, "n nv"]]:
         """Mean and variance of the accelerations that the latents make, by all rows but that of the state itself.
 
         f + S C^T B^-1 C S and so on, with B = (T^-1)_ii (Rasmussen & Williams 2006, section 5.4.2).

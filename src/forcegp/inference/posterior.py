@@ -13,16 +13,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from forcegp.errors import InvalidInput
+from forcegp.inference import likelihood
 from forcegp.inference.dense_kernels import LatentKernels
-from forcegp.inference.likelihood import (
-    CholeskyFactor,
-    DeflatedSystem,
-    Deflation,
-    Terms,
-    deflated_covariance,
-    factorize,
-    solve_deflated,
-)
 
 BLOCK_BYTES = 64 * 2**20  # working memory of one block of test points
 Features = Sequence[Float[Tensor, "n _"]]
@@ -33,7 +25,7 @@ class LatentPosterior(ABC):
 
     kernels: LatentKernels
     features: tuple[Float[Tensor, "_ _"], ...]
-    factor: CholeskyFactor
+    factor: likelihood.CholeskyFactor
     """What covariances are solved with."""
     remedy: ClassVar[str] = "fit with engine='exact' (and fewer points, where memory does not suffice)"
     """What to do where the factorised covariance of all rows is needed."""
@@ -96,18 +88,18 @@ class ExactPosterior(LatentPosterior):
 
     kernels: LatentKernels
     features: tuple[Float[Tensor, "N _"], ...]
-    system: DeflatedSystem
+    system: likelihood.DeflatedSystem
 
     @classmethod
-    def condition(cls, kernels: LatentKernels, terms: Terms) -> "ExactPosterior":
+    def condition(cls, kernels: LatentKernels, terms: likelihood.Terms) -> "ExactPosterior":
         """Condition on the residual y - m."""
         with torch.no_grad():
-            system = solve_deflated(terms.deflated(), kernels(terms.features))
+            system = likelihood.solve_deflated(terms.deflated(), kernels(terms.features))
         return cls(kernels, tuple(z.detach() for z in terms.features), system)
 
     @property
     @override
-    def factor(self) -> CholeskyFactor:  # type: ignore[override]  # a field there, read only
+    def factor(self) -> likelihood.CholeskyFactor:  # type: ignore[override]  # a field there, read only
         return self.system.factor
 
     @property
@@ -159,7 +151,7 @@ def exact(latent: LatentPosterior, what: str) -> ExactPosterior:
     )
 
 
-def with_rows(latent: ExactPosterior, terms: Terms) -> ExactPosterior:
+def with_rows(latent: ExactPosterior, terms: likelihood.Terms) -> ExactPosterior:
     """The posterior of the old rows and those of `terms` (Golub & Van Loan 2013, 4.2.9); the old one stays valid.
 
     Raises NumericalError where the new ones are not finite or the covariance cannot be factorised.
@@ -172,8 +164,8 @@ def with_rows(latent: ExactPosterior, terms: Terms) -> ExactPosterior:
         cross = added.t.new_zeros(added.t.numel(), old.t.numel())
         for c, (kernel, z, at) in enumerate(zip(latent.kernels.dense, features, latent.features, strict=True)):
             cross += added.through(c, old.through(c, kernel.cross(z, at).mT).mT)
-        factor = appended(factor, cross, deflated_covariance(added.C, latent.kernels(features)))
-        joined = Deflation(*map(torch.cat, zip(old, added, strict=True)))
+        factor = appended(factor, cross, likelihood.deflated_covariance(added.C, latent.kernels(features)))
+        joined = likelihood.Deflation(*map(torch.cat, zip(old, added, strict=True)))
         joint = tuple(torch.cat([z, new.detach()]) for z, new in zip(latent.features, features, strict=True))
         return ExactPosterior(latent.kernels, joint, _solved(joined, factor))
 
@@ -181,13 +173,15 @@ def with_rows(latent: ExactPosterior, terms: Terms) -> ExactPosterior:
 def with_only(latent: ExactPosterior, rows: Int[Tensor, " kept"]) -> ExactPosterior:
     """The posterior of some rows, in the order given, factorised anew. Raises NumericalError where it cannot be."""
     with torch.no_grad():
-        deflation = Deflation(*(part[rows] for part in latent.system.deflation))
+        deflation = likelihood.Deflation(*(part[rows] for part in latent.system.deflation))
         features = tuple(z[rows] for z in latent.features)
-        factor = factorize(lambda: deflated_covariance(deflation.C, latent.kernels(features)))
+        factor = likelihood.factorize(lambda: likelihood.deflated_covariance(deflation.C, latent.kernels(features)))
         return ExactPosterior(latent.kernels, features, _solved(deflation, factor))
 
 
-def appended(factor: CholeskyFactor, cross: Float[Tensor, "m n"], own: Float[Tensor, "m m"]) -> CholeskyFactor:
+def appended(
+    factor: likelihood.CholeskyFactor, cross: Float[Tensor, "m n"], own: Float[Tensor, "m m"]
+) -> likelihood.CholeskyFactor:
     """The factor of [[T11, cross^T], [cross, own]] from that of T11, which is copied; `own` is overwritten.
 
     Only the lower triangle of `own` is read. Jitter is added to the new rows alone, as `factorize` does.
@@ -198,30 +192,30 @@ def appended(factor: CholeskyFactor, cross: Float[Tensor, "m n"], own: Float[Ten
     below = factor.solve_lower(cross.mT).mT if size else cross
     lower[size:, :size] = below
     own.sub_(below @ below.mT)
-    corner = factorize(own.clone)
+    corner = likelihood.factorize(own.clone)
     lower[size:, size:] = corner.lower
-    return CholeskyFactor(lower, max(factor.jitter, corner.jitter))
+    return likelihood.CholeskyFactor(lower, max(factor.jitter, corner.jitter))
 
 
-def _solved(deflation: Deflation, factor: CholeskyFactor) -> DeflatedSystem:
+def _solved(deflation: likelihood.Deflation, factor: likelihood.CholeskyFactor) -> likelihood.DeflatedSystem:
     """alpha = T^-1 t and beta from a factor of T."""
     white = factor.solve_lower(deflation.t.reshape(-1, 1))  # two solves of one column, 5 times as fast as LAPACK's
     alpha = factor.solve_upper(white).reshape(deflation.t.shape)
-    return DeflatedSystem(deflation, factor, alpha, torch.einsum("irc,ir->ic", deflation.C, alpha))
+    return likelihood.DeflatedSystem(deflation, factor, alpha, torch.einsum("irc,ir->ic", deflation.C, alpha))
 
 
-def _padded(deflation: Deflation, rank: int) -> Deflation:
+def _padded(deflation: likelihood.Deflation, rank: int) -> likelihood.Deflation:
     """The same with zeros in place of the directions that rows of higher rank have; nothing depends on them."""
     more, pad = rank - deflation.rank, torch.nn.functional.pad
     U, C, t = pad(deflation.U, (0, more)), pad(deflation.C, (0, 0, 0, more)), pad(deflation.t, (0, more))
-    return Deflation(U, C, t, deflation.remainder)
+    return likelihood.Deflation(U, C, t, deflation.remainder)
 
 
-def _with_rank(factor: CholeskyFactor, count: int, rank: int, wanted: int) -> CholeskyFactor:
+def _with_rank(factor: likelihood.CholeskyFactor, count: int, rank: int, wanted: int) -> likelihood.CholeskyFactor:
     """The factor of T where every row has `wanted` directions; the new ones have variance 1, of noise alone."""
     if rank == wanted:
         return factor
     lower = torch.eye(count * wanted, dtype=factor.lower.dtype, device=factor.lower.device)
     place = torch.arange(count * wanted, device=lower.device).reshape(count, wanted)[:, :rank].reshape(-1)
     lower[place[:, None], place] = factor.lower.tril()
-    return CholeskyFactor(lower, factor.jitter)
+    return likelihood.CholeskyFactor(lower, factor.jitter)

@@ -21,18 +21,7 @@ from pyarrow import parquet, types
 from typing_extensions import override
 
 from forcegp.errors import DataWarning, FileFormatError, InvalidInput
-from forcegp.recordings.source import (
-    HARMLESS,
-    LARGEST_EXPANSION,
-    LONGEST_VECTOR,
-    Columns,
-    Source,
-    arrow_numbers,
-    element_names,
-    reading,
-    require_distinct,
-    require_plausible_size,
-)
+from forcegp.recordings import source
 from forcegp.recordings.tables import seconds_of
 from forcegp.sandbox import MEMORY, SECONDS, read_apart
 from forcegp.summary import listed
@@ -49,7 +38,7 @@ Arrays = Mapping[str, tuple[tuple[int, ...], Callable[[], np.ndarray]]]
 """By full name, shape and content of every array of numbers in a file."""
 
 
-class ArrayFile(Source):
+class ArrayFile(source.Source):
     """Arrays (rows,) and (rows, k) by name; the latter are the columns `name[0] ... name[k-1]`.
 
     With `within`, only what is under that name counts, and names begin after it: a file with one array or one group per
@@ -88,8 +77,8 @@ class ArrayFile(Source):
                 continue
             if len(shape) == 1 or (len(shape) == 2 and shape[1] == 1 and name):
                 places[name or "[0]"] = (full, None if len(shape) == 1 else 0)
-            elif len(shape) == 2 and shape[1] <= LONGEST_VECTOR:
-                places |= {element: (full, index) for index, element in enumerate(element_names(name, shape[1]))}
+            elif len(shape) == 2 and shape[1] <= source.LONGEST_VECTOR:
+                places |= {element: (full, index) for index, element in enumerate(source.element_names(name, shape[1]))}
         if not places:
             inside = f" under {self.within!r}" if self.within else ""
             seen = f"{self.path} has no array of numbers with one or two dimensions and more than one row{inside}"
@@ -101,7 +90,7 @@ class ArrayFile(Source):
         return tuple(self._places)
 
     @override
-    def table(self, names: Sequence[str]) -> Columns:
+    def table(self, names: Sequence[str]) -> source.Columns:
         chosen = {self._places[name][0]: self.arrays[self._places[name][0]] for name in names}
         if len({shape[0] for shape, _ in chosen.values()}) > 1:
             counts = ", ".join(f"{array} {shape[0]}" for array, (shape, _) in chosen.items())
@@ -115,17 +104,17 @@ def numpy_arrays(path: Path) -> Arrays:
     """Of an .npz file. What it claims to hold is compared with its size before anything is expanded."""
 
     def content(name: str) -> np.ndarray:
-        with reading(path, NUMPY), np.load(path, allow_pickle=False) as archive:
+        with source.reading(path, NUMPY), np.load(path, allow_pickle=False) as archive:
             return archive[name]
 
     found = {}
-    with reading(path, NUMPY), zipfile.ZipFile(path) as archive:
+    with source.reading(path, NUMPY), zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         if len({member.filename.removesuffix(".npy") for member in members}) < len(members):
             raise FileFormatError(f"{path} holds two arrays of one name; save it again, each under its own.")
-        require_plausible_size(path, "the archive", sum(x.file_size for x in members), path.stat().st_size)
+        source.require_plausible_size(path, "the archive", sum(x.file_size for x in members), path.stat().st_size)
         for member in members:
-            require_plausible_size(path, repr(member.filename), member.file_size, member.compress_size)
+            source.require_plausible_size(path, repr(member.filename), member.file_size, member.compress_size)
             name = member.filename.removesuffix(".npy")
             if name == member.filename:
                 continue
@@ -139,7 +128,7 @@ def numpy_arrays(path: Path) -> Arrays:
                 raise FileFormatError(f"{path}: {name!r} claims the shape {shape}, but the file holds less than that.")
             if dtype.kind in "fiu":
                 if len(shape) < 3:
-                    require_plausible_size(path, repr(name), 8 * math.prod(shape), member.compress_size)
+                    source.require_plausible_size(path, repr(name), 8 * math.prod(shape), member.compress_size)
                 found[name] = shape, lambda name=name: content(name)
     return found
 
@@ -148,15 +137,15 @@ def hdf5_arrays(path: Path) -> Arrays:
     """Of all groups of an HDF5 file, in which they must lie: links to other files are never followed."""
 
     def content(name: str) -> np.ndarray:
-        with reading(path, HDF5), h5py.File(path, "r") as file:
+        with source.reading(path, HDF5), h5py.File(path, "r") as file:
             stored = file[name]
             assert isinstance(stored, h5py.Dataset)
             return stored[()]
 
-    with reading(path, HDF5), h5py.File(path, "r") as file:
+    with source.reading(path, HDF5), h5py.File(path, "r") as file:
         found = list(_stored(path, file, "", set()))
         flat = [(8 * math.prod(shape), size) for _, shape, size in found if len(shape) < 3]  # no pictures
-        require_plausible_size(path, "the file", *(sum(sizes) for sizes in zip((0, 0), *flat, strict=True)))
+        source.require_plausible_size(path, "the file", *(sum(sizes) for sizes in zip((0, 0), *flat, strict=True)))
         return {name: (shape, lambda name=name: content(name)) for name, shape, _ in found}
 
 
@@ -176,7 +165,7 @@ def _stored(path: Path, group: h5py.Group, prefix: str, seen: set[Any]) -> Itera
             yield from _stored(path, item, f"{full}/", seen)
         elif isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and item.shape is not None:
             stored = item.id.get_storage_size()
-            require_plausible_size(path, repr(full), item.size * item.dtype.itemsize, stored)
+            source.require_plausible_size(path, repr(full), item.size * item.dtype.itemsize, stored)
             yield full, tuple(item.shape), stored
 
 
@@ -187,7 +176,7 @@ def matlab_arrays(path: Path) -> Arrays:
     """
     if path.is_file() and h5py.is_hdf5(path):
         arrays = hdf5_arrays(path)
-        with reading(path, MATLAB), h5py.File(path, "r") as file:
+        with source.reading(path, MATLAB), h5py.File(path, "r") as file:
             if file.visititems(lambda _, item: True if getattr(item, "dtype", None) == REFERENCE else None):
                 left = iter(range(path.stat().st_size // 8))  # a reference takes so many bytes
                 return _lists({x: _referred(file, file[x], left) for x in map(str, file) if x[0] != INTERNAL})
@@ -197,9 +186,9 @@ def matlab_arrays(path: Path) -> Arrays:
             name: (shape, lambda name=name, shape=shape: arrays[name][1]().T.reshape(shape))
             for name, shape in upright.items()
         }
-    with reading(path, MATLAB), tempfile.TemporaryDirectory() as folder:
+    with source.reading(path, MATLAB), tempfile.TemporaryDirectory() as folder:
         kept, size = Path(folder, "kept.npz"), path.stat().st_size
-        asked = {"path": str(path), "kept": str(kept), "most": max(HARMLESS, LARGEST_EXPANSION * size)}
+        asked = {"path": str(path), "kept": str(kept), "most": max(source.HARMLESS, source.LARGEST_EXPANSION * size)}
         asked |= {"seconds": SECONDS + (size >> 22), "memory": MEMORY + 50 * size}
         answer = read_apart("matlab", str(path), asked, FileFormatError, "save it again, as arrays of numbers")
         if "refused" in answer:
@@ -222,7 +211,7 @@ def _referred(file: h5py.File, item: Any, left: Iterator[int]) -> Any:
 
 def json_arrays(path: Path) -> Arrays:
     """Of JSON, or of lines that are JSON each: arrays, and rows of a list of objects. The last line may be cut."""
-    with reading(path, "JSON"):
+    with source.reading(path, "JSON"):
         text = path.read_text(encoding="utf-8-sig")
         try:
             return _lists(json.loads(text))
@@ -266,7 +255,7 @@ def _numbers(value: Any, name: str) -> Iterator[tuple[str, np.ndarray]]:
         parts = [dict(_numbers(inside, "")) for inside in value]
         shapes = {key: own.shape for part in parts for key, own in part.items()}
         if all(own.shape == shapes[key] and own.size < len(parts) for part in parts for key, own in part.items()):
-            if len(shapes) * len(parts) > max(MOST_MISSING, LARGEST_EXPANSION * sum(map(len, parts))):
+            if len(shapes) * len(parts) > max(MOST_MISSING, source.LARGEST_EXPANSION * sum(map(len, parts))):
                 raise ValueError(f"{len(parts)} entries of a list have {len(shapes)} names, each of them few")
             for key, shape in shapes.items():
                 lost = np.full(shape, np.nan)
@@ -280,24 +269,24 @@ def parquet_arrays(path: Path) -> Arrays:
     """Of a Parquet file: numeric columns, and columns of lists of equal length, that of the first row."""
 
     def content(name: str, width: int | None) -> np.ndarray:
-        with reading(path, PARQUET), parquet.ParquetFile(path, pre_buffer=False) as file:
+        with source.reading(path, PARQUET), parquet.ParquetFile(path, pre_buffer=False) as file:
             column = file.read(columns=[name], use_threads=False).column(name).combine_chunks()
             if width is None:
-                return arrow_numbers(column)
+                return source.arrow_numbers(column)
             lengths = pc.call_function("list_value_length", [column]).fill_null(0).to_numpy(zero_copy_only=False)
             for row in np.flatnonzero(lengths != width)[:1]:
                 seen = f"{path}: column {name!r} has {lengths[row]} elements at row {row}, {width} before"
                 raise FileFormatError(f"{seen}; lists must be of one length.")
-            return arrow_numbers(column.flatten()).reshape(len(column), width)
+            return source.arrow_numbers(column.flatten()).reshape(len(column), width)
 
     widths: dict[str, int | None] = {}
-    with reading(path, PARQUET), parquet.ParquetFile(path, pre_buffer=False) as file:
+    with source.reading(path, PARQUET), parquet.ParquetFile(path, pre_buffer=False) as file:
         rows, stored = file.metadata.num_rows, file.metadata
         if not rows:
             raise FileFormatError(f"{path} has columns but no rows.")
         groups = (stored.row_group(index) for index in range(stored.num_row_groups))
         values = sum(group.column(index).num_values for group in groups for index in range(stored.num_columns))
-        require_plausible_size(path, "a column", 8 * values, path.stat().st_size)  # equal numbers take no space
+        source.require_plausible_size(path, "a column", 8 * values, path.stat().st_size)  # equal numbers take no space
         for field in file.schema_arrow:
             if types.is_floating(field.type) or types.is_integer(field.type):
                 widths[field.name] = None
@@ -306,8 +295,10 @@ def parquet_arrays(path: Path) -> Arrays:
                 kind = field.type.value_type
                 if first.is_valid and len(first) and (types.is_floating(kind) or types.is_integer(kind)):
                     widths[field.name] = len(first)
-        elements = [name for own, width in widths.items() for name in (element_names(own, width) if width else [own])]
-        require_distinct(path, [*(name for name in file.schema_arrow.names if name not in widths), *elements])
+        elements = [
+            name for own, width in widths.items() for name in (source.element_names(own, width) if width else [own])
+        ]
+        source.require_distinct(path, [*(name for name in file.schema_arrow.names if name not in widths), *elements])
     return {
         name: ((rows,) if width is None else (rows, width), lambda name=name, width=width: content(name, width))
         for name, width in widths.items()

@@ -14,6 +14,7 @@ from typing_extensions import override
 
 from forcegp.atomic_files import write_text
 from forcegp.errors import InvalidInput, RobotFileWarning, require_plausible, usable_arguments
+from forcegp.robots import urdf_file
 from forcegp.robots.arguments import (
     Armature,
     JointValues,
@@ -33,15 +34,6 @@ from forcegp.robots.mjcf import MjcfWriter, is_mjcf, translate
 from forcegp.robots.mjcf_model import Translation
 from forcegp.robots.structure import RigidBodyDynamics, RobotStructure, bodies_without_inertia, compile_tree
 from forcegp.robots.urdf import parse_urdf
-from forcegp.robots.urdf_file import (
-    InertiaChoice,
-    read_robot_file,
-    read_text,
-    with_armature,
-    with_chosen_inertias,
-    with_joint_values,
-    with_limits,
-)
 
 GRAVITY = (0.0, 0.0, -9.81)
 STRONGEST_GRAVITY = 1000.0  # m/s^2; the Sun has 274
@@ -66,7 +58,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
 
         ``options`` are those of :meth:`from_urdf_text`, and so are errors. MissingExtra for .xacro without the package.
         """
-        return cls.from_urdf_text(read_robot_file(path), source=str(path), **options)
+        return cls.from_urdf_text(urdf_file.read_robot_file(path), source=str(path), **options)
 
     @classmethod
     @usable_arguments("Robot.from_urdf_text")
@@ -78,7 +70,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         gravity: Vector = GRAVITY,
         armature: Armature | None = None,
         locked: Mapping[str, float | int] | None = None,
-        inertias: InertiaChoice = "strict",
+        inertias: urdf_file.InertiaChoice = "strict",
         base: BaseChoice | None = None,
     ) -> "Robot":
         """Read URDF text; ``source`` is what error messages call it.
@@ -104,7 +96,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         file; RobotModelError has MuJoCo's reason, or names what closes a loop (lock its joints). A RobotFileWarning
         names what acts in MuJoCo only (`Model.from_mjcf` has springs).
         """
-        return cls.read_mjcf(read_text(path), str(path), Path(path), **options)[0]
+        return cls.read_mjcf(urdf_file.read_text(path), str(path), Path(path), **options)[0]
 
     @classmethod
     @usable_arguments("Robot.from_mjcf_text")
@@ -116,7 +108,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
     @usable_arguments("Robot.from_file")
     def from_file(cls, path: str | Path, **options: Any) -> "Robot":
         """:meth:`from_mjcf` where the root element is <mujoco>, else :meth:`from_urdf`; ``options`` are theirs."""
-        return (cls.from_mjcf if is_mjcf(read_text(path)) else cls.from_urdf)(path, **options)
+        return (cls.from_mjcf if is_mjcf(urdf_file.read_text(path)) else cls.from_urdf)(path, **options)
 
     @classmethod
     def read_mjcf(
@@ -128,7 +120,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         gravity: Vector | None = None,
         armature: Armature | None = None,
         locked: Mapping[str, float | int] | None = None,
-        inertias: InertiaChoice = "strict",
+        inertias: urdf_file.InertiaChoice = "strict",
         base: BaseChoice | None = None,
         for_system: bool = False,
     ) -> "tuple[Robot, Translation]":
@@ -165,10 +157,10 @@ class Robot(RobotStructure, RigidBodyDynamics):
         with problems.collected():
             layout = lay_out(description, locked, base, problems)
             if armature is not None:
-                text = with_armature(text, layout, armature, description.name, source=problems.source)
+                text = urdf_file.with_armature(text, layout, armature, description.name, source=problems.source)
                 description = parse_urdf(text, Problems(problems.source, problems.given))
                 layout = lay_out(description, locked, base, Problems(problems.source, problems.given))
-            text, description = with_chosen_inertias(inertias, text, description, layout, problems)
+            text, description = urdf_file.with_chosen_inertias(inertias, text, description, layout, problems)
             tree = compile_tree(description, layout, down)
             robot = cls(description, layout, tree, text, tuple(locked.items()), layout.base)
             without = bodies_without_inertia(description, layout, tree, problems.broken)
@@ -229,7 +221,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         """A robot whose URDF has this damping and friction (nv,) of every joint; None: as they are."""
         values = {"damping": damping, "friction": friction}
         given = {name: value.tolist() for name, value in values.items() if value is not None}
-        return self.with_text(with_joint_values(self.urdf_text, self.layout, given, source=self.source))
+        return self.with_text(urdf_file.with_joint_values(self.urdf_text, self.layout, given, source=self.source))
 
     def to_urdf(self, path: str | Path | None = None) -> str:
         """The URDF text, written to ``path`` if given, with a RobotFileWarning about rotor inertias.
@@ -241,7 +233,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
             source, owners = self.source if path is None else Path(path).name, ", ".join(rotors)
             seen = f"{source}: only forcegp reads rotor inertias from URDF, those of {owners}; give them to others."
             warnings.warn(seen, RobotFileWarning, stacklevel=2)
-        text = with_limits(self.urdf_text)
+        text = urdf_file.with_limits(self.urdf_text)
         if path is not None:
             write_text(path, text)
         return text

@@ -27,15 +27,7 @@ from forcegp.model import Model
 from forcegp.noise import Noise
 from forcegp.posterior import observing
 from forcegp.posterior.posterior import Posterior
-from forcegp.scores.accuracy import (
-    Matrices,
-    mass_matrices,
-    overlaps,
-    poor_scores,
-    row_scores,
-    rows_outside,
-    unfinished_search,
-)
+from forcegp.scores import accuracy
 from forcegp.scores.held_out import STARTS, HeldOutMotions, Split, held_out_motions, motion_scores
 from forcegp.scores.models import (
     Candidate,
@@ -220,7 +212,7 @@ def _score(
     posterior = experiment.fitted(work, train, split.apply(experiment.recording)[0], identified, spec["seed"])
     seconds = before + time.process_time() - start
     model, _ = identified_before(store, spec["mass_matrix"])
-    mass = mass_matrices(test, experiment.model if isinstance(model, str) else model)
+    mass = accuracy.mass_matrices(test, experiment.model if isinstance(model, str) else model)
     known = isinstance(work.given, Posterior)
     how: dict[str, Any] = {"fitted_here": not known, "whole": experiment.rows}
     found = scored(posterior, test, experiment.motions(split), experiment.integrator, mass, **how)
@@ -240,7 +232,7 @@ def scored(
     test: Dataset,
     motions: HeldOutMotions,
     integrator: str = "rk4",
-    mass: Matrices | None = None,
+    mass: accuracy.Matrices | None = None,
     *,
     fitted_here: bool = False,
     whole: Dataset | None = None,
@@ -249,9 +241,13 @@ def scored(
     alone, recorded = posterior, test
     if test.time_ordered:
         posterior, test = observing(posterior, test, whole=True)
-    table, stretches = row_scores(posterior, test, mass, whole)
+    table, stretches = accuracy.row_scores(posterior, test, mass, whole)
     moving, facts = motion_scores(alone, motions, integrator)
-    doubts = [] if fitted_here else [*overlaps(alone, recorded), *contact_doubts(test, posterior.model)]
-    doubts += [*unfinished_search(posterior), *rows_outside(posterior, test), *poor_scores(posterior, test, table)]
+    doubts = [] if fitted_here else [*accuracy.overlaps(alone, recorded), *contact_doubts(test, posterior.model)]
+    doubts += [
+        *accuracy.unfinished_search(posterior),
+        *accuracy.rows_outside(posterior, test),
+        *accuracy.poor_scores(posterior, test, table),
+    ]
     told = [*map(str, doubts), *([] if posterior is alone else [OBSERVED])]
     return {"table": table | moving, "stretches": stretches, "motions": facts, "warnings": told, "test_rows": len(test)}

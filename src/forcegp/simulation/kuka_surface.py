@@ -20,20 +20,9 @@ from forcegp.robots import Robot
 from forcegp.robots.structure import RigidBodyDynamics
 from forcegp.robots.urdf import numbers
 from forcegp.robots.urdf_file import inertial_element
+from forcegp.simulation import trajectory
 from forcegp.simulation.joint_friction import Friction, laws_of_joints
 from forcegp.simulation.scenarios import KukaSurfaceConfig
-from forcegp.simulation.trajectory import (
-    ArmState,
-    Vector,
-    compiled_plant,
-    joint_acceleration,
-    middle_of,
-    over_table,
-    random_path,
-    recorded,
-    slope_of,
-    table_of,
-)
 
 TOOL_LINK = "lbr_iiwa_link_7"
 BASE_LINK = "lbr_iiwa_link_0"
@@ -101,7 +90,9 @@ class PointFriction:
         """`|F| / |N|` of dry friction at tangential speeds [m/s]."""
         return np.asarray(self._per_velocity(speed) * speed)
 
-    def forces(self, velocity: Vector, normal: Vector) -> tuple[Vector, Vector]:
+    def forces(
+        self, velocity: trajectory.Vector, normal: trajectory.Vector
+    ) -> tuple[trajectory.Vector, trajectory.Vector]:
         """Viscous friction [N], and dry friction per newton of normal force; `normal` is a unit vector."""
         tangential = velocity - (normal @ velocity) * normal
         return -self.viscous * velocity, -self._per_velocity(np.sqrt(tangential @ tangential)) * tangential
@@ -115,7 +106,7 @@ class ContactForces(NamedTuple):
     """What acts at the tool: normal force [N], friction (3,) [N, world axes] and joint torques, `push` all of these."""
 
     multiplier: float
-    tool_force: Vector
+    tool_force: trajectory.Vector
     tool_torques: Float[np.ndarray, " nv"]
     in_contact: bool
     push: Float[np.ndarray, " nv"]
@@ -134,7 +125,7 @@ class IdealContact:
     zeta: float
     touched: bool = False
 
-    def forces(self, state: ArmState, applied: Float[np.ndarray, " nv"]) -> ContactForces:
+    def forces(self, state: trajectory.ArmState, applied: Float[np.ndarray, " nv"]) -> ContactForces:
         """Those under these torques [Nm]. SimulationError where friction leaves the normal force undetermined."""
         point = torch.from_numpy(state.position)
         distance = float(self.table.value(point))
@@ -191,21 +182,24 @@ def simulate_episode(config: KukaSurfaceConfig, robot: Robot, plant: RigidBodyDy
     Raises SimulationError if the motion diverges, never touches the surface, or meets a singular posture.
     """
     settle, steps = config.settle_steps, config.settle_steps + config.rows_per_episode
-    limits, table = np.array(config.torque_limits), table_of(config)
+    limits, table = np.array(config.torque_limits), trajectory.table_of(config)
     laws = joint_friction_of(config, robot)
     rows: list[dict[str, Any]] = []
     q, v = np.deg2rad(config.start_degrees), np.zeros(robot.nv)
     law = None if config.surface == "none" else tool_friction_of(config)
     contact = IdealContact(table, law, config.baumgarte_omega, config.baumgarte_zeta)
-    tool, duration = ArmState.of(plant, TOOL_LINK, config.tool_point, q, v).position, steps * config.time_step
-    flat = tool - [0.0, 0.0, (tool - middle_of(config))[:2] @ slope_of(config)]
-    path = random_path(config, flat, duration, np.random.default_rng([config.seed, episode, 0]))
-    reference = over_table(config, path.sample(config.time_step * np.arange(steps)))
+    tool, duration = (
+        trajectory.ArmState.of(plant, TOOL_LINK, config.tool_point, q, v).position,
+        steps * config.time_step,
+    )
+    flat = tool - [0.0, 0.0, (tool - trajectory.middle_of(config))[:2] @ trajectory.slope_of(config)]
+    path = trajectory.random_path(config, flat, duration, np.random.default_rng([config.seed, episode, 0]))
+    reference = trajectory.over_table(config, path.sample(config.time_step * np.arange(steps)))
     for step in range(steps):
         aim = reference[0][step], reference[1][step], reference[2][step]
-        state = ArmState.of(plant, TOOL_LINK, config.tool_point, q, v)
+        state = trajectory.ArmState.of(plant, TOOL_LINK, config.tool_point, q, v)
         try:
-            wanted = joint_acceleration(config, state, aim)
+            wanted = trajectory.joint_acceleration(config, state, aim)
         except np.linalg.LinAlgError as error:
             seen = f"episode {episode}: the arm is in a singular posture at {step * config.time_step:.3g} s"
             advice = "Start from another posture (start_degrees) or keep the way-points nearer."
@@ -262,12 +256,12 @@ def simulate_kuka_surface(config: KukaSurfaceConfig) -> Dataset:
     motion, whatever `noise`, `seconds` and `episodes` are. Raises SimulationError as `simulate_episode`.
     """
     robot, motions = kuka_robot(config), []
-    plant = compiled_plant(robot)
+    plant = trajectory.compiled_plant(robot)
     for episode in range(config.episodes):
         with part(episode, config.episodes):
             motions.append(simulate_episode(config, robot, plant, episode))
     columns = {name: np.concatenate([motion[name] for motion in motions]) for name in motions[0]}
-    contacts = () if config.surface == "none" else (Contact(TOOL_LINK, config.tool_point, table_of(config)),)
+    contacts = () if config.surface == "none" else (Contact(TOOL_LINK, config.tool_point, trajectory.table_of(config)),)
     baumgarte = Baumgarte(config.baumgarte_omega, config.baumgarte_zeta) if contacts else None
     model = Model(robot, contacts, (Actuation(), RigidBodies()), baumgarte=baumgarte)
     signals = {name: columns[name] for name in ("q", "v", "u", "a", "time")}
@@ -280,4 +274,4 @@ def simulate_kuka_surface(config: KukaSurfaceConfig) -> Dataset:
     if config.joint_friction != "none":
         parts["Q_U.joint-friction"] = columns["joint_torques"]
     truth |= {**parts, "Q_U": sum(parts.values(), np.zeros_like(columns["a"]))}
-    return recorded("kuka-surface", config, model, signals, truth, more)
+    return trajectory.recorded("kuka-surface", config, model, signals, truth, more)
