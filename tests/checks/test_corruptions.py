@@ -325,6 +325,8 @@ def test_torques_in_steps_are_right_and_friction_that_fades_is_named():
         assert told == [True] * bool(fade)
     alone = check(replace(data, u=data.u + dry * (1.0 - np.array([0.0, 0.05]) * data.time[:, None]))).doubts.of("drift")
     assert [each.joints for each in alone] == [("joint2",)]
+    cold = check(replace(data, u=data.u + dry * (1.0 + np.exp(-np.square(data.time / 2.0)))[:, None])).doubts
+    assert [each.about for each in cold if each.level != "ok"] == ["drift"], "no push, either"
 
 
 def test_short_and_unordered_logs_are_looked_at_too():

@@ -12,20 +12,11 @@ from tests.checks.logs import PENDULUM
 from tests.checks.logs import clean as filtered_log
 from tests.goldens.compare import assert_unchanged
 
+from forcegp.checks import signals
 from forcegp.checks.check_input import CheckInput, _drop_outs, _even, _few_stretches, _smoothed
 from forcegp.checks.explanations import candidates
 from forcegp.checks.report import _held, excitation_doubts
 from forcegp.checks.search import DOUBTFUL, Explanation, _root, search
-from forcegp.checks.signals import (
-    FACTORS,
-    _compared,
-    _constant,
-    _differences,
-    sampling_doubts,
-    signal_doubts,
-    target_doubts,
-    without_registers,
-)
 from forcegp.checks.torque_doubts import elastic_doubts, held_points, torque_doubts
 from forcegp.checks.torques import positive_solution
 from forcegp.data import Dataset
@@ -65,14 +56,14 @@ def test_frozen_channels(rate):
                     x[at : at + rows + 1] = x[at]
                     if not jumps:  # a joint that sticks goes on from where it was
                         x[at + rows + 1 :] += x[at] - x[at + rows + 1]
-                    said.append(levels(signal_doubts(seen(replace(log, **{name: x[:, None]}))), "frozen"))
+                    said.append(levels(signals.signal_doubts(seen(replace(log, **{name: x[:, None]}))), "frozen"))
                 found[f"{name} {at} {jumps}"] = said
     u = np.cos(3.0 * np.arange(1000) / 100.0)
     for name, value in (("off", 0.0), ("extreme", u.max() + 0.1)):
         stopped = u.copy()
         stopped[100:130] = stopped[500:530] = value
-        found[name] = numbers(signal_doubts(seen(swing(u=stopped))))
-    found["held"] = [levels(signal_doubts(seen(swing(u=u[np.arange(1000) // k * k])))) for k in (2, 3)]
+        found[name] = numbers(signals.signal_doubts(seen(swing(u=stopped))))
+    found["held"] = [levels(signals.signal_doubts(seen(swing(u=u[np.arange(1000) // k * k])))) for k in (2, 3)]
     assert_unchanged(f"checks/frozen {rate:g}", found)
 
 
@@ -80,14 +71,14 @@ def test_frozen_channels(rate):
 def test_a_torque_that_stands_still_while_its_joint_turns_and_rests_is_frozen(turns, frozen):
     u, v = swing().u[:, 0].copy(), swing().v[:, 0].copy()
     u[300:400], v[300 + turns : 400] = u[300], 1e-6 * np.random.default_rng(0).normal(size=100 - turns)
-    assert (levels(signal_doubts(seen(swing(u=u, v=v))), "frozen") > 0) == frozen
+    assert (levels(signals.signal_doubts(seen(swing(u=u, v=v))), "frozen") > 0) == frozen
 
 
 @pytest.mark.parametrize(("counts", "still"), [(4, True), (8, False)])
 def test_a_joint_whose_encoder_dithers_by_counts_stands_still_and_is_not_frozen(counts, still):
     generator = np.random.default_rng(1)
     q = 0.3 + 2e-5 * np.repeat(generator.integers(0, counts + 1, 40), 25)
-    found = signal_doubts(seen(swing(q=q, v=1e-3 * generator.normal(size=1000), u=generator.normal(size=1000))))
+    found = signals.signal_doubts(seen(swing(q=q, v=1e-3 * generator.normal(size=1000), u=generator.normal(size=1000))))
     assert ([(x.about, x.level) for x in found] == [("constant channel", "look")]) == still
     assert "frozen channel" not in [x.about for x in found]
 
@@ -99,7 +90,7 @@ def test_a_joint_whose_encoder_dithers_by_counts_stands_still_and_is_not_frozen(
 def test_single_rows_far_from_their_neighbours_are_named(name, size, rows, told):
     x = getattr(swing(), name)[:, 0].copy()
     x[[*rows]] += size * np.abs(np.diff(x, 2)).max() / 2.0
-    found = signal_doubts(CheckInput.quick(swing(**{name: x}), MODEL))
+    found = signals.signal_doubts(CheckInput.quick(swing(**{name: x}), MODEL))
     assert [each.numbers["rows"] for each in found if each.about == "spike"] == [len(rows)] * told
     assert not told or f"--without {rows[0] / 100 - 0.005:.5f},{rows[0] / 100 + 0.005:.5f}" in found[0].do
 
@@ -107,7 +98,7 @@ def test_single_rows_far_from_their_neighbours_are_named(name, size, rows, told)
 def test_steps_bounces_chatter_and_counts_are_no_spikes():
     u, k = swing().u[:, 0], np.arange(1000)
     for x in (u + (k > 500), u + 0.1 * abs(k - 500), u + (k % 500 < 20) * (-1.0) ** k, np.round(u, 1)):
-        assert not signal_doubts(CheckInput.quick(swing(u=x), MODEL))
+        assert not signals.signal_doubts(CheckInput.quick(swing(u=x), MODEL))
 
 
 @pytest.mark.parametrize(("more", "frozen"), [(0, False), (1, True)])
@@ -115,7 +106,9 @@ def test_a_velocity_that_stands_still_while_its_encoder_counts_evenly_is_right(m
     v, count = 2.0 * np.cos(2.0 * np.arange(1000) / 100.0), 0.003
     steps = np.round(v / 100.0 / count)
     steps[501:531], v[500:531] = 5 + more * (np.arange(30) % 2), 5 * count * 100.0
-    assert (levels(signal_doubts(seen(swing(q=count * np.cumsum(steps), v=np.rad2deg(v)))), "frozen") > 0) == frozen
+    assert (
+        levels(signals.signal_doubts(seen(swing(q=count * np.cumsum(steps), v=np.rad2deg(v)))), "frozen") > 0
+    ) == frozen
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -127,13 +120,13 @@ def test_clipped_torques(sign):
             for rows in range(7, 34):
                 u = np.random.default_rng(0).permutation(np.linspace(-1.0, 0.99, 2000))
                 u[100 + np.arange(rows) // run * 50 + np.arange(rows) % run], u[5 : 5 + near] = 1.0, 1.0 - 1.9e-3
-                doubts = signal_doubts(seen(swing(rows=2000, u=sign * u, v=np.ones(2000))))
+                doubts = signals.signal_doubts(seen(swing(rows=2000, u=sign * u, v=np.ones(2000))))
                 said.append([levels(doubts), *(each.numbers.get("row", 0) for each in doubts)])
             found[f"{near} {run}"] = [sum(each) for each in said]
     u = np.random.default_rng(0).permutation(np.linspace(-1.0, 0.99, 2000))
     u[100:120] = 1.0
     speeds = [np.where(np.arange(2000) // 20 == 5, speed, 1.0) for speed in np.linspace(0.1, 0.4, 16)]
-    found["slow"] = [levels(signal_doubts(seen(swing(rows=2000, u=sign * u, v=v)))) for v in speeds]
+    found["slow"] = [levels(signals.signal_doubts(seen(swing(rows=2000, u=sign * u, v=v)))) for v in speeds]
     assert_unchanged(f"checks/clipped {sign:g}", found)
 
 
@@ -145,35 +138,35 @@ def test_repeated_rows_and_constant_channels():
         q[at] = q[at - 1]
         for name, speed in (("rows", 2.0), ("slow", 0.1)):
             v = np.where(np.isin(np.arange(1000), at), speed, 2.0)[:, None]
-            found[name].append(levels(sampling_doubts(seen(replace(log, q=q, v=v)))))
-    found["sampling"] = numbers(sampling_doubts(seen(replace(swing(), episode=np.repeat([3, 4], [300, 700])))))
+            found[name].append(levels(signals.sampling_doubts(seen(replace(log, q=q, v=v)))))
+    found["sampling"] = numbers(signals.sampling_doubts(seen(replace(swing(), episode=np.repeat([3, 4], [300, 700])))))
     arm = filtered_log(4)
     for names in ("q", "v", "u", "qv", "qvu"):
         for joints in ([0], [1, 2], [0, 1, 2]):
             still = {name: np.where(np.isin(np.arange(3), joints), 0.3, getattr(arm, name)) for name in names}
-            found[f"{names} {joints}"] = numbers(_constant(CheckInput.quick(replace(arm, **still), arm.model)))
+            found[f"{names} {joints}"] = numbers(signals._constant(CheckInput.quick(replace(arm, **still), arm.model)))
     assert_unchanged("checks/repeated", found)
 
 
 def test_how_a_signal_differs_from_a_derivative():
     inputs, found = seen(swing()), {}
-    every = [*FACTORS, -1.0, 1.0]
+    every = [*signals.FACTORS, -1.0, 1.0]
     grid = sorted([f * x for f in every for x in (0.94, 0.96, 1.0, 1.04, 1.06)] + np.linspace(-1.5, 1.5, 61).tolist())
     for name, source in (("v", "q"), ("a", "v")):
         for left in (0.0, 0.04, 0.06, 0.29, 0.31):
-            said = {f: list(_differences(inputs, name, source, {0: (f, np.nan, left)}, [0])) for f in grid}
+            said = {f: list(signals._differences(inputs, name, source, {0: (f, np.nan, left)}, [0])) for f in grid}
             found[f"{name} {left}"] = [levels(each) for each in said.values()]
             stated = {f"{f:.4g}": [each.correction for each in said[f]] for f in grid}
             found[f"{name} {left} corrections"] = {f: own for f, own in stated.items() if any(own)}
         shifts = np.linspace(-0.02, 0.02, 81)
-        late = [list(_differences(inputs, name, source, {0: (1.0, shift, 0.0)}, [0])) for shift in shifts]
+        late = [list(signals._differences(inputs, name, source, {0: (1.0, shift, 0.0)}, [0])) for shift in shifts]
         found[f"{name} late"] = [levels(each) for each in late]
     time = np.arange(1000) / 100.0
     for late in (-0.0123, 0.008):
         v = 2.6 * np.cos(2.0 * (time - late)) + 0.2 * np.sin(23.0 * time)
         pieces = [swing(v=v).rows(slice(0, 400)), swing(v=v).rows(slice(400, 1000))]
-        found[f"compared {late}"] = _compared(pieces, "v", "q", 0)
-    assert _compared([swing(rows=12)], "v", "q", 0) is None
+        found[f"compared {late}"] = signals._compared(pieces, "v", "q", 0)
+    assert signals._compared([swing(rows=12)], "v", "q", 0) is None
     assert_unchanged("checks/differences", found)
 
 
@@ -183,20 +176,20 @@ def test_registers_and_targets():
         for few in range(10, 30, 2):
             wave = np.abs((np.arange(1000) - 37) % (2 * (100 + few)) - 100 - few) - few
             for stored in (np.where(wave < 0, 32768 - wave, wave), np.where(wave < 0, 65536 + wave, wave)):
-                decoded, doubts = without_registers(swing(**{name: stored.astype(float)}))
+                decoded, doubts = signals.without_registers(swing(**{name: stored.astype(float)}))
                 found[f"{name} {few} {stored.max()}"] = levels(doubts), decoded.u
     for size in np.geomspace(3.0, 3e4, 25):
         noisy = np.round(100.0 * np.sin(time) + size * np.random.default_rng(0).standard_normal(1000))
         stored = np.where(noisy < 0.0, noisy + 65536.0, noisy) % 65536.0
-        found[f"noise {size:.2g}"] = levels(without_registers(swing(u=stored))[1])
-    assert without_registers(swing(q=np.mod(0.01 * np.arange(1000) + 3.0, 2.0 * np.pi)))[1] == []
+        found[f"noise {size:.2g}"] = levels(signals.without_registers(swing(u=stored))[1])
+    assert signals.without_registers(swing(q=np.mod(0.01 * np.arange(1000) + 3.0, 2.0 * np.pi)))[1] == []
     for factor in (0.88, 0.92, 1.0, 1.08, 1.12, 180.0 / np.pi):
         for noise in (0.0, 0.12, 0.15, 0.18):
             said = []
             for lag in np.linspace(0.02, 0.6, 12):
                 ahead = np.sin(2.0 * (time + lag)) + np.sin(13.0 * (time + lag))
                 u = factor * (ahead + noise * np.random.default_rng(0).standard_normal(1000))
-                doubts = target_doubts(seen(swing(q=np.sin(2.0 * time) + np.sin(13.0 * time), u=u)))
+                doubts = signals.target_doubts(seen(swing(q=np.sin(2.0 * time) + np.sin(13.0 * time), u=u)))
                 said.append(doubts[0].numbers["lag"] if doubts else 0.0)
             found[f"target {factor:.3g} {noise:g}"] = said
     assert_unchanged("checks/registers", found)

@@ -12,17 +12,8 @@ from tests.recordings.test_mapping_file import mapped
 
 from forcegp import Model, Robot
 from forcegp.errors import InvalidInput
-from forcegp.recordings import ColumnMapping, by_quantity, listed, open_source
+from forcegp.recordings import ColumnMapping, by_quantity, listed, mapping, open_source
 from forcegp.recordings.expression import parse_expression
-from forcegp.recordings.mapping import (
-    UNITS,
-    counted_columns,
-    expanded,
-    guessed_columns,
-    guessed_time,
-    log_unit,
-    named_unit,
-)
 from forcegp.recordings.signal_plan import signal_plan
 
 COLUMNS = ("theta1", "theta2", "theta", "a-b", "a", "b", "/js:position.j1", "x[0]", "1e3")
@@ -81,7 +72,7 @@ def test_a_combination_has_the_value_of_its_terms(terms, data):
     ],
 )  # fmt: skip
 def test_patterns(pattern, names):
-    assert expanded(pattern, JOINTS) == names
+    assert mapping.expanded(pattern, JOINTS) == names
 
 
 @pytest.mark.parametrize(
@@ -95,7 +86,7 @@ def test_patterns(pattern, names):
     ],
 )
 def test_braces_of_a_combination_go_on_together(pattern, texts):
-    assert expanded(pattern, JOINTS, {"a-1-1"}) == texts
+    assert mapping.expanded(pattern, JOINTS, {"a-1-1"}) == texts
 
 
 def test_lists_are_split_at_the_commas_that_separate():
@@ -112,14 +103,18 @@ def test_lists_are_split_at_the_commas_that_separate():
     ],
 )  # fmt: skip
 def test_units(quantity, name, given, si):
-    np.testing.assert_allclose(log_unit(quantity, name).in_si(np.array([given])), si, rtol=1e-15)
-    assert named_unit(quantity, f"q1 [{name}]") == named_unit(quantity, f"q1 ({name})") == log_unit(quantity, name).name
-    assert [named_unit("q", each) for each in ("q_deg", "q[1]", "q_m", "q_hand", "mm")] == ["deg", *[None] * 4]
+    np.testing.assert_allclose(mapping.log_unit(quantity, name).in_si(np.array([given])), si, rtol=1e-15)
+    assert (
+        mapping.named_unit(quantity, f"q1 [{name}]")
+        == mapping.named_unit(quantity, f"q1 ({name})")
+        == mapping.log_unit(quantity, name).name
+    )
+    assert [mapping.named_unit("q", each) for each in ("q_deg", "q[1]", "q_m", "q_hand", "mm")] == ["deg", *[None] * 4]
 
 
 READERS = {
     "combination": lambda text: parse_expression(text, COLUMNS, "log.csv"),
-    "pattern": lambda text: expanded(text, JOINTS),
+    "pattern": lambda text: mapping.expanded(text, JOINTS),
     "flags": lambda text: mapped(*text.split()),
 }
 MEANINGLESS = {
@@ -151,32 +146,32 @@ def test_short_forms_of_the_command_line():
 def test_names_are_guessed_only_where_nothing_else_can_be_meant(tmp_path):
     columns = table(motion(10))
     source = open_source(write_text(tmp_path / "log.csv", columns))
-    assert guessed_columns("q", JOINTS, source) == ("q_shoulder", "q_elbow")
-    assert guessed_columns("q", ("shoulder_joint", "elbow_joint"), source) == ("q_shoulder", "q_elbow")
-    assert guessed_columns("a", JOINTS, source) is None
+    assert mapping.guessed_columns("q", JOINTS, source) == ("q_shoulder", "q_elbow")
+    assert mapping.guessed_columns("q", ("shoulder_joint", "elbow_joint"), source) == ("q_shoulder", "q_elbow")
+    assert mapping.guessed_columns("a", JOINTS, source) is None
     names = [f"{x}_{joint}" for x in ("goal_position", "Present_position", "actual_torque") for joint in JOINTS]
     present = open_source(write_text(tmp_path / "present.csv", {name: columns["time"] for name in names}))
-    assert guessed_columns("q", JOINTS, present) == ("Present_position_shoulder", "Present_position_elbow")
-    assert guessed_columns("u", JOINTS, present) == ("actual_torque_shoulder", "actual_torque_elbow")
-    assert guessed_columns("q", ("shoulder", "wrist"), source) is None
-    assert guessed_time(source, []) == "time"
+    assert mapping.guessed_columns("q", JOINTS, present) == ("Present_position_shoulder", "Present_position_elbow")
+    assert mapping.guessed_columns("u", JOINTS, present) == ("actual_torque_shoulder", "actual_torque_elbow")
+    assert mapping.guessed_columns("q", ("shoulder", "wrist"), source) is None
+    assert mapping.guessed_time(source, []) == "time"
     both = columns | {f"position_{joint}": columns[f"q_{joint}"] for joint in JOINTS} | {"t": columns["time"]}
     source = open_source(write_text(tmp_path / "both.csv", both))
     with pytest.raises(InvalidInput, match=r"q_shoulder, q_elbow .*position_shoulder, position_elbow"):
-        guessed_columns("q", JOINTS, source)
+        mapping.guessed_columns("q", JOINTS, source)
     with pytest.raises(InvalidInput, match="time could be time or t"):
-        guessed_time(source, [])
+        mapping.guessed_time(source, [])
     of_messages = {f"/a:{x}.{joint}": columns["time"] for x in ("state.positions", "position") for joint in JOINTS}
     source = open_source(write_text(tmp_path / "messages.csv", of_messages))
-    assert guessed_columns("q", JOINTS, source) == ("/a:position.shoulder", "/a:position.elbow")
+    assert mapping.guessed_columns("q", JOINTS, source) == ("/a:position.shoulder", "/a:position.elbow")
     source = open_source(write_text(tmp_path / "plot.csv", {"__time": columns["time"], "q_elbow": columns["time"]}))
-    assert guessed_time(source, []) == "__time"
+    assert mapping.guessed_time(source, []) == "__time"
     for signal, text in (text.split(":") for text in COUNTED):
         names, found = (part.split() for part in text.split(">"))
         counted = open_source(write_text(tmp_path / "counted.csv", dict.fromkeys(names, columns["time"])))
-        assert counted_columns(signal, 2, counted) == (tuple(found) or None)
+        assert mapping.counted_columns(signal, 2, counted) == (tuple(found) or None)
     one = open_source(write_text(tmp_path / "one.csv", dict.fromkeys(("q", "q_des"), columns["time"])))
-    assert counted_columns("q", 1, one) == ("q",)
+    assert mapping.counted_columns("q", 1, one) == ("q",)
 
 
 COUNTED = (
@@ -206,4 +201,4 @@ def test_joints_without_a_column_are_named_with_what_holds_them(tmp_path):
 
 
 def test_units_are_what_they_were():
-    assert_unchanged("recordings/units", {quantity: dict(units) for quantity, units in UNITS.items()})
+    assert_unchanged("recordings/units", {quantity: dict(units) for quantity, units in mapping.UNITS.items()})
