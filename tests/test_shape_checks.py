@@ -120,8 +120,7 @@ def test_what_does_not_fit_must_be_refused_by_the_function_itself():
 
 SIZES = {"q": "nq", "v": "nv", "a": "nv", "u": "nu"}
 ARMS = {
-    "control/informative_motions", "forces/columns", "simulation/trajectory",
-    "simulation/kuka_motion",
+    "control/informative_motions", "forces/columns", "simulation/trajectory", "simulation/kuka_motion"
 }  # fmt: skip
 """Modules of robots that are bolted to the world and driven in every joint, where these sizes are one."""
 

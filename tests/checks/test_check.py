@@ -258,8 +258,9 @@ def test_a_stop_is_a_twentieth_of_the_motion_at_most(wide, stops, rows):
     pushed = replace(log, q=q, u=tau + 50.0 * rng.uniform(0.5, 1.0, tau.shape) * (q > 1.0 - wide))
     held = Comparison(robot=log.model.robot, laws=(), rows=pushed, given=pushed)
     vars(held).update(tau=tau, friction=np.zeros((*tau.shape, 1)))
-    found = _stop(Explanation(held, np.zeros(log.nv)), 0)
-    assert found == stops if found is None else found == pytest.approx((1.0, stops), abs=1e-2)
+    assert (_stop(Explanation(held, np.zeros(log.nv)), 0) or (0.0, None))[1] == (
+        stops and pytest.approx(stops, rel=0.05)
+    )
 
 
 @pytest.mark.parametrize("stops", [True, False])

@@ -25,8 +25,7 @@ def dataset(model: Model, time, q, u, episode) -> Dataset:
     """A raw log: q and u as recorded; v and a are for `Preparation` to compute."""
     nothing = np.zeros_like(q)
     return Dataset(
-        q=q, v=nothing, u=u, a=nothing, time=time,
-        model=model, episode=episode,
+        q=q, v=nothing, u=u, a=nothing, time=time, model=model, episode=episode
     )  # fmt: skip
 
 

@@ -7,23 +7,15 @@ from tests.posterior.arm import URDF
 from tests.robots.robot_models import TREE
 
 from forcegp.errors import NonPhysicalInertia
-from forcegp.evidence.bodies import (
-    Bodies,
-    body_pseudo_inertias,
-    carrying,
-    standard_parameters,
-    thickened,
-    upper_cholesky,
-    with_bodies,
-)
+from forcegp.evidence import bodies as of_bodies
 from forcegp.forces import Body
 from forcegp.robots import Robot
 from forcegp.robots.inertia import pseudo_inertia_of_standard
 
 
 def bodies(robot=None):
-    references = list(body_pseudo_inertias(robot or Robot.from_urdf_text(URDF)).numpy())
-    return Bodies(references, [Body()] * len(references))
+    references = list(of_bodies.body_pseudo_inertias(robot or Robot.from_urdf_text(URDF)).numpy())
+    return of_bodies.Bodies(references, [Body()] * len(references))
 
 
 def derivatives(ours, x):
@@ -40,7 +32,7 @@ def difference(function, x, step=1e-6):
 
 def test_zero_is_the_reference():
     ours, robot = bodies(), Robot.from_urdf_text(URDF)
-    np.testing.assert_allclose(ours.parameters(np.zeros(30)).ravel(), standard_parameters(robot), atol=1e-13)
+    np.testing.assert_allclose(ours.parameters(np.zeros(30)).ravel(), of_bodies.standard_parameters(robot), atol=1e-13)
     np.testing.assert_allclose(ours.distance(np.zeros(30))[0], 0.0, atol=1e-14)
 
 
@@ -87,31 +79,33 @@ def test_equal_eigenvalues_have_a_derivative():
 
 @pytest.mark.parametrize("text", [URDF, TREE], ids=["arm", "tree"])
 def test_a_robot_with_other_bodies(text):
-    robot, _ = thickened(Robot.from_urdf_text(text))
+    robot, _ = of_bodies.thickened(Robot.from_urdf_text(text))
     ours = bodies(robot)
-    x, numbers = 0.3 * np.random.default_rng(2).normal(size=ours.size), carrying(robot)
-    changed = with_bodies(robot, dict(zip(numbers, ours.pseudo_inertias(x), strict=True)))
-    np.testing.assert_allclose(standard_parameters(changed), ours.parameters(x).ravel(), atol=1e-12, rtol=1e-12)
-    same = with_bodies(robot, dict(zip(numbers, ours.pseudo_inertias(np.zeros(ours.size)), strict=True)))
+    x, numbers = 0.3 * np.random.default_rng(2).normal(size=ours.size), of_bodies.carrying(robot)
+    changed = of_bodies.with_bodies(robot, dict(zip(numbers, ours.pseudo_inertias(x), strict=True)))
+    np.testing.assert_allclose(
+        of_bodies.standard_parameters(changed), ours.parameters(x).ravel(), atol=1e-12, rtol=1e-12
+    )
+    same = of_bodies.with_bodies(robot, dict(zip(numbers, ours.pseudo_inertias(np.zeros(ours.size)), strict=True)))
     for name in robot.link_names:
         np.testing.assert_allclose(same.link(name).inertia, robot.link(name).inertia, atol=1e-12)
 
 
 def test_no_robot_has_impossible_bodies():
     robot = Robot.from_urdf_text(URDF)
-    wanted = body_pseudo_inertias(robot).numpy()
+    wanted = of_bodies.body_pseudo_inertias(robot).numpy()
     wanted[1, 3, 3] = -1.0
     with pytest.raises(NonPhysicalInertia, match=r"found for fore, .*more motion, or a prior"):
-        with_bodies(robot, dict(enumerate(wanted)))
+        of_bodies.with_bodies(robot, dict(enumerate(wanted)))
 
 
 def test_points_are_given_some_thickness():
     hand = 'ixx="0.01" iyy="0.011" izz="0.006" ixy="0.001" ixz="0" iyz="-0.001"'
     text = URDF.replace(hand, 'ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"')
-    robot, changed = thickened(Robot.from_urdf_text(text))
+    robot, changed = of_bodies.thickened(Robot.from_urdf_text(text))
     assert changed == ("hand",)
-    upper_cholesky(body_pseudo_inertias(robot).numpy())
-    same, none = thickened(Robot.from_urdf_text(URDF))
+    of_bodies.upper_cholesky(of_bodies.body_pseudo_inertias(robot).numpy())
+    same, none = of_bodies.thickened(Robot.from_urdf_text(URDF))
     assert none == ()
     assert same.urdf_text == URDF
 
@@ -129,5 +123,5 @@ def test_joint_dynamics_stand_in_the_urdf():
 
 def test_pseudo_inertias_of_standard_parameters():
     robot = Robot.from_urdf_text(TREE)
-    found = pseudo_inertia_of_standard(standard_parameters(robot).reshape(-1, 10)).numpy()
-    np.testing.assert_allclose(found, body_pseudo_inertias(robot), atol=1e-13)
+    found = pseudo_inertia_of_standard(of_bodies.standard_parameters(robot).reshape(-1, 10)).numpy()
+    np.testing.assert_allclose(found, of_bodies.body_pseudo_inertias(robot), atol=1e-13)

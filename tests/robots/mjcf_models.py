@@ -59,6 +59,5 @@ OPEN_BARS = f"""<mujoco model="four-bar"><worldbody>
 <body name="rocker" pos=".4 0 0"><joint name="rocker" axis="0 1 0"/>{BAR.format(0.05, 0.1, 0.8)}</body>
 </worldbody></mujoco>"""
 ALL = {
-    "arm": ARM, "gripper": GRIPPER, "quadruped": QUADRUPED, "quadrotor": QUADROTOR, "chain": CHAIN,
-    "bars": OPEN_BARS,
+    "arm": ARM, "gripper": GRIPPER, "quadruped": QUADRUPED, "quadrotor": QUADROTOR, "chain": CHAIN, "bars": OPEN_BARS
 }  # fmt: skip

@@ -36,8 +36,7 @@ def case(request):
 
 
 FUNCTIONS = {
-    "mass_matrix": "q", "bias_forces": "qv", "gravity_forces": "q", "inverse_dynamics": "qva",
-    "forward_dynamics": "qvt",
+    "mass_matrix": "q", "bias_forces": "qv", "gravity_forces": "q", "inverse_dynamics": "qva", "forward_dynamics": "qvt"
 }  # fmt: skip
 
 

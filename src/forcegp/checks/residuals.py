@@ -30,8 +30,7 @@ def pushed_where_they_are(rows: Dataset, model: Model, *, by_all: bool = False) 
         if not power > LEAST * len(u) * float(u.var()) > 0.0:  # passive joints have rounding
             continue
         stays = left_by_positions(rows.q, hats[:, :0], missed)[1] * power if by_all else _left(hats, missed)
-        if stays < ASKED * power:
-            found.append(name)
+        found += [name] * (stays < ASKED * power)
     return tuple(found)
 
 

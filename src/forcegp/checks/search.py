@@ -237,17 +237,13 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         begin, end = time[runs(there) - np.array([0, 1])].T + np.array([[-smeared], [smeared]])
         apart = np.insert(begin[1:] - end[:-1] > SHORT, 0, True)  # what stays between them is of no use
         ends = np.stack([begin[apart], np.maximum.reduceat(end, np.flatnonzero(apart))], axis=1)
-        numbers["seconds"] = ends.ravel().tolist()
-        seconds = ",".join(f"{each:.2f}" for each in ends.ravel())
-        do = f"Leave them out by forcegp import --without {seconds}, as forcegp auto does."
+        numbers["seconds"] = seconds = ends.ravel().tolist()
     elif left <= min(EXPLAINED, (1.0 - MOSTLY) * root.rough.max()):  # far less than there
-        ends = [float(x) for x in seconds.split(",")]
-        steps = np.diff(inputs.log.q[(inputs.log.time >= ends[0]) & (inputs.log.time <= ends[1])], axis=0)
+        steps = np.diff(inputs.log.q[(inputs.log.time >= seconds[0]) & (inputs.log.time <= seconds[1])], axis=0)
         still = inputs.named([k for k in bad.tolist() if (steps[:, k] == 0.0).mean() > UNCHANGED])
         why = f"the position of {listed(still)} stands still, as of a dead encoder or a brake" if still else ""
         where += f", elsewhere at most {100.0 * left:.2g} % stays: {why or 'a contact, or a load'}, in these seconds"
-        numbers |= {"seconds": ends, **({"stands": still} if still else {})}
-        do = f"Leave them out by forcegp import --without {seconds}, as forcegp auto does."
+        numbers |= {"seconds": seconds, **({"stands": still} if still else {})}
     else:
         fits = ((k, left_by_positions(rows.q, np.c_[tau[:, k], friction[:, k]], rows.u[:, k])) for k in bad.tolist())
         if names := inputs.named([k for k, (alone, beside) in fits if beside < EXPLAINED < alone]):
@@ -255,6 +251,10 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
             do = "Give the robot what pulls there, or learn it: "
             do += "forcegp score LOG.h5 --forces identified,gp:joint:inputs=q --out scores."
             numbers["positions"] = names
+    if "seconds" in numbers:
+        do = (
+            f"Leave them out by forcegp import --without {','.join(f'{x:.2f}' for x in seconds)}, as forcegp auto does."
+        )
     yield look(
         about=UNKNOWN,
         what="something is wrong that is none of the causes that were tried (signs, units, orders, zeros, gears, "
@@ -298,12 +298,12 @@ def held_at_rest(root: Explanation, joint: int) -> Bool[np.ndarray, " rows"]:
     return ~moves & (left <= HELD * (number[-2 - len(WIDTHS) : -2].sum() + np.sqrt(np.square(left[moves]).mean())))
 
 
-def _where(root: Explanation, joint: int, inputs: CheckInput) -> tuple[str, str, float]:
+def _where(root: Explanation, joint: int, inputs: CheckInput) -> tuple[str, list[float], float]:
     """Where in time, q or v most of what is left of a torque sits; of time the ends, and what stays elsewhere at most.
 
     Time is enough where little stays elsewhere: what touches a robot also stops it, so that v shows it as well.
     """
-    rows, best, found = root.log.rows, 0.0, ("", "", np.inf)
+    rows, best, found = root.log.rows, 0.0, ("", list[float](), np.inf)
     level = np.ones(len(rows))
     signals = np.c_[root.log.friction[:, joint], level, -level, rows.u[:, joint] - root.log.tau[:, joint]]
     for name, values, unit in (("time", rows.time, "s"), ("q", rows.q[:, joint], inputs.unit_of_each("q")[joint]),
@@ -326,5 +326,5 @@ def _where(root: Explanation, joint: int, inputs: CheckInput) -> tuple[str, str,
             text = f"; {100.0 * share:.0f} % of it at {inputs.names[joint]} for {name} between {ends[0]:.3g} and "
             edge = name == "q" and (first == 0 or last == len(rows))
             unit += ", an end of its motion, as of an end stop that gives way" if edge else ""
-            best, found = gain, (f"{text}{ends[1]:.3g} {unit}", f"{ends[0]:.2f},{ends[1]:.2f}", left)
+            best, found = gain, (f"{text}{ends[1]:.3g} {unit}", [round(float(x), 2) for x in ends], left)
     return found

@@ -29,8 +29,7 @@ from forcegp.progress import tell
 
 ROWS = 5_000  # rows that are used at most, evenly spread: more of a filtered recording add little
 EQUATIONS = 40_000  # as many rows hold these equations, one per degree of freedom, at most
-ROUGH_EQUATIONS = 7_000
-"""Of acceleration, which take three times as long as those of torque, where a search begins or ends roughly."""
+ROUGH_EQUATIONS = 7_000  # of acceleration, where a search begins or is rough: they take thrice the time of torques
 WINDOWED, PER_WINDOW = 2_000, 10
 """Of means over windows so many rows are enough, or so many in each: half a second of a filtered log has few more."""
 REWEIGHTINGS = 2  # searches in which accelerations are weighted by noise of both kinds
