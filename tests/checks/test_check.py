@@ -206,7 +206,7 @@ def test_of_few_rows_a_push_explains_a_nat_of_each(monkeypatch):
     monkeypatch.setattr("forcegp.checks.torque_doubts.SURE", np.inf)
     touched = touched_by(clean(4, seconds=12.0), [-4.0, 8.0, 2.0])
     inputs = replace(CheckInput.of(touched, touched.model), most_rows=200)
-    [found] = push(search(inputs)[0], inputs)
+    [found] = push(search(inputs)[0], inputs, -np.inf, np.inf)
     assert found.numbers["seconds"] == pytest.approx([4.0, 6.0], abs=0.3)
 
 
@@ -220,6 +220,9 @@ def test_the_seconds_of_a_push_are_named_and_left_out():
     begin, end = found.numbers["seconds"]
     assert 3.8 < begin < 4.0
     assert 6.0 < end < 6.2
+    beside = 0.35 * np.std(log.u, axis=0) * np.sin(7.0 * log.time)[:, None] * [0.0, 1.0, 0.0]  # what has no cause
+    [found] = check(replace(hard := touched_by(log, [-4.0, 8.0, 2.0]), u=hard.u + beside)).doubts.of("push")
+    assert found.numbers["seconds"] == pytest.approx([4.0, 6.0], abs=0.1)
     kept = without_pushes(touched, doubts)
     assert (len(kept.episodes), len(kept)) == (2, pytest.approx(1950, abs=10))
     cut = replace(touched, episode=(touched.time > 1.0).astype(int))  # of whose episodes no time comes twice

@@ -41,8 +41,7 @@ def test_episodes_are_left_out_whole():
     three = held_out_noise(model, replace(rows, episode=np.repeat([3, 1, 2], 40)), Accelerations())
     assert not np.array_equal(one.acceleration, three.acceleration)
     left = [_left_out(replace(rows, episode=np.arange(120) // length)) for length in (24, 10)]
-    assert [len(each) for each in left] == [5, 6]
-    assert np.unique(left[1][1] // 10).tolist() == [1, 7], "of twelve pieces two at once"
+    assert (len(left[0]), np.unique(left[1][1] // 10).tolist()) == (5, [1, 7]), "of twelve pieces two at once"
 
 
 def test_refusals():

@@ -155,13 +155,16 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
         open_ = {x.about for x in said} <= {UNKNOWN, "dry friction"}
         if thorough and open_ and (jumps := list(jump(found, inputs))):
             said = [*(x for x in said if x.about != UNKNOWN or x.joints != jumps[0].joints), *jumps]
-        elif thorough and not any(each.about == UNKNOWN or each.level == "wrong" for each in said):
-            said = [*said, *push(found, inputs)]
+        elif thorough and not any(each.level == "wrong" for each in said):
+            unknown = Doubts(said).of(UNKNOWN)
+            within = unknown[0].numbers.get("where") if unknown else (-np.inf, np.inf)
+            pushes = list(push(found, inputs, *within)) if within else []
+            said = [*(x for x in said if x.about != UNKNOWN or not pushes), *pushes]
         if not moved or {"degrees", "turns", "time unit"} & {doubt.about for doubt in said}:  # torques follow
             said = [doubt for doubt in said if doubt.about not in ("torque unit", "torque constant")]
-        more, begin = torque_doubts(inputs, found), float(inputs.log.time.min())
+        more, early = torque_doubts(inputs, found), float(inputs.log.time.min()) + SHORT
         if Doubts(more).of("drift"):  # of gears that are cold at first
-            said = [x for x in said if x.about != "push" or x.numbers["seconds"][0] > begin + SHORT]
+            said = [x for x in said if x.about != "push" or x.numbers["seconds"][0] > early]
         doubts, comparison = [*doubts, *said, *more], found
     return doubts, comparison
 

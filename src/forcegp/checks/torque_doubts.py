@@ -206,8 +206,8 @@ def _delays(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
         )
 
 
-def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
-    """A stretch of time in which several torques are far from any robot of these lengths, unlike before and after."""
+def push(found: Explanation, inputs: CheckInput, since: float, until: float) -> Iterator[Doubt]:
+    """A stretch between two times, or up to those known, in which torques of several joints fit no masses at all."""
     rows, place = found.log.rows, np.arange(len(found.log.rows))
     ones, smeared = np.ones((len(rows), 1)), 1.5 / inputs.compared_cutoff
     if len(rows) < FEWEST_ROWS:
@@ -233,7 +233,7 @@ def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
             tried.append((float(gains.sum()), first, last, gains, np.sqrt(power[0] / power[1])))
     most, first, last, gains, times = max(tried, key=lambda each: each[0], default=(0.0, 0, 0, ones, ones))
     joints = np.flatnonzero(gains > TELLS)
-    if most <= min(SURE, len(rows)) or len(joints) < 2:
+    if most <= min(SURE, len(rows)) or len(joints) < 2 or rows.time[last - 1] < since or rows.time[first] > until:
         return
     for _ in range(ENDS):  # what is touched tells no masses, and hides behind those that fit it as well
         inside = (place >= first) & (place < last)
@@ -247,6 +247,7 @@ def push(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
             break
         first, last = begin, end
     begin, end = rows.time[first] - smeared, rows.time[last - 1] + smeared
+    begin, end = (y if np.isfinite(y) else x for x, y in zip((begin, end), (since, until), strict=True))
     yield look(
         about="push",
         what=f"from {begin:.4g} to {end:.4g} s the torques of {listed(inputs.named(joints))} are up to "

@@ -24,6 +24,7 @@ import forcegp.posterior
 import forcegp.robots
 import forcegp.scores
 from forcegp.atomic_files import file_digest, write_json, write_text
+from forcegp.cli import robot_options
 from forcegp.cli.command import (
     DATASET,
     FIELDS,
@@ -34,15 +35,6 @@ from forcegp.cli.command import (
     options_of,
     unless_given,
     values_of,
-)
-from forcegp.cli.robot_options import (
-    CONTACTS,
-    SYSTEM_FILE,
-    RobotOptions,
-    SearchOptions,
-    forces_of,
-    identified_system,
-    parse_contacts,
 )
 from forcegp.cli.terminal import Terminal, columns, facts, with_option_names
 from forcegp.doubts import Doubts
@@ -84,7 +76,9 @@ class Fit(Command):
     evidence: Annotated[tuple[str, ...], listed(), unless_given("EVIDENCE,...", LEARNED_FROM)] = ()
     """What is learned from: accelerations or torques (torques:both where accelerations are noisy, too, torques:mean=.4
     of means). Beside it motions:S refines the numbers on recorded positions, over windows of S seconds."""
-    contact: Annotated[tuple[str, ...], listed(goes_on=NUMBERS), unless_given(CONTACTS, "the dataset's")] = ()
+    contact: Annotated[
+        tuple[str, ...], listed(goes_on=NUMBERS), unless_given(robot_options.CONTACTS, "the dataset's")
+    ] = ()
     """Points that stay on surfaces, instead of the dataset's contacts; m, in the axes of the link FRAME. SURFACE is
     plane:nx,ny,nz,offset or sphere:cx,cy,cz,radius; FRAME@x,y,z:held is bolted down. none: no contact."""
     noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
@@ -101,8 +95,8 @@ class Fit(Command):
     logs_from: Annotated[Path | None, unless_given("LIST", "one log", Path)] = None
     """In the place of LOG a text file with one in each line, and the options that differ for it, such as --robot.
     --out gets a folder for each and fleet.csv; --jobs logs are at work at once. What is finished is kept."""
-    robot: RobotOptions = RobotOptions()
-    search: SearchOptions = SearchOptions()
+    robot: robot_options.RobotOptions = robot_options.RobotOptions()
+    search: robot_options.SearchOptions = robot_options.SearchOptions()
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Fit, save and show."""
@@ -113,7 +107,7 @@ class Fit(Command):
         evidence = forcegp.evidence.parse_evidence(self.evidence) if self.evidence else ()
         start, notes = time.monotonic(), []
         dataset = forcegp.Dataset.load(self.log)
-        contacts, given = parse_contacts(self.contact), self.robot.chosen_model(dataset, self.log)
+        contacts, given = robot_options.parse_contacts(self.contact), self.robot.chosen_model(dataset, self.log)
         given = given.with_contacts(contacts) if self.contact else given
         self._check(terminal, dataset, given)
         recording = dataset
@@ -132,7 +126,7 @@ class Fit(Command):
         summary = fit_summary(posterior, time.monotonic() - start)
         tables = fit_report(self.out, posterior, summary)
         self._write(posterior)
-        for note in [*forces_of(given), *notes, *found]:
+        for note in [*robot_options.forces_of(given), *notes, *found]:
             terminal.note(note)
         for doubt in forcegp.scores.unfinished_search(posterior):
             terminal.warn(str(doubt))
@@ -154,7 +148,8 @@ class Fit(Command):
         if self.checks:
             used = quick_doubts(self.log, dataset, model)
             if used:  # check has no --contact: it would find nothing wrong with the contacts of the data
-                see = f"See {shlex.join(['forcegp', 'check', str(self.log), *self.words(*options_of(RobotOptions))])}"
+                words = self.words(*options_of(robot_options.RobotOptions))
+                see = f"See {shlex.join(['forcegp', 'check', str(self.log), *words])}"
                 see = used[0].advice.rstrip(".") if self.contact else see
                 terminal.warn(f"{used.in_one_line()}. {see} (--no-checks does not look)")
         warnings.simplefilter("ignore", ContactWarning)
@@ -197,9 +192,9 @@ def quick_doubts(log: Path, dataset: forcegp.Dataset, model: forcegp.Model) -> D
 
 def write_estimates(folder: Path, posterior: Any, name: str = "identified") -> None:
     """The numbers that were found, and robot and known forces with them: for --identified, and as a URDF."""
-    estimates, known = posterior.estimates, identified_system(posterior.model)
+    estimates, known = posterior.estimates, robot_options.identified_system(posterior.model)
     write_json(folder / "estimates.json", estimates.to_dict())
-    write_text(folder / SYSTEM_FILE, known.to_json() + "\n")
+    write_text(folder / robot_options.SYSTEM_FILE, known.to_json() + "\n")
     known.to_urdf(folder / f"{name}.urdf")
 
 
