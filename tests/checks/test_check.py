@@ -77,11 +77,14 @@ def test_a_rest_on_brakes_is_left_out(lacking):
         assert len(without_stops(data.rows(slice(680, None)))[0].episodes) == 1  # 20 rows before it teach nothing
 
 
-def test_a_rest_at_an_end_of_its_motion_presses_on_a_stop():
-    data = stopped(np.array([0.0, 6.0, 0.0]), int(np.argmax(clean(4, arm()).q[:, 1])))
+def test_a_rest_at_an_end_of_its_motion_presses_on_a_stop_unless_its_drive_is_off():
+    data = stopped(np.array([0.0, 6.0, 0.0]), end := int(np.argmax(clean(4, arm()).q[:, 1])))
     kept, [doubt] = without_stops(data)
     assert "lift is held at an end of its motion" in doubt.what
     assert data.q[:, 1].max() - kept.q[:, 1].max() == pytest.approx(0.1 * np.ptp(data.q[:, 1]), rel=0.2)
+    for share, told in ((0.0, "brakes"), (0.08, "at an end of its motion")):
+        (u := data.u.copy())[end : end + 200, 1] = share * np.std(data.u[:, 1])
+        assert told in without_stops(replace(data, u=u))[1][0].what
 
 
 def test_a_prepared_log_is_not_filtered_twice():

@@ -9,12 +9,7 @@ from tests.robots.robot_models import CHAIN, MODELS, TREE, loaded
 
 from forcegp.errors import InvalidInput, NumericalError, UnknownName
 from forcegp.robots import Robot
-from forcegp.robots.inertia import (
-    pseudo_inertia_of_standard,
-    rotation_from_rpy,
-    rpy_from_rotation,
-    standard_of_pseudo_inertia,
-)
+from forcegp.robots import inertia as inertias
 
 
 @pytest.fixture(scope="module")
@@ -161,8 +156,8 @@ def test_pseudo_inertia_of_standard_parameters():
     expected[:3, :3] = 0.5 * inertia.trace() * torch.eye(3, dtype=torch.float64) - inertia
     expected[:3, 3] = expected[3, :3] = torch.stack([hx, hy, hz])
     expected[3, 3] = m
-    torch.testing.assert_close(pseudo_inertia_of_standard(parameters), expected, rtol=0.0, atol=1e-15)
-    torch.testing.assert_close(standard_of_pseudo_inertia(expected), parameters, rtol=0.0, atol=1e-14)
+    torch.testing.assert_close(inertias.pseudo_inertia_of_standard(parameters), expected, rtol=0.0, atol=1e-15)
+    torch.testing.assert_close(inertias.standard_of_pseudo_inertia(expected), parameters, rtol=0.0, atol=1e-14)
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -180,5 +175,7 @@ def test_the_regressor_times_any_parameters_is_the_joint_force(model):
 @pytest.mark.parametrize("pitch", [0.3, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-9, 2.5])
 def test_angles_of_a_rotation_give_it_back(pitch):
     for roll, yaw in ((0.0, 0.0), (1.0, -2.0), (-3.0, 0.4)):
-        rotation = rotation_from_rpy((roll, pitch, yaw))
-        np.testing.assert_allclose(rotation_from_rpy(rpy_from_rotation(rotation)), rotation, atol=1e-15)
+        rotation = inertias.rotation_from_rpy((roll, pitch, yaw))
+        np.testing.assert_allclose(
+            inertias.rotation_from_rpy(inertias.rpy_from_rotation(rotation)), rotation, atol=1e-15
+        )

@@ -35,7 +35,8 @@ SURE, TELLS = 150.0, 30.0
 BRIEF = 0.05  # of the rows, for which a torque is another
 ENDS = 5  # times that the ends of such a stretch are sought anew, as those that are most likely (Page 1954)
 SEEN, WARMER = 1e-3, 0.1  # share of the largest direction of columns; logarithm of a ratio of friction that is told
-PRESSED = 0.1  # of a joint's motion, of which an end stop may hold it
+PRESSED, IDLE = 0.1, 0.1
+"""Of a joint's motion, where an end stop may hold it; of the deviation of its torque, below which its drive is off."""
 RESTS = 0.05  # share of what the joints alone would move a point by, below which it stays where it is
 
 
@@ -387,7 +388,7 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
     for k in np.flatnonzero((alone := held[np.isin(still, out)].mean(axis=0) > 0.5) & (alone.sum() == 1)):
         for end in (log.q[:, k].min(), log.q[:, k].max()):
             there = np.abs(log.q[:, k] - end) <= PRESSED * np.ptp(log.q[:, k])
-            if there[out].all():
+            if there[out].all() and np.abs(log.u[out, k]).mean() > IDLE * log.u[:, k].std():
                 out = np.union1d(out, np.flatnonzero(there))
                 why = f"{inputs.names[k]} is held at an end of its motion, {end:.3g} {inputs.unit_of_each('q')[k]}, as "
                 why += "by an end stop or a contact; all rows near that end are left out"

@@ -18,12 +18,8 @@ LEAST_COVERAGE = 0.8  # of 95 % intervals that is no reason to doubt them
 
 def short_name(name: str) -> str:
     """What a model is called in the answer."""
-    forces = {
-        "gp:joint-friction": "friction",
-        "gp:aerodynamic": "air forces",
-        "gp:joint-position": "forces of position",
-    }
-    forces |= {"gp:joint:inputs=q": "forces of positions"}
+    forces = {"gp:joint-friction": "friction", "gp:aerodynamic": "air forces"}
+    forces |= {"gp:joint-position": "forces of position", "gp:joint:inputs=q": "forces of positions"}
     learned = " and ".join(what for force, what in forces.items() if force in name)
     plain = {"given": "the URDF", "identified@accelerations": "identified by accelerations"}
     plain |= {"identified@torques:both": "identified by torques and accelerations"}
