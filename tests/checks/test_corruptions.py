@@ -12,6 +12,7 @@ from tests.checks.corruptions import (
     ROBOTS,
     at,
     clean,
+    gripped,
     invented,
     named,
     numbers,
@@ -327,6 +328,16 @@ def test_torques_in_steps_are_right_and_friction_that_fades_is_named():
     assert [each.joints for each in alone] == [("joint2",)]
     cold = check(replace(data, u=data.u + dry * (1.0 + np.exp(-np.square(data.time / 2.0)))[:, None])).doubts
     assert [each.about for each in cold if each.level != "ok"] == ["drift"], "no push, either"
+
+
+@pytest.mark.parametrize(("begin", "left_out"), [(7.1, (0.0, 7.1)), (12.2, (12.2, 14.99))])
+def test_the_time_of_a_load_is_told_also_behind_a_rest(begin, left_out):
+    time = np.arange(0.0, 15.0, 0.01)
+    ways = (
+        np.stack([np.sin(2.1 * time), 0.8 * np.sin(3.3 * time)], axis=1) * np.clip(time - 4.0, 0.0, 1.0)[:, None] ** 3
+    )
+    [found] = check(gripped(with_motion(two_links(), ways, 100.0, 3, 0.0), begin)).doubts.of("load")
+    assert found.numbers["seconds"] == pytest.approx(left_out, abs=0.2)
 
 
 def test_short_and_unordered_logs_are_looked_at_too():

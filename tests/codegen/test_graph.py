@@ -6,17 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from forcegp.codegen import library as programs
 from forcegp.codegen.c_writer import Program, write_function, write_program
 from forcegp.codegen.graph import BINARY, FUNCTIONS, ONE, UNARY, ZERO, Copier, Graph, interpreted, jacobian
-from forcegp.codegen.library import (
-    NOT_FINITE,
-    NOT_POSITIVE,
-    OPTIONS,
-    RESULT_NOT_FINITE,
-    RowFunction,
-    compile_library,
-    vector_unit,
-)
 from forcegp.codegen.tracing import StraightLineAlgebra, cholesky, pseudo_inverse, solve_lower, trace
 from forcegp.errors import InvalidInput
 
@@ -28,23 +20,23 @@ def evaluated(graph, outputs, inputs):
 
 @pytest.fixture(params=[1, "here"], ids=["C99", "vectors"])
 def lanes(request) -> int:
-    return vector_unit()[0] if request.param == "here" else request.param
+    return programs.vector_unit()[0] if request.param == "here" else request.param
 
 
 @pytest.fixture
 def compiled(tmp_path, lanes):
     """A program as a function of rows, for one double or for vectors."""
 
-    def build(program: Program) -> RowFunction:
+    def build(program: Program) -> programs.RowFunction:
         strict = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1", "-fPIC", "-shared")
-        options = strict if lanes == 1 else (*OPTIONS, *vector_unit()[1])
-        library = compile_library(write_program(program, lanes, 60), options, tmp_path / "x.so", "evaluate")
-        return RowFunction(library, len(program.inputs), [len(x) for x in program.outputs.values()])
+        options = strict if lanes == 1 else (*programs.OPTIONS, *programs.vector_unit()[1])
+        library = programs.compile_library(write_program(program, lanes, 60), options, tmp_path / "x.so", "evaluate")
+        return programs.RowFunction(library, len(program.inputs), [len(x) for x in program.outputs.values()])
 
     return build
 
 
-def rows_of(function: RowFunction, *inputs: torch.Tensor) -> list[torch.Tensor]:
+def rows_of(function: programs.RowFunction, *inputs: torch.Tensor) -> list[torch.Tensor]:
     outputs = [torch.empty(len(inputs[0]), size, dtype=torch.float64) for size in function.outputs]
     assert function.rows(inputs, outputs) == 0
     return outputs
@@ -149,9 +141,9 @@ def test_programs_report_what_is_wrong_with_their_states(compiled):
         return function.single(torch.tensor([value], dtype=torch.float64))[0]
 
     assert bits(0.5) == 0
-    assert bits(2.0) == NOT_POSITIVE
-    assert bits(-1.0) == RESULT_NOT_FINITE
-    assert bits(math.nan) & NOT_FINITE
+    assert bits(2.0) == programs.NOT_POSITIVE
+    assert bits(-1.0) == programs.RESULT_NOT_FINITE
+    assert bits(math.nan) & programs.NOT_FINITE
 
 
 def test_an_index_that_no_graph_holds_is_named():

@@ -10,6 +10,7 @@ from tests.forces.world_forces import WorldForces
 from tests.posterior.arm import arm_data, arm_model
 
 from forcegp import Accelerations, ContactForces, JointTorques, Torques, fit, load_posterior, save_posterior
+from forcegp import forces as acting
 from forcegp.data import Dataset, Preparation, low_pass, resample, with_memory
 from forcegp.data.dataset import FORCE, IMU, TORQUE
 from forcegp.data.imu import specific_force
@@ -18,18 +19,6 @@ from forcegp.evidence.likelihood import MarginalLikelihood, TrainingData
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
 from forcegp.fit.physical import typical_sizes
-from forcegp.forces import (
-    FORCES,
-    Actuation,
-    Coulomb,
-    GearFriction,
-    JointForces,
-    LoadFriction,
-    LogNormal,
-    Offset,
-    Payload,
-    Viscous,
-)
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import AffineMap, fixed_point
 from forcegp.model import Model
@@ -84,8 +73,10 @@ def assert_slopes(residual, x, slopes):
 
 
 def test_stacked_rows_have_the_density_of_one_large_gaussian():
-    model = replace(on_plane(JointForces(("q",))), noise=Noise(0.05, 0.02, learn=True, sensor=(0.3, 0.2, 0.2, 0.2)))
-    log = with_imu(measured(on_plane(Viscous(0.7)), model.known, rows=12, noise=0.05))
+    model = replace(
+        on_plane(acting.JointForces(("q",))), noise=Noise(0.05, 0.02, learn=True, sensor=(0.3, 0.2, 0.2, 0.2))
+    )
+    log = with_imu(measured(on_plane(acting.Viscous(0.7)), model.known, rows=12, noise=0.05))
     likelihood = MarginalLikelihood(model, TrainingData.of(log, torch.device("cpu"), log.measured))
     kernels, parameters = likelihood.kernels, likelihood.noise.parameters(3)
     parameters = {**kernels.initial_parameters(), **parameters}
@@ -110,8 +101,10 @@ def test_stacked_rows_have_the_density_of_one_large_gaussian():
 
 @pytest.mark.parametrize("contact", [held, on_plane])
 def test_slopes_of_stacked_residuals_are_those_of_finite_differences(contact):
-    model = contact(Viscous(), Offset(), Payload("hand")).with_forces(noise=Noise(None, sensor=(9.0, 0.1, 0.2, 0.3)))
-    log = with_imu(measured(contact(Viscous(0.4)), contact(), rows=6))
+    model = contact(acting.Viscous(), acting.Offset(), acting.Payload("hand")).with_forces(
+        noise=Noise(None, sensor=(9.0, 0.1, 0.2, 0.3))
+    )
+    log = with_imu(measured(contact(acting.Viscous(0.4)), contact(), rows=6))
     space = ParameterSpace(model, typical_sizes(model, [log]))
     rows = RecordedRows(space, log.q, log.v, log.u, any_contact=True, sensed=log.measured)
     x = 0.3 + 0.1 * np.random.default_rng(1).standard_normal(space.size)
@@ -124,8 +117,8 @@ def test_slopes_of_stacked_residuals_are_those_of_finite_differences(contact):
 
 
 def test_gains_are_found_beside_a_sensor_and_not_without():
-    log = measured(held(Actuation(gain=[0.8, 0.9, 1.2]), Viscous(0.5)), held())
-    model = held(Actuation(gain=LogNormal(1.0, 0.3)), Viscous())
+    log = measured(held(acting.Actuation(gain=[0.8, 0.9, 1.2]), acting.Viscous(0.5)), held())
+    model = held(acting.Actuation(gain=acting.LogNormal(1.0, 0.3)), acting.Viscous())
     gains = dict(zip(("pan", "lift", "bend"), (0.8, 0.9, 1.2), strict=True))
     behind = {f"{TORQUE}{name}": (gain * log.u - 0.5 * log.v)[:, [j]] for j, (name, gain) in enumerate(gains.items())}
     alone = fit(model, log, Torques()).parameters
@@ -138,11 +131,13 @@ def test_gains_are_found_beside_a_sensor_and_not_without():
 
 
 def test_friction_under_load_counts_the_gain():
-    truth = arm_model(0).with_forces(Actuation(gain=[0.8, 0.9, 1.2]), LoadFriction(0.1, 0.0, 0.2))
+    truth = arm_model(0).with_forces(acting.Actuation(gain=[0.8, 0.9, 1.2]), acting.LoadFriction(0.1, 0.0, 0.2))
     log = measured(held(), held())
     a = truth.dynamics(*tensors(log, "q", "v", "u")).acceleration_map().offset.numpy()
     free = replace(log, model=arm_model(0), measured={}, a=a)
-    model = arm_model(0).with_forces(Actuation(gain=LogNormal(1.0, 0.3)), LoadFriction(None, 0.0, 0.2))
+    model = arm_model(0).with_forces(
+        acting.Actuation(gain=acting.LogNormal(1.0, 0.3)), acting.LoadFriction(None, 0.0, 0.2)
+    )
     space = ParameterSpace(model, typical_sizes(model, [free]))
     rows = RecordedRows(space, free.q, free.v, free.u)
     x, motion = space.start + 0.05, rows.moving(free.a)
@@ -154,7 +149,7 @@ def test_friction_under_load_counts_the_gain():
 
 def test_a_sensor_shows_forces_along_the_normal(tmp_path, monkeypatch):
     """Something pulls the tool onto the plane, the more the faster it moves: no acceleration shows it."""
-    monkeypatch.setitem(FORCES, "world-forces", WorldForces)  # so that files carry it
+    monkeypatch.setitem(acting.FORCES, "world-forces", WorldForces)  # so that files carry it
     at = measured(on_plane(), on_plane(), rows=160)
     J = on_plane().robot.kinematics(*tensors(at, "q", "v")).frame_jacobian("hand", (0.0, 0.0, 0.2))[:, :3].numpy()
     push = (J.transpose(0, 2, 1) @ NORMAL) * (-4.0 * np.tanh(2.0 * (J @ at.v[..., None])[:, 1, 0]))[:, None]
@@ -180,7 +175,7 @@ def test_a_sensor_shows_forces_along_the_normal(tmp_path, monkeypatch):
 class TestLogsOfSensors:
     @pytest.fixture
     def log(self):
-        return measured(on_plane(Viscous(0.7)), on_plane(), rows=80)
+        return measured(on_plane(acting.Viscous(0.7)), on_plane(), rows=80)
 
     def test_a_sensor_goes_through_files_filters_and_choices_of_rows(self, log, tmp_path):
         behind = {f"{TORQUE}lift": log.u[:, :1]}
@@ -211,27 +206,27 @@ class TestLogsOfSensors:
 
     def test_evidence_that_a_log_lacks_is_refused(self, log):
         with pytest.raises(InvalidInput, match=r"need the sensor force.fore; the log has ..force.hand"):
-            fit(on_plane(Viscous()), log, [Torques(), ContactForces("fore")])
+            fit(on_plane(acting.Viscous()), log, [Torques(), ContactForces("fore")])
         with pytest.raises(InvalidInput, match=r"need the sensor force.FRAME; the log has ..:"):
-            fit(on_plane(Viscous()), replace(log, measured={}), [Torques(), ContactForces()])
+            fit(on_plane(acting.Viscous()), replace(log, measured={}), [Torques(), ContactForces()])
         with pytest.raises(InvalidInput, match="beside torques"):
-            fit(on_plane(Viscous()), log, [Accelerations(), ContactForces()])
+            fit(on_plane(acting.Viscous()), log, [Accelerations(), ContactForces()])
         behind = replace(log, measured={f"{TORQUE}lift": log.u[:, :1]})
         with pytest.raises(InvalidInput, match="torque sensors at links teach numbers of laws and bodies, beside"):
-            fit(on_plane(JointForces()), behind, [Accelerations(), JointTorques()])
+            fit(on_plane(acting.JointForces()), behind, [Accelerations(), JointTorques()])
         with pytest.raises(InvalidInput, match="has no contact"):
-            fit(arm_model(0).with_forces(JointForces()), log, [Accelerations(), ContactForces()])
+            fit(arm_model(0).with_forces(acting.JointForces()), log, [Accelerations(), ContactForces()])
         with pytest.raises(InvalidInput, match="noise of contact-forces"):
             ContactForces(noise=0.0)
 
     def test_a_sensor_without_a_contact_is_a_force_that_is_known(self, log):
         free = arm_model(0)
-        at = free.with_forces(Coulomb(0.4, 0.1)).dynamics(*tensors(log, "q", "v", "u"))
+        at = free.with_forces(acting.Coulomb(0.4, 0.1)).dynamics(*tensors(log, "q", "v", "u"))
         force = np.random.default_rng(3).normal(0.0, 5.0, (80, 3))
         J = at.state.kinematics.frame_jacobian("hand")[:, :3].numpy()
         a = at.acceleration(torch.tensor((J.transpose(0, 2, 1) @ force[..., None])[..., 0])).numpy()
         pulled = replace(log, model=free, a=a, measured={SENSOR: force})
-        model = free.with_forces(Coulomb(None, 0.1))
+        model = free.with_forces(acting.Coulomb(None, 0.1))
         found = fit(model, pulled, [Torques(), ContactForces()]).parameters["coulomb.level.lift"]
         assert found.value == pytest.approx(0.4, abs=1e-6)
 
@@ -246,7 +241,7 @@ def test_a_real_leg_tells_its_contact_force_without_the_sensor_after_a_calibrati
     raw = Dataset(q=q, v=still, u=u, a=still, time=time, model=model, measured={name: force})
     log = Preparation(cutoff=20.0, every=10, trim=0.2).apply(raw)
     train, test = (log.rows(slice(*ends)) for ends in ((0, 2 * len(log) // 3), (2 * len(log) // 3, len(log))))
-    laws = (Actuation(gain=LogNormal(1.0, 0.3)), GearFriction(), Offset())
+    laws = (acting.Actuation(gain=acting.LogNormal(1.0, 0.3)), acting.GearFriction(), acting.Offset())
 
     def left(forces, evidence):
         with warnings.catch_warnings(action="ignore", category=DataWarning):
@@ -260,7 +255,7 @@ def test_a_real_leg_tells_its_contact_force_without_the_sensor_after_a_calibrati
     error, holds = left(laws, [Torques(), ContactForces("contact")])  # measured: 1.17 N, .975
     assert error < 1.5
     assert 0.9 <= holds <= 0.99
-    for forces, evidence in ((laws, Torques()), ((JointForces(),), Accelerations())):  # 2.71 N, .955 and .99
+    for forces, evidence in ((laws, Torques()), ((acting.JointForces(),), Accelerations())):  # 2.71 N, .955 and .99
         error, holds = left(forces, evidence)
         assert error < 2.75
         assert holds >= 0.9

@@ -30,6 +30,7 @@ HEAVIEST = 1.3  # times the assumed gravity, beyond which it is something else
 FACTORS = np.exp(np.linspace(-2.5, 2.5, 251))  # of lengths, its ends left out
 RATIOS = np.exp(np.linspace(-1.2, 1.2, 25))  # of gears: the steps are then divided by ten
 PARTS = 16  # of the log, at whose ends a load is sought that is not held all the time; then as many of a part
+UNSURE = 10.0  # nats within which a load may be taken up at another time
 MOST_ENDS = 4  # links that may hold something beside a tilt
 ALL_TRIED = 8  # joints up to which every pair is exchanged; of more, those that fit badly
 
@@ -344,8 +345,7 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         text = f"torques fit a constant force of ({force}) N at ({place}) mm of {joint.child}, as of a hose or a cable"
         told = {"do": PULLED, "numbers": {"force": pull.tolist(), "point": at.tolist(), "link": joint.child}}
         added = columns[..., :3] @ pull
-        after, before = _left_of(now, np.stack([now.rows.u, now.tau + added, now.tau]), np.eye(2))
-        if after < before:  # the steps may lead astray
+        if np.diff(_left_of(now, np.stack([now.rows.u, now.tau, now.tau + added]), np.eye(2)))[0] < 0.0:  # not astray
             yield number("pull", text, drive.joint, 0.0, 3.0 * NUMBER, **told), replace(now, more=now.more + added)
     for joint in range(rows.nv):
         only = (rows.q - rows.q.mean(axis=0)) * (np.arange(rows.nv) == joint)
@@ -376,12 +376,20 @@ def _parts(
         if not tried:
             return
     _, at, later = min(tried)
-    begin, end = inputs.log.time[[0, -1]].tolist()
-    time, unsure = begin + at * (end - begin), (end - begin) / PARTS**2
-    short = (time - unsure, end) if at > 0.5 else (begin, time + unsure)
+    held, first = (share >= at) == later, int(np.searchsorted(share, at))
+    load = columns @ solved(now, held[:, None, None] * columns)
+    bases = np.linalg.qr(now.friction.swapaxes(0, 1))[0]
+    left = (now.rows.u - now.tau - held[:, None] * load).T[..., None]
+    left = (left - bases @ (bases.swapaxes(1, 2) @ left))[..., 0].T
+    other = np.square(left + np.where(held[:, None], load, -load)) - np.square(left)  # on the other side of that time
+    cost = np.cumsum((0.5 * other / (left.var(axis=0) + 1e-300)).sum(axis=1))
+    cost = np.where(np.arange(len(cost)) < first, 1.0, -1.0) * (cost[first] - cost)
+    times, (begin, end), smeared = now.given.time, inputs.log.time[[0, -1]].tolist(), 1.5 / inputs.compared_cutoff
+    likely, time = times[cost < cost.min() + UNSURE], float(times[max(int(np.argmin(cost)) - 1, 0) :][:2].mean())
+    short = (float(likely[0]) - smeared, end) if at > 0.5 else (begin, float(likely[-1]) + smeared)
     do = "Leave the shorter part out by forcegp import --without {:.2f},{:.2f}, as forcegp auto does.".format(*short)
     when = f" from {time:.4g} s on: it takes up a load" if later else f" until {time:.4g} s: it lets go of a load"
-    yield when, ((share >= at) == later)[:, None, None] * columns, 3.5 * NUMBER, {"do": do, "seconds": short}
+    yield when, ((times >= time) == later)[:, None, None] * columns, 3.5 * NUMBER, {"do": do, "seconds": short}
 
 
 def _gravities(

@@ -18,6 +18,7 @@ from forcegp.evidence import Evidence, Motions, Sensor, Torques, TrainingData
 from forcegp.evidence.likelihood import MarginalLikelihood, check_distance, problem_size
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.fit import doubts as checked
+from forcegp.fit import search as searching
 from forcegp.fit.friction_choice import with_friction_chosen
 from forcegp.fit.joint import CHANGE, MOST_ROUNDS, FreeNumbers, estimates_beside, numbers_beside, with_free_numbers
 from forcegp.fit.motion_fit import refine_on_motions
@@ -29,16 +30,6 @@ from forcegp.fit.refinement import (
     learning_rows,
     on_all_rows,
     require_memory_to_learn,
-)
-from forcegp.fit.search import (
-    MOST_POINTS_FOR_RESTARTS,
-    FitObjective,
-    Search,
-    described_rows,
-    learns_noise,
-    resolved_noise,
-    widened,
-    with_variance_priors,
 )
 from forcegp.fit.sensors import usual_evidence, with_sensors
 from forcegp.fit.unseen import Unseen
@@ -152,7 +143,7 @@ def fit(
     else:
         if baseline is not None:
             raise InvalidInput("a baseline is for payloads, without unknown functions; leave one of them out.")
-        search = Search(checked_jobs(jobs), restarts, seed, options, start)
+        search = searching.Search(checked_jobs(jobs), restarts, seed, options, start)
         posterior = _Functions(model, search, engine, learning_points, unseen).fitted(dataset, points)
     if choice is not None:
         posterior = posterior.with_settings(gear_friction=choice.to_dict())
@@ -226,7 +217,7 @@ def _of_numbers(model: Model, logs: Sequence[Dataset], evidence: Any, rows: int 
     training = TrainingData.of(found.rows, model.robot.device)
     result = OptimizationResult({}, found.history[-1], found.history, "Gauss-Newton steps", found.estimates.settled,
                                 found.estimates.evaluations, 0.0)  # fmt: skip
-    settings = described_rows(found.rows, logs[0]) | {
+    settings = searching.described_rows(found.rows, logs[0]) | {
         "seed": seed,
         "evidence": str(evidence),
         "noise": found.noise.to_dict(),
@@ -241,7 +232,7 @@ class _Functions:
     """How unknown functions are learned, and numbers beside them."""
 
     model: Model
-    search: Search
+    search: searching.Search
     engine: Engine | str
     learning_points: int | None
     unseen: Unseen | None = None
@@ -269,20 +260,24 @@ class _Functions:
             # now, not after the search
             chosen.require_memory(problem_size(self.model, len(all_rows)), self.model.robot.device)
         ordered = len(all_rows) < len(dataset)
-        rows = independent_rows(all_rows) if learns_noise(self.model.noise, dataset) else all_rows
+        rows = independent_rows(all_rows) if searching.learns_noise(self.model.noise, dataset) else all_rows
         if points is not None:  # which rows these are is not the caller's choice
             all_rows = rows
         rows = learning_rows(rows, self.learning_points, ordered=ordered)
-        described = described_rows(all_rows, dataset)
+        described = searching.described_rows(all_rows, dataset)
         own = replace(self, search=replace(self.search, start=self._continuation(rows, dataset)))
-        fitted = widened(own._with_numbers(rows, dataset))
+        fitted = searching.widened(own._with_numbers(rows, dataset))
         checked.warn_of_contacts(self.model, dataset)  # last: what refuses the rows comes first
         return on_all_rows(fitted, with_memory(all_rows, fitted.model), chosen, described)
 
     def _continuation(self, rows: Dataset, dataset: Dataset) -> Mapping[str, Tensor] | None:
         """Where a single search on many rows begins: at the end of searches on fewer of them."""
         search = self.search
-        if search.start is not None or len(rows) <= MOST_POINTS_FOR_RESTARTS or search.restarts not in (None, 1):
+        if (
+            search.start is not None
+            or len(rows) <= searching.MOST_POINTS_FOR_RESTARTS
+            or search.restarts not in (None, 1)
+        ):
             return search.start
         _, options = search.resolved(len(rows))
         stages = [stage for stage in CONTINUE_FROM if 1.5 * stage < len(rows)]
@@ -336,7 +331,7 @@ class _Functions:
         self, rows: Dataset, dataset: Dataset, beside: Callable[[MarginalLikelihood], FreeNumbers] | None = None
     ) -> Posterior:
         """One search on these rows with this model, and its posterior; `beside` gives a likelihood of numbers."""
-        noise = resolved_noise(self.model.noise, rows)
+        noise = searching.resolved_noise(self.model.noise, rows)
         noise = noise if self.unseen is None else self.unseen.with_pushes(noise, len(rows))
         model = replace(self.model, noise=noise)
         training = TrainingData.of(rows, model.robot.device, rows.measured)
@@ -345,12 +340,12 @@ class _Functions:
         check_distance(model, training)
         checked.check_forces(likelihood)
         require_memory_to_learn(likelihood)
-        described = described_rows(rows, dataset) | {"noise": noise.to_dict()}
+        described = searching.described_rows(rows, dataset) | {"noise": noise.to_dict()}
         learned_noise, fixed = likelihood.split_noise
         kernels = likelihood.kernels
         if beside is not None:
-            kernels, described["log_variance_spread"] = with_variance_priors(kernels), LOG_VARIANCE_SPREAD
-        objective = FitObjective(likelihood if beside is None else beside(likelihood), kernels, noise, fixed)
+            kernels, described["log_variance_spread"] = searching.with_variance_priors(kernels), LOG_VARIANCE_SPREAD
+        objective = searching.FitObjective(likelihood if beside is None else beside(likelihood), kernels, noise, fixed)
         starts = self.search.starts(kernels.initial_parameters() | learned_noise, fixed)
         result, of_search = self.search.best(objective, starts)
         found = result.parameters | fixed, result, {**described, **of_search}

@@ -116,6 +116,11 @@ class Prediction(Gaussian):
         return facts
 
     @property
+    def acceleration(self) -> Gaussian:
+        """`mean` and `covariance` under their full name."""
+        return Gaussian(self.mean, self.covariance)
+
+    @property
     def measurement(self) -> Gaussian:
         """The acceleration as a sensor with the model's noise would report it."""
         return Gaussian(self.mean, None if self.covariance is None else self.covariance + self.noise_covariance)

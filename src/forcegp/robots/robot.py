@@ -14,18 +14,8 @@ from typing_extensions import override
 
 from forcegp.atomic_files import write_text
 from forcegp.errors import InvalidInput, RobotFileWarning, require_plausible, usable_arguments
+from forcegp.robots import arguments as checks
 from forcegp.robots import urdf_file
-from forcegp.robots.arguments import (
-    Armature,
-    JointValues,
-    Positions,
-    Problems,
-    Vector,
-    broadcast_batch,
-    checked_tensor,
-    finite_vector,
-    locked_positions,
-)
 from forcegp.robots.compiled import CompiledRobot
 from forcegp.robots.inertia import SINGULAR
 from forcegp.robots.kinematics import Kinematics
@@ -67,8 +57,8 @@ class Robot(RobotStructure, RigidBodyDynamics):
         text: str,
         *,
         source: str = "<text>",
-        gravity: Vector = GRAVITY,
-        armature: Armature | None = None,
+        gravity: checks.Vector = GRAVITY,
+        armature: checks.Armature | None = None,
         locked: Mapping[str, float | int] | None = None,
         inertias: urdf_file.InertiaChoice = "strict",
         base: BaseChoice | None = None,
@@ -83,7 +73,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         Raises a subclass of RobotModelError with all that is wrong, and the arguments that mend it (its ``remedy``).
         """
         given = {"locked": locked, "inertias": inertias, "base": base}
-        return cls._made(text.lstrip(), Problems(source, given), gravity, armature)
+        return cls._made(text.lstrip(), checks.Problems(source, given), gravity, armature)
 
     @classmethod
     @usable_arguments("Robot.from_mjcf")
@@ -117,15 +107,15 @@ class Robot(RobotStructure, RigidBodyDynamics):
         source: str,
         path: Path | None,
         *,
-        gravity: Vector | None = None,
-        armature: Armature | None = None,
+        gravity: checks.Vector | None = None,
+        armature: checks.Armature | None = None,
         locked: Mapping[str, float | int] | None = None,
         inertias: urdf_file.InertiaChoice = "strict",
         base: BaseChoice | None = None,
         for_system: bool = False,
     ) -> "tuple[Robot, Translation]":
         """The robot of MJCF text, and what a model takes from it, which is noted as left out unless ``for_system``."""
-        problems = Problems(source, {"locked": locked, "inertias": inertias, "base": base}, "Robot.from_mjcf")
+        problems = checks.Problems(source, {"locked": locked, "inertias": inertias, "base": base}, "Robot.from_mjcf")
         found = translate(text, path, for_system, problems)
         problems.given["locked"] = found.locked | dict(locked or {})
         gravity = found.gravity if gravity is None else gravity
@@ -135,9 +125,9 @@ class Robot(RobotStructure, RigidBodyDynamics):
     def _made(
         cls,
         text: str,
-        problems: Problems,
-        gravity: Vector,
-        armature: Armature | None,
+        problems: checks.Problems,
+        gravity: checks.Vector,
+        armature: checks.Armature | None,
         loops: Loops = (),
         quiet: bool = False,
     ) -> "Robot":
@@ -145,10 +135,10 @@ class Robot(RobotStructure, RigidBodyDynamics):
         base, inertias = problems.given["base"], problems.given["inertias"]
         if base is not None and base not in get_args(BaseChoice):
             raise InvalidInput(f"base is {base!r}; give one of {', '.join(get_args(BaseChoice))}.")
-        locked = locked_positions(problems.given["locked"] or {})
+        locked = checks.locked_positions(problems.given["locked"] or {})
         named = problems.given | {"locked": locked, "inertias": inertias if inertias != "strict" else None}
         problems.given = {name: value for name, value in named.items() if value}
-        down, robot = finite_vector("gravity", gravity, 3), None
+        down, robot = checks.finite_vector("gravity", gravity, 3), None
         if np.linalg.norm(down) > STRONGEST_GRAVITY:
             raise InvalidInput(f"gravity is {gravity!r}; give m/s^2, {STRONGEST_GRAVITY:g} at most.")
         description = parse_urdf(text, problems)
@@ -158,8 +148,8 @@ class Robot(RobotStructure, RigidBodyDynamics):
             layout = lay_out(description, locked, base, problems)
             if armature is not None:
                 text = urdf_file.with_armature(text, layout, armature, description.name, source=problems.source)
-                description = parse_urdf(text, Problems(problems.source, problems.given))
-                layout = lay_out(description, locked, base, Problems(problems.source, problems.given))
+                description = parse_urdf(text, checks.Problems(problems.source, problems.given))
+                layout = lay_out(description, locked, base, checks.Problems(problems.source, problems.given))
             text, description = urdf_file.with_chosen_inertias(inertias, text, description, layout, problems)
             tree = compile_tree(description, layout, down)
             robot = cls(description, layout, tree, text, tuple(locked.items()), layout.base)
@@ -184,7 +174,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
     def _again(cls, text: str, source: str, stored: Mapping[str, Any], armature: Any = None) -> "Robot":
         """Of a text that was warned of before."""
         given = {"locked": stored["locked"], "inertias": "strict", "base": stored["base"]}
-        return cls._made(text.lstrip(), Problems(source, given), stored["gravity"], armature, quiet=True)
+        return cls._made(text.lstrip(), checks.Problems(source, given), stored["gravity"], armature, quiet=True)
 
     def to_stored(self) -> dict[str, Any]:
         """The robot as plain JSON values."""
@@ -198,7 +188,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         values, vectors = torch.linalg.eigh(scale[:, None] * M * scale)
         return set((vectors[:, values <= SINGULAR].abs() > 1e-6).any(1).nonzero()[:, 0].tolist())
 
-    def with_armature(self, armature: Armature) -> "Robot":
+    def with_armature(self, armature: checks.Armature) -> "Robot":
         """A robot with other rotor inertias (kg m^2 or kg), one per joint or by joint name (the others keep theirs)."""
         if isinstance(armature, Mapping):
             armature = dict(zip(self.joint_names, self.armature.tolist(), strict=True)) | dict(armature)
@@ -212,7 +202,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         """Its dynamics as machine code, kept in ``folder``: see :class:`~forcegp.robots.compiled.CompiledRobot`."""
         return CompiledRobot(self, folder)
 
-    def with_text(self, text: str, armature: Armature | None = None) -> "Robot":
+    def with_text(self, text: str, armature: checks.Armature | None = None) -> "Robot":
         """A robot of another URDF text, with its rotor inertias if none are given: same gravity, base and device."""
         robot = Robot._again(text, self.source, self.to_stored(), armature)
         return robot if self.device.type == "cpu" else robot.to(self.device)
@@ -254,22 +244,22 @@ class Robot(RobotStructure, RigidBodyDynamics):
             write_text(path, text)
         return text
 
-    def kinematics(self, q: Positions, v: JointValues | None = None) -> Kinematics:
+    def kinematics(self, q: checks.Positions, v: checks.JointValues | None = None) -> Kinematics:
         """One kinematics pass, to ask for several quantities at the same states; ``v`` only if they need it."""
         q = self.checked_input("q", q)
         if v is None:
             return Kinematics.of(self, q, None)
         v = self.checked_input("v", v)
         if q.shape[:-1] != v.shape[:-1]:
-            batch = broadcast_batch({"q": q.shape[:-1], "v": v.shape[:-1]})
+            batch = checks.broadcast_batch({"q": q.shape[:-1], "v": v.shape[:-1]})
             q, v = q.expand(*batch, -1), v.expand(*batch, -1)
         return Kinematics.of(self, q, v)
 
-    def integrate(self, q: Positions, step: JointValues) -> Float[Tensor, "... nq"]:
+    def integrate(self, q: checks.Positions, step: checks.JointValues) -> Float[Tensor, "... nq"]:
         """q after the constant velocity ``step`` (..., nv) has acted for one second: ``q + step`` on a fixed base."""
         return self.space.integrate(self.checked_input("q", q), self.checked_input("step", step))
 
-    def difference(self, q0: Positions, q1: Positions) -> Float[Tensor, "... nv"]:
+    def difference(self, q0: checks.Positions, q1: checks.Positions) -> Float[Tensor, "... nv"]:
         """The constant velocity (..., nv) that leads from ``q0`` to ``q1`` in one second, by the shorter turn."""
         return self.space.difference(self.checked_input("q", q0), self.checked_input("q", q1))
 
@@ -279,7 +269,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
 
     def normalized(self, q: Float[Tensor, "*batch nq"]) -> Float[Tensor, "*batch nq"]:
         """q with quaternions divided by their lengths. Raises InvalidInput for length 0."""
-        unit = self.space.normalized(checked_tensor("q", q, self.nq, f"positions of {self.name}", self.device))
+        unit = self.space.normalized(checks.checked_tensor("q", q, self.nq, f"positions of {self.name}", self.device))
         self.space.check(unit)
         return unit
 
@@ -289,7 +279,7 @@ class Robot(RobotStructure, RigidBodyDynamics):
         if len(others) == 2 and len({getattr(x, "shape", ())[:-1] for x in arguments}) > 1:
             names = "q", "v", "tau" if function == "forward_dynamics" else "a"
             given = {name: self.checked_input(name, x) for name, x in zip(names, arguments, strict=True)}
-            batch = broadcast_batch({name: x.shape[:-1] for name, x in given.items()})
+            batch = checks.broadcast_batch({name: x.shape[:-1] for name, x in given.items()})
             q, *others = (x.expand(*batch, -1) for x in given.values())
         return getattr(self.kinematics(q, *others[:1]), function)(*others[1:])
 
@@ -297,6 +287,8 @@ class Robot(RobotStructure, RigidBodyDynamics):
         """Pose (..., 4, 4) of a link frame in the world, position in m."""
         return self.kinematics(q).frame_pose(frame)
 
-    def frame_jacobian(self, q: Positions, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6 nv"]:
+    def frame_jacobian(
+        self, q: checks.Positions, frame: str, point: checks.Vector | None = None
+    ) -> Float[Tensor, "... 6 nv"]:
         """Jacobian (..., 6, nv) of a ``point`` (3,) fixed in ``frame`` (m), world axes, rows [linear; angular]."""
         return self.kinematics(q).frame_jacobian(frame, point)
