@@ -26,7 +26,7 @@ NOT_COPIED = ".git", ".venv", ".*_cache", "build", "__pycache__"
 LONGEST = 1200.0  # seconds of one run: a guard against a fault that never ends
 GUARD = 1e-9  # the largest number that guards against zero or rounding
 UNSEEN = {"stacklevel", "figsize", "dpi", "fontsize", "labelsize", "linewidth", "linestyle", "markersize", "zorder",
-          "markeredgewidth", "nbins", "bar_width", "cell_size"}  # fmt: skip
+          "markeredgewidth", "alpha", "nbins", "bar_width", "cell_size"}  # fmt: skip
 LEFT_OUT = ast.Raise | ast.Assert | ast.JoinedStr | ast.ImportFrom | ast.Import
 EXCHANGED: dict[type[ast.AST], type[ast.AST]] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.MatMult: ast.Mult, ast.Lt: ast.GtE,

@@ -214,13 +214,14 @@ def test_the_answer_repeats_what_concerns_sensors_and_velocities():
         look(about="force sensor", what="one is off.", do="Tare it."),
         ok(about="velocity", what="v is dq/dt."),
         look(about="unknown cause", what="a push.", numbers={"seconds": [1.0, 2.0]}),
+        look(about="unknown cause", what="its end.", numbers={"seconds": [1.0, 2.0], "stops": {"lift": 0.1}}),
         wrong(about="saturation", what="one is clipped."),  # but accepted
         wrong(about="delay", what="u is shifted."),
     ]
     seen = seen_in([doubt.to_dict() for doubt in found])
     off = "one is in kgf. State it. one is off. Tare it."
     told = {"sensor": "one agrees.", "force sensor": off, "push": "a push.", "saturation": "one is clipped."}
-    assert seen == {"velocity": "v is late. Shift it.", **told}
+    assert seen == {"velocity": "v is late. Shift it.", "stop": "its end.", **told}
     assert FIRST & {*seen} == {"force sensor"}
 
 

@@ -149,7 +149,7 @@ def seen_in(doubts: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     told = (x for x in doubts if x["about"] in TOLD and (x["level"] != "ok" or x["about"] == "force sensor"))
     for x in (*told, *(x for x in doubts if x["level"] == "wrong" and x["about"] not in {*TOLD, "delay"})):
         passes = "seconds" in x["numbers"] and x["about"] in FIRST
-        comes = "stop" if "stands" in x["numbers"] else "push"
+        comes = "stop" if {"stands", "stops"} & {*x["numbers"]} else "push"
         about = comes if passes else "sensor" if x["level"] == "ok" else x["about"]
         seen[about] = f"{seen.get(about, '')} {x['what']} {x['do']}".strip()
     return seen

@@ -138,7 +138,7 @@ def fit_physical(
         level = found_levels if noise is None else Noise(tuple(noise.acceleration), tuple(noise.force))
         level = unseen.with_pushes(level)
     found_rows = with_memory(logs[0], found)
-    return Solution(found, estimates, level, found_rows, tuple(history) or (0.0,), fit.x, typical, told)
+    return Solution(found, estimates, level, found_rows, tuple(history), fit.x, typical, told)
 
 
 def _with_accelerations_weighted(
