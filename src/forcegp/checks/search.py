@@ -245,7 +245,7 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         where += f", elsewhere at most {100.0 * left:.2g} % stays: {why or 'a contact, or a load'}, in these seconds"
         numbers |= {"seconds": seconds, **({"stands": still} if still else {})}
     else:
-        numbers |= {"where": seconds} if " for time " in where else {}
+        numbers |= {"where": seconds} if left <= EXPLAINED else {}  # of time; a wider stretch shows no more
         fits = ((k, left_by_positions(rows.q, np.c_[tau[:, k], friction[:, k]], rows.u[:, k])) for k in bad.tolist())
         if names := inputs.named([k for k, (alone, beside) in fits if beside < EXPLAINED < alone]):
             where += f"; positions alone explain that of {listed(names)}: a cable, a hose, a balancer, or a spring"

@@ -24,7 +24,18 @@ import forcegp.posterior
 import forcegp.robots
 import forcegp.scores
 from forcegp.atomic_files import file_digest, write_json, write_text
-from forcegp.cli import command, robot_options
+from forcegp.cli import robot_options
+from forcegp.cli.command import (
+    DATASET,
+    FIELDS,
+    NUMBERS,
+    Command,
+    listed,
+    numbers_of,
+    options_of,
+    unless_given,
+    values_of,
+)
 from forcegp.cli.terminal import Terminal, columns, facts, with_option_names
 from forcegp.doubts import Doubts
 from forcegp.errors import ContactError, ContactWarning, DatasetError
@@ -39,7 +50,7 @@ SHOWN = {"m": ("mm", 1e3), "kg m^2": ("kg m²", 1.0)}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit(command.Command):
+class Fit(Command):
     """Find what a model leaves open, from a log: coefficients of laws, bodies and payloads, and unknown forces.
 
     The dataset carries its robot, contacts and forces; --robot, --contact and --forces replace or add to them. The
@@ -53,30 +64,26 @@ class Fit(command.Command):
       forcegp fit train.h5 --forces gp:independent --points 100 --out baseline
     """
 
-    log: Annotated[Positional[Path], command.DATASET, arg(metavar="LOG")]
+    log: Annotated[Positional[Path], DATASET, arg(metavar="LOG")]
     """The dataset to learn from (HDF5)."""
     out: Annotated[Path, arg(metavar="FOLDER")]
     """The folder to write."""
-    forces: Annotated[
-        tuple[str, ...], command.listed(goes_on=command.FIELDS), command.unless_given("FORCE,...", USUAL_FORCES)
-    ] = ()
+    forces: Annotated[tuple[str, ...], listed(goes_on=FIELDS), unless_given("FORCE,...", USUAL_FORCES)] = ()
     """What is found, beside the forces that the model has. Laws: viscous, coulomb, rotor, offset, spring,
     payload:LINK, bodies; their numbers are estimated unless they are given, as in viscous:.1. Unknown forces: gp:joint,
     gp:joint-friction, gp:tool-friction, and others. With "only" as the first word the list is complete.
     gp:independent is without physics, none the noise alone. See docs/how-to/forces.md."""
-    evidence: Annotated[tuple[str, ...], command.listed(), command.unless_given("EVIDENCE,...", LEARNED_FROM)] = ()
+    evidence: Annotated[tuple[str, ...], listed(), unless_given("EVIDENCE,...", LEARNED_FROM)] = ()
     """What is learned from: accelerations or torques (torques:both where accelerations are noisy, too, torques:mean=.4
     of means). Beside it motions:S refines the numbers on recorded positions, over windows of S seconds."""
     contact: Annotated[
-        tuple[str, ...],
-        command.listed(goes_on=command.NUMBERS),
-        command.unless_given(robot_options.CONTACTS, "the dataset's"),
+        tuple[str, ...], listed(goes_on=NUMBERS), unless_given(robot_options.CONTACTS, "the dataset's")
     ] = ()
     """Points that stay on surfaces, instead of the dataset's contacts; m, in the axes of the link FRAME. SURFACE is
     plane:nx,ny,nz,offset or sphere:cx,cy,cz,radius; FRAME@x,y,z:held is bolted down. none: no contact."""
     noise: Annotated[str, arg(metavar="learned|dataset|SIGMA")] = "dataset"
     """Noise of the measured acceleration: a standard deviation in rad/s², learned, or the dataset's (else learned)."""
-    force_noise: Annotated[float | None, command.unless_given("SIGMA", "none", float)] = None
+    force_noise: Annotated[float | None, unless_given("SIGMA", "none", float)] = None
     """Noise of the joint forces as well: a standard deviation in Nm, where the search begins with --noise learned."""
     engine: Literal["auto", "exact", "inducing"] = "auto"
     """How the posterior is computed. exact: from the covariance of all points. inducing: through fewer points. auto: by
@@ -85,7 +92,7 @@ class Fit(command.Command):
     """Do not look for wrong units, signs, joints, contacts, masses and drop-outs first, as forcegp check does."""
     device: Annotated[str, arg(metavar="cpu|cuda|cuda:K")] = "cpu"
     """Where to compute; see docs/how-to/gpu.md. The folder that is written can be used on any machine."""
-    logs_from: Annotated[Path | None, command.unless_given("LIST", "one log", Path)] = None
+    logs_from: Annotated[Path | None, unless_given("LIST", "one log", Path)] = None
     """In the place of LOG a text file with one in each line, and the options that differ for it, such as --robot.
     --out gets a folder for each and fleet.csv; --jobs logs are at work at once. What is finished is kept."""
     robot: robot_options.RobotOptions = robot_options.RobotOptions()
@@ -133,7 +140,7 @@ class Fit(command.Command):
         level = None
         if self.noise not in ("learned", "dataset"):
             complaint = f"--noise is {self.noise!r}; give learned, dataset or a number such as 0.1."
-            [level] = command.numbers_of(self.noise, complaint, one=True)
+            [level] = numbers_of(self.noise, complaint, one=True)
         return forcegp.Noise(level, self.force_noise, learn=self.noise == "learned")
 
     def _check(self, terminal: Terminal, dataset: forcegp.Dataset, model: forcegp.Model) -> None:
@@ -141,7 +148,7 @@ class Fit(command.Command):
         if self.checks:
             used = quick_doubts(self.log, dataset, model)
             if used:  # check has no --contact: it would find nothing wrong with the contacts of the data
-                words = self.words(*command.options_of(robot_options.RobotOptions))
+                words = self.words(*options_of(robot_options.RobotOptions))
                 see = f"See {shlex.join(['forcegp', 'check', str(self.log), *words])}"
                 see = used[0].advice.rstrip(".") if self.contact else see
                 terminal.warn(f"{used.in_one_line()}. {see} (--no-checks does not look)")
@@ -165,7 +172,7 @@ class Fit(command.Command):
 
     def _write(self, posterior: forcegp.posterior.Posterior) -> None:
         """The model, how it was made and what was estimated; what is known also as a robot's file."""
-        given = {name: x for name, x in command.values_of(self).items() if name not in ("json", "debug", "overwrite")}
+        given = {name: x for name, x in values_of(self).items() if name not in ("json", "debug", "overwrite")}
         options = {name: str(x) if isinstance(x, Path) else x for name, x in given.items()}
         data = {"path": str(self.log), "sha256": file_digest(self.log)}
         content = {"options": options, "data": data, "resolved": dict(posterior.settings)}
