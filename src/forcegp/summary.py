@@ -6,6 +6,7 @@ from html import escape
 from math import isfinite
 
 WIDTH = 100  # longest text that stands on one line
+TOLD = 0.1  # of a number: half widths of intervals from which on they stand beside it
 
 
 class Summary:
@@ -35,6 +36,11 @@ def listed(names: Iterable[object], most: int = 4) -> str:
 def rounded(values: Iterable[float]) -> str:
     """Three digits of each: `0.05, 0.051, 0.048`."""
     return listed((f"{value:.3g}" for value in values), most=7)
+
+
+def within(value: float, half: float) -> str:
+    """Three digits, and the half width of an interval of more than a tenth of it: `0.05`, `0.05 ± 0.01`."""
+    return f"{value:.3g}" + f" ± {half:.1g}" * (half > TOLD * abs(value))
 
 
 def plain(values: Iterable[float]) -> list[float | None]:

@@ -52,7 +52,7 @@ def parts_of(log, *laws):
 )
 def test_what_is_there_is_found_and_memory_is_not(friction, expected):
     posterior, found = parts_of(log := log_with(friction))
-    assert expected != {"breakaway"} or "near rest" in friction_in_words(posterior.model, log, "Nm")[0]
+    assert expected != {"breakaway"} or "near rest" in friction_in_words(posterior, log, "Nm")[0]
     assert found["few_reversals"] == []
     names = [set(parts) for parts in found["parts"].values()]
     assert all("memory" not in each for each in names)
@@ -76,7 +76,7 @@ def test_all_points_are_all_rows_whose_past_is_known():
 
 def test_what_is_told_of_a_curve_is_the_line_nearest_to_it():
     log = log_with(lambda v, rigid: LEVEL * (1.0 + np.sqrt(np.abs(v))) * sign(v))
-    words, slopes = friction_in_words(parts_of(log)[0].model, log, "Nm")
+    words, slopes = friction_in_words(parts_of(log)[0], log, "Nm")
     told = map(float, words.split(" Nm")[0].split(", "))
     for dry, slope, v, level in zip(told, slopes.values(), abs(log.v.T), LEVEL, strict=True):
         v = v[v > 0.1 * np.sqrt(np.square(v).mean())]
@@ -100,11 +100,11 @@ def test_motors_that_turn_with_two_joints_are_found(T):
         np.testing.assert_array_equal(np.eye(3) if given is None else given, T)
     np.testing.assert_allclose(laws[GearFriction].values["level"], LEVEL, rtol=0.1)
     np.testing.assert_allclose(laws[Viscous].values["damping"], 0.2, rtol=0.2)
-    words, slopes = friction_in_words(posterior.model, log, "Nm")
+    words, slopes = friction_in_words(posterior, log, "Nm")
     assert list(slopes.values()) == pytest.approx(3 * [0.2], rel=0.2)
     assert ("the motor of bend turns with -1 lift +1 bend" in words) == bool(coupled)
     assert words.count("the motor of") == coupled
-    [first, *_] = friction_in_words(posterior.model, log, "Nm", log.joint_names[1:2])[0].split(" Nm")
+    [first, *_] = friction_in_words(posterior, log, "Nm", log.joint_names[1:2])[0].split(" Nm")
     assert first.split(", ")[1] == "–" != first.split(", ")[0]
 
 

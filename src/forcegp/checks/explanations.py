@@ -5,6 +5,7 @@ Causes of the torques alone (signs, factors) are found joint by joint in `search
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 from itertools import combinations, permutations, product
 from typing import Any
 
@@ -17,7 +18,7 @@ from forcegp.checks.causes import NUMBER, SIGN, Candidate, Cause, changed, like_
 from forcegp.checks.check_input import DEGREE, CheckInput
 from forcegp.checks.couplings import coupled_joints
 from forcegp.checks.residuals import cogging
-from forcegp.checks.torques import Change, Comparison, needed_torques, solved
+from forcegp.checks.torques import Change, Comparison, inverse_dynamics, needed_torques, solved
 from forcegp.data import Dataset
 from forcegp.doubts import listed
 from forcegp.fit.payloads import with_gravity, with_length
@@ -209,7 +210,7 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
     parabolas = np.vander(FACTORS, 3) @ np.linalg.inv(np.vander(parts, 3))
     laws, found = now.tau - needed_torques(robot, rows), list[tuple[float, Cause, Callable[[], Comparison]]]()
 
-    def best(taus: Sequence[np.ndarray], weights: np.ndarray, values: np.ndarray) -> tuple[float, float]:
+    def best(taus: Sequence[np.ndarray] | np.ndarray, weights: np.ndarray, values: np.ndarray) -> tuple[float, float]:
         left = _left_of(now, np.stack([now.rows.u, *(laws + tau for tau in taus)]), weights)
         at = int(np.argmin(left))
         return (float(left[at]), float(values[at])) if 0 < at < len(values) - 1 else (np.inf, 0.0)
@@ -223,8 +224,17 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         moved, turned = changed("qva", factor=np.where(own, x, 1.0)), changed("u", factor=np.where(own, x**power, 1.0))
         return lambda rows: turned(moved(rows))
 
+    def scaled(joint: int, factors: np.ndarray) -> Float[np.ndarray, "ratios 1 nv"]:
+        return np.where(np.arange(rows.nv) == joint, factors[:, None, None], 1.0)
+
+    @cache
+    def geared_torques(joint: int, middle: float, step: float) -> Float[np.ndarray, "ratios rows nv"]:
+        factors = scaled(joint, middle * RATIOS**step)
+        return inverse_dynamics(robot, *(factors * x for x in (rows.q, rows.v, rows.a)))
+
     for joint in _places(inputs.rotates):
-        left, x = best([needed_torques(robot, moved(joint, y)(rows)) for y in zeros], waves, turns)
+        there = rows.q + zeros[:, None, None] * np.eye(rows.nv)[joint]
+        left, x = best(inverse_dynamics(robot, there, rows.v, rows.a), waves, turns)
         what = (
             f"the torques fit positions of {names[joint]} that are {x:+.3g} rad ({x / DEGREE:+.0f} degrees) from the "
             "logged ones: its zero is elsewhere"
@@ -237,9 +247,8 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
     for joint, power in product(np.flatnonzero(np.ptp(rows.q, axis=0) > 0.0).tolist(), (0.0, -1.0)):
         left, x = np.inf, 1.0
         for step in (1.0, 0.1):
-            every = (x or 1.0) * RATIOS**step
-            own = np.where(np.arange(rows.nv) == joint, every[:, None] ** -power, 1.0)  # what u would have to be
-            taus = [one * needed_torques(robot, geared(joint, y)(rows)) for one, y in zip(own, every, strict=True)]
+            middle, every = x or 1.0, (x or 1.0) * RATIOS**step
+            taus = geared_torques(joint, middle, step) * scaled(joint, every**-power)  # what u would have to be
             left, x = best(taus, np.eye(len(every)), every)
         beside = f", and {1.0 / x:.4g} times its torques" if power and x else ""
         what = f"the torques fit positions and velocities of {names[joint]} that are {x:.4g} times the logged ones"

@@ -95,9 +95,13 @@ def in_motion(rows: Dataset) -> Bool[np.ndarray, "rows nv"]:
 
 def needed_torques(robot: Robot, rows: Dataset) -> Float[np.ndarray, "rows nv"]:
     """What the rigid bodies need at these rows [Nm or N]."""
+    return inverse_dynamics(robot, rows.q, rows.v, rows.a)
+
+
+def inverse_dynamics(robot: Robot, *motion: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch nv"]:
+    """What they need at these q, v and a."""
     with torch.no_grad():
-        q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
-        return robot.inverse_dynamics(q, v, a).cpu().numpy()
+        return robot.inverse_dynamics(*(torch.tensor(x, device=robot.device) for x in motion)).cpu().numpy()
 
 
 def _torques_of_laws(log: Comparison, rows: Dataset) -> Float[np.ndarray, "rows nv"]:

@@ -12,6 +12,7 @@ from forcegp.cli.terminal import shown
 from forcegp.scores.accuracy import ACCELERATION, TORQUE
 from forcegp.scores.page import number
 from forcegp.scores.scores import USABLE
+from forcegp.summary import within
 
 LEAST_COVERAGE = 0.8  # of 95 % intervals that is no reason to doubt them
 
@@ -77,14 +78,14 @@ def answer_lines(
     def but_for(names: Sequence[str]) -> str:
         return f"; of {', '.join(names)} not known from this log" if names else ""
 
-    def each(field: str, unit: str, lines: Mapping[str, float] = {}) -> str:
-        own = {name: values[f"{field}.{name}"] for name in joints}
-        lost = [x for x, value in own.items() if x in still or lines.get(x, value.interval[0]) <= 0.0]
-        numbers = {name: lines.get(name, value.value) for name, value in own.items()}
-        told = ", ".join("–" if x in lost else f"{numbers[x]:.3g}" for x in own) + f" {unit}{but_for(lost)}"
-        return told if len(lost) < len(own) else "not known from this log"
+    def each(field: str, unit: str, lines: Mapping[str, tuple[float, float]] = {}) -> str:
+        own = {x: values[f"{field}.{x}"] for x in joints}
+        numbers = {x: lines.get(x, (each.value, each.value - each.interval[0])) for x, each in own.items()}
+        lost = [x for x, (value, half) in numbers.items() if x in still or value <= half]
+        told = ", ".join("–" if x in lost else within(*both) for x, both in numbers.items())
+        return f"{told} {unit}{but_for(lost)}" if len(lost) < len(own) else "not known from this log"
 
-    dry, lines = friction_in_words(identified.model, recording, force, still) if joints else ("", {})
+    dry, lines = friction_in_words(identified, recording, force, still) if joints else ("", {})
     bent = {name for name in joints if f"gear.root.{name}" in values}
     of_joints = [
         ("dry friction", dry + but_for(still)),

@@ -281,6 +281,8 @@ def finite_columns(
         raise DatasetError(f"{name} has {len(values)} {what}; expected {rows}.")
     if values.shape[0] == 0:
         raise DatasetError(f"{name} has no {what}; at least one is needed.")
+    if (np.abs(values) <= LARGEST_MEASURED).all():
+        return _read_only(values)
     for bad, how in (~np.isfinite(values), "not finite."), (np.abs(values) > LARGEST_MEASURED, BEYOND):
         for row, *at in np.argwhere(bad)[:1]:
             column = f", column {at[0]}" + (f" ({columns[at[0]]})" if columns else "") if at else ""

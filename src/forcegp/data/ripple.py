@@ -7,8 +7,10 @@ FEWEST, FINEST, STEP = 3.0, 300.0, 0.2
 """Repetitions over the reach of a joint: fewest, most, and steps of what is tried."""
 REPEATS = 0.5
 """Share of what is left that one wave explains, from which on it is one: of wrong friction it was .26 at most."""
-LITTLE, MOST_ROWS = 0.02, 300
-"""Share that columns leave of a force, below which no wave is sought; and rows that show it."""
+LITTLE = 0.02
+"""Share that columns leave of a force, below which no wave is sought."""
+PLACES = 2048
+"""Bins of the reach, in which a wave is sought first: seven of the finest."""
 
 
 def rate_of_waves(
@@ -19,19 +21,21 @@ def rate_of_waves(
     It is that of the largest power (Lomb 1976, Scargle 1982); 0 where no wave explains most, and what the best of so
     many would of noise: twice the logarithm of their number over that of the rows.
     """
-    reach, thin = float(np.ptp(q)), -(-len(q) // MOST_ROWS)
+    reach = float(np.ptp(q))
     left = force - basis @ (basis.T @ force)
     left = left - left.mean()
     if not reach > 0.0 or not np.square(left).sum() > LITTLE * np.square(force - force.mean()).sum():
         return 0.0
     from scipy.signal import lombscargle  # half a second, which only few logs should cost
 
-    best, power, tried = 0.0, 0.0, np.arange(FEWEST, FINEST, STEP)  # of few rows, then closer of all
+    bins = np.bincount(((q - q.min()) / reach * (PLACES - 1)).round().astype(int), left, PLACES)
+    size = round((PLACES - 1) / STEP)  # of which one frequency is a step of repetitions
+    tried = np.abs(np.fft.rfft(bins, size))[round(FEWEST / STEP) : round(FINEST / STEP)]
+    repetitions = FEWEST + STEP * int(np.argmax(tried)) + np.linspace(-STEP, STEP, 41)  # then closer
+    rates = 2.0 * np.pi / reach * repetitions
+    found = lombscargle(q - q.mean(), left, rates)
+    best, power = float(rates[int(np.argmax(found))]), float(found.max())
     by_chance = 2.0 * np.log(len(tried)) / len(q)
-    for repetitions, step in ((tried, thin), (np.linspace(-STEP, STEP, 41), 1)):
-        rates = best + 2.0 * np.pi / reach * repetitions
-        found = lombscargle(q[::step] - q.mean(), left[::step], rates)
-        best, power = float(rates[int(np.argmax(found))]), float(found.max())
     return best if 2.0 * power > (REPEATS + by_chance) * np.square(left).sum() else 0.0
 
 

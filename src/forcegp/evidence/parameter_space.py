@@ -147,8 +147,7 @@ class ParameterSpace:
             ]
         for term in self.terms:
             law = self.model.laws[term.law]
-            own = force_title(law)
-            label = own if len(law.coefficients) == 1 else f"{own}.{term.name}"
+            label = coefficient_title(law, term.name)
             for k, joint in enumerate([None] if term.joints is None else [robot.joint_names[j] for j in term.joints]):
                 unit = law.coefficients[term.name].unit if joint is None else law.unit(term.name, joint, robot)
                 kind = LogNormal if term.logarithm else Normal
@@ -293,6 +292,11 @@ def force_title(law: Law) -> str:
         return law.called or force_name(law)
     except InvalidInput:
         return law.title
+
+
+def coefficient_title(law: Law, name: str) -> str:
+    """What parameters of a coefficient are called by, but for their joint."""
+    return force_title(law) if len(law.coefficients) == 1 else f"{force_title(law)}.{name}"
 
 
 def _derivatives(
