@@ -19,6 +19,7 @@ from forcegp.fit.transmission_choice import SHARE, _clearly
 from forcegp.forces import Actuation, Coulomb, DirectionalFriction, GearFriction, JointFriction, Rotor, Viscous
 from forcegp.inference import OptimizerOptions
 from forcegp.noise import Noise
+from forcegp.summary import within
 
 LEVEL = np.array([0.8, 0.5, 0.3])
 
@@ -78,10 +79,29 @@ def test_what_is_told_of_a_curve_is_the_line_nearest_to_it():
     log = log_with(lambda v, rigid: LEVEL * (1.0 + np.sqrt(np.abs(v))) * sign(v))
     words, slopes = friction_in_words(parts_of(log)[0], log, "Nm")
     told = map(float, words.split(" Nm")[0].split(", "))
-    for dry, slope, v, level in zip(told, slopes.values(), abs(log.v.T), LEVEL, strict=True):
+    for dry, (slope, half), v, level in zip(told, slopes.values(), abs(log.v.T), LEVEL, strict=True):
         v = v[v > 0.1 * np.sqrt(np.square(v).mean())]
-        assert (slope, dry) == pytest.approx(np.polyfit(v, level * (1.0 + np.sqrt(v)), 1), rel=0.03)
+        true = np.polyfit(v, level * (1.0 + np.sqrt(v)), 1)
+        assert (slope, dry) == pytest.approx(true, rel=0.03)
+        assert abs(slope - true[0]) < half < 0.1 * slope
     assert "near rest" not in words
+
+
+def test_wide_intervals_of_what_is_told_stand_beside_it():
+    """Of a line they are those of level and viscous friction themselves; and of a tenth of the number and more."""
+    log = log_with(lambda v, rigid: LEVEL * sign(v) + 0.2 * v, rows=400)
+    noise = [0.01, 0.3, 0.3] * np.random.default_rng(1).standard_normal(log.u.shape)
+    posterior = fit(arm_model(0).with_forces(Viscous(), Coulomb()), replace(log, u=log.u + noise), Torques())
+    words, slopes = friction_in_words(posterior, log, "Nm")
+    found = [[posterior.estimates[f"{law}.{name}"] for name in slopes] for law in ("coulomb.level", "viscous")]
+    for (slope, half), each in zip(slopes.values(), found[1], strict=True):
+        assert (slope, half) == pytest.approx((each.value, each.value - each.interval[0]), rel=1e-3)
+    halves = [each.value - each.interval[0] for each in found[0]]
+    narrow = [half < 0.1 * each.value for half, each in zip(halves, found[0], strict=True)]
+    assert narrow == [True, False, False]
+    expected = zip(found[0], halves, narrow, strict=True)
+    assert words == ", ".join(f"{x.value:.3g}" + f" ± {half:.1g}" * (not few) for x, half, few in expected) + " Nm"
+    assert [within(1.0, 0.099), within(-1.0, 0.15), within(0.0, 0.0)] == ["1", "-1 ± 0.1", "0"]
 
 
 COUPLED = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 1.0]])
@@ -101,7 +121,7 @@ def test_motors_that_turn_with_two_joints_are_found(T):
     np.testing.assert_allclose(laws[GearFriction].values["level"], LEVEL, rtol=0.1)
     np.testing.assert_allclose(laws[Viscous].values["damping"], 0.2, rtol=0.2)
     words, slopes = friction_in_words(posterior, log, "Nm")
-    assert list(slopes.values()) == pytest.approx(3 * [0.2], rel=0.2)
+    assert [slope for slope, _ in slopes.values()] == pytest.approx(3 * [0.2], rel=0.2)
     assert ("the motor of bend turns with -1 lift +1 bend" in words) == bool(coupled)
     assert words.count("the motor of") == coupled
     [first, *_] = friction_in_words(posterior, log, "Nm", log.joint_names[1:2])[0].split(" Nm")

@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 
 import tyro
-from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes
+from tyro.conf import FlagCreatePairsOff, HelptextFromCommentsOff, OmitArgPrefixes
 
 from forcegp.cli.command import Command, options_of, with_texts
 from forcegp.errors import InvalidInput
@@ -77,7 +77,7 @@ def parsed(words: Sequence[str]) -> Command:
         what = f"there is no command {name!r}.{hint}" if name else "no command was given."
         raise InvalidInput(f"{what} Available subcommands: {', '.join(COMMANDS)}. See forcegp --help.")
     kind = command_class(name)
-    config = (FlagCreatePairsOff, OmitArgPrefixes)
+    config = (FlagCreatePairsOff, HelptextFromCommentsOff, OmitArgPrefixes)
     if {"-h", "--help"} & set(others):
         tyro.cli(with_texts(kind), prog=f"forcegp {name}", args=["--help"], config=config)
     others, complaint = _checked(name, kind, others), io.StringIO()

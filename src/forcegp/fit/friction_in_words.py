@@ -75,4 +75,3 @@ def friction_in_words(
         told_ways = ", ".join("–" if name in still else f"{way:.3g}" for name, way in ways)
         text += f"; {who} remember reversals, over {told_ways} {length}"
     return text, dict(zip(names, zip(here[2].tolist(), errors[2].tolist(), strict=True), strict=True))
-
