@@ -237,7 +237,7 @@ def test_searches_beside_noise_of_accelerations_end_where_little_is_left_to_gain
     equations = SimpleNamespace(levels=lambda *_: levels, parts=[], measured=[], sizes=one, whitened=max)
 
     def search(*_, start, **more) -> Fit:
-        return Fit(start, one[None], np.zeros((1, 1, 2)), one, np.eye(2), 1, True, expected=next(gains))
+        return Fit(start, one[None], np.zeros((1, 1, 2)), one, np.eye(2), np.zeros(2), 1, True, expected=next(gains))
 
     found, _ = _with_noise_in_both(equations, search, np.zeros(2), lambda *_: None)
     assert (found.expected, found.evaluations, found.settled) == (0.03, 4, True)

@@ -150,8 +150,9 @@ Moved = Callable[[np.ndarray, np.ndarray], np.ndarray]
 class Fit:
     """Where least squares ended.
 
-    `x` (k,), `residual` (rows, nv) and `jacobian` (rows, nv, k), `noise` (nv,), `prior_information` (k, k). `span`
-    (rows, nv, m): directions of whitened residuals that unknown forces have. `expected`: nats of the last first step.
+    `x` (k,), `residual` (rows, nv) and `jacobian` (rows, nv, k), `noise` (nv,), `prior_information` (k, k) and
+    `prior_gradient` (k,), of half a square. `span` (rows, nv, m): directions of whitened residuals that unknown forces
+    have. `expected`: nats of the last first step.
     """
 
     x: Float[np.ndarray, " k"]
@@ -159,6 +160,7 @@ class Fit:
     jacobian: Float[np.ndarray, "rows nv k"]
     noise: Float[np.ndarray, " nv"]
     prior_information: Float[np.ndarray, "k k"]
+    prior_gradient: Float[np.ndarray, " k"]
     evaluations: int
     settled: bool
     span: Float[np.ndarray, "rows nv m"] | None = None
@@ -241,8 +243,9 @@ def weighted_least_squares(
         content = CONTENT if near else ROUGHLY
         if settled:
             break
-    span, in_prior = _span(held, noise), prior(x)[1]
-    return Fit(x, r, np.asarray(jacobian), noise, in_prior.T @ in_prior, total, settled and converged, span, expected)
+    p, P = prior(x)
+    done = total, settled and converged, _span(held, noise), expected
+    return Fit(x, r, np.asarray(jacobian), noise, P.T @ P, P.T @ p, *done)
 
 
 def without(values: Float[np.ndarray, "rows nv *k"], span: Float[np.ndarray, "rows nv m"] | None) -> np.ndarray:

@@ -156,12 +156,14 @@ def misfit(
     It has no doubt where less than `NAMED` is explained: what gears do beside a model is never one cause alone.
 
     `model` has the numbers of the fit, of torques of rows with accelerations `a` it leaves `left`, and `white` makes
-    residuals of the fit of such torques. At the best x, causes c with columns C lower the whitened residual r (Frisch &
-    Waugh 1933): c = -(C' C - C' J F^-1 J' C + S^-2)^-1 C' r with F = J' J + prior, and x moves by -F^-1 J' C c.
+    residuals of the fit of such torques. At x, causes c with columns C lower the whitened residual r (Frisch & Waugh
+    1933): c = -(C' C - C' J F^-1 J' C + S^-2)^-1 C' (r - J F^-1 g) with F = J' J + prior, and x moves by -F^-1 J' C c.
+    The gradient g is not 0 where a search ends before what cannot be, such as a payload that weighs less than nothing.
     """
     [actuation] = [law for law in model.laws if isinstance(law, Actuation)]
     r, J = fit.white.ravel(), fit.white_jacobian.reshape(fit.white.size, -1)
     inverse, cost = np.linalg.inv(fit.information + fit.prior_information), 0.5 * float(r @ r)
+    beyond = r - J @ (inverse @ (J.T @ r + fit.prior_gradient))
     best, least, found, moving = 0.0, max(CLEARLY_MORE, LEAST * cost), None, model.robot.base != "fixed"
     scales = [10 * k for k, each in enumerate(rows[0].space.carried) if each.payload is not None]
     if np.linalg.norm(fit.residual) <= RIGHT * np.linalg.norm(0.5 * fit.jacobian[..., scales]):
@@ -176,7 +178,7 @@ def misfit(
         if not C.shape[1]:
             continue
         across, every = J.T @ C, np.arange(C.shape[1])
-        own, slope = C.T @ C - across.T @ inverse @ across + np.eye(len(every)) / usual**2, C.T @ r
+        own, slope = C.T @ C - across.T @ inverse @ across + np.eye(len(every)) / usual**2, C.T @ beyond
         tried = list[tuple[float, float, np.ndarray, np.ndarray]]()
         single = every.reshape(-1, 3 if cause in ("centres of mass", "gravity") else 1)
         for some in (*([] if moving or cause in (*ALONE, *ADDED) else [every]), *single):
@@ -190,7 +192,8 @@ def misfit(
         usual, said, do = CAUSES[cause]
         instead = _instead(rows[0].space, fit, C, usual, least, most) if cause == "gains" else None
         change, move = instead or changes
-        off, factors = abs(change) > WRONG, np.exp(change) if instead is None else 1.0 + change
+        factors = 1.0 + change if instead else 1.0 / (1.0 - change) if cause == "gains" else np.exp(change)
+        off = abs(change) > WRONG
         count = int((change != 0.0).sum())
         fewer = cause not in ALONE and count < fewest[0]
         better = worth > best or (fewer and (more > fewest[1] or 1.1 * worth > best))
@@ -273,7 +276,8 @@ def _columns(
 ) -> tuple[list[str], Float[np.ndarray, "rows nv causes"]]:
     """Names of joints or links, and derivatives of torques needed less those measured in logarithms of factors.
 
-    Of gains they are as the log has them: with the torques, what is needed would vanish, too.
+    Of gains they are as the log has them: with the torques, what is needed would vanish, too. What the log should have
+    is linear in the factor's inverse.
     """
     robot = model.loaded_robot if rows.loaded else model.robot
     if cause == "gains":
