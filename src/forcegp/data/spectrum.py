@@ -13,6 +13,7 @@ from forcegp.data.dataset import Dataset
 from forcegp.data.delay import ROWS_PER_PARAMETER, estimate_delay, torque_columns
 from forcegp.data.filters import LowPass, Signal, differentiated, episodes_in_order, low_pass, shifted, uniform_step
 from forcegp.data.strokes import with_strokes
+from forcegp.data.views import postures
 from forcegp.errors import DatasetError
 
 DERIVATIVES = {"q": 2, "v": 1}  # that lead from a signal to the acceleration
@@ -175,6 +176,7 @@ def _judged(dataset: Dataset, cutoff: float, source: Source) -> tuple[float, dic
     nv, columns = dataset.nv, 10 * dataset.nv + 10
     rows = int(min(MOST_ROWS, MOST_NUMBERS / (nv * columns)))
     log = dataset.rows(slice(0, rows))
+    log = with_strokes(log) if postures(log) is not None else log  # as behind the filter that is chosen
     step = uniform_step(log.time[log.episode == log.episodes[0]])
     tried = [cutoff * factor for factor in FACTORS if cutoff * factor < 0.4 / step]
     if len(log) < 5 * FOLDS * columns // nv or len(tried) < 2:

@@ -129,7 +129,7 @@ of, and what to do. All factors of a cause are tried, and each alone; of centres
 named, unless the other explains a tenth more, or as much by fewer numbers, or more: what it explains less the half of
 the logarithm of the rows for each factor (Schwarz 1978)."""
 ADDED = {"joint zero": " rad", "centres of mass": " m", "gravity": " g"}
-ALONE, MOSTLY = {"gear ratio": 0.1, "joint zero": 0.05}, 0.3
+ALONE, MOSTLY = {"gear ratio": 0.1, "joint zero": 0.03}, 0.3
 """Of these no two are tried at once, and one is so large at least, and explains this share of what is left."""
 NAMED = 0.5
 """Share of what is left that gains, lengths, masses and centres explain, to be named: in logs of LuGre gears with
