@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.checks.clean_logs import between_postures
 from tests.fit.test_payload import ROBOT, TEXT, log
+from tests.posterior.arm import arm_model
 
 from forcegp import Model, Rotor, Stribeck, Torques, Viscous, fit
 from forcegp.data import Preparation
@@ -45,6 +47,15 @@ def test_a_spectrum_that_shows_too_low_a_cutoff_is_overruled():
         return np.sqrt(np.square(motion_residuals(log(TEXT, 9), found.model)[0]).mean())
 
     assert error(best) < 0.6 * error(low)
+
+
+def test_where_joints_rest_a_filter_lets_no_gear_creep():
+    """Shares of what is left are those of noise behind every filter, though rests last longer than moves."""
+    rows = between_postures(arm_model(0).robot, 1, 30.0, 0.4)
+    rows = replace(rows, q=rows.q + 2e-5 * np.random.default_rng(1).standard_normal(rows.q.shape))
+    best, shares = held_out_cutoff(rows, 15.0)
+    assert 15.0 < best < 45.0  # moves of .8 s
+    assert max(shares.values()) < 2e-3  # of filtered positions, .8
 
 
 def test_a_passive_robot_keeps_the_cutoff_of_its_spectrum():
