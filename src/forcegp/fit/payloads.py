@@ -188,9 +188,11 @@ def misfit(
             tried.append((more - 0.5 * len(some) * np.log(r.size), more, change, -inverse @ (across @ change)))
         options[cause] = names[0], C, *max(tried, key=lambda each: each[0])
     most, fewest = max((more for _, _, _, more, *_ in options.values()), default=0.0), (0, 0.0)
-    for cause, (names, C, worth, more, *changes) in options.items():
-        usual, said, do = CAUSES[cause]
-        instead = _instead(rows[0].space, fit, C, usual, least, most) if cause == "gains" else None
+    singly = {x: _instead(rows[0].space, fit, C, CAUSES[x][0], least, most) for x, (_, C, *_) in options.items()}
+    others = max((nats for cause, (nats, _) in singly.items() if cause != "gains"), default=0.0)
+    for cause, (names, _, worth, more, *changes) in options.items():
+        _, said, do = CAUSES[cause]
+        instead = singly[cause][1] if cause == "gains" and singly[cause][0] > FAR_BEHIND * others else None
         change, move = instead or changes
         factors = 1.0 + change if instead else 1.0 / (1.0 - change) if cause == "gains" else np.exp(change)
         off = abs(change) > WRONG
@@ -218,8 +220,8 @@ def misfit(
                 joints=tuple(np.array(names)[off].tolist()),
                 numbers={cause: {names[k]: float(factors[k]) for k in np.flatnonzero(change)}},
             )
-            others = max((option[2] for name, option in options.items() if name != cause), default=0.0)
-            alone = count == 1 and worth >= max(DECIDED, FAR_BEHIND * others)
+            next_best = max((option[2] for name, option in options.items() if name != cause), default=0.0)
+            alone = count == 1 and worth >= max(DECIDED, FAR_BEHIND * next_best)
             named = instead is not None or cause in ALONE or more >= NAMED * cost or alone
             best, fewest, found = 1.1 * worth, (count, more), (doubt if named else None, move, more)
             if instead is not None:
@@ -229,8 +231,8 @@ def misfit(
 
 def _instead(
     space: ParameterSpace, fit: Fit, C: Float[np.ndarray, "equations causes"], usual: float, least: float, most: float
-) -> tuple[Float[np.ndarray, " causes"], Float[np.ndarray, " k"]] | None:
-    """The change of one cause, and the move of x with it, that explain the log as well as a payload, and without it.
+) -> tuple[float, tuple[Float[np.ndarray, " causes"], Float[np.ndarray, " k"]] | None]:
+    """Nats that one number explains without a payload; its change, and the move of x, where it does as well as one.
 
     So many numbers are no better than one that explains hardly less: `most` nats less than the best cause beside it.
     """
@@ -251,9 +253,9 @@ def _instead(
     more = explained[k] + 0.5 * (r @ r - left @ left + slope @ inner[:, 0])
     enough = max(least, MOSTLY * 0.5 * float(left @ left))  # of what is left without the payload
     if not none.any() or explained[k] < enough or more < max(-CLEARLY_MORE, most - least):
-        return None
+        return float(explained[k]), None
     none[free] -= inner[:, 0] + inner[:, 1 + k] * change[k]
-    return np.where(np.arange(len(change)) == k, change, 0.0), none
+    return float(explained[k]), (np.where(np.arange(len(change)) == k, change, 0.0), none)
 
 
 def with_gravity(robot: Robot, gravity: Float[np.ndarray, "3"]) -> Robot:
