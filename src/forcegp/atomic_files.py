@@ -76,6 +76,18 @@ def atomic_folder(path: str | Path, *, overwrite: bool = True) -> Iterator[Path]
             temporary.rename(target)  # fails where another process has made the folder meanwhile
 
 
+@contextmanager
+def locked(path: Path, taken: str) -> Iterator[None]:
+    """No other process holds this file meanwhile. Raises InvalidInput with the words of `taken` if one does."""
+    from filelock import FileLock, Timeout  # which --help does without
+
+    try:
+        with FileLock(path).acquire(blocking=False):
+            yield
+    except Timeout:
+        raise InvalidInput(taken) from None
+
+
 def require_writable(path: str | Path) -> None:
     """Write a little where `path` will be, and delete it: disks that are full are noticed first. Raises OSError."""
     target = _target(path)

@@ -14,6 +14,7 @@ from forcegp.errors import DataWarning
 Level = Literal["ok", "look", "wrong"]
 LEVELS: tuple[Level, ...] = ("ok", "look", "wrong")
 """From harmless to spoiling every result."""
+Correction = Mapping[str, Mapping[str, tuple[Any, ...]]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +34,7 @@ class Doubt:
     do: str = ""
     joints: tuple[str, ...] = ()
     numbers: Mapping[str, Any] = field(default_factory=dict)
-    correction: Mapping[str, Mapping[str, tuple[Any, ...]]] = field(default_factory=dict)
+    correction: Correction = field(default_factory=dict)
 
     @property
     def command(self) -> str:

@@ -21,9 +21,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
-from forcegp.atomic_files import atomic_folder, read_json, remove_leftovers, require_writable, write_json
+from forcegp.atomic_files import atomic_folder, locked, read_json, remove_leftovers, require_writable, write_json
 from forcegp.errors import BackendError, DataWarning, FileFormatError, FitError, ForceGPError, InvalidInput
 from forcegp.parallel import Jobs, executor_for, outcome_of, stop, submit
 from forcegp.progress import tell, watched
@@ -153,13 +151,9 @@ class JobStore:
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Only one process works on the folder; the lock ends with its process. Raises InvalidInput if another does."""
-        try:
-            with FileLock(self.folder / LOCK).acquire(blocking=False):
-                yield
-        except Timeout:
-            raise InvalidInput(
-                f"another `{self.kind}` is at work in {self.folder}; wait for it, or choose another `folder`."
-            ) from None
+        working = f"another `{self.kind}` is at work in {self.folder}; wait for it, or choose another `folder`."
+        with locked(self.folder / LOCK, working):
+            yield
 
     def place(self, name: str) -> Path:
         """The folder where the job of this name lies, or will lie."""

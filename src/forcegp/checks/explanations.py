@@ -18,7 +18,7 @@ from forcegp.checks.causes import NUMBER, SIGN, Candidate, Cause, changed, like_
 from forcegp.checks.check_input import DEGREE, CheckInput
 from forcegp.checks.couplings import coupled_joints
 from forcegp.checks.residuals import cogging
-from forcegp.checks.torques import Change, Comparison, inverse_dynamics, needed_torques, solved
+from forcegp.checks.torques import Change, Comparison, inverse_dynamics, left_of, needed_torques, solved
 from forcegp.data import Dataset
 from forcegp.doubts import listed
 from forcegp.fit.payloads import with_gravity, with_length
@@ -211,7 +211,7 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
     laws, found = now.tau - needed_torques(robot, rows), list[tuple[float, Cause, Callable[[], Comparison]]]()
 
     def best(taus: Sequence[np.ndarray] | np.ndarray, weights: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-        left = _left_of(now, np.stack([now.rows.u, *(laws + tau for tau in taus)]), weights)
+        left = left_of(now, np.stack([now.rows.u, *(laws + tau for tau in taus)]), weights)
         at = int(np.argmin(left))
         return (float(left[at]), float(values[at])) if 0 < at < len(values) - 1 else (np.inf, 0.0)
 
@@ -220,16 +220,15 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
 
     def geared(joint: int, x: float, power: float = 0.0) -> Change:
         """Motion times x, and torque times x^power: a ratio through which both were computed keeps their product."""
-        own = np.arange(rows.nv) == joint
-        moved, turned = changed("qva", factor=np.where(own, x, 1.0)), changed("u", factor=np.where(own, x**power, 1.0))
+        moved, turned = changed("qva", factor=scaled(joint, x)), changed("u", factor=scaled(joint, x**power))
         return lambda rows: turned(moved(rows))
 
-    def scaled(joint: int, factors: np.ndarray) -> Float[np.ndarray, "ratios 1 nv"]:
-        return np.where(np.arange(rows.nv) == joint, factors[:, None, None], 1.0)
+    def scaled(joint: int, factors: np.ndarray | float) -> Float[np.ndarray, "*ratios nv"]:
+        return np.where(np.arange(rows.nv) == joint, factors, 1.0)
 
     @cache
     def geared_torques(joint: int, middle: float, step: float) -> Float[np.ndarray, "ratios rows nv"]:
-        factors = scaled(joint, middle * RATIOS**step)
+        factors = scaled(joint, middle * RATIOS[:, None, None] ** step)
         return inverse_dynamics(robot, *(factors * x for x in (rows.q, rows.v, rows.a)))
 
     for joint in _places(inputs.rotates):
@@ -248,7 +247,9 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         left, x = np.inf, 1.0
         for step in (1.0, 0.1):
             middle, every = x or 1.0, (x or 1.0) * RATIOS**step
-            taus = geared_torques(joint, middle, step) * scaled(joint, every**-power)  # what u would have to be
+            taus = geared_torques(joint, middle, step) * scaled(
+                joint, every[:, None, None] ** -power
+            )  # what u would have to be
             left, x = best(taus, np.eye(len(every)), every)
         beside = f", and {1.0 / x:.4g} times its torques" if power and x else ""
         what = f"the torques fit positions and velocities of {names[joint]} that are {x:.4g} times the logged ones"
@@ -270,19 +271,6 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
             found.append((left, cause, lambda x=x, b=body: now.after(changed(), with_length(robot, b, x))))
     for _, cause, made in sorted(found, key=lambda each: each[0])[:SCANNED]:
         yield cause, made()
-
-
-def _left_of(now: Comparison, signals: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, " values"]:
-    """Logarithm of what is left of u, for `weights` (values, k) of torques behind u, over all joints."""
-    factors, total = np.c_[np.ones(len(weights)), -weights], np.zeros(len(weights))
-    for joint in np.flatnonzero(np.ptp(now.rows.u, axis=0) > 0.0):
-        basis = np.linalg.qr(now.friction[:, joint])[0]
-        parts = signals[:, :, joint].T - signals[:, :, joint].mean(axis=1)
-        parts = parts - basis @ (basis.T @ parts)
-        power = np.square(parts[:, 0]).sum() + 1e-300
-        left = np.einsum("xi,ij,xj->x", factors, parts.T @ parts, factors)
-        total += np.log(np.maximum(left / power, 1e-5))
-    return total
 
 
 def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
@@ -354,7 +342,7 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         text = f"torques fit a constant force of ({force}) N at ({place}) mm of {joint.child}, as of a hose or a cable"
         told = {"do": PULLED, "numbers": {"force": pull.tolist(), "point": at.tolist(), "link": joint.child}}
         added = columns[..., :3] @ pull
-        if np.diff(_left_of(now, np.stack([now.rows.u, now.tau, now.tau + added]), np.eye(2)))[0] < 0.0:  # not astray
+        if np.diff(left_of(now, np.stack([now.rows.u, now.tau, now.tau + added]), np.eye(2)))[0] < 0.0:  # not astray
             yield number("pull", text, drive.joint, 0.0, 3.0 * NUMBER, **told), replace(now, more=now.more + added)
     for joint in range(rows.nv):
         only = (rows.q - rows.q.mean(axis=0)) * (np.arange(rows.nv) == joint)
@@ -380,7 +368,7 @@ def _parts(
             for later in (False, True):
                 part = ((share >= at) == later)[:, None, None] * columns
                 if (found := solved(now, part)) is not None and found[0] > 0.0:
-                    left = _left_of(now, np.stack([now.rows.u, now.tau + part @ found]), np.ones((1, 1)))
+                    left = left_of(now, np.stack([now.rows.u, now.tau + part @ found]), np.ones((1, 1)))
                     tried.append((float(left[0]), float(at), later))
         if not tried:
             return

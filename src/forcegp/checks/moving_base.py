@@ -291,12 +291,9 @@ def stance_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         stands = logged > OPEN
         odd = int((~np.isin(logged, [0.0, OPEN, 1.0])).sum())
         if odd:
-            yield wrong(
-                about="contact flag",
-                what=f"{name!r} is neither 0 nor 1 in {odd} of {len(logged)} rows; above .5 it counts as 1.",
-                do="Write 1 where the contact holds and 0 elsewhere, for example force > threshold.",
-                numbers={"rows": odd},
-            )
+            what = f"{name!r} is neither 0 nor 1 in {odd} of {len(logged)} rows; above .5 it counts as 1."
+            do = "Write 1 where the contact holds and 0 elsewhere, for example force > threshold."
+            yield wrong(about="contact flag", what=what, do=do, numbers={"rows": odd})
         lifted, resting = stands & ((shown == 0.0) | found.moves[:, k]), (logged == 0.0) & (shown == 1.0)
         sliding, rests = (float(x.sum() / max(y.sum(), 1)) for x, y in ((lifted, stands), (resting, ~stands)))
         numbers = {"standing": float(stands.mean()), "moving while standing": sliding, "resting while free": rests}
@@ -328,9 +325,7 @@ def unmeasured_base_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         still = not np.ptp(dataset.q[:, group.places], axis=0).any() and not dataset.v[:, group.rows].any()
         moves = not len(others) or np.ptp(dataset.v[:, others], axis=0).any()
         if still and moves and len(dataset) > 1:
-            yield wrong(
-                about="base",
-                what=f"{group.name!r} stands still in all {len(dataset)} rows to the last digit: it was not measured.",
-                do="Record its pose by motion capture or a state estimator (position and quaternion), and its "
-                "velocity. Without, learn joint friction on a stand: base='fixed'.",
-            )
+            what = f"{group.name!r} stands still in all {len(dataset)} rows to the last digit: it was not measured."
+            do = "Record its pose by motion capture or a state estimator (position and quaternion), and its "
+            do += "velocity. Without, learn joint friction on a stand: base='fixed'."
+            yield wrong(about="base", what=what, do=do)

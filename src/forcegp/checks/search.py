@@ -100,14 +100,12 @@ def _all_turned(root: Explanation, inputs: CheckInput) -> tuple[Explanation, lis
     if np.log(left[0] / left[1]).sum() < GAIN + SIGN * moving.sum() or left[1].mean() > RESTS:
         return None
     before, after = (100.0 * each.mean() for each in left)
+    what = "the torques of all joints have the opposite sign of what any robot of these lengths needs: bodies and "
+    what += f"friction that can exist leave {before:.2g} % of a torque, and {after:.2g} % of the turned one (mean of "
+    what += "joints). Masses of the robot's file are wrong as well."
+    do = "Turn u; forcegp fit --forces bodies finds the masses."
     doubt = wrong(
-        about="torque sign",
-        what="the torques of all joints have the opposite sign of what any robot of these lengths needs: bodies and "
-        f"friction that can exist leave {before:.2g} % of a torque, and {after:.2g} % of the turned one (mean of "
-        "joints). Masses of the robot's file are wrong as well.",
-        do="Turn u; forcegp fit --forces bodies finds the masses.",
-        joints=inputs.names,
-        correction={"sign": {"u": (-1.0,) * log.rows.nv}},
+        about="torque sign", what=what, do=do, joints=inputs.names, correction={"sign": {"u": (-1.0,) * log.rows.nv}}
     )
     turned = log.with_torques(changed("u", factor=-1.0))
     return replace(root, log=turned, turned=tuple(range(log.rows.nv))), [doubt]
@@ -213,13 +211,10 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     sticky = [k for k in bad.tolist() if _sticks(root, k)]
     if sticky and (left > EXPLAINED or len(sticky) == len(bad)):  # what passes stops a joint as well
         names = inputs.named(sticky)
-        yield look(
-            about="dry friction",
-            what=f"what stays of the torque of {listed(names)} is near rest and no more than dry friction holds: gears "
-            "that stick, or give way before they slip.",
-            do="Friction that remembers explains it; forcegp auto and forcegp fit --forces gear choose it.",
-            joints=names,
-        )
+        what = f"what stays of the torque of {listed(names)} is near rest and no more than dry friction holds: gears "
+        what += "that stick, or give way before they slip."
+        do = "Friction that remembers explains it; forcegp auto and forcegp fit --forces gear choose it."
+        yield look(about="dry friction", what=what, do=do, joints=names)
         if not len(bad := np.setdiff1d(bad, sticky)):
             return
         where, seconds, left = _where(root, int(bad[np.argmax(root.rough[bad])]), inputs)
@@ -256,14 +251,9 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         do = (
             f"Leave them out by forcegp import --without {','.join(f'{x:.2f}' for x in seconds)}, as forcegp auto does."
         )
-    yield look(
-        about=UNKNOWN,
-        what="something is wrong that is none of the causes that were tried (signs, units, orders, zeros, gears, "
-        f"gravity, masses, payload, springs, delay): unexplained stay of the torque of {shares}{where}.",
-        do=do,
-        joints=inputs.named(bad),
-        numbers=numbers,
-    )
+    what = "something is wrong that is none of the causes that were tried (signs, units, orders, zeros, gears, "
+    what += f"gravity, masses, payload, springs, delay): unexplained stay of the torque of {shares}{where}."
+    yield look(about=UNKNOWN, what=what, do=do, joints=inputs.named(bad), numbers=numbers)
 
 
 def _stop(root: Explanation, joint: int) -> tuple[float, float] | None:

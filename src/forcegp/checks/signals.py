@@ -300,13 +300,10 @@ def sampling_doubts(inputs: CheckInput) -> Iterator[Doubt]:
     if share < OFTEN_REPEATED:
         return
     row = int(np.argmax(same & moves)) + 1
-    yield look(
-        about="repeated rows",
-        what=f"{100.0 * share:.2g} % of the rows in motion repeat all positions of the row before (the first: row "
-        f"{row} at {log.time[row]:.3f} s): the logger runs faster than the robot's measurements.",
-        do="Drop the repeated rows before anything is differentiated, or log at the robot's own rate.",
-        numbers={"share": share, "row": row},
-    )
+    what = f"{100.0 * share:.2g} % of the rows in motion repeat all positions of the row before (the first: row "
+    what += f"{row} at {log.time[row]:.3f} s): the logger runs faster than the robot's measurements."
+    do = "Drop the repeated rows before anything is differentiated, or log at the robot's own rate."
+    yield look(about="repeated rows", what=what, do=do, numbers={"share": share, "row": row})
 
 
 RPM = np.pi / 30.0

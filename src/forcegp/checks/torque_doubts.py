@@ -53,14 +53,10 @@ def _offsets(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         spread = float((rows.u - tau)[:, joint].std())  # of dry friction, that of both directions
         if abs(missing) > max(spread, MUCH * abs(weight)):
             name = inputs.names[joint]
-            yield look(
-                about="offset",
-                what=f"the force of {name} is {missing:+.3g} N from that of its weight all the time: a gas spring or a "
-                "counterweight carries it, or the sensor is off, or masses are wrong.",
-                do="Give the robot's file the mass that is left, or subtract it from the column of u.",
-                joints=(name,),
-                numbers={"offset": missing, "weight": weight},
-            )
+            what = f"the force of {name} is {missing:+.3g} N from that of its weight all the time: a gas spring or a "
+            what += "counterweight carries it, or the sensor is off, or masses are wrong."
+            do = "Give the robot's file the mass that is left, or subtract it from the column of u."
+            yield look(about="offset", what=what, do=do, joints=(name,), numbers={"offset": missing, "weight": weight})
 
 
 def _drift(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
@@ -154,14 +150,12 @@ def elastic_doubts(inputs: CheckInput, log: Comparison) -> list[Doubt]:
     if not found:
         return []
     cutoff = BELOW * min(found.values())
+    what = "the torque grows with the frequency as behind an elastic gear, with a resonance near "
+    what += f"{', '.join(f'{hertz:.2g} Hz ({name})' for name, hertz in found.items())}."
+    do = f"No rigid model predicts motions near it: filter by forcegp import --cutoff {cutoff:.2g}."
     return [
         look(
-            about="elastic joint",
-            what="the torque grows with the frequency as behind an elastic gear, with a resonance near "
-            f"{', '.join(f'{hertz:.2g} Hz ({name})' for name, hertz in found.items())}.",
-            do=f"No rigid model predicts motions near it: filter by forcegp import --cutoff {cutoff:.2g}.",
-            joints=tuple(found),
-            numbers={"resonance": found, "cutoff": cutoff},
+            about="elastic joint", what=what, do=do, joints=tuple(found), numbers={"resonance": found, "cutoff": cutoff}
         )
     ]
 
@@ -317,18 +311,12 @@ def held_points(inputs: CheckInput) -> list[Doubt]:
     if share > RESTS:
         return []
     joints = inputs.named(np.flatnonzero(alone > MUCH * alone.max()))
-    return [
-        wrong(
-            about="contact",
-            what=f"{link} stays where it is, within {1e3 * share * np.sqrt(np.square(alone).sum()):.2g} mm, although "
-            f"{listed(joints)} would move it by up to {1e3 * alone.max():.3g} mm each: something holds it, and "
-            "its force is missing beside the torques.",
-            do=f"Free motion needs no contact. Of this log: forcegp fit --contact {link}:held, with columns of a force "
-            f"sensor there by forcegp import --force {link}=fx,fy,fz.",
-            joints=joints,
-            numbers={"share": share},
-        )
-    ]
+    what = f"{link} stays where it is, within {1e3 * share * np.sqrt(np.square(alone).sum()):.2g} mm, although "
+    what += f"{listed(joints)} would move it by up to {1e3 * alone.max():.3g} mm each: something holds it, and "
+    what += "its force is missing beside the torques."
+    do = f"Free motion needs no contact. Of this log: forcegp fit --contact {link}:held, with columns of a force "
+    do += f"sensor there by forcegp import --force {link}=fx,fy,fz."
+    return [wrong(about="contact", what=what, do=do, joints=joints, numbers={"share": share})]
 
 
 TOUCHES = ok(
@@ -396,13 +384,10 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
     out = np.unique(np.concatenate([out, *(each for each in pieces if len(each) < FEWEST_ROWS)]))  # none to learn from
     apart = (np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) for rows in (out, np.unique(np.concatenate(stops))))
     spans, rested = ([log.time[each[[0, -1]]].tolist() for each in some] for some in apart)
-    doubt = look(
-        about="stop",
-        what=f"all joints stand still from {', '.join(f'{x:.4g} to {y:.4g}' for x, y in rested)} s, and their torques "
-        f"are not those that this posture needs by what the motion tells: {why}.",
-        do="These rows are left out of all checks, and of forcegp auto; of other fits leave them out yourself.",
-        numbers={"seconds": spans},
-    )
+    what = f"all joints stand still from {', '.join(f'{x:.4g} to {y:.4g}' for x, y in rested)} s, and their torques "
+    what += f"are not those that this posture needs by what the motion tells: {why}."
+    do = "These rows are left out of all checks, and of forcegp auto; of other fits leave them out yourself."
+    doubt = look(about="stop", what=what, do=do, numbers={"seconds": spans})
     return _cut(log, out), [doubt]
 
 

@@ -194,3 +194,16 @@ def solved(now: Comparison, columns: Float[np.ndarray, "rows nv k"]) -> Float[np
         left = [np.square(b[:, -1] - b[:, :-1] @ number).sum() for b, _ in parts]
         weights = [1.0 / (x + 1e-6 * p) for x, (_, p) in zip(left, parts, strict=True)]
     return number
+
+
+def left_of(now: Comparison, signals: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, " values"]:
+    """Logarithm of what is left of u, for `weights` (values, k) of torques behind u, over all joints."""
+    factors, total = np.c_[np.ones(len(weights)), -weights], np.zeros(len(weights))
+    for joint in np.flatnonzero(np.ptp(now.rows.u, axis=0) > 0.0):
+        basis = np.linalg.qr(now.friction[:, joint])[0]
+        parts = signals[:, :, joint].T - signals[:, :, joint].mean(axis=1)
+        parts = parts - basis @ (basis.T @ parts)
+        power = np.square(parts[:, 0]).sum() + 1e-300
+        left = np.einsum("xi,ij,xj->x", factors, parts.T @ parts, factors)
+        total += np.log(np.maximum(left / power, 1e-5))
+    return total

@@ -202,8 +202,6 @@ class Command(ABC):
     @contextlib.contextmanager
     def alone(self) -> Iterator[None]:
         """No other command of this user and machine writes to the same place meanwhile. Raises InvalidInput."""
-        from filelock import FileLock, Timeout  # which --help does without
-
         # not beside the output: a lock would stay there, and the folder may not exist yet
         user = os.getuid() if hasattr(os, "getuid") else None  # Windows has a folder for each user
         place = Path(tempfile.gettempdir(), f"forcegp-locks-{user}")
@@ -214,13 +212,9 @@ class Command(ABC):
             yield
             return
         name = hashlib.sha256(os.path.realpath(self.output).encode()).hexdigest()
-        try:
-            with FileLock(place / name).acquire(blocking=False):
-                yield
-        except Timeout:
-            raise InvalidInput(
-                f"another command of forcegp is writing {self.output}; wait for it, or choose another name."
-            ) from None
+        writing = f"another command of forcegp is writing {self.output}; wait for it, or choose another name."
+        with atomic_files.locked(place / name, writing):
+            yield
 
     def words(self, *names: str) -> list[str]:
         """The options of these names that are not left at their defaults, as words of a command."""

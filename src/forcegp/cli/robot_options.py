@@ -137,10 +137,8 @@ def forces_of(model: forcegp.Model) -> list[str]:
 def require_same_joints(posterior: forcegp.posterior.Posterior, dataset: forcegp.Dataset, path: Path) -> None:
     """Refuse a recording of another robot: InvalidInput."""
     if tuple(posterior.joint_names) != dataset.joint_names:
-        raise InvalidInput(
-            f"{path} has joints {', '.join(dataset.joint_names)}; the model was trained on "
-            f"{', '.join(posterior.joint_names)}. Give a recording of the same robot."
-        )
+        seen = f"{path} has joints {', '.join(dataset.joint_names)}; the model was trained on "
+        raise InvalidInput(f"{seen}{', '.join(posterior.joint_names)}. Give a recording of the same robot.")
 
 
 def _named(words: Sequence[str], option: str, syntax: str) -> dict[str, float]:

@@ -281,13 +281,13 @@ def finite_columns(
         raise DatasetError(f"{name} has {len(values)} {what}; expected {rows}.")
     if values.shape[0] == 0:
         raise DatasetError(f"{name} has no {what}; at least one is needed.")
-    if (np.abs(values) <= LARGEST_MEASURED).all():
-        return _read_only(values)
-    for bad, how in (~np.isfinite(values), "not finite."), (np.abs(values) > LARGEST_MEASURED, BEYOND):
-        for row, *at in np.argwhere(bad)[:1]:
-            column = f", column {at[0]}" + (f" ({columns[at[0]]})" if columns else "") if at else ""
-            seen = f"{name} is {values[row, *at]} at row {row}{column}; {int(bad.sum())} values are {how}"
-            raise DatasetError(f"{seen} Drop or repair these rows first.")
+    if not (inside := np.abs(values) <= LARGEST_MEASURED).all():  # False of NaN
+        finite = np.isfinite(values)
+        bad, how = (~inside, BEYOND) if finite.all() else (~finite, "not finite.")
+        row, *at = np.argwhere(bad)[0]
+        column = f", column {at[0]}" + (f" ({columns[at[0]]})" if columns else "") if at else ""
+        seen = f"{name} is {values[row, *at]} at row {row}{column}; {int(bad.sum())} values are {how}"
+        raise DatasetError(f"{seen} Drop or repair these rows first.")
     return _read_only(values)
 
 

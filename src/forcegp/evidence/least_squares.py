@@ -143,6 +143,7 @@ Jacobian = Float[np.ndarray, "rows nv k"] | Chained
 Residual = Callable[[np.ndarray], tuple[np.ndarray, Any]]
 """x -> residuals (rows, nv) and `Jacobian` (rows, nv, k); of the prior (p,) and (p, k)."""
 Moved = Callable[[np.ndarray, np.ndarray], np.ndarray]
+Progress = Callable[[int, float], None]
 """x and a step -> where it leads: x + step to first order."""
 
 
@@ -190,7 +191,7 @@ def weighted_least_squares(
     bounds: tuple[np.ndarray, np.ndarray],
     *,
     longest: Callable[[np.ndarray], np.ndarray] | float = np.inf,
-    progress: Callable[[int, float], None] | None = None,
+    progress: Progress | None = None,
     held: Float[np.ndarray, "rows m nv"] | None = None,
     known: Float[np.ndarray, " nv"] | None = None,
     evaluations: int = MOST_EVALUATIONS,

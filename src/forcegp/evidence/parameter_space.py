@@ -118,6 +118,11 @@ class ParameterSpace:
         off = np.abs(x[: self.bodies.size].reshape(-1, 10)) * (np.arange(10) > 3)
         return np.concatenate([np.maximum(1.0, off).ravel(), *each])
 
+    @property
+    def steps(self) -> dict[str, Any]:
+        """How a search may move, as options of `weighted_least_squares`."""
+        return {"longest": self.longest_steps, "moved": self.moved}
+
     def prior(self, x: bodies.Coordinates) -> tuple[Float[np.ndarray, " entries"], Float[np.ndarray, "entries k"]]:
         """Distance from the prior in its standard deviations, and its Jacobian."""
         of_bodies, of_terms = self.split(x)

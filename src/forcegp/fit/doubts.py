@@ -62,10 +62,8 @@ def _hidden(names: Sequence[str], terms: Sequence[int], free: Tensor, effect: Te
     blind = listed(repr(name) for name, flat in zip(names, hidden, strict=True) if flat)
     remedy = "learn a force along the surface, such as gp:tool-friction, or leave that prior out"
     if all(nothing or flat for nothing, flat in zip(absent, hidden, strict=True)):
-        raise InvalidInput(
-            f"no data can identify {blind}: the contacts take the whole force, and the acceleration shows none "
-            f"of it; {remedy}"
-        )
+        seen = f"no data can identify {blind}: the contacts take the whole force, and the acceleration shows none "
+        raise InvalidInput(f"{seen}of it; {remedy}")
     if any(hidden):
         what = f"no data can identify {blind}: the contacts take that force, the acceleration shows none of it, "
         what += "and its posterior and that of the normal force are the prior;"
@@ -108,12 +106,10 @@ def doubts_of_past(model: Model, log: Dataset, known: Bool[np.ndarray, " rows"])
     """That many rows do not know the past of friction that is estimated."""
     share, estimated = 1.0 - known.mean(), any(law.learned and law.memory_names(model.robot) for law in model.laws)
     if estimated and share > MISLEADING:
-        yield look(
-            about="friction that remembers",
-            what="until a joint has moved a little, a log does not tell which way its gear was turned last: "
-            f"{share:.0%} of the rows come before that, and levels of dry friction may be too small by as much.",
-            do="Give longer episodes, or leave memory out.",
-        )
+        what = "until a joint has moved a little, a log does not tell which way its gear was turned last: "
+        what += f"{share:.0%} of the rows come before that, and levels of dry friction may be too small by as much."
+        do = "Give longer episodes, or leave memory out."
+        yield look(about="friction that remembers", what=what, do=do)
 
 
 def doubts_of_reversals(model: Model, log: Dataset) -> Iterator[Doubt]:
@@ -123,12 +119,10 @@ def doubts_of_reversals(model: Model, log: Dataset) -> Iterator[Doubt]:
             steps = motor_positions(log, log.transmission)[1]
             turns = steps * law.values["sigma"].expand(model.robot.nv).cpu().numpy()
             if names := [f"{log.joint_names[j]} ({1e3 * steps[j]:.2g})" for j in joints if turns[j] > 1.0]:
-                yield look(
-                    about="friction that remembers",
-                    what="steps of encoders [mrad or mm] are larger than the ways over which it turns: "
-                    f"{', '.join(names)}.",
-                    do="Do not rely on sigma there, or record finer positions.",
-                )
+                what = "steps of encoders [mrad or mm] are larger than the ways over which it turns: "
+                what += f"{', '.join(names)}."
+                do = "Do not rely on sigma there, or record finer positions."
+                yield look(about="friction that remembers", what=what, do=do)
 
 
 def doubts_of_memory(space: ParameterSpace, x: np.ndarray) -> Iterator[Doubt]:
@@ -137,9 +131,7 @@ def doubts_of_memory(space: ParameterSpace, x: np.ndarray) -> Iterator[Doubt]:
         joints = np.array(space.model.robot.joint_names)[list(term.joints or ())]
         for ends, when in ((term.high, "sooner"), (term.low, "later")) if term.name == "sigma" else ():
             if (own == ends).any():
-                yield look(
-                    about="friction that remembers",
-                    what=f"friction of {listed(joints[own == ends])} turns {when} after a reversal than the log can "
-                    "tell (its sigma is at a bound).",
-                    do="Give a log of slower reversals; predictions between reversals do not depend on it.",
-                )
+                what = f"friction of {listed(joints[own == ends])} turns {when} after a reversal than the log can "
+                what += "tell (its sigma is at a bound)."
+                do = "Give a log of slower reversals; predictions between reversals do not depend on it."
+                yield look(about="friction that remembers", what=what, do=do)

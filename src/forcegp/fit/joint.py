@@ -118,16 +118,8 @@ def numbers_beside(
             columns = white(slopes.at(x)).cpu().numpy()  # one equation in a row
             return columns[:, :1], columns[:, None, 1:]
 
-        fit = weighted_least_squares(
-            residual,
-            space.prior,
-            x,
-            space.bounds,
-            longest=space.longest_steps,
-            moved=space.moved,
-            known=np.ones(1),
-            evaluations=30,
-        )
+        stated = {"known": np.ones(1), "evaluations": 30}
+        fit = weighted_least_squares(residual, space.prior, x, space.bounds, **stated, **space.steps)
     spread = np.sqrt(np.linalg.inv(fit.information + fit.prior_information).diagonal())
     return fit.x, fit, float((abs(fit.x - x) / spread).max(initial=0.0))
 

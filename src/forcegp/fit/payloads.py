@@ -78,13 +78,11 @@ def doubts_of_payloads(space: ParameterSpace, fit: Fit, least: float) -> Iterato
         moves = payload @ space.standard_parameters(fit.x)[body]
         clearly = max(NO_BODY, LEAST * cost, least + 4.5 * np.log(white.size))  # nine numbers more than one cause
         if np.linalg.norm(fit.residual) > RIGHT * np.linalg.norm(moves) and more > clearly:
-            yield look(
-                about="payload",
-                what=f"no body on {getattr(space.model.laws[each.payload], 'link', '')} explains the log: free numbers "
-                f"in place of its mass, centre and inertia leave {more / cost:.0%} less. The payload is on another "
-                "link, or links weigh less or otherwise than the URDF states.",
-                do="Give link, or a baseline (a log without the payload), or identify all links.",
-            )
+            what = f"no body on {getattr(space.model.laws[each.payload], 'link', '')} explains the log: free numbers "
+            what += f"in place of its mass, centre and inertia leave {more / cost:.0%} less. The payload is on another "
+            what += "link, or links weigh less or otherwise than the URDF states."
+            do = "Give link, or a baseline (a log without the payload), or identify all links."
+            yield look(about="payload", what=what, do=do)
 
 
 def changes_without_rests(

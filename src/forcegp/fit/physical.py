@@ -15,7 +15,7 @@ from forcegp.doubts import Doubts
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence import Accelerations, Torques
 from forcegp.evidence.bodies import thickened
-from forcegp.evidence.least_squares import LEAST, ROUNDS, Fit, NoiseLevels, weighted_least_squares
+from forcegp.evidence.least_squares import LEAST, ROUNDS, Fit, NoiseLevels, Progress, weighted_least_squares
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.fit.doubts import doubts_of_memory
 from forcegp.fit.equations import Equations
@@ -97,7 +97,7 @@ def fit_physical(
         history.append(rms)
         tell(min(done, ROUNDS), ROUNDS, f"all rows, step {done}: {rms:.3g}")
 
-    options: dict[str, Any] = {"longest": space.longest_steps, "moved": space.moved, "roughly": roughly}
+    options: dict[str, Any] = {"roughly": roughly, **space.steps}
     options["sizes"] = equations.sizes if all(len(log) == len(log.episodes) > 2 for log in logs) else None
     search = partial(weighted_least_squares, prior=space.prior, bounds=space.bounds, **options)
     noise, x, changes = None, space.start if near is None else near.x, None
@@ -142,7 +142,7 @@ def fit_physical(
 
 
 def _with_accelerations_weighted(
-    equations: Equations, search: Callable[..., Fit], x: np.ndarray, note: Callable[[int, float], None]
+    equations: Equations, search: Callable[..., Fit], x: np.ndarray, note: Progress
 ) -> tuple[Fit, NoiseLevels]:
     """A search among accelerations that the noise of both kinds about x weights."""
     predicted, M, H = equations.accelerations(x)
@@ -157,12 +157,7 @@ def _with_accelerations_weighted(
 
 
 def _with_noise_in_both(
-    equations: Equations,
-    search: Callable[..., Fit],
-    x: np.ndarray,
-    note: Callable[[int, float], None],
-    *,
-    rough: bool = True,
+    equations: Equations, search: Callable[..., Fit], x: np.ndarray, note: Progress, *, rough: bool = True
 ) -> tuple[Fit, NoiseLevels]:
     """Searches about likely accelerations, whose levels of noise are found along; `rough` where x may be far off."""
     noise, least, number, evaluations, steps = None, None, 0, 0, STEPS

@@ -62,10 +62,8 @@ def with_sensors(dataset: Dataset, model: Model, rest: Evidence, sensors: Sequen
                     )
             elif isinstance(each, JointTorques):
                 if isinstance(rest, Accelerations):
-                    raise InvalidInput(
-                        "torque sensors at links teach numbers of laws and bodies, beside torques; give Torques(), "
-                        "without unknown forces."
-                    )
+                    seen = "torque sensors at links teach numbers of laws and bodies, beside torques; give Torques(), "
+                    raise InvalidInput(f"{seen}without unknown forces.")
                 if said := links.get((name.removeprefix(TORQUE),)):
                     raise InvalidInput(str(said))
             elif said := forces.get(name.removeprefix(FORCE)):
@@ -73,10 +71,8 @@ def with_sensors(dataset: Dataset, model: Model, rest: Evidence, sensors: Sequen
             elif isinstance(rest, Accelerations) and model.is_open and not model.unknown_forces:
                 raise InvalidInput("force sensors teach numbers beside torques, not accelerations; give Torques().")
             elif model.unknown_forces and not at:
-                raise InvalidInput(
-                    f"a force was measured at {name.removeprefix(FORCE)!r}, where the model has no contact; give it "
-                    "one, or leave unknown forces out, so that it is a force that is known."
-                )
+                seen = f"a force was measured at {name.removeprefix(FORCE)!r}, where the model has no contact; give it "
+                raise InvalidInput(f"{seen}one, or leave unknown forces out, so that it is a force that is known.")
             measured[found] = dataset.measured[name]
             channels = 1 if any(map(slides, at)) else measured[found].shape[1]
             levels[found] = [each.noise or share_of(measured[found])] * channels

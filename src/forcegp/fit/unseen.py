@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from forcegp.data import Dataset, evenly
 from forcegp.doubts import Doubt, look
-from forcegp.evidence.least_squares import NoiseLevels, orthonormal_columns, without
+from forcegp.evidence.least_squares import NoiseLevels, Rows, orthonormal_columns, without
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
 from forcegp.forces import Payload, RigidBodies
@@ -106,15 +106,10 @@ class Unseen:
         """One, where something pushes a joint."""
         if not (names := [model.robot.joint_names[j] for j in self.pushed]):
             return []
-        return [
-            look(
-                about="pushed joints",
-                what=f"nothing drives {listed(names)}, u is 0 there, and the motion needs forces there that nobody "
-                "measured. Its own equation is left out.",
-                do="Contact forces follow from the other joints: predict them given accelerations, a=...",
-                joints=tuple(names),
-            )
-        ]
+        what = f"nothing drives {listed(names)}, u is 0 there, and the motion needs forces there that nobody "
+        what += "measured. Its own equation is left out."
+        do = "Contact forces follow from the other joints: predict them given accelerations, a=..."
+        return [look(about="pushed joints", what=what, do=do, joints=tuple(names))]
 
 
 def rows_of_known_physics(model: Model, log: Dataset) -> RecordedRows:
@@ -127,10 +122,7 @@ def rows_of_known_physics(model: Model, log: Dataset) -> RecordedRows:
 
 
 def push(
-    residual: Float[np.ndarray, "rows nv"],
-    open_: Float[np.ndarray, "rows m nv"],
-    typical: Float[np.ndarray, " nv"],
-    joint: int,
+    residual: Rows, open_: Float[np.ndarray, "rows m nv"], typical: Float[np.ndarray, " nv"], joint: int
 ) -> Float[np.ndarray, " rows"]:
     """What acts on a joint if it alone explains the residual of joint forces (`typical` size) that contacts leave."""
     span = orthonormal_columns(open_ / typical)

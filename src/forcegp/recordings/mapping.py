@@ -9,7 +9,7 @@ from numbers import Real
 from typing import Any
 
 from forcegp.data.units import UNITS, LogUnit
-from forcegp.doubts import stated_as
+from forcegp.doubts import Correction, stated_as
 from forcegp.errors import InvalidInput, require_known, require_type, usable_arguments
 from forcegp.recordings.expression import weighted_sum
 from forcegp.recordings.source import Source
@@ -139,10 +139,7 @@ class ColumnMapping:
                 raise InvalidInput(f"sign of {signal} is {', '.join(map(str, numbers))}; give 1 or -1.")
 
     def corrected_by(
-        self,
-        correction: Mapping[str, Mapping[str, tuple[Any, ...]]],
-        joints: tuple[str, ...],
-        columns: Mapping[str, Sequence[str]],
+        self, correction: Correction, joints: tuple[str, ...], columns: Mapping[str, Sequence[str]]
     ) -> "ColumnMapping":
         """The mapping after a correction that `forcegp.check` found, whose entries are in the order of `joints`.
 
