@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from importlib import import_module
 from pathlib import Path
@@ -125,14 +126,12 @@ def imports(path: Path) -> Iterator[Import]:
     yield from visit(ast.parse(path.read_text(encoding="utf-8")), True, False)
 
 
-IMPORTS = {module: tuple(imports(path)) for module, path in MODULES.items()}
+imports_of = cache(lambda module: tuple(imports(MODULES[module])))
 
 
 def modules_loaded_by(code: str) -> set[str]:
     """Top-level packages in `sys.modules` after `code` ran in a fresh interpreter."""
-    report = (
-        "import atexit, sys; atexit.register(lambda: print('LOADED', *{name.split('.')[0] for name in sys.modules}))"
-    )
+    report = "import atexit, sys; atexit.register(lambda: print('LOADED', *{x.split('.')[0] for x in sys.modules}))"
     run = subprocess.run([sys.executable, "-c", f"{report}\n{code}"], capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     return set(run.stdout.rpartition("LOADED")[2].split())
@@ -169,7 +168,7 @@ def test_imports_go_only_to_allowed_rooms(module):
     allowed = PACKAGES[package_of(module)]
     offences = [
         f"{MODULES[module].relative_to(REPOSITORY)}:{item.line} imports {item.name}"
-        for item in IMPORTS[module]
+        for item in imports_of(module)
         if item.name.split(".")[0] == "forcegp"
         and package_of(item.name) not in allowed | {package_of(module)}
         and item.name not in ("forcegp", "forcegp.__version__")
@@ -187,7 +186,7 @@ def longest_module(name: str) -> str:
 def test_no_module_imports_itself_through_others():
     graph: dict[str, set[str]] = {}
     for module in MODULES.keys() - {"forcegp"}:
-        needed = [item.name for item in IMPORTS[module]]  # those under TYPE_CHECKING, too
+        needed = [item.name for item in imports_of(module)]  # those under TYPE_CHECKING, too
         graph[module] = {source for name in needed if (source := longest_module(name))} - {module}
     try:
         TopologicalSorter(graph).prepare()
@@ -200,7 +199,7 @@ def test_slow_and_optional_packages_are_imported_where_they_are_used(package):
     offences = [
         f"{MODULES[module].relative_to(REPOSITORY)}:{item.line}"
         for module in MODULES
-        for item in IMPORTS[module]
+        for item in imports_of(module)
         if item.at_module_import
         and item.name.split(".")[0] == package
         and not module.startswith(IMPORTED_WHERE_USED[package] or "-")
@@ -214,10 +213,8 @@ def test_an_exported_name_that_is_a_module_too_comes_from_there(package):
     modules = {name.rpartition(".")[2] for name in MODULES if name.rpartition(".")[0] == package}
     for name in modules & EXPORTS[package].keys():
         assert EXPORTS[package][name] == f"{package}.{name}"
-        code = (
-            f"from importlib import import_module as load; load('{package}.{name}'); load('{package}').{name}.__call__"
-        )
-        subprocess.run([sys.executable, "-c", code], check=True)
+        code = f"load('{package}.{name}'); load('{package}').{name}.__call__"
+        subprocess.run([sys.executable, "-c", f"from importlib import import_module as load; {code}"], check=True)
 
 
 @pytest.mark.parametrize("package", EXPORTS)

@@ -333,10 +333,8 @@ def test_torques_in_steps_are_right_and_friction_that_fades_is_named():
 @pytest.mark.parametrize(("begin", "left_out"), [(7.1, (0.0, 7.1)), (12.2, (12.2, 14.99))])
 def test_the_time_of_a_load_is_told_also_behind_a_rest(begin, left_out):
     time = np.arange(0.0, 15.0, 0.01)
-    ways = (
-        np.stack([np.sin(2.1 * time), 0.8 * np.sin(3.3 * time)], axis=1) * np.clip(time - 4.0, 0.0, 1.0)[:, None] ** 3
-    )
-    [found] = check(gripped(with_motion(two_links(), ways, 100.0, 3, 0.0), begin)).doubts.of("load")
+    way = np.stack([np.sin(2.1 * time), 0.8 * np.sin(3.3 * time)], axis=1) * np.clip(time - 4, 0, 1)[:, None] ** 3
+    [found] = check(gripped(with_motion(two_links(), way, 100.0, 3, 0.0), begin)).doubts.of("load")
     assert found.numbers["seconds"] == pytest.approx(left_out, abs=0.2)
 
 

@@ -12,19 +12,7 @@ from tests.data.test_stance import hop, walk
 from tests.data.test_wind import flight
 from tests.goldens.compare import assert_unchanged
 
-from forcegp.data import (
-    Dataset,
-    LowPass,
-    Preparation,
-    contact_doubts,
-    differentiated,
-    estimate_delay,
-    estimate_stance,
-    find_wind,
-    low_pass,
-    motion_spectrum,
-    resample,
-)
+from forcegp import data
 from forcegp.data.configurations import as_vectors, in_base
 from forcegp.data.filters import shifted, sums_before
 from forcegp.data.imu import BesideMotion, expected, imu_doubts
@@ -33,24 +21,24 @@ from forcegp.data.strokes import encoder_step, strokes, white_noise
 from forcegp.data.views import farthest_rows, move_on
 
 
-def columns(log: Dataset) -> dict:
+def columns(log: data.Dataset) -> dict:
     return {name: getattr(log, name) for name in ("q", "v", "u", "a", "time", "measured", "noise_std")}
 
 
 @pytest.fixture(scope="module")
-def arm() -> Dataset:
+def arm() -> data.Dataset:
     """Two episodes with a late torque and noise on positions."""
     log = arm_log(0.012, seconds=6.0)
     q = log.q + 1e-4 * np.random.default_rng(0).standard_normal(log.q.shape)
-    return replace(differentiated(replace(log, q=q), "q"), episode=(log.time > 2.5).astype(int))
+    return replace(data.differentiated(replace(log, q=q), "q"), episode=(log.time > 2.5).astype(int))
 
 
 @pytest.mark.parametrize("source", ["q", "v"])
 def test_spectra_and_cutoffs(arm, source):
-    spectrum = motion_spectrum(arm, source)
+    spectrum = data.motion_spectrum(arm, source)
     best, shares = held_out_cutoff(arm, 8.0, source)
-    more = {"noise": spectrum.noise_density, "behind": spectrum.acceleration_noise(LowPass(15.0)), "best": best}
-    chosen = Preparation(cutoff="auto", delay="auto", differentiate=source, every=3, trim=0.1)
+    more = {"noise": spectrum.noise_density, "behind": spectrum.acceleration_noise(data.LowPass(15.0)), "best": best}
+    chosen = data.Preparation(cutoff="auto", delay="auto", differentiate=source, every=3, trim=0.1)
     report = chosen.apply(arm).metadata["preparation"]
     report.pop("why")
     found = {"spectrum": spectrum, **more, "tried": sorted(shares), "report": report}
@@ -58,18 +46,20 @@ def test_spectra_and_cutoffs(arm, source):
 
 
 def test_delays(arm):
-    smooth = low_pass(arm, 20.0)
-    assert_unchanged("data/delay", {"arm": estimate_delay(smooth), "far": estimate_delay(arm_log(-0.08))}, rtol=1e-4)
+    smooth = data.low_pass(arm, 20.0)
+    found = {"arm": data.estimate_delay(smooth), "far": data.estimate_delay(arm_log(-0.08))}
+    assert_unchanged("data/delay", found, rtol=1e-4)
 
 
 def test_filters(arm):
     walking = walk(2, 0.02, seconds=1.0)[0]
     walking = replace(walking, measured={"imu.trunk": walking.a[:, :3]})
     made = {
-        "filtered": columns(low_pass(walking, 12.0)), "shifted": columns(shifted(walking, 0.013, 0.03, [1, 4])),
-        "differentiated": columns(differentiated(walking, "q")), "resampled": columns(resample(walking, 0.0031)),
+        "filtered": columns(data.low_pass(walking, 12.0)), "shifted": columns(shifted(walking, 0.013, 0.03, [1, 4])),
+        "differentiated": columns(data.differentiated(walking, "q")),
+        "resampled": columns(data.resample(walking, 0.0031)),
         "vectors": as_vectors(walking),
-        "uneven": columns(differentiated(arm.rows(np.delete(np.arange(400), [0, 7, 300])), "q")),
+        "uneven": columns(data.differentiated(arm.rows(np.delete(np.arange(400), [0, 7, 300])), "q")),
         "sums": sums_before(arm.u[:300], arm.time[:300], 0.4), "farthest": farthest_rows(arm, 40).time,
     }  # fmt: skip
     turned = [torch.tensor(x[::15]) for x in (walking.q, walking.v, walking.a)]
@@ -96,18 +86,18 @@ def test_stance(noise):
     hopping = hop("floating", 50.0, 0.14)[0]
     quiet = replace(hopping, v=0.05 * hopping.v)
     still = walk(3, noise, seconds=1.0, lift=False)[0]
-    found = {name: estimate_stance(each) for name, each in (("walk", log), ("hop", quiet), ("still", still))}
+    found = {name: data.estimate_stance(each) for name, each in (("walk", log), ("hop", quiet), ("still", still))}
     assert_unchanged(f"data/stance {noise:g}", found)
 
 
 def test_contacts():
     logs = {"moved": moved(on_a_line(4), (0.02, 0.0, 0.0)), "invented": invented(clean(two_links(), 4))}
-    assert_unchanged("data/contacts", {name: contact_doubts(log)[0].numbers for name, log in logs.items()})
+    assert_unchanged("data/contacts", {name: data.contact_doubts(log)[0].numbers for name, log in logs.items()})
 
 
 def test_wind():
     log = flight([(4.0, 1.0, 0.0), (-2.0, 5.0, 0.0)], episodes=2, noise=0.3)
-    law, wind = find_wind(log)
+    law, wind = data.find_wind(log)
     assert_unchanged("data/wind", {"law": law, "wind": wind, "before": law.wind_before(log, 0.5)}, rtol=1e-4)
 
 

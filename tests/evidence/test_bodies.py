@@ -83,9 +83,8 @@ def test_a_robot_with_other_bodies(text):
     ours = bodies(robot)
     x, numbers = 0.3 * np.random.default_rng(2).normal(size=ours.size), of_bodies.carrying(robot)
     changed = of_bodies.with_bodies(robot, dict(zip(numbers, ours.pseudo_inertias(x), strict=True)))
-    np.testing.assert_allclose(
-        of_bodies.standard_parameters(changed), ours.parameters(x).ravel(), atol=1e-12, rtol=1e-12
-    )
+    found = of_bodies.standard_parameters(changed)
+    np.testing.assert_allclose(found, ours.parameters(x).ravel(), atol=1e-12, rtol=1e-12)
     same = of_bodies.with_bodies(robot, dict(zip(numbers, ours.pseudo_inertias(np.zeros(ours.size)), strict=True)))
     for name in robot.link_names:
         np.testing.assert_allclose(same.link(name).inertia, robot.link(name).inertia, atol=1e-12)

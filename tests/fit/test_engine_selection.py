@@ -69,9 +69,8 @@ def test_few_features_take_inducing_points(data, monkeypatch):
     posterior = fit(data, prior=JointFriction(), learning_points=60)
     assert posterior.engine == Inducing()
     assert posterior.latent.left_out <= 0.02
-    exact = fit(
-        data, "exact", prior=JointFriction(), start=posterior.hyperparameters, options=OptimizerOptions(iterations=0)
-    )
+    there = {"start": posterior.hyperparameters, "options": OptimizerOptions(iterations=0)}
+    exact = fit(data, "exact", prior=JointFriction(), **there)
     test = arm_data(8, seed=2)
     expected, given = (p.predict(test.q, test.v, test.u).mean for p in (exact, posterior))
     torch.testing.assert_close(given, expected, rtol=0.0, atol=2e-2)

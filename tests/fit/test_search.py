@@ -38,9 +38,8 @@ def test_starts_behind_those_before_are_dropped_and_say_so():
 
 
 def test_a_fit_reports_the_end_of_every_start(train):
-    posterior = fit(
-        train.model.with_forces(JointForces()), train, restarts=4, seed=1, options=OptimizerOptions(patience=1)
-    )
+    model, options = train.model.with_forces(JointForces()), OptimizerOptions(patience=1)
+    posterior = fit(model, train, restarts=4, seed=1, options=options)
     statuses, values = posterior.settings["restart_status"], posterior.settings["restart_objective"]
     assert len(statuses) == len(values) == 4
     dropped = [status.startswith("dropped") for status in statuses]

@@ -102,9 +102,8 @@ def test_what_has_no_form():
     assert one_input_form(several, 0) is None
     assert one_input_form(several, 0, functions=draw_functions(posterior("matern-3/2", 2), 2, seed=0)) is None
     assert one_input_form(latents("squared-exponential", normal(5)), 0) is None
-    assert (
-        one_input_form(posterior("matern-5/2"), 0, functions=draw_functions(posterior("matern-5/2"), 2, seed=0)) is None
-    )
+    smooth = posterior("matern-5/2")
+    assert one_input_form(smooth, 0, functions=draw_functions(smooth, 2, seed=0)) is None
 
 
 def posterior(expression: str, dimension: int = 1) -> ExactPosterior:

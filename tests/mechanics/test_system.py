@@ -110,9 +110,8 @@ def test_contacts_contradict_each_other_from_a_millionth_on():
     height = float((robot("iiwa").frame_pose(q[0], tool) @ point)[2])
     for gap, fits in ((1.6e-8, True), (2.6e-8, False)):
         floors = [Plane((0.0, 0.0, 1.0), height + sign * gap / 2) for sign in (-1, 1)]
-        held = Model(
-            robot("iiwa"), [Contact(tool, (0.0, 0.0, 0.1), floor) for floor in floors], baumgarte=Baumgarte(10.0)
-        )
+        contacts = [Contact(tool, (0.0, 0.0, 0.1), floor) for floor in floors]
+        held = Model(robot("iiwa"), contacts, baumgarte=Baumgarte(10.0))
         with contextlib.nullcontext() if fits else pytest.raises(ContactError, match="contradict"):
             held.check_states(q, torch.zeros_like(q), u)
 

@@ -29,9 +29,8 @@ def test_compiled_motions_carry_the_state_along(integrator, transmission, lugre_
     u[..., :3] = lugre_log.u[None, :60] * np.array([1.0, 0.5, -0.5, 0.2])[:, None, None]
     u[:, 0, 3:] = np.random.default_rng(0).uniform(-0.9, 0.9, (4, 2))
     given = lugre_log.q[0], 0.1 * lugre_log.v[0], u, DT
-    compiled, by_torch = (
-        posterior.predictor(compile=how).rollouts(*given, integrator=integrator) for how in (True, False)
-    )
+    both = [posterior.predictor(compile=how) for how in (True, False)]
+    compiled, by_torch = (each.rollouts(*given, integrator=integrator) for each in both)
     torch.testing.assert_close(compiled.q, by_torch.q, rtol=1e-9, atol=1e-11)
     again = posterior.rollout(*given, integrator=integrator)
     torch.testing.assert_close(again.q, by_torch.q, rtol=1e-9, atol=1e-11)

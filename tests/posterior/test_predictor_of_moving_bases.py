@@ -151,9 +151,8 @@ def test_a_linear_step_is_that_of_differences(case, integrator):
         change[:, j] = size
         ends = []
         for sign in (1.0, -1.0):
-            there = predictor.step(
-                robot.integrate(q, sign * change[:, :nv]), v + sign * change[:, nv:], u, dt, integrator
-            )
+            at = robot.integrate(q, sign * change[:, :nv]), v + sign * change[:, nv:]
+            there = predictor.step(*at, u, dt, integrator)
             ends.append(torch.cat([robot.difference(step.q, there[0]), there[1]], -1))
         close(step.A[..., j], (ends[0] - ends[1]) / (2 * size), 1e-6)
 

@@ -173,7 +173,7 @@ def test_predictions_given_accelerations_are_those_of_one_large_gaussian():
 
 def test_what_contacts_hide_is_in_the_interval_of_their_force():
     log = measured(held(Viscous(0.7)), held(), rows=60)
-    posterior = fit(held(Viscous()), replace(log, measured={}, noise_std=[0.05] * 3), Accelerations())
+    posterior = fit(held(Viscous()), replace(log, measured={}), Accelerations())
     h = torch.tensor(posterior.settings["hidden_force"])
     typical = typical_sizes(held(), [replace(log, measured={})])["force"]
     assert h.numpy() == pytest.approx(0.2 * typical)  # a leg, a UR10e: gains off by 10 to 16 % and friction
@@ -184,12 +184,11 @@ def test_what_contacts_hide_is_in_the_interval_of_their_force():
     torch.testing.assert_close(found.multiplier.variance, expected, rtol=1e-5, atol=0.0)
     assert float(found.unseen.min()) > 0.999  # of a model without functions all is the prior
     assert float(found.variance.max()) < 1e-6 * float(expected.min())
-    sensed = fit(
-        held(JointForces(("v",))), replace(log, noise_std=[0.05] * 3), [Accelerations(), ContactForces()], **QUICK
-    )
+    log = replace(log, noise_std=[0.05] * 3)
+    sensed = fit(held(JointForces(("v",))), log, [Accelerations(), ContactForces()], **QUICK)
     assert "hidden_force" not in sensed.settings
     assert not bool(sensed.predict(*tensors(log, "q", "v", "u")).unseen.any())
-    learned = fit(held(JointForces(("v",))), replace(log, measured={}, noise_std=[0.05] * 3), **QUICK)
+    learned = fit(held(JointForces(("v",))), replace(log, measured={}), **QUICK)
     found = learned.predict(*tensors(log, "q", "v", "u"))
     seen = learned.with_settings(hidden_force=None).predict(*tensors(log, "q", "v", "u"))
     torch.testing.assert_close(found.unseen, 1.0 - seen.multiplier.variance / found.multiplier.variance)

@@ -176,6 +176,5 @@ def test_the_regressor_times_any_parameters_is_the_joint_force(model):
 def test_angles_of_a_rotation_give_it_back(pitch):
     for roll, yaw in ((0.0, 0.0), (1.0, -2.0), (-3.0, 0.4)):
         rotation = inertias.rotation_from_rpy((roll, pitch, yaw))
-        np.testing.assert_allclose(
-            inertias.rotation_from_rpy(inertias.rpy_from_rotation(rotation)), rotation, atol=1e-15
-        )
+        again = inertias.rotation_from_rpy(inertias.rpy_from_rotation(rotation))
+        np.testing.assert_allclose(again, rotation, atol=1e-15)
