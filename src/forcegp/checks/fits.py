@@ -191,7 +191,7 @@ class Explanation:
         if self.log.drives is not None:
             regressor = np.einsum("rmp,mk->rkp", regressor, np.linalg.inv(self.log.drives))
         left = []
-        for k, u in enumerate(rows.u.T):
+        for k, u in enumerate((rows.u - self.log.more).T):  # a load that is taken up is no mass of a link
             columns = np.c_[regressor[:, k], self.log.friction[:, k], np.ones(len(u)), more[:, k]]
             size = np.linalg.norm(columns, axis=0)
             columns = columns[:, size > 0.0] / size[size > 0.0]

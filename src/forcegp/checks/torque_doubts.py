@@ -75,7 +75,7 @@ def _drift(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     friction_of = np.concatenate([found.log.friction, _remembered(found, inputs)], axis=-1)
     often = in_motion(rows).mean(axis=0) >= RARELY
     for joint in np.flatnonzero((found.chosen == 0) & (found.shares > DOUBTFUL) & often):
-        u, friction, name = rows.u[:, joint], friction_of[:, joint], rows.joint_names[joint]
+        u, friction, name = (rows.u - found.log.more)[:, joint], friction_of[:, joint], rows.joint_names[joint]
         steady, moved = np.c_[bodies[:, joint], np.ones(count)], np.c_[friction, friction * time[:, None]]
         left = []
         for columns in (np.c_[steady, friction], np.c_[steady, moved]):
