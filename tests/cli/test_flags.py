@@ -66,6 +66,7 @@ def test_empty_entries_are_refused(text):
         (f"{FIT} --pionts 3", "forcegp fit has no option --pionts. Did you mean --points? See forcegp fit --help."),
         (f"{FIT} --jobs a", "--jobs is 'a'; give a whole number. See forcegp fit --help."),
         (f"{FIT} --force-noise 1,5", "--force-noise is '1,5'; give a number. See forcegp fit --help."),
+        ("auto x.csv --urdf a.urdf --out run", "forcegp auto has no option --urdf. Did you mean --robot?"),
         ("fit x.h5 --checks --out run", "has no option --checks. Did you mean --no-checks?"),
         ("--json", "Options follow the command"),
         ("", "no command was given"),

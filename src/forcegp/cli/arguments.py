@@ -50,6 +50,9 @@ MODULES = {
     "simulated": ("simulate", "demo", "reproduce"),
 }
 """Where commands stand that have no module of their own name."""
+MEANT = {"--urdf": "--robot", "--mjcf": "--robot", "--torque": "--u", "--effort": "--u", "--position": "--q"}
+MEANT |= {"--velocity": "--v", "--output": "--out"}
+"""What others call options."""
 NOT_NUMBERS = {
     r"invalid literal for int\(\) with base 10": "a whole number",
     "could not convert string to float": "a number",
@@ -108,7 +111,7 @@ def _checked(name: str, kind: type[Command], words: Sequence[str]) -> list[str]:
             continue
         if word.startswith("--"):
             if flag not in flags:
-                close = difflib.get_close_matches(flag, flags, n=1)
+                close = [MEANT[flag]] if MEANT.get(flag) in flags else difflib.get_close_matches(flag, flags, n=1)
                 hint = f" Did you mean {close[0]}?" if close else ""
                 raise InvalidInput(f"forcegp {name} has no option {flag}.{hint} See forcegp {name} --help.")
             if flag in given and not flags[flag].repeats:

@@ -191,7 +191,7 @@ def payload_text(found: Any) -> str:
         size = f"{mass.value:.2g} ± {error:.1g} kg"
         return f"none, or {size}" if mass.value > mass.std else f"none ({size})"
     both = zip(center, widths, strict=True)
-    place = ", ".join(f"{1e3 * x.value:.0f}" + f" ± {1e3 * width:.0f}" * (width > FAR) for x, width in both)
+    place = ", ".join(f"{round(1e3 * x.value)}" + f" ± {1e3 * width:.0f}" * (width > FAR) for x, width in both)
     [held] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
     links = f"if the URDF's links{' and ' * bool(drives := drives_of(found.model))}{drives} are right"
     return f"{mass.value:.3g} ± {error:.1g} kg at ({place}) mm of {held.link}, {links}"
