@@ -182,15 +182,6 @@ def test_the_page_on_deploying_runs(tmp_path: Path):
     assert {"lbr_iiwa.casadi", "lbr_iiwa_step.casadi"} <= {file.name for file in (tmp_path / "planner").iterdir()}
 
 
-@pytest.mark.nightly  # as the site is built, too
-def test_the_tutorial_on_the_mathematics_gives_the_numbers_of_fit(repository: Path, tmp_path: Path, monkeypatch):
-    monkeypatch.syspath_prepend(repository / "examples")
-    page = (repository / "docs" / "tutorials" / "mathematics.md").read_text(encoding="utf-8")
-    cells = re.findall(r"```{code-cell} ipython3\n(.*?)```", page, re.DOTALL)
-    assert cells[-1].count("assert_allclose") == 1
-    run_example("\n".join(cells), tmp_path)
-
-
 @pytest.mark.nightly
 def test_the_page_on_robots_runs_from_files_to_learned_forces(tmp_path: Path):
     record, drone = blocks("robots")

@@ -28,7 +28,7 @@ WINDOW = 0.4
 """Seconds that torques are averaged over: it takes noise of the acceleration, and leaves friction as sharp as it is."""
 WIDER = 2.3  # where a base moves, times the windows of a fit: a mass needs less of what is fast than rotors do
 LAWS = "viscous", "gear", "offset", "rotor"
-SURE, LEAST_PAYLOAD = 3.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
+SURE, LEAST_PAYLOAD = 4.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
 MOST_OPEN = 0.3  # of the robot's mass in half an interval, from which on a payload is not known
 FAR = 0.01  # m of half an interval, from which on a coordinate of a centre is shown with it
 MOST_FACTORS = 3  # of one cause that a person can look for
