@@ -247,10 +247,8 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         left, x = np.inf, 1.0
         for step in (1.0, 0.1):
             middle, every = x or 1.0, (x or 1.0) * RATIOS**step
-            taus = geared_torques(joint, middle, step) * scaled(
-                joint, every[:, None, None] ** -power
-            )  # what u would have to be
-            left, x = best(taus, np.eye(len(every)), every)
+            turned = scaled(joint, every[:, None, None] ** -power)  # so that it is what u would have to be
+            left, x = best(geared_torques(joint, middle, step) * turned, np.eye(len(every)), every)
         beside = f", and {1.0 / x:.4g} times its torques" if power and x else ""
         what = f"the torques fit positions and velocities of {names[joint]} that are {x:.4g} times the logged ones"
         do = f"Correct its gear ratio, or the columns, as in forcegp import --q 'COLUMN * {x:.4g}'."
