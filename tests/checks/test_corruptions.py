@@ -330,14 +330,13 @@ def test_torques_in_steps_are_right_and_friction_that_fades_is_named():
     assert [each.about for each in cold if each.level != "ok"] == ["drift"], "no push, either"
 
 
-@pytest.mark.parametrize(("begin", "rest", "left_out"), [(7.0, 4, (0.0, 7.0)), (12.2, 4, (12.2, 14.99)),
-                                                         (11.0, -1, (11.0, 14.99))])  # fmt: skip
-def test_the_time_of_a_load_is_told_also_behind_a_rest(begin, rest, left_out):
+@pytest.mark.parametrize(("at", "rest", "out"), [(7.0, 4, (0.0, 7.0)), (12.2, 4, (12.2, 14.99)), (11, -1, (11, 14.99))])
+def test_the_time_of_a_load_is_told_also_behind_a_rest(at, rest, out):
     time = np.arange(0.0, 15.0, 0.01)
     way = np.stack([np.sin(2.1 * time), 0.8 * np.sin(3.3 * time)], axis=1) * np.clip(time - rest, 0, 1)[:, None] ** 3
-    doubts = check(gripped(with_motion(two_links(), way, 100.0, 3, 0.0), begin)).doubts
+    doubts = check(gripped(with_motion(two_links(), way, 100.0, 3, 0.0), at)).doubts
     [found] = doubts.of("load")
-    assert found.numbers["seconds"] == pytest.approx(left_out, abs=0.2)
+    assert found.numbers["seconds"] == pytest.approx(out, abs=0.2)
     assert not doubts.of("push", "drift")  # a load that is taken up is none
 
 
