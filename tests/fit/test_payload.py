@@ -212,7 +212,7 @@ def test_causes_that_explain_more_are_named_and_in_the_interval(cause, off):
 @pytest.mark.parametrize("times", [5.0, 2.0])
 def test_a_gain_stands_for_a_payload_where_no_other_number_explains_a_third(times, monkeypatch):
     nats, module = iter([1.0, times, *9 * [1.0]]), import_module("forcegp.fit.payloads")
-    monkeypatch.setattr(module, "_instead", lambda _, fit, C, *__: (next(nats), (0.2 * np.eye(C.shape[1])[0], 0 * fit.x)))
+    monkeypatch.setattr(module, "_instead", lambda _, f, C, *__: (next(nats), (0.2 * np.eye(C.shape[1])[0], 0 * f.x)))
     doubts = Found(log(TEXT, 1, noise=0.05), rows=800).posterior.settings["doubts"]
     assert any("as well as any payload" in each["what"] for each in doubts) == (times > 3.0)
 
