@@ -257,8 +257,8 @@ def _even(dataset: Dataset, jumps: np.ndarray) -> Dataset:  # stretches without 
         breaks = np.flatnonzero(steps > GAP * np.median(steps)) + 1 if len(steps) else []
         pieces += [piece for piece in np.split(rows, breaks) if len(piece) >= FEWEST_ROWS]
     if not pieces:
-        seen = f"no stretch of {FEWEST_ROWS} rows without a gap; a check needs one. Give a longer recording, or number "
-        raise InvalidInput(f"{seen}the episodes.")
+        seen = f"no stretch of {FEWEST_ROWS} rows without a gap; a check needs one"
+        raise InvalidInput(f"{seen}. Give a longer recording, or number the episodes.")
     rows = np.concatenate(pieces)
     numbers = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
     even = replace(dataset.rows(rows), episode=numbers, noise_std=None, truth={}, time_ordered=True)

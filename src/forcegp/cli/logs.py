@@ -264,8 +264,8 @@ class Import(Command):
             what = about_logs[0].partition("=")[0] if about_logs else "more than one file"
             raise InvalidInput(f"{path} is a dataset of forcegp already, of which one is prepared; leave {what} out.")
         if preparation.changes_nothing:
-            seen = f"{path} is a dataset of forcegp already, so there is nothing to do: give --cutoff, --delay, --lag, "
-            raise InvalidInput(f"{seen}--stance, --every or --trim.")
+            seen = f"{path} is a dataset of forcegp already, so there is nothing to do"
+            raise InvalidInput(f"{seen}: give --cutoff, --delay, --lag, --stance, --every or --trim.")
         dataset = forcegp.Dataset.load(path)
         return replace(dataset, model=self.robot.chosen_model(dataset, path))
 

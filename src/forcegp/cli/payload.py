@@ -88,8 +88,8 @@ class Payload(Command):
                 "alone, such as viscous,gear,offset,rotor."
             )
         if model.actuation.learned and baseline is not None and self.mass is None:
-            seen = "gains and all masses are unknown, so only their products are known; give --mass of the payload, or "
-            raise InvalidInput(f"{seen}leave the baseline or the gains out.")
+            seen = "gains and all masses are unknown, so only their products are known"
+            raise InvalidInput(f"{seen}; give --mass of the payload, or leave the baseline or the gains out.")
         with terminal.progress("identifying"):
             found = with_payload(model, rows, self.link, baseline, self.mass)
         content = {"data": str(self.log), **payload_dict(found, baseline is not None)}

@@ -137,8 +137,9 @@ def forces_of(model: forcegp.Model) -> list[str]:
 def require_same_joints(posterior: forcegp.posterior.Posterior, dataset: forcegp.Dataset, path: Path) -> None:
     """Refuse a recording of another robot: InvalidInput."""
     if tuple(posterior.joint_names) != dataset.joint_names:
-        seen = f"{path} has joints {', '.join(dataset.joint_names)}; the model was trained on "
-        raise InvalidInput(f"{seen}{', '.join(posterior.joint_names)}. Give a recording of the same robot.")
+        here, there = (", ".join(each.joint_names) for each in (dataset, posterior))
+        seen = f"{path} has joints {here}; the model was trained on {there}"
+        raise InvalidInput(f"{seen}. Give a recording of the same robot.")
 
 
 def _named(words: Sequence[str], option: str, syntax: str) -> dict[str, float]:

@@ -90,8 +90,8 @@ class Score(Command):
         if self.observe:
             seen = raw.time < raw.time[0] + self.observe
             if fits or len(raw.episodes) > 1 or not 0 < seen.sum() < len(raw):
-                seen = f"--observe is {self.observe:g} s; give seconds that one record is longer than, with folders of "
-                raise InvalidInput(f"{seen}models alone, without --forces and --split.")
+                remedy = "give seconds that one record is longer than, with folders of models alone, without --forces"
+                raise InvalidInput(f"--observe is {self.observe:g} s; {remedy} and --split.")
             models = {name: posterior.update(raw.rows(seen)) for name, posterior in models.items()}
             raw = raw.rows(~seen)
         models |= {name: name for name in self.models.names()}

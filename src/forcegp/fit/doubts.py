@@ -62,8 +62,8 @@ def _hidden(names: Sequence[str], terms: Sequence[int], free: Tensor, effect: Te
     blind = listed(repr(name) for name, flat in zip(names, hidden, strict=True) if flat)
     remedy = "learn a force along the surface, such as gp:tool-friction, or leave that prior out"
     if all(nothing or flat for nothing, flat in zip(absent, hidden, strict=True)):
-        seen = f"no data can identify {blind}: the contacts take the whole force, and the acceleration shows none "
-        raise InvalidInput(f"{seen}of it; {remedy}")
+        seen = f"no data can identify {blind}: the contacts take the whole force, and the acceleration shows none of it"
+        raise InvalidInput(f"{seen}; {remedy}")
     if any(hidden):
         what = f"no data can identify {blind}: the contacts take that force, the acceleration shows none of it, "
         what += "and its posterior and that of the normal force are the prior;"

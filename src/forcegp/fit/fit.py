@@ -168,8 +168,8 @@ def _chosen(
     sensors = tuple(each for each in given if isinstance(each, Sensor))
     others = [each for each in given if not isinstance(each, Motions | Sensor)]
     if len(motions) > 1 or len(others) > 1:
-        seen = f"evidence is {', '.join(map(str, given))}: the same rows twice; give accelerations or torques, and "
-        raise InvalidInput(f"{seen}motions beside them if these shall refine it.")
+        seen = f"evidence is {', '.join(map(str, given))}: the same rows twice"
+        raise InvalidInput(f"{seen}; give accelerations or torques, and motions beside them if these shall refine it.")
     refinement = motions[0] if motions else None
     if refinement is not None:
         refinement.refuse(start.trained.unknown_forces if isinstance(start, Posterior) else model.unknown_forces)

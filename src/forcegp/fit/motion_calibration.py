@@ -54,8 +54,8 @@ def calibrated(
     while len(parts := _folds(dataset, wanted[-1])) < 2 and horizons is None and len(wanted) > 1:
         wanted = wanted[:-1]
     if len(parts) < 2:
-        seen = f"intervals need two stretches of {wanted[-1]:g} s at least, of which one is left out in turn; give "
-        raise InvalidInput(f"{seen}shorter horizons, or a longer recording.")
+        seen = f"intervals need two stretches of {wanted[-1]:g} s at least, of which one is left out in turn"
+        raise InvalidInput(f"{seen}; give shorter horizons, or a longer recording.")
     errors, spreads, shifts, kept, inputs = [], [], [], tuple(wanted), posterior.model.inputs
     drift = posterior.settings.get("drift") if _records(dataset, wanted[-1]) == 1 else None
     for other, motions in _left_out(posterior, dataset, parts, wanted[-1]):

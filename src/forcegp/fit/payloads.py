@@ -192,6 +192,7 @@ def misfit(
         _, said, do = CAUSES[cause]
         instead = singly[cause][1] if cause == "gains" and singly[cause][0] > FAR_BEHIND * others else None
         change, move = instead or changes
+        # beside a payload that leaves nothing, a column is the torque as logged, and linear in the factor itself
         factors = 1.0 + change if instead else 1.0 / (1.0 - change) if cause == "gains" else np.exp(change)
         off = abs(change) > WRONG
         count = int((change != 0.0).sum())

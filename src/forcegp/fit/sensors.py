@@ -62,8 +62,8 @@ def with_sensors(dataset: Dataset, model: Model, rest: Evidence, sensors: Sequen
                     )
             elif isinstance(each, JointTorques):
                 if isinstance(rest, Accelerations):
-                    seen = "torque sensors at links teach numbers of laws and bodies, beside torques; give Torques(), "
-                    raise InvalidInput(f"{seen}without unknown forces.")
+                    seen = "torque sensors at links teach numbers of laws and bodies, beside torques"
+                    raise InvalidInput(f"{seen}; give Torques(), without unknown forces.")
                 if said := links.get((name.removeprefix(TORQUE),)):
                     raise InvalidInput(str(said))
             elif said := forces.get(name.removeprefix(FORCE)):
@@ -71,8 +71,9 @@ def with_sensors(dataset: Dataset, model: Model, rest: Evidence, sensors: Sequen
             elif isinstance(rest, Accelerations) and model.is_open and not model.unknown_forces:
                 raise InvalidInput("force sensors teach numbers beside torques, not accelerations; give Torques().")
             elif model.unknown_forces and not at:
-                seen = f"a force was measured at {name.removeprefix(FORCE)!r}, where the model has no contact; give it "
-                raise InvalidInput(f"{seen}one, or leave unknown forces out, so that it is a force that is known.")
+                seen = f"a force was measured at {name.removeprefix(FORCE)!r}, where the model has no contact"
+                remedy = "give it one, or leave unknown forces out, so that it is a force that is known"
+                raise InvalidInput(f"{seen}; {remedy}.")
             measured[found] = dataset.measured[name]
             channels = 1 if any(map(slides, at)) else measured[found].shape[1]
             levels[found] = [each.noise or share_of(measured[found])] * channels

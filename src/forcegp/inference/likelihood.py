@@ -78,8 +78,8 @@ def factorize(build: Callable[[], Float[Tensor, "n n"]]) -> CholeskyFactor:
     for relative in JITTER_LADDER:
         matrix = build()
         if not bool(torch.isfinite(matrix.diagonal()).all()):
-            seen = "the covariance matrix has entries that are not finite; check the data for huge or constant columns "
-            raise NumericalError(f"{seen}and the start values of the hyper-parameters")
+            remedy = "check the data for huge or constant columns and the start values of the hyper-parameters"
+            raise NumericalError(f"the covariance matrix has entries that are not finite; {remedy}")
         jitter = relative * float(matrix.diagonal().mean()) if relative and matrix.shape[0] else relative
         if jitter:
             matrix.diagonal().add_(jitter)
@@ -154,8 +154,8 @@ def whiten(
         return W / std[..., None], residual / std, std.log().expand(count, -1).sum()
     lower, info = torch.linalg.cholesky_ex(noise)
     if bool((info != 0).any()):
-        seen = f"the noise covariance of row {int(torch.nonzero(info)[0])} is not positive definite; raise the "
-        raise NumericalError(f"{seen}acceleration noise")
+        seen = f"the noise covariance of row {int(torch.nonzero(info)[0])} is not positive definite"
+        raise NumericalError(f"{seen}; raise the acceleration noise")
     logdet = lower.diagonal(dim1=-2, dim2=-1).log().sum(-1).expand(count).sum()
     W_white = torch.linalg.solve_triangular(lower, W, upper=False)
     return W_white, torch.linalg.solve_triangular(lower, residual[..., None], upper=False)[..., 0], logdet
@@ -302,8 +302,9 @@ class _DeflatedNLL(torch.autograd.Function):
     @staticmethod
     def backward(ctx, upstream: Tensor):  # type: ignore[override]  # the base takes *args
         if torch.is_grad_enabled():  # create_graph=True: the gradients would pass for constants
-            seen = "the deflated likelihood has first derivatives only; for a Hessian take finite differences of its "
-            raise NotImplementedError(f"{seen}gradient")
+            seen = "the deflated likelihood has first derivatives only"
+            # the type that torch raises itself where a Function has no second derivative
+            raise NotImplementedError(f"{seen}; for a Hessian take finite differences of its gradient")
         return tuple(None if g is None else upstream * g for g in ctx.gradients)
 
 

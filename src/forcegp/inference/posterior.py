@@ -145,8 +145,8 @@ def exact(latent: LatentPosterior, what: str) -> ExactPosterior:
     """`latent` itself where it is exact. Raises InvalidInput, saying what is impossible, where it is not."""
     if isinstance(latent, ExactPosterior):
         return latent
-    seen = f"{what} needs the factorised covariance of all rows, which a {type(latent).__name__} does not have; "
-    raise InvalidInput(f"{seen}{latent.remedy}.")
+    seen = f"{what} needs the factorised covariance of all rows, which a {type(latent).__name__} does not have"
+    raise InvalidInput(f"{seen}; {latent.remedy}.")
 
 
 def with_rows(latent: ExactPosterior, terms: likelihood.Terms) -> ExactPosterior:

@@ -76,8 +76,8 @@ class Split:
         known, unseen = dataset.rows(train), dataset.rows(test)
         again = repeated_rows((known.q, known.v, known.u), unseen)
         if again.size:
-            seen = f"{again.size} of {len(unseen)} test rows are also training rows (the first: test row {again[0]}). "
-            raise DatasetError(f"{seen}Test on another trajectory: another episode, recording or seed.")
+            seen = f"{again.size} of {len(unseen)} test rows are also training rows (the first: test row {again[0]})"
+            raise DatasetError(f"{seen}. Test on another trajectory: another episode, recording or seed.")
         return known, unseen
 
     def to_dict(self) -> dict[str, Any]:

@@ -83,8 +83,8 @@ def friction_curves_figure(posterior: Posterior, dataset: Dataset | None = None)
     """
     panels = curve_panels(posterior)
     if not panels:
-        seen = f"a model of {posterior.description} has no process that is a curve; fit one with friction priors, for "
-        raise InvalidInput(f"{seen}example JointFriction() or ContactFriction().")
+        seen = f"a model of {posterior.description} has no process that is a curve"
+        raise InvalidInput(f"{seen}; fit one with friction priors, for example JointFriction() or ContactFriction().")
     chosen = panels[:LARGEST_GRID]
     columns = min(4 if len(chosen) > 6 else 3, len(chosen))
     rows = math.ceil(len(chosen) / columns)
