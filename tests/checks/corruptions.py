@@ -10,9 +10,9 @@ import torch
 from tests.checks.logs import column, exchanged
 from tests.robots.robot_models import loaded
 
-from forcegp.checks import CheckReport, quick_check
+from forcegp.checks import CheckReport
 from forcegp.data import Dataset
-from forcegp.doubts import Doubt
+from forcegp.doubts import Doubt, Doubts
 from forcegp.errors import ForceGPError
 from forcegp.mechanics import Contact, Plane
 from forcegp.model import Model
@@ -310,12 +310,12 @@ def numbers(doubts: Iterable[Doubt]) -> dict[str, object]:
     }
 
 
-def said_by_fit(data: Dataset) -> str:
-    """The line that `forcegp fit` prints, or why it refuses these rows."""
+def said_by_fit(data: Dataset, quick: Doubts) -> str:
+    """The line that `forcegp fit` prints of these doubts, or why it refuses these rows."""
     assert data.model is not None
     try:
         q, v, u = (torch.tensor(getattr(data.rows([*range(0, len(data), 50)]), name)) for name in "qvu")
         data.model.check_states(q, v, u)
     except ForceGPError as error:
         return str(error)
-    return quick_check(data).in_one_line()
+    return quick.in_one_line()

@@ -52,18 +52,19 @@ def test_a_corruption_is_named_by_check_and_before_a_fit(name):
     data = corrupt(log_of(list(CORRUPTIONS).index(name)))
     report = check(data)
     assert named(said_by(report), words), said_by(report)
-    found = {"joints": report.per_joint(), "quick": numbers(quick_check(data)), **numbers(report.doubts)}
+    quick = quick_check(data)
+    found = {"joints": report.per_joint(), "quick": numbers(quick), **numbers(report.doubts)}
     assert_unchanged(f"checks/{name}", found, rtol=1e-3)
-    line = said_by_fit(data)
+    line = said_by_fit(data, quick)
     assert "\n" not in line
     assert named(line, words), line
-    assert words not in ("register", "targets") or len(quick_check(data).at("wrong")) == 1, line
+    assert words not in ("register", "targets") or len(quick.at("wrong")) == 1, line
 
 
 def test_an_invented_contact_is_named_by_check_and_before_a_fit():
     data = invented(clean(two_links(), 2))
     assert named(said_by(check(data)), "contact")
-    assert named(said_by_fit(data), "contact")
+    assert named(said_by_fit(data, quick_check(data)), "contact")
 
 
 def test_a_contact_is_not_sought_where_velocities_are_wrong(monkeypatch):

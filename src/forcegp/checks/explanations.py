@@ -23,6 +23,7 @@ from forcegp.data import Dataset
 from forcegp.doubts import listed
 from forcegp.fit.payloads import with_gravity, with_length
 from forcegp.robots import Robot
+from forcegp.robots.inertia import standard_of_pseudo_inertia
 
 MOST_ORDERS = 24  # of legs
 SCANNED = 3  # best of the numbers that are scanned, which are looked at in full
@@ -274,36 +275,34 @@ def _scanned(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
 def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
     """Numbers of which torques are linear: gravity, a payload, masses, springs."""
     robot, rows, names, layout = now.robot, now.rows, now.robot.joint_names, now.robot.layout
-    q, tau = torch.tensor(rows.q, device=robot.device), needed_torques(robot, rows)
+    q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
+
+    def per_parameter(robot: Robot) -> Float[np.ndarray, "rows nv bodies 10"]:
+        """Torques per unit of the standard parameters of each body."""
+        with torch.no_grad():
+            return replace(kinematics, robot=robot).torque_regressor(a).cpu().numpy()
+
     with torch.no_grad():
-        pulls = [with_gravity(robot, axis).gravity_forces(q).cpu().numpy() for axis in np.eye(3)]
-
-    def of_part(body: int, part: torch.Tensor, robot: Robot = robot, tau: np.ndarray = tau) -> np.ndarray:
-        inertias = robot.tree.inertias.clone()
-        inertias[body, :, :, 0] += part
-        return needed_torques(replace(robot, tree=replace(robot.tree, inertias=inertias)), rows) - tau
-
-    def of_load(body: int, robot: Robot = robot) -> np.ndarray:
-        """Of 1 kg at the origin of a body, or of as much as it has, and of 1 kg m along each axis."""
-        parts = torch.zeros(4, 4, 4, dtype=torch.float64, device=robot.device)
-        for part, k in zip(parts, (3, 0, 1, 2), strict=True):
-            part[k, 3] = part[3, k] = float(robot.tree.inertias[body, 3, 3, 0]) or 1.0
-        needed = needed_torques(robot, rows)
-        return np.stack([of_part(body, part, robot, needed) for part in parts], axis=-1)
-
+        kinematics = robot.kinematics(q, v)
+        along = (replace(kinematics, robot=with_gravity(robot, axis)) for axis in np.eye(3))
+        pulls = np.stack([each.gravity_forces().cpu().numpy() for each in along], axis=-1)
+        frames = torch.tensor(np.linalg.inv(layout.child_frames), device=robot.device)
+        bodies = frames @ robot.tree.inertias[..., 0] @ frames.mT
+    columns_of = per_parameter(robot)
     ends = [body for body in range(len(layout.bodies)) if body not in layout.parents]
-    yield from _gravities(now, np.stack(pulls, axis=-1), ends[:MOST_ENDS], of_load)
+    yield from _gravities(now, pulls, ends[:MOST_ENDS], lambda robot: per_parameter(robot)[..., :4])
     for body, (joint, drive) in enumerate(zip(layout.bodies, layout.drives, strict=True)):
-        J = robot.tree.inertias[body, :, :, 0]
-        size = float(J[3, 3])
-        if body in ends:
-            unit, columns, offset = size or 1.0, of_load(body), np.linalg.inv(layout.child_frames[body])
+        P = bodies[body]
+        size = float(P[3, 3])
+        if body in ends:  # in kg and kg m, or in masses of the link
+            unit = size or 1.0
+            columns = unit * columns_of[:, :, body, :4]
             always = ": it holds something", columns, 2.5 * NUMBER, {}
             for when, part, cost, told in (always, *_parts(now, inputs, columns)):
                 held = solved(now, part)
                 if held is None or held[0] <= 0.0:
                     continue
-                center = offset[:3, :3] @ held[1:] / held[0] + offset[:3, 3]
+                center = held[1:] / held[0]
                 at = ", ".join(f"{1e3 * x:.3g}" for x in center)
                 text = f"the torques fit {unit * held[0]:.3g} kg more at ({at}) mm of {joint.child}{when}"
                 numbers = {"mass": unit * float(held[0]), "center_of_mass": center.tolist()}
@@ -313,16 +312,13 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
                 yield cause, replace(now, more=now.more + part @ held)
         if size <= 0.0:
             continue
-        center = J[:, 3] / size
-        for part in (J, size * torch.outer(center, center)):  # with its inertia, and the mass alone
-            column = of_part(body, part)
+        for part in (P, torch.outer(P[:, 3], P[:, 3]) / size):  # with its inertia, and the mass alone
+            column = columns_of[:, :, body] @ standard_of_pseudo_inertia(part).cpu().numpy()
             one = solved(now, column[..., None])
             if one is not None and abs(one[0]) > 0.1 and -0.9 < one[0] < 9.0:
                 text = f"the torques fit a mass of {joint.child} of {1.0 + one[0]:.3g} times that of the URDF"
                 cause = number("masses", text, drive.joint, 1.0 + float(one[0]))
                 yield cause, replace(now, more=now.more + one[0] * column)
-    with torch.no_grad():
-        kinematics = robot.kinematics(q)
     for joint, drive in zip(layout.bodies, layout.drives, strict=True):  # what hangs at a hose or a cable
         R = kinematics.frame_pose(joint.child)[:, :3, :3].cpu().numpy()
         pull, at, columns = np.zeros(3), np.zeros(3), np.zeros((len(rows), rows.nv, 0))
@@ -391,7 +387,7 @@ def _gravities(
     now: Comparison,
     pulls: Float[np.ndarray, "rows nv 3"],
     ends: Sequence[int],
-    of_load: Callable[[int, Robot], Float[np.ndarray, "rows nv 4"]],
+    of_loads: Callable[[Robot], Float[np.ndarray, "rows nv bodies 4"]],
 ) -> Iterator[Candidate]:
     """The gravity that the torques show: its direction, its size, or both, also beside a load, which would bend it."""
     nominal = now.robot.gravity.cpu().numpy()
@@ -407,12 +403,11 @@ def _gravities(
     for end in ends if norm > 0.0 and size > 0.0 else ():
         along, load = size / norm * estimate, None
         for _ in range(3):  # it weighs along the gravity that is sought
-            tilted = with_gravity(now.robot, along)
-            columns = of_load(end, tilted)
-            both = solved(now.after(changed(), tilted), np.concatenate([pulls, columns], axis=-1))
+            columns = of_loads(with_gravity(now.robot, along))[:, :, end]
+            both = solved(now, np.concatenate([pulls, columns], axis=-1))
             if both is None or both[3] <= 0.0:
                 break
-            along, load = along + both[:3], columns @ both[3:]
+            along, load = nominal + both[:3], columns @ both[3:]
             along = size / float(np.linalg.norm(along)) * along
         else:
             tried.append((along, 4.0 * NUMBER, load))

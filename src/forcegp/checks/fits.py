@@ -39,38 +39,31 @@ class Explanation:
     def _fits(self) -> tuple[np.ndarray, np.ndarray]:
         """Shares (nv, 4) that remain of every choice, NaN for a constant torque, and factors (nv,) of the chosen."""
         u, tau = (x - x.mean(axis=0) for x in (self.log.rows.u, self.log.tau))
-        every = np.concatenate([self.log.friction, tau[..., None], u[..., None]], axis=-1)
-        power = np.square(u).sum(axis=0)
-        shares, factors = np.full((u.shape[1], 4), np.nan), np.full((u.shape[1], 2), np.nan)
-        count = every.shape[-1] - 2
-        plain, last = [*range(count), count + 1], np.eye(count + 1)[[-1]]
-        sides = np.outer(*2 * (np.append(np.ones(count + 1), -1.0),))
-
-        def less(products: np.ndarray) -> np.ndarray:
-            """Of friction, and u less what is needed."""
-            cross = products[plain][:, [count]] * last
-            return products[plain][:, plain] - cross - cross.T + products[count, count] * last * last.T
-
-        for k in np.flatnonzero(np.ptp(self.log.rows.u, axis=0) > 0.0):
-            products = every[:, k].T @ every[:, k]
-            shares[k, 0] = positive_solution(less(products))[1]
-            shares[k, 1:], size = np.inf, np.sqrt(np.diag(products))
-            size[size == 0.0] = 1.0
-            scaled = products / np.outer(size, size)
-            number = np.linalg.lstsq(scaled[:-1, :-1], scaled[-1, :-1], rcond=1e-10)[0]
-            factors[k], bound = number[-1] * size[-1] / size[-2], power[k] * (1.0 - scaled[-1, :-1] @ number)
-            if bound * np.exp(SIGN) > shares[k, 0] or shares[k, 0] < LEAST * power[k]:
-                shares[k] /= power[k]
-                continue  # neither sign nor factor is worth what it costs
-            for turn, sign in enumerate((1.0, -1.0)):
-                turned = products * sides if sign < 0.0 else products
-                alone = positive_solution(turned[plain][:, plain])[1]
-                found, left = positive_solution(turned)
-                factors[k, turn] = found[-1]
-                shares[k, turn + 2] = left + power[k] * (left > (1.0 - RESTS) * alone)  # not a multiple of tau
-                shares[k, turn] = positive_solution(less(turned))[1]
-            shares[k] /= power[k]
-        return shares, factors
+        every = np.concatenate([self.log.friction, tau[..., None], u[..., None]], axis=-1).swapaxes(0, 1)
+        products, power, count = every.mT @ every, np.square(u).sum(axis=0), every.shape[-1]
+        alone = np.delete(np.eye(count), -2, axis=1)  # friction, and u
+        less = alone - np.eye(count)[:, [-2]] * np.eye(count - 1)[-1]  # and u less what is needed
+        turns = np.stack([np.eye(count), np.diag(np.append(np.ones(count - 1), -1.0))])
+        size = np.sqrt(np.diagonal(products, axis1=1, axis2=2))
+        size = np.where(size > 0.0, size, 1.0)
+        scaled = products / (size[..., None] * size[:, None])
+        number = np.linalg.pinv(scaled[:, :-1, :-1], rcond=1e-10, hermitian=True) @ scaled[:, :-1, -1:]
+        bound = power * (1.0 - (scaled[:, -1:, :-1] @ number)[:, 0, 0])
+        shares, factors = (
+            np.full((len(power), 4), np.inf),
+            np.repeat(number[:, -1] * (size[:, -1:] / size[:, -2:-1]), 2, 1),
+        )
+        shares[:, 0] = positive_solution(less.T @ products @ less)[1]
+        worth = np.flatnonzero((bound * np.exp(SIGN) <= shares[:, 0]) & (shares[:, 0] >= LEAST * power))
+        if len(worth):  # elsewhere neither sign nor factor is worth what it costs
+            turned = turns.mT @ products[worth, None] @ turns
+            found, left = positive_solution(turned)
+            multiple = left > (1.0 - RESTS) * positive_solution(alone.T @ turned @ alone)[1]
+            factors[worth], shares[worth, :2] = found[..., -1], positive_solution(less.T @ turned @ less)[1]
+            shares[worth, 2:] = left + power[worth, None] * multiple  # which is not one of tau
+        constant = np.ptp(self.log.rows.u, axis=0) <= 0.0
+        shares[constant], factors[constant] = np.nan, np.nan
+        return shares / np.where(constant, 1.0, power)[:, None], factors
 
     @cached_property
     def chosen(self) -> Int[np.ndarray, " nv"]:
@@ -108,8 +101,8 @@ class Explanation:
         shares, factors = self._fits
         turn = np.nanargmin(np.where(np.isnan(shares[:, 2:]), np.inf, shares[:, 2:]), axis=1)
         u = self.log.rows.u - self.log.rows.u.mean(axis=0)
-        alone = [positive_fit(each, x)[1] for each, x in zip(self.log.friction.swapaxes(0, 1), u.T, strict=True)]
-        told = shares.min(axis=1) * np.square(u).sum(axis=0) < RESTS * np.array(alone)
+        alone = positive_fit(self.log.friction.swapaxes(0, 1), u.T)[1]
+        told = shares.min(axis=1) * np.square(u).sum(axis=0) < RESTS * alone
         return np.where(told, factors[np.arange(len(turn)), turn], np.nan)
 
     @property

@@ -60,6 +60,8 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
         frontier = sorted(grown, key=lambda each: each.value)[:BEAM]
         if not grown or (frontier[0].shares <= np.maximum(NOISE * root.floor, DOUBTFUL)).all():
             break
+        if frontier[0].value > root.plain - GAIN and root.good.all():
+            break  # of a good log, of which no cause explains much, two explain no more
     every.sort(key=lambda each: each.value)
     for best in every:
         near = best.value < every[0].value + 2.0 * GAIN

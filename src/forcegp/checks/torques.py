@@ -48,9 +48,7 @@ class Comparison:
 
     def with_torques(self, change: Change) -> "Comparison":
         """With a change of u alone, which needs the same torques."""
-        new = self.after(change)
-        vars(new).update(tau=self.tau, friction=self.friction)
-        return new
+        return self._at_the_same_motion(self.after(change))
 
     def shifted(self, dense: Dataset, seconds: float) -> "Comparison":
         """With the torques that `dense`, which holds the rows, has some seconds later."""
@@ -60,7 +58,10 @@ class Comparison:
             for joint, values in enumerate(dense.u[own].T):
                 u[here, joint] = np.interp(self.rows.time[here] + seconds, dense.time[own], values)
         new = replace(self, rows=self._changed(replace(self.given, u=u)), shift=seconds)
-        vars(new).update(tau=self.tau, friction=self.friction)
+        return self._at_the_same_motion(new)
+
+    def _at_the_same_motion(self, new: "Comparison") -> "Comparison":
+        vars(new).update(tau=self.tau, friction=self.friction, basis=self.basis)
         return new
 
     def changed(self, dataset: Dataset) -> Dataset:
@@ -87,6 +88,16 @@ class Comparison:
         columns = np.stack([a, v, *(np.tanh(v / (width * slow)) for width in WIDTHS)], axis=-1)
         return columns - columns.mean(axis=0)
 
+    @cached_property
+    def basis(self) -> Float[np.ndarray, "nv rows 5"]:
+        """Orthonormal columns of the friction of each joint."""
+        return np.linalg.qr(self.friction.swapaxes(0, 1))[0]
+
+    def beside_friction(self, signals: Float[np.ndarray, "rows nv k"]) -> Float[np.ndarray, "nv rows k"]:
+        """What friction and a constant of each joint leave of its signals."""
+        parts = (signals - signals.mean(axis=0)).swapaxes(0, 1)
+        return parts - self.basis @ (self.basis.mT @ parts)
+
 
 def in_motion(rows: Dataset) -> Bool[np.ndarray, "rows nv"]:
     """In which rows each joint moves: at rest, stiction holds any torque."""
@@ -109,27 +120,30 @@ def _torques_of_laws(log: Comparison, rows: Dataset) -> Float[np.ndarray, "rows 
 
 
 def positive_fit(
-    columns: Float[np.ndarray, "rows k"], target: Float[np.ndarray, " rows"]
-) -> tuple[Float[np.ndarray, " k"], float]:
+    columns: Float[np.ndarray, "*batch rows k"], target: Float[np.ndarray, "*batch rows"]
+) -> tuple[Float[np.ndarray, "*batch k"], Float[np.ndarray, "*batch"]]:
     """Factors of columns, none negative, and the square sum that they leave. Units of the columns do not matter."""
-    both = np.c_[columns, target]
-    return positive_solution(both.T @ both)
+    both = np.concatenate([columns, target[..., None]], axis=-1)
+    return positive_solution(both.mT @ both)
 
 
-def positive_solution(products: Float[np.ndarray, "k1 k1"]) -> tuple[Float[np.ndarray, " k"], float]:
+def positive_solution(
+    products: Float[np.ndarray, "*batch k1 k1"],
+) -> tuple[Float[np.ndarray, "*batch k"], Float[np.ndarray, "*batch"]]:
     """The same of the products of all columns, of which the last is the target."""
-    size = np.sqrt(np.diag(products))
+    size = np.sqrt(np.diagonal(products, axis1=-2, axis2=-1))
     size = np.where(size > 0.0, size, 1.0)
-    scaled = products / np.outer(size, size)
-    normal, right = scaled[:-1, :-1] + RIDGE * np.eye(len(size) - 1), scaled[:-1, -1]
-    try:
-        triangle = np.linalg.cholesky(normal)
-    except np.linalg.LinAlgError:  # of differences of sums, where rounding is more than what is left
-        values, vectors = np.linalg.eigh(normal)
-        triangle = vectors * np.sqrt(np.maximum(values, RIDGE))
-    factors, _ = nnls(triangle.T, np.linalg.solve(triangle, right))
-    left = scaled[-1, -1] - 2.0 * factors @ right + factors @ scaled[:-1, :-1] @ factors
-    return factors / size[:-1] * size[-1], max(float(left), 0.0) * float(size[-1]) ** 2
+    scaled = products / (size[..., None] * size[..., None, :])
+    normal, right = scaled[..., :-1, :-1], scaled[..., :-1, -1]
+    # of differences of sums, where rounding is more than what is left, there are negative ones
+    values, vectors = np.linalg.eigh(normal)
+    roots = np.sqrt(np.maximum(values + RIDGE, RIDGE))
+    target = (right[..., None, :] @ vectors)[..., 0, :] / roots
+    factors = (vectors @ (target / roots)[..., None])[..., 0]
+    for at in map(tuple, np.argwhere((factors < 0.0).any(axis=-1))):
+        factors[at] = nnls(roots[at][:, None] * vectors[at].T, target[at])[0]
+    left = scaled[..., -1, -1] - np.sum(factors * (2.0 * right - (normal @ factors[..., None])[..., 0]), axis=-1)
+    return factors / size[..., :-1] * size[..., -1:], np.maximum(left, 0.0) * np.square(size[..., -1])
 
 
 def torque_noise(robot: Robot, rows: Dataset, noise: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " nv"]:
@@ -154,56 +168,50 @@ def stretch(signals: Float[np.ndarray, "rows k"]) -> tuple[float, float, int, in
     sums = np.concatenate([np.zeros_like(sums[:1]), sums])
     whole = positive_solution(sums[-1])[1]
 
-    def told(first: int, last: int) -> tuple[float, float, int, int]:
+    def best(*stretches: tuple[int, int]) -> tuple[float, float, int, int]:
+        first, last = np.array(stretches).T
         own, inside = last - first, sums[last] - sums[first]
         rest = sums[-1] - inside
-        rest *= np.outer(*2 * (np.diag(rest) > UNSEEN * np.diag(sums[-1]),))  # else rounding is all there is
-        number, left = positive_solution(rest)
-        number = np.append(-number, 1.0)
-        each = np.array([left / (count - own), number @ inside @ number / own]) / (whole / count + 1e-300)
-        gain = float(-np.log(np.maximum(each, LEAST)) @ (count - own, own))
-        return (gain if each[1] > each[0] else 0.0), each[1] * own / (each @ (count - own, own)), first, last
+        seen = np.diagonal(rest, axis1=1, axis2=2) > UNSEEN * np.diag(sums[-1])  # else rounding is all there is
+        number, left = positive_solution(rest * (seen[:, None] * seen[..., None]))
+        number = np.append(-number, np.ones((len(own), 1)), axis=1)
+        each = np.stack([left / (count - own), np.einsum("ni,nij,nj->n", number, inside, number) / own])
+        each, weights = each / (whole / count + 1e-300), np.stack([count - own, own])
+        gain = np.where(each[1] > each[0], -(np.log(np.maximum(each, LEAST)) * weights).sum(axis=0), 0.0)
+        share = each[1] * own / (each * weights).sum(axis=0)
+        return max(zip(gain.tolist(), share.tolist(), first.tolist(), last.tolist(), strict=True))
 
     edges = np.linspace(0, count, EDGES, dtype=int).tolist()
-    best = max(told(a, b) for a in edges for b in edges if 0 < b - a <= count // 2)
+    found = best(*((a, b) for a in edges for b in edges if 0 < b - a <= count // 2))
     for _ in range(2):  # to the row
-        best = max(told(a, best[3]) for a in range(max(best[3] - count // 2, 0), best[3]))
-        best = max(told(best[2], b) for b in range(best[2] + 1, min(best[2] + count // 2, count) + 1))
-    return best
+        last = found[-1]
+        *_, first, last = best(*((a, last) for a in range(max(last - count // 2, 0), last)))
+        found = best(*((first, b) for b in range(first + 1, min(first + count // 2, count) + 1)))
+    return found
 
 
 def solved(now: Comparison, columns: Float[np.ndarray, "rows nv k"]) -> Float[np.ndarray, " k"] | None:
     """Numbers that leave least of u, every joint by the power that is left of it."""
-    parts = []
-    for joint in np.flatnonzero(np.ptp(now.rows.u, axis=0) > 0.0):
-        basis = np.linalg.qr(now.friction[:, joint])[0]
-        both = np.c_[columns[:, joint], now.rows.u[:, joint] - now.tau[:, joint]]
-        both = both - both.mean(axis=0)
-        both = both - basis @ (basis.T @ both)
-        parts.append((both, np.square(now.rows.u[:, joint] - now.rows.u[:, joint].mean()).sum()))
-    if not parts or not any(np.square(both[:, :-1]).sum() > 0.0 for both, _ in parts):
+    moving = np.ptp(now.rows.u, axis=0) > 0.0
+    both = now.beside_friction(np.append(columns, (now.rows.u - now.tau)[..., None], axis=-1))[moving]
+    products = both.mT @ both
+    if not (np.diagonal(products, axis1=1, axis2=2)[:, :-1] > 0.0).any():
         return None
-    weights = [1.0 / (np.square(b[:, -1]).sum() + 1e-9 * p) for b, p in parts]
-    number = np.zeros(columns.shape[-1])
+    power = np.square(now.rows.u - now.rows.u.mean(axis=0)).sum(axis=0)[moving]
+    weights, number = 1.0 / (products[:, -1, -1] + 1e-9 * power), np.zeros(columns.shape[-1])
     for _ in range(4):
-        normal = np.sum([w * b.T @ b for w, (b, _) in zip(weights, parts, strict=True)], axis=0)
+        normal = np.tensordot(weights, products, 1)
         scale = np.sqrt(np.diag(normal)[:-1])
         scale[scale == 0.0] = 1.0
         inverse = np.linalg.pinv(normal[:-1, :-1] / np.outer(scale, scale), rcond=1e-8)
         number = inverse @ (normal[:-1, -1] / scale) / scale
-        left = [np.square(b[:, -1] - b[:, :-1] @ number).sum() for b, _ in parts]
-        weights = [1.0 / (x + 1e-6 * p) for x, (_, p) in zip(left, parts, strict=True)]
+        weights = 1.0 / (np.square(both @ np.append(-number, 1.0)).sum(axis=1) + 1e-6 * power)
     return number
 
 
 def left_of(now: Comparison, signals: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, " values"]:
     """Logarithm of what is left of u, for `weights` (values, k) of torques behind u, over all joints."""
-    factors, total = np.c_[np.ones(len(weights)), -weights], np.zeros(len(weights))
-    for joint in np.flatnonzero(np.ptp(now.rows.u, axis=0) > 0.0):
-        basis = np.linalg.qr(now.friction[:, joint])[0]
-        parts = signals[:, :, joint].T - signals[:, :, joint].mean(axis=1)
-        parts = parts - basis @ (basis.T @ parts)
-        power = np.square(parts[:, 0]).sum() + 1e-300
-        left = np.einsum("xi,ij,xj->x", factors, parts.T @ parts, factors)
-        total += np.log(np.maximum(left / power, 1e-5))
-    return total
+    factors, moving = np.c_[np.ones(len(weights)), -weights], np.ptp(now.rows.u, axis=0) > 0.0
+    parts = now.beside_friction(np.moveaxis(signals, 0, -1))[moving]
+    left = np.einsum("xi,jik,xk->xj", factors, parts.mT @ parts, factors)
+    return np.log(np.maximum(left / (np.square(parts[..., 0]).sum(axis=1) + 1e-300), 1e-5)).sum(axis=1)

@@ -72,24 +72,28 @@ class Payload(Command):
         self.require_free(self.out)
         if self.mass is not None:
             require_number("--mass", self.mass, f"give kg, above 0 and below {LARGEST:g}", below=LARGEST)
-        notes: list[str] = []
-        model, rows = self._rows(terminal, self.log, notes)
-        baseline = None if self.baseline is None else self._rows(terminal, self.baseline, notes)[1]
-        notes += forces_of(model)
-        words = [word for word in self.forces if word != "none"]
-        if self.forces == LAWS and forcegp.data.views.at_rest(rows):
-            words = ["offset"]
-            notes.append("the log is of postures alone: no motion shows friction, of which each rest has its own share")
-        words = ["gain", *words] if self.mass is not None and "gain" not in words else words
-        model = forcegp.scores.named_model(model, words)
+        logs = [(path, forcegp.Dataset.load(path)) for path in (self.log, self.baseline) if path is not None]
+        robots = [self.robot.chosen_model(dataset, path) for path, dataset in logs]
+        words = ["gain"] * (self.mass is not None and "gain" not in self.forces)
+        model = forcegp.scores.named_model(robots[0], [*words, *(word for word in self.forces if word != "none")])
         if model.unknown_forces:
             raise InvalidInput(
                 f"--forces is {','.join(self.forces)}, with unknown functions, which would hide a payload; name laws "
                 "alone, such as viscous,gear,offset,rotor."
             )
-        if model.actuation.learned and baseline is not None and self.mass is None:
+        if model.actuation.learned and self.baseline is not None and self.mass is None:
             seen = "gains and all masses are unknown, so only their products are known"
             raise InvalidInput(f"{seen}; give --mass of the payload, or leave the baseline or the gains out.")
+        if self.link is not None:
+            model.robot.frame(self.link)
+        preparation, notes = self.filter.preparation(), list[str]()
+        both = zip(logs, robots, strict=True)
+        rows, *unloaded = [self._prepared(terminal, preparation, *log, robot, notes) for log, robot in both]
+        notes += forces_of(robots[0])
+        if self.forces == LAWS and forcegp.data.views.at_rest(rows):
+            model = forcegp.scores.named_model(robots[0], [*words, "offset"])
+            notes.append("the log is of postures alone: no motion shows friction, of which each rest has its own share")
+        baseline = unloaded[0] if unloaded else None
         with terminal.progress("identifying"):
             found = with_payload(model, rows, self.link, baseline, self.mass)
         content = {"data": str(self.log), **payload_dict(found, baseline is not None)}
@@ -120,19 +124,25 @@ class Payload(Command):
         terminal.show(estimates_table(title, own), *([estimates_table("joints", others)] if others else []))
         return content
 
-    def _rows(self, terminal: Terminal, path: Path, notes: list[str]) -> tuple[forcegp.Model, forcegp.Dataset]:
-        """The robot, and rows behind the filter; those of a dataset that was prepared before are as they are."""
-        dataset = forcegp.Dataset.load(path)
-        model = self.robot.chosen_model(dataset, path)
+    def _prepared(
+        self,
+        terminal: Terminal,
+        preparation: forcegp.data.Preparation,
+        path: Path,
+        dataset: forcegp.Dataset,
+        model: forcegp.Model,
+        notes: list[str],
+    ) -> forcegp.Dataset:
+        """Rows behind the filter; those of a dataset that was prepared before are as they are."""
         if used := quick_doubts(path, dataset, model).at("wrong"):
             terminal.warn(f"{path}: {used.in_one_line()}. See forcegp check.")
         if forcegp.data.preparation_report(dataset.metadata):
-            return model, dataset
+            return dataset
         with terminal.progress(f"preparing {path}"):
-            prepared = self.filter.preparation().apply(replace(dataset, model=model))
+            prepared = preparation.apply(replace(dataset, model=model))
         why = forcegp.data.preparation_report(prepared.metadata)["why"]
         notes += [f"{path}: {name}: {why[name]}" for name in ("cutoff", "delay") if name in why]
-        return model, prepared
+        return prepared
 
 
 def with_payload(

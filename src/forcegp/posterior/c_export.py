@@ -186,7 +186,7 @@ def _compared(export: CFiles, checks: Sequence[Check], folder: Path) -> dict[str
     except CompilerError as error:
         warnings.warn(f"the exported program was not compared with forcegp: {error}", stacklevel=3)
         return {}
-    options = ("-std=c99", "-O2", "-fPIC", "-shared", "-I", str(folder))
+    options = ("-std=c99", "-O1", "-fPIC", "-shared", "-I", str(folder))
     with tempfile.TemporaryDirectory() as place:
         path = Path(place) / "checked.so"
         library = compile_library(f'#include "{export.name}.c"\n', options, path, f"{export.name}_mean")

@@ -137,7 +137,6 @@ class Kinematics:
     vectors: Tensor  # (n, 6, batch)
     twists: Tensor  # (n, 3, 4, batch)
     v: Tensor | None  # (n, batch), of the joints of the bodies
-    accelerations: Tensor | None  # (n, 3, 4, batch), at zero joint acceleration and without gravity
 
     @classmethod
     def of(cls, robot: RobotStructure, q: Tensor, v: Tensor | None) -> "Kinematics":
@@ -145,10 +144,13 @@ class Kinematics:
         batch = q.shape[:-1]
         poses = body_poses(robot.tree, _columns(q, batch))
         vectors, twists = joint_twists(robot.tree, poses)
-        if v is None:
-            return cls(robot, batch, poses, vectors, twists, None, None)
-        v = of_bodies(robot.tree, _columns(v, batch))
-        return cls(robot, batch, poses, vectors, twists, v, body_accelerations(robot.tree, twists, v))
+        v = None if v is None else of_bodies(robot.tree, _columns(v, batch))
+        return cls(robot, batch, poses, vectors, twists, v)
+
+    @cached_property
+    def accelerations(self) -> Twists:
+        """Of the bodies at zero joint acceleration and without gravity."""
+        return self._accelerations(None)
 
     @cached_property
     def inertias(self) -> Bodies:
@@ -230,7 +232,7 @@ class Kinematics:
     def frame_bias_acceleration(self, frame: str, point: Vector | None = None) -> Float[Tensor, "... 6"]:
         """Jdot v (..., 6) of a ``point`` fixed in ``frame``: [linear; angular], m/s^2 and rad/s^2, no gravity."""
         body, position = self._world_point(frame, point)
-        accelerations, _ = self._moving("frame_bias_acceleration")
+        accelerations = self.accelerations
         if body == WORLD:
             return self.twists.new_zeros(*self.batch_shape, 6)
         linear = product(accelerations[body], position)[:, 0]
@@ -265,8 +267,7 @@ class Kinematics:
         return out.movedim(-1, 0).contiguous()
 
     def _bias_forces(self, inertias: Bodies) -> Float[Tensor, "batch nv"]:
-        accelerations, _ = self._moving("bias_forces")
-        return self._joint_forces(accelerations, inertias)
+        return self._joint_forces(self.accelerations, inertias)
 
     def _joint_forces(self, accelerations: Twists, inertias: Bodies) -> Float[Tensor, "batch nv"]:
         """Joint forces under which the bodies accelerate so against gravity (without armature)."""
@@ -274,14 +275,11 @@ class Kinematics:
         wrenches = over_tree(tree.descendants, product(accelerations - tree.fall, inertias))
         return of_joints(tree, (self.twists * wrenches).sum((1, 2)).mT)
 
-    def _moving(self, what: str) -> tuple[Tensor, Tensor]:
-        if self.accelerations is None or self.v is None:
-            raise InvalidInput(f"{what} needs velocities; make the kinematics with robot.kinematics(q, v).")
-        return self.accelerations, self.v
-
-    def _accelerations(self, a: Tensor) -> Twists:
-        _, v = self._moving("this")
-        return body_accelerations(self.robot.tree, self.twists, v, of_bodies(self.robot.tree, a))
+    def _accelerations(self, a: Tensor | None) -> Twists:
+        if self.v is None:
+            raise InvalidInput("accelerations need velocities; make the kinematics with robot.kinematics(q, v).")
+        tree = self.robot.tree
+        return body_accelerations(tree, self.twists, self.v, None if a is None else of_bodies(tree, a))
 
     def _world_point(self, frame: str, point: Vector | None) -> tuple[int, Tensor]:
         """The body of ``frame``, and the point (4, 1, batch) of it in the world."""
