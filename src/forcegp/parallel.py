@@ -50,9 +50,7 @@ def checked_jobs(jobs: object) -> Jobs:
 def executor_for(jobs: Jobs) -> Executor:
     """Where so many tasks run at once. Raises as `checked_jobs`."""
     jobs = checked_jobs(jobs)
-    if isinstance(jobs, Executor):
-        return jobs
-    return ThisProcess() if jobs == 1 else _own_processes(jobs)
+    return jobs if isinstance(jobs, Executor) else ThisProcess() if jobs == 1 else _own_processes(jobs)
 
 
 def mapped(function: Callable[[Any], Outcome], arguments: Iterable[Any], jobs: Jobs) -> Iterator[Outcome]:

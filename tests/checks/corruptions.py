@@ -70,8 +70,7 @@ def clean(robot: Robot, seed: int, *, rate: float = 250.0, seconds: float = 8.0,
     q, v = (size * np.sin(angle)).sum(0), (size * omega * np.cos(angle)).sum(0)
     a = (-size * omega**2 * np.sin(angle)).sum(0)
     u = robot.inverse_dynamics(*(torch.tensor(x) for x in (q, v, a))).numpy()
-    u = u + np.std(u, axis=0) * (0.05 * v + 0.1 * np.tanh(v / 0.05))
-    noise_std = None
+    u, noise_std = u + np.std(u, axis=0) * (0.05 * v + 0.1 * np.tanh(v / 0.05)), None
     if noise == "a":
         noise_std = np.full(2, 0.1)
         a = a + noise_std * generator.normal(size=a.shape)

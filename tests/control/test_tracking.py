@@ -188,8 +188,7 @@ def test_references_and_states_that_cannot_be():
 
 
 def test_it_raises_and_keeps_the_last_torques():
-    still = [0.0, 0.0]
-    control = ComputedTorque(URDF_ALONE, stiffness=1e308, damping=0.0)
+    still, control = [0.0, 0.0], ComputedTorque(URDF_ALONE, stiffness=1e308, damping=0.0)
     safe = control(STILL[0], still, STILL[0], still, [1.0, 0.0])
     with pytest.raises(NumericalError):
         control([2.9, 0.0], still, [-2.9, 0.0], still, still)

@@ -46,8 +46,7 @@ def test_it_is_nested_without_repetition_and_deterministic(points, data):
 
 @given(TABLES)
 def test_repeated_rows_come_last(points):
-    repeated = np.concatenate([points, points[::-1]])
-    distinct = len(np.unique(points, axis=0))
+    repeated, distinct = np.concatenate([points, points[::-1]]), len(np.unique(points, axis=0))
     assert len(np.unique(repeated[farthest_point_sampling(repeated, len(repeated))[:distinct]], axis=0)) == distinct
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from tests.checks.clean_logs import between_postures
 from tests.fit.test_payload import ROBOT, TEXT, log
 from tests.posterior.arm import arm_model
@@ -73,3 +74,20 @@ def test_a_passive_robot_keeps_the_cutoff_of_its_spectrum():
 def test_short_logs_are_refused():
     with pytest.raises(DatasetError, match="too few to choose a cut-off"):
         held_out_cutoff(raw(1, 1e-4).rows(slice(0, 300)), 6.0)
+
+
+@pytest.mark.parametrize(("lag", "delay"), [(0.04, 0.0), (0.0, 0.02)])
+def test_a_torque_behind_a_filter_of_the_robot_is_told_from_one_that_is_late(lag, delay):
+    rows = between_postures(arm_model(0).robot, 1, 16.0, 0.4)
+    rows = replace(rows, q=rows.q + 2e-5 * np.random.default_rng(1).standard_normal(rows.q.shape))
+    keep = np.exp(-0.005 / lag) if lag else 0.0  # the filter's exact steps
+    u = rows.u[0] + lfilter([1.0 - keep], [1.0, -keep], rows.u - rows.u[0], axis=0)
+    u = np.stack([np.interp(rows.time - delay, rows.time, each) for each in u.T], axis=1)
+    late, plain = replace(rows, u=u), Preparation(cutoff=30.0, trim=0.3)
+    found = replace(plain, delay="auto").resolved(late)
+    assert found.lag == pytest.approx(-lag, rel=0.1)
+    assert found.delay == pytest.approx(delay, abs=6e-3)
+    undone, left, true = found.rows(late), plain.rows(late), plain.rows(rows)
+    off = [np.abs(each.u - true.u[np.isin(true.time, each.time)]).mean() for each in (undone, left)]
+    assert off[0] < 0.5 * off[1]
+    assert ("behind a low-pass of first order at" in found.why["delay"]) == bool(lag)

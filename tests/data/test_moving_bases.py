@@ -80,8 +80,7 @@ def test_velocities_and_accelerations_of_a_tumbling_body():
 
 @pytest.mark.parametrize("how", [{}, {"differentiate": "v"}])
 def test_neither_signs_nor_the_frame_of_the_world_matter(how):
-    generator = np.random.default_rng(2)
-    world = Rotation.from_rotvec([0.4, -1.9, 0.8])
+    generator, world = np.random.default_rng(2), Rotation.from_rotvec([0.4, -1.9, 0.8])
     one, other = tumbling(), jumbled(tumbling(world=world, shift=(1.0, -2.0, 0.5)))
     bump = torch.tensor(1e-3 * generator.normal(size=one.v.shape))
     one, other = (

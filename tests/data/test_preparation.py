@@ -221,7 +221,7 @@ def test_rows_that_no_longer_carry_the_motion_are_warned_of():
     [
         ({"cutoff": -1.0}, "cutoff is -1.0; give a frequency > 0 in Hz"),
         ({"cutoff": "automatic"}, "cutoff is 'automatic'"), ({"delay": "soon"}, "delay is 'soon'; give seconds"),
-        ({"lag": -0.1}, "lag is -0.1; give seconds, at least 0"),
+        ({"lag": np.inf}, "lag is inf; give seconds"), ({"trim": -0.1}, "trim is -0.1; give seconds, at least 0"),
         ({"every": 0}, "`every=0` must be an integer of at least 1"), ({"trim": -1.0}, "trim is -1.0"),
         ({"differentiate": "u"}, "allowed: 'q' or 'v'"),
     ],

@@ -262,8 +262,7 @@ def test_a_drone_without_joints(walker):
 
 
 def test_a_payload_on_the_trunk_of_a_walker(walker):
-    heavier = body_pseudo_inertias(walker.robot).numpy().copy()
-    link = body_names(walker.robot)[0]
+    heavier, link = body_pseudo_inertias(walker.robot).numpy().copy(), body_names(walker.robot)[0]
     heavier[0] += np.diag([2e-3, 2e-3, 2e-3, 0.0])
     heavier[0] += 0.8 * np.outer([0.05, 0.0, 0.1, 1.0], [0.05, 0.0, 0.1, 1.0])
     truth = replace(walker, robot=with_bodies(walker.robot, dict(zip(carrying(walker.robot), heavier, strict=True))))

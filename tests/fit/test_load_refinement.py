@@ -134,8 +134,7 @@ def test_joint_friction_beside_it_counts_for_the_normal_force():
     data, test = sliding_data(60, 0, 1.5), sliding_data(80, 7, 1.5)
     model = data.model.with_forces(JointFriction(kernel="linear"), LOAD)
     refined = fit(model, data, restarts=1, options=OPTIONS)
-    nominal = errors(first_fit(model, data), test)
-    friction = refined.model.unknown_forces[1]
+    nominal, friction = errors(first_fit(model, data), test), refined.model.unknown_forces[1]
     assert [name for name, _ in friction.expected.joints] == list(data.model.robot.joint_names)
     for _, curve in friction.expected.joints:
         at, values = (torch.tensor(part, dtype=torch.float64) for part in (curve.at, curve.values))

@@ -299,8 +299,7 @@ def test_causes_are_named_from_ten_nats_on_and_from_a_twentieth_of_what_is_left(
 
     basis = np.linalg.qr(white([np.concatenate([jacobian, data.u[:, :, None] * np.eye(6)], axis=-1)]).reshape(2010, -1))
     other = np.random.default_rng(0).standard_normal(2010)
-    other = (other - basis[0] @ (basis[0].T @ other)).reshape(-1, 6)
-    wrong = 0.05 * data.u * one
+    other, wrong = (other - basis[0] @ (basis[0].T @ other)).reshape(-1, 6), 0.05 * data.u * one
     left = wrong * (nats / cause(wrong)[2]) ** 0.5 + noise * other * (2.0 * rest / np.square(other).sum()) ** 0.5
     found = cause(left)
     assert (found is not None) + (found is not None and found[0] is not None) == told

@@ -55,8 +55,7 @@ def test_an_elbow_that_stuck_is_a_holonomic_constraint(shared):
     """
     folder = shared("realdata")
     model = dfki_system(folder)
-    train = dfki(folder, model, 143524, 143601, 143704, 144115)
-    stuck = dfki(folder, model, 143906)
+    train, stuck = dfki(folder, model, 143524, 143601, 143704, 144115), dfki(folder, model, 143906)
     laws = RigidBodies("all"), Viscous(), LoadFriction(), open_rotors(model)
     found = fit(model.with_forces(*laws), train, Accelerations(), rows=1000).model
     offset, length = 0.1, 0.2

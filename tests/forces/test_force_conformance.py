@@ -39,8 +39,7 @@ class TestAerodynamicForce(UnknownConformance):
 
 
 class TestToolForces(UnknownConformance):
-    prior = ToolForces()
-    acts_at = TIP
+    prior, acts_at = ToolForces(), TIP
 
 
 class TestToolForcesOfThePlace(UnknownConformance):

@@ -117,8 +117,7 @@ def test_memory_is_a_matter_of_joints(lugre_log):
     assert names == {f"coulomb.level.{joint}" for joint in JOINTS} | {
         "coulomb.sigma.lift", "coulomb.velocity_scale.pan", "coulomb.velocity_scale.bend"
     }  # fmt: skip
-    law = found.model.laws[-1]
-    seen = with_memory(lugre_log, found.model)
+    law, seen = found.model.laws[-1], with_memory(lugre_log, found.model)
     state = found.model.state(*(torch.tensor(np.array(x[:50])) for x in (seen.q, seen.v, seen.u)))
     expected = torch.tanh(state.v / law.values["velocity_scale"])
     expected[:, 1] = state.u[:, 3]

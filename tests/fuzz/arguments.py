@@ -103,8 +103,7 @@ def _prior(kind: Any, **arguments: Any) -> Any:
 
 def _forces(kind: Any, **arguments: Any) -> None:
     """No numbers are returned: what a coefficient of 1e308 overflows to is refused by `predict`."""
-    made = kind(**arguments)
-    model = INPUTS.data.model.with_contacts(())
+    made, model = kind(**arguments), INPUTS.data.model.with_contacts(())
     forcegp.Model(model.robot, (), (*model.forces, made)).dynamics(*STATE).acceleration_map()
 
 

@@ -58,8 +58,7 @@ def test_the_smallest_sufficient_jitter_is_added_and_reported(relative):
     with pytest.warns(NumericalWarning, match=r"5 x 5 covariance positive definite; larger noise"):
         factor = factorize(matrix.clone)
     assert factor.jitter == pytest.approx(relative * float(matrix.diagonal().mean()))
-    shifted = matrix + factor.jitter * torch.eye(5, dtype=torch.float64)
-    lower = factor.lower.tril()
+    shifted, lower = matrix + factor.jitter * torch.eye(5, dtype=torch.float64), factor.lower.tril()
     torch.testing.assert_close(lower @ lower.mT, shifted, rtol=0.0, atol=1e-14)
 
 

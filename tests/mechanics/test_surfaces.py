@@ -44,8 +44,7 @@ class Paraboloid(Surface):
 
 
 class TestSubclassWithValueOnly(SurfaceConformance):
-    surface = Paraboloid()
-    storable = False
+    surface, storable = Paraboloid(), False
     signed_distance = False
 
 

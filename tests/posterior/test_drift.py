@@ -122,8 +122,7 @@ def test_records_that_differ_are_learned_from_them():
 def test_update_is_conditioning_on_all_rows(steady):
     """Against a Gaussian process of the level, with its dense covariance over all rows."""
     _, posterior = steady
-    rows = recording(9, level=0.05, seconds=4.0)
-    given = replace(drift_of(posterior), rate=[0.02])
+    rows, given = recording(9, level=0.05, seconds=4.0), replace(drift_of(posterior), rate=[0.02])
     updated = posterior.with_settings(drift=asdict(given)).update(rows)
     q, v, u = (torch.tensor(x) for x in (rows.q, rows.v, rows.u))
     coulomb = next(law for law in posterior.model.laws if isinstance(law, Coulomb))

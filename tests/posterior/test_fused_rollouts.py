@@ -27,8 +27,7 @@ def predictor(friction) -> Predictor:
 @pytest.fixture(scope="module")
 def starts() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """11 motions, more than the lanes of a vector hold."""
-    data = arm_data(11, 1)
-    wave = torch.linspace(0.0, 3.0, STEPS, dtype=torch.float64).sin()
+    data, wave = arm_data(11, 1), torch.linspace(0.0, 3.0, STEPS, dtype=torch.float64).sin()
     q, v, u = (torch.tensor(x) for x in (data.q, data.v, data.u))
     return q, v, u[:, None] * (1.0 + 0.1 * wave[:, None])
 

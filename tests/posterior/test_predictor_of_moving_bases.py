@@ -91,8 +91,7 @@ def assert_motions_of_torch(predictor, posterior, start, integrator):
 def test_means_and_covariances_are_those_of_predict(floating, covariance, monkeypatch):
     monkeypatch.setattr(preparation, "TOLERANCE", 1e-6)
     posterior, *states = floating
-    predictor = posterior.predictor(covariance=covariance)
-    expected = posterior.predict(*states)
+    predictor, expected = posterior.predictor(covariance=covariance), posterior.predict(*states)
     assert predictor.compiled("mean") is not None
     close(predictor.mean(*states), expected.mean)
     close(predictor.mean(*(x[3] for x in states)), expected.mean[3])

@@ -145,8 +145,7 @@ HOPPER = """<robot name="hopper"><link name="trunk"><inertial><mass value="5"/>
 def test_joints_of_another_topic_are_interpolated_and_their_torques_held(tmp_path):
     """The base of a legged robot and its joints; stamps of JointState at its own rate."""
     base, joint = np.arange(60) / 100, np.arange(-0.01, 0.7, 0.003)
-    rows = zip(base, nanoseconds(base).tolist(), strict=True)
-    forwards = [1.0, 0, 0, 0, 0, 0]
+    rows, forwards = zip(base, nanoseconds(base).tolist(), strict=True), [1.0, 0, 0, 0, 0, 0]
     messages = [("/odom", stamp, odometry(stamp, [t, 0, 1, 0, 0, 0, 1], forwards)) for t, stamp in rows]
     for t, stamp in zip(joint, nanoseconds(joint).tolist(), strict=True):
         values = {"position": np.array([0.3 * t]), "velocity": np.array([0.3]), "effort": np.array([5.0 + t])}

@@ -164,8 +164,7 @@ def test_pseudo_inertia_of_standard_parameters():
 def test_the_regressor_times_any_parameters_is_the_joint_force(model):
     robot, rng = Robot.from_urdf_text(MODELS[model]()), np.random.default_rng(1)
     q, v, a = torch.tensor(rng.normal(size=(3, 4, robot.nv)))
-    parameters = torch.tensor(rng.normal(size=(robot.nv, 10)))
-    kinematics = robot.kinematics(q, v)
+    parameters, kinematics = torch.tensor(rng.normal(size=(robot.nv, 10))), robot.kinematics(q, v)
     mass, bias = kinematics.dynamics_of_bodies(parameters)
     expected = (mass @ a[..., None])[..., 0] + bias
     found = torch.einsum("...ikp,kp->...i", kinematics.torque_regressor(a), parameters)

@@ -147,8 +147,7 @@ def test_a_frame_without_mass_loses_its_inertia():
     assert caught.value.remedy == {"inertias": "nearest"}
     with pytest.warns(RobotFileWarning, match=r"'tip'.* changed by 1e\+02 %"):
         robot = Robot.from_urdf_text(text, **caught.value.remedy)
-    plain = Robot.from_urdf_text(URDF.format(mass=1.0, ixx=0.02))
-    q = torch.zeros(1).double()
+    plain, q = Robot.from_urdf_text(URDF.format(mass=1.0, ixx=0.02)), torch.zeros(1).double()
     assert robot.mass_matrix(q).equal(plain.mass_matrix(q))
 
 

@@ -280,8 +280,7 @@ def slips(inputs: CheckInput) -> Iterator[Doubt]:
             moved = np.flatnonzero(steps[:row])
             first = int(moved[-1]) + 1 if len(moved) else 0
             begin, then, at, end = log.time[[0, first, row + 1, -1]].tolist()
-            size = f"{steps[row]:+.3g} {inputs.unit_of_each('q')[joint]}"
-            stood = row - first >= STOOD
+            size, stood = f"{steps[row]:+.3g} {inputs.unit_of_each('q')[joint]}", row - first >= STOOD
             seen = f"jumps by {size} at {at:.3f} s and stays there: its encoder has slipped, or was set anew."
             left_out = (then, at) if stood else (at, end) if at - begin > end - at else (begin, at)
             if stood:

@@ -369,9 +369,7 @@ def _parts(
     _, at, later = min(tried)
     held, first = (share >= at) == later, int(np.searchsorted(share, at))
     load = columns @ solved(now, held[:, None, None] * columns)
-    bases = np.linalg.qr(now.friction.swapaxes(0, 1))[0]
-    left = (now.rows.u - now.tau - held[:, None] * load).T[..., None]
-    left = (left - bases @ (bases.swapaxes(1, 2) @ left))[..., 0].T
+    left = now.beside_friction((now.rows.u - now.tau - held[:, None] * load)[..., None])[..., 0].T
     other = np.square(left + np.where(held[:, None], load, -load)) - np.square(left)  # on the other side of that time
     cost = np.cumsum((0.5 * other / (left.var(axis=0) + 1e-300)).sum(axis=1))
     cost = np.where(np.arange(len(cost)) < first, 1.0, -1.0) * (cost[first] - cost)

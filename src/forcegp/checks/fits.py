@@ -4,11 +4,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 
 from forcegp.checks.causes import NUMBER, SIGN, Cause, changed
-from forcegp.checks.torques import LEAST, Comparison, in_motion, positive_fit, positive_solution
+from forcegp.checks.torques import LEAST, Comparison, in_motion, positive_fit, positive_solution, regressor
 
 NOISE = 3.0  # how much of the power of the noise is left to every explanation
 WORSE = 1.05  # share from which on predicting nothing is better
@@ -177,15 +176,12 @@ class Explanation:
         self, more: Float[np.ndarray, "rows nv k"], told: Bool[np.ndarray, " rows"] | None = None
     ) -> Float[np.ndarray, "rows nv"]:
         """The same with these columns of each joint, too, whose numbers the rows `told` tell."""
-        rows, robot = self.log.rows, self.log.robot
-        q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
-        with torch.no_grad():
-            regressor = robot.kinematics(q, v).torque_regressor(a).flatten(-2).cpu().numpy()
+        rows, bodies = self.log.rows, regressor(self.log.robot, self.log.rows)
         if self.log.drives is not None:
-            regressor = np.einsum("rmp,mk->rkp", regressor, np.linalg.inv(self.log.drives))
+            bodies = np.einsum("rmp,mk->rkp", bodies, np.linalg.inv(self.log.drives))
         left = []
         for k, u in enumerate((rows.u - self.log.more).T):  # a load that is taken up is no mass of a link
-            columns = np.c_[regressor[:, k], self.log.friction[:, k], np.ones(len(u)), more[:, k]]
+            columns = np.c_[bodies[:, k], self.log.friction[:, k], np.ones(len(u)), more[:, k]]
             size = np.linalg.norm(columns, axis=0)
             columns = columns[:, size > 0.0] / size[size > 0.0]
             own = slice(None) if told is None else told

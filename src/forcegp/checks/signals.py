@@ -293,8 +293,7 @@ def sampling_doubts(inputs: CheckInput) -> Iterator[Doubt]:
         numbers={"sample_rate": 1.0 / median, "seconds": seconds, "episodes": count, "rows": len(log)},
     )
     # rows in which every position is that of the row before although velocities show that the robot moves
-    same = (np.diff(log.q, axis=0) == 0).all(axis=1) & follows
-    speed = np.abs(log.v).max(axis=1)[1:]
+    same, speed = (np.diff(log.q, axis=0) == 0).all(axis=1) & follows, np.abs(log.v).max(axis=1)[1:]
     moves = speed > 0.1 * np.sqrt(np.square(speed).mean())
     share = float((same & moves).sum() / max(1, (moves & follows).sum()))
     if share < OFTEN_REPEATED:
@@ -376,8 +375,7 @@ def _compared(
     sizes = [float(np.square(getattr(rows, name)).mean()) for rows in pieces]
     if not min(steep, float(power.min())) > TINY_SPEED * max(*sizes, steep / len(slopes)) * len(slopes):
         return None  # a joint that stands still
-    factor = values @ slopes / steep
-    unexplained = 1.0 - np.square(values @ slopes) / (steep * power)
+    factor, unexplained = values @ slopes / steep, 1.0 - np.square(values @ slopes) / (steep * power)
     best = int(np.argmin(unexplained))
     return float(factor[best]), lowest(unexplained, SHIFTS), float(max(0.0, unexplained[best]))
 

@@ -1,5 +1,6 @@
 """Doubts of torques beside those of the search: drift, elastic joints, delay, stops."""
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -10,8 +11,10 @@ from jaxtyping import Float
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
 from forcegp.checks.fits import RARELY
 from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, SHORT, UNKNOWN, Explanation, held_at_rest
-from forcegp.checks.torques import WIDTHS, Comparison, in_motion, stretch
-from forcegp.data import Dataset, estimate_delay, with_strokes
+from forcegp.checks.torques import WIDTHS, Comparison, in_motion, regressor, stretch
+from forcegp.data import Dataset, Delay, estimate_delay, with_strokes
+from forcegp.data.delay import orthonormal
+from forcegp.data.filters import shifted
 from forcegp.data.views import consecutive, rests
 from forcegp.doubts import Doubt, listed, look, ok, wrong
 from forcegp.errors import DatasetError
@@ -65,11 +68,10 @@ def _drift(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     Blocks of time that are left out decide, of all joints together and the change in the median joint, or of each.
     Joints that mostly rest tell nothing: stiction holds any torque.
     """
-    rows, robot, count = found.log.rows, found.log.robot, len(found.log.rows)
+    rows, count = found.log.rows, len(found.log.rows)
     if count < FEWEST_ROWS or found.log.drives is not None:  # which are joints once the log is corrected
         return
-    q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
-    bodies = robot.kinematics(q, v).torque_regressor(a).flatten(-2).cpu().numpy()
+    bodies = regressor(found.log.robot, rows)
     time = (rows.time - rows.time.mean()) / max(float(np.ptp(rows.time)), 1e-300)
     block, changed, told = np.arange(count) * BLOCKS // count, dict[str, float](), dict[str, float]()
     friction_of = np.concatenate([found.log.friction, _remembered(found, inputs)], axis=-1)
@@ -79,11 +81,11 @@ def _drift(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         steady, moved = np.c_[bodies[:, joint], np.ones(count)], np.c_[friction, friction * time[:, None]]
         left = []
         for columns in (np.c_[steady, friction], np.c_[steady, moved]):
-            basis = _basis(columns)
+            basis = orthonormal(columns, SEEN)
             numbers = [np.linalg.lstsq(basis[block != k], u[block != k])[0] for k in range(BLOCKS)]
             left.append(sum(np.square((u - basis @ x)[block == k]).sum() for k, x in enumerate(numbers)))
         told[name] = float(np.log(left[1] / max(left[0], 1e-300)))
-        basis, size = _basis(steady), np.linalg.norm(moved, axis=0) + 1e-300
+        basis, size = orthonormal(steady, SEEN), np.linalg.norm(moved, axis=0) + 1e-300
         rest = (moved - basis @ (basis.T @ moved)) / size
         level, slope = np.split(np.linalg.lstsq(rest, u - basis @ (basis.T @ u), rcond=SEEN)[0] / size, 2)
         begin, end = (float(np.std(friction @ (level + x * slope))) for x in (-0.5, 0.5))
@@ -95,12 +97,6 @@ def _drift(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         what = f"friction changes, perhaps with temperature: at the end it is so many times the first: {each}."
         do = "Record the warm robot; updates of a posterior follow the level of friction."
         yield look(about="drift", what=what, do=do, joints=tuple(changed), numbers={"ratio": changed})
-
-
-def _basis(columns: np.ndarray) -> np.ndarray:
-    """Orthonormal, of the directions that show."""
-    u, s, _ = np.linalg.svd(columns / (np.linalg.norm(columns, axis=0) + 1e-300), full_matrices=False)
-    return u[:, s > SEEN * s[0]]
 
 
 def elastic_doubts(inputs: CheckInput, log: Comparison) -> list[Doubt]:
@@ -182,23 +178,29 @@ def _delays(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
     if inputs.prepared is None:
         return  # without an order
     quick = inputs.most_rows == QUICK_ROWS
-    data = log.changed(inputs.even if quick else inputs.prepared)
-    try:
-        delay = estimate_delay(replace(data, model=Model(log.robot)), None if quick else inputs.cutoff)
-    except DatasetError:
-        return  # too short
-    seconds, remains = delay.significant, delay.remains
-    if abs(seconds) > LEAST_DELAY * float(np.median(np.diff(inputs.even.time))):
-        late = "later" if seconds > 0.0 else "earlier"
+    delay = _delay(log.changed(inputs.even if quick else inputs.prepared), log.robot, None if quick else inputs.cutoff)
+    if delay is None:
+        return
+    seconds, remains, lag = delay.significant, delay.remains, delay.lag
+    how = f"{1e3 * abs(seconds):.1f} ms ± {1e3 * delay.common_std:.1f} ms {'later' if seconds > 0.0 else 'earlier'} "
+    how = f"{delay.behind} ({1e3 * lag:.3g} ms); without it" if lag else f"{how}than the motion needs it; shifted"
+    if lag or abs(seconds) > LEAST_DELAY * float(np.median(np.diff(inputs.even.time))):
+        numbers = {"delay": seconds, "std": delay.common_std, "remains": remains, "per_joint": plain(delay.seconds)}
         yield Doubt(
             level="wrong" if remains < MUCH else "look",
             about="delay",
-            what=f"the torque of all joints is logged {1e3 * abs(seconds):.1f} ms ± {1e3 * delay.common_std:.1f} ms "
-            f"{late} than the motion needs it; shifted, {100.0 * remains:.0f} % of what was unexplained remains.",
+            what=f"the torque of all joints is logged {how}, {100.0 * remains:.2g} % of what was unexplained remains.",
             do="forcegp import --delay auto; a filter of the robot's own, of the torque or of the motion, does this.",
             joints=inputs.names,
-            numbers={"delay": seconds, "std": delay.common_std, "remains": remains, "per_joint": plain(delay.seconds)},
+            numbers=numbers | ({"lag": lag} if lag else {}),
         )
+
+
+def _delay(data: Dataset, robot: Robot, cutoff: float | None = None) -> Delay | None:
+    """That of a log of torques; None where it is too short."""
+    with contextlib.suppress(DatasetError):
+        return estimate_delay(replace(data, model=Model(robot)), cutoff)
+    return None
 
 
 def push(found: Explanation, inputs: CheckInput, since: float, until: float) -> Iterator[Doubt]:
@@ -326,10 +328,10 @@ TOUCHES = ok(
 )
 
 
-def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, list[Doubt]]:
+def without_stops(log: Dataset, model: Model | None = None, late: bool = True) -> tuple[Dataset, list[Doubt]]:
     """The log without rests whose torques are not those of this posture, and what is said of them.
 
-    Torques in motion say what a posture needs, under any gravity and with any masses.
+    Torques in motion say what a posture needs, under any gravity and with any masses, also where they are `late`.
     """
     model = log.model if model is None else model
     plain = log.time_ordered and not model.robot.layout.groups and not model.contacts and log.u.shape == log.v.shape
@@ -370,6 +372,9 @@ def without_stops(log: Dataset, model: Model | None = None) -> tuple[Dataset, li
             held[settled, k] |= (np.abs(np.subtract.outer(u, ends)) > HELD * most).any(axis=1)
     stops = [each for each, rest in zip(found, places, strict=True) if held[rest].any(axis=1).mean() > 0.5]
     if not stops:
+        return log, []
+    delay = _delay(inputs.even, model.robot) if late else None
+    if delay and delay.significant and not without_stops(shifted(log, delay.significant), model, late=False)[1]:
         return log, []
     out = np.unique(np.concatenate(stops))
     why = "brakes hold the robot, its drives are off, or they bear what stiction holds"

@@ -115,6 +115,13 @@ def inverse_dynamics(robot: Robot, *motion: Float[np.ndarray, "*batch n"]) -> Fl
         return robot.inverse_dynamics(*(torch.tensor(x, device=robot.device) for x in motion)).cpu().numpy()
 
 
+def regressor(robot: Robot, rows: Dataset) -> Float[np.ndarray, "rows nv 10n"]:
+    """What they need per unit of the standard parameters of each body."""
+    q, v, a = (torch.tensor(x, device=robot.device) for x in (rows.q, rows.v, rows.a))
+    with torch.no_grad():
+        return robot.kinematics(q, v).torque_regressor(a).flatten(-2).cpu().numpy()
+
+
 def _torques_of_laws(log: Comparison, rows: Dataset) -> Float[np.ndarray, "rows nv"]:
     return sum(law_columns(log.laws, log.robot, rows.q, rows.v, rows.u, rows.a), np.zeros_like(rows.v))
 

@@ -39,9 +39,10 @@ class FilterOptions:
     """q: v and a from filtered positions. v: a from filtered velocities."""
     delay: Annotated[str, arg(metavar="S|auto")] = "0"
     """Delay of u in the log, in s. auto: estimated for all joints together where u are the torques of all joints and
-    nothing is touched, else 0."""
+    nothing is touched, else 0; with the lag of a filter, if one shows."""
     lag: Annotated[float, arg(metavar="S")] = 0.0
-    """Time constant in s with which actuators of first order follow u, thrusters where a base has them."""
+    """Time constant in s with which actuators of first order follow u, thrusters where a base has them. Below 0, that
+    of a filter behind which u was logged, which is undone."""
     every: Annotated[int | None, unless_given("N", "1, or what the filter leaves", int)] = None
     """Keep every N-th row, after the filter."""
     trim: Annotated[float, arg(metavar="S")] = 0.0

@@ -86,14 +86,21 @@ class Payload(Command):
             raise InvalidInput(f"{seen}; give --mass of the payload, or leave the baseline or the gains out.")
         if self.link is not None:
             model.robot.frame(self.link)
-        preparation, notes = self.filter.preparation(), list[str]()
-        both = zip(logs, robots, strict=True)
-        rows, *unloaded = [self._prepared(terminal, preparation, *log, robot, notes) for log, robot in both]
+        preparation, notes, prepared = self.filter.preparation(), list[str](), list[forcegp.Dataset]()
+        for (path, dataset), robot in zip(logs, robots, strict=True):
+            if used := quick_doubts(path, dataset, robot).at("wrong"):
+                terminal.warn(f"{path}: {used.in_one_line()}. See forcegp check.")
+            if not forcegp.data.preparation_report(dataset.metadata):  # those that were prepared before are as they are
+                with terminal.progress(f"preparing {path}"):
+                    dataset = preparation.apply(replace(dataset, model=robot))
+                why = forcegp.data.preparation_report(dataset.metadata)["why"]
+                notes += [f"{path}: {name}: {why[name]}" for name in ("cutoff", "delay") if name in why]
+            prepared.append(dataset)
+        rows, baseline = prepared[0], prepared[-1] if self.baseline is not None else None
         notes += forces_of(robots[0])
         if self.forces == LAWS and forcegp.data.views.at_rest(rows):
             model = forcegp.scores.named_model(robots[0], [*words, "offset"])
             notes.append("the log is of postures alone: no motion shows friction, of which each rest has its own share")
-        baseline = unloaded[0] if unloaded else None
         with terminal.progress("identifying"):
             found = with_payload(model, rows, self.link, baseline, self.mass)
         content = {"data": str(self.log), **payload_dict(found, baseline is not None)}
@@ -123,26 +130,6 @@ class Payload(Command):
         others = {name: each for name, each in found.estimates.items() if name not in own and baseline is None}
         terminal.show(estimates_table(title, own), *([estimates_table("joints", others)] if others else []))
         return content
-
-    def _prepared(
-        self,
-        terminal: Terminal,
-        preparation: forcegp.data.Preparation,
-        path: Path,
-        dataset: forcegp.Dataset,
-        model: forcegp.Model,
-        notes: list[str],
-    ) -> forcegp.Dataset:
-        """Rows behind the filter; those of a dataset that was prepared before are as they are."""
-        if used := quick_doubts(path, dataset, model).at("wrong"):
-            terminal.warn(f"{path}: {used.in_one_line()}. See forcegp check.")
-        if forcegp.data.preparation_report(dataset.metadata):
-            return dataset
-        with terminal.progress(f"preparing {path}"):
-            prepared = preparation.apply(replace(dataset, model=model))
-        why = forcegp.data.preparation_report(prepared.metadata)["why"]
-        notes += [f"{path}: {name}: {why[name]}" for name in ("cutoff", "delay") if name in why]
-        return prepared
 
 
 def with_payload(

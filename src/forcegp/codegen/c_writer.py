@@ -106,9 +106,7 @@ def write_function(
                 if numbers is None or "/" in written:  # neither NaN nor infinity is a number
                     return f"({written})"
                 return f"(n[{numbers.setdefault(written, len(numbers))}])"
-            if operation == "input":
-                return f"x[{rest[0]}]"
-            return f"x{node}" if node in here else f"w[{places[node][1]}]"
+            return f"x[{rest[0]}]" if operation == "input" else f"x{node}" if node in here else f"w[{places[node][1]}]"
 
         text.append(f"static APART void {name}_{number}({arguments}, real *w) {{")
         text.append("  (void)t; (void)live; (void)x; (void)y; (void)w;")

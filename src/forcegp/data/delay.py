@@ -8,9 +8,10 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
+from scipy.optimize import minimize_scalar
 
 from forcegp.data.dataset import Dataset
-from forcegp.data.filters import LowPass, episodes_in_order
+from forcegp.data.filters import LowPass, episodes_in_order, lagged
 from forcegp.data.ripple import rate_of_waves, waves
 from forcegp.data.strokes import joint_positions, with_strokes
 from forcegp.errors import DatasetError, InvalidInput
@@ -35,6 +36,9 @@ memory a delay is less sharp, though: where a low-pass filter of dry friction al
 ROWS_PER_PARAMETER = 3
 
 APART = 0.01  # width of the 95 % interval of a delay [s] beyond which the log is said not to tell it
+LAGS, LAGGING, LAG_ROWS = (0.5, 3.0), 0.6, 2_500
+"""Bounds of the lag of a filter, over the delay that it looks like; the share of what that leaves, below which it is a
+lag; and the rows that tell it."""
 WORTH = 0.95
 """Unexplained torque with the common delay, relative to that without, above which the delay explains nothing."""
 
@@ -44,7 +48,8 @@ class Delay:
     """Delay of the torque behind the motion [s], with standard deviations [s]; NaN where the log shows none.
 
     `common` suits all joints best; `seconds` (nv,) is that of each joint alone, which may be one of friction. `remains`
-    is what the common delay leaves of what was unexplained, as the geometric mean over the joints.
+    is what the common delay leaves of what was unexplained, as the geometric mean over the joints, and `left` that of
+    the square sums themselves. With a `lag` [s] the torque was logged behind a filter of first order, and then shifted.
     """
 
     common: float
@@ -52,6 +57,8 @@ class Delay:
     seconds: Float[np.ndarray, " nv"]
     std: Float[np.ndarray, " nv"]
     remains: float
+    left: float = float("nan")
+    lag: float = 0.0
 
     @property
     def significant(self) -> float:
@@ -64,11 +71,19 @@ class Delay:
         return self.common if abs(self.common) > max(SIGNIFICANT * spread, LEAST_DELAY) else 0.0
 
     @property
+    def behind(self) -> str:
+        """What a lag is."""
+        return f"behind a low-pass of first order at {0.5 / np.pi / self.lag:.2g} Hz"
+
+    @property
     def reason(self) -> str:
         """The common delay and what became of it, for people."""
         if not np.isfinite(self.common):
             return "the torques show no common delay"
         size, used = f"{1e3 * self.common:.1f} ms ± {1e3 * self.common_std:.1f} ms", self.significant
+        if self.lag:
+            left = f"{100.0 * self.remains:.2g} % of what inverse dynamics does not explain are left"
+            return f"u is logged {self.behind}, which is undone; {left}"
         if used:
             return f"{size}, which leaves {100.0 * self.remains:.0f} % of what inverse dynamics does not explain"
         ends = (self.common - 2.0 * self.common_std, self.common + 2.0 * self.common_std)
@@ -86,9 +101,9 @@ def estimate_delay(dataset: Dataset, cutoff: float | None = None) -> Delay:
     For every shift up to .2 s, u is fitted by least squares to the torque regressor of the model's robot, a rotor,
     friction of several widths, a constant, and the model's laws; and to friction that remembers, which
     may take the delay's place. The best shift is the vertex of a parabola; its standard deviation is a block jackknife
-    (Kuensch 1989). Filter q, v, u and a alike before, by a `LowPass` at `cutoff` Hz: friction is filtered as u is, else
-    it seems to turn late. Raises InvalidInput with contacts, or without torques;
-    DatasetError for a log shorter than .4 s.
+    (Kuensch 1989). Where a filter of first order explains a late torque far better, that is its `lag`. Filter q, v, u
+    and a alike before, by a `LowPass` at `cutoff` Hz: friction is filtered as u is, else it seems to turn late. Raises
+    InvalidInput with contacts, or without torques; DatasetError for a log shorter than .4 s.
     """
     if dataset.model.contacts:
         seen = "the forces of contacts are not known, so a delay cannot be found in this log"
@@ -100,29 +115,52 @@ def estimate_delay(dataset: Dataset, cutoff: float | None = None) -> Delay:
     open_ones = np.isnan(near.seconds) & np.array([bool(np.ptp(u)) for u in dataset.u.T])
     at_end = np.isnan(near.common + near.common_std)  # that of a part of the log lies beyond
     if not (open_ones.any() or at_end):
-        return near
+        return _with_lag(dataset, near, cutoff)
     try:
         far = _told_apart(dataset, LARGEST_DELAY, cutoff)
     except DatasetError:  # too short for that
         return near
     if at_end:
-        return far
+        return _with_lag(dataset, far, cutoff)
     parts = {name: np.where(open_ones, getattr(far, name), getattr(near, name)) for name in ("seconds", "std")}
     return replace(near, **parts)
 
 
-def _told_apart(dataset: Dataset, largest: float, cutoff: float | None) -> Delay:
+def _with_lag(dataset: Dataset, delay: Delay, cutoff: float | None) -> Delay:
+    """The delay behind a filter of first order, where that leaves far less than the delay alone."""
+    late = delay.significant
+    if not 0.0 < late < USUAL_DELAY:
+        return delay
+    rate = max(1, int(late / (3.0 * float(np.median(np.diff(dataset.time))))))  # that still shows it
+    some = dataset.rows(slice(0, rate * LAG_ROWS, rate))
+
+    def left(lag: float) -> float:
+        return _told_apart(some, USUAL_DELAY, cutoff, lag).left
+
+    try:
+        before = left(0.0)
+        if all(left(share * late) >= LAGGING * before for share in (1.0, 2.0)):
+            return delay
+    except DatasetError:  # too short for that
+        return delay
+    ends = LAGS[0] * late, LAGS[1] * late
+    lag = float(minimize_scalar(left, bounds=ends, method="bounded", options={"xatol": 0.03 * late}).x)
+    found = _told_apart(some, USUAL_DELAY, cutoff, lag)
+    return replace(found, remains=delay.remains * found.left / before, lag=lag)
+
+
+def _told_apart(dataset: Dataset, largest: float, cutoff: float | None, lag: float = 0.0) -> Delay:
     """The delay under friction of velocity if it shows beside friction that remembers, too, else that beside memory."""
-    (alone, left), (beside, least) = _estimated(with_strokes(dataset), largest, cutoff)
-    if least < REMEMBERS * left:
+    alone, beside = _estimated(with_strokes(dataset), largest, cutoff, lag)
+    if beside.left < REMEMBERS * alone.left:
         return beside
     used, width = alone.significant, 4.0 * beside.common_std
     apart = abs(used - beside.common) > max(SIGNIFICANT * (alone.common_std + beside.common_std), 0.5 * abs(used))
     return alone if not used or (not apart and (beside.significant or width <= APART)) else beside
 
 
-def _estimated(dataset: Dataset, largest: float, cutoff: float | None) -> list[tuple[Delay, float]]:
-    """The delay, and the geometric mean over joints of what it leaves of the square sums; then both beside memory."""
+def _estimated(dataset: Dataset, largest: float, cutoff: float | None, lag: float) -> list[Delay]:
+    """The delay behind a `lag`; then that beside memory."""
     thin, shifts = max(1, -(-len(dataset) // MOST_ROWS)), np.linspace(-largest, largest, 2 * STEPS + 1)
     episodes = []
     for number, part, _ in episodes_in_order(dataset):
@@ -133,7 +171,10 @@ def _estimated(dataset: Dataset, largest: float, cutoff: float | None) -> list[t
     if len(compared) < 10 * BLOCKS:
         seen = f"{len(compared)} rows lie more than {largest} s from the ends of their episodes"
         raise DatasetError(f"{seen}; a delay needs at least {10 * BLOCKS}. Record longer, or give the delay in s.")
-    features, positions = torque_columns(dataset, compared, cutoff), joint_positions(dataset)
+    features, positions = torque_columns(dataset, slice(None) if lag else compared, cutoff), joint_positions(dataset)
+    for own, _ in episodes if lag else ():
+        features[:, own] = lagged(features[:, own].swapaxes(0, 1), dataset.time[own], lag).swapaxes(0, 1)
+    features = features[:, compared] if lag else features
     profiles = np.full((2, dataset.nv, BLOCKS + 1, len(shifts)), np.nan)  # of all rows, and of all but one block
     for joint in range(dataset.nv):
         splines = [(CubicSpline(dataset.time[own], dataset.u[own, joint]), dataset.time[at]) for own, at in episodes]
@@ -149,7 +190,7 @@ def _estimated(dataset: Dataset, largest: float, cutoff: float | None) -> list[t
     return [_from_profiles(each, shifts) for each in profiles]
 
 
-def _from_profiles(profiles: Float[np.ndarray, "nv parts shifts"], shifts: np.ndarray) -> tuple[Delay, float]:
+def _from_profiles(profiles: Float[np.ndarray, "nv parts shifts"], shifts: np.ndarray) -> Delay:
     """The best shift of all rows, and how much it differs without each block."""
     seconds = np.array([[lowest(profile, shifts) for profile in own] for own in profiles])
     # Noise of every joint is unknown: the likelihood of one delay is the product of powers of the residuals.
@@ -159,16 +200,16 @@ def _from_profiles(profiles: Float[np.ndarray, "nv parts shifts"], shifts: np.nd
     gained = likelihoods[0].min() - likelihoods[0, STEPS]
     remains, spread = float(np.exp(gained / max(len(finite), 1))), float(jackknife(common[None, 1:])[0])
     each, std = seconds[:, 0], jackknife(seconds[:, 1:])
-    found = Delay(common=float(common[0]), common_std=spread, seconds=each, std=std, remains=remains)
-    return found, float(np.exp(likelihoods[0].min() / max(len(finite), 1)))
+    left = float(np.exp(likelihoods[0].min() / max(len(finite), 1)))
+    return Delay(common=float(common[0]), common_std=spread, seconds=each, std=std, remains=remains, left=left)
 
 
-def orthonormal(columns: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows k"]:
-    """A basis of what the columns span, without those that are rounding."""
+def orthonormal(columns: Float[np.ndarray, "rows columns"], least: float = 1e-6) -> Float[np.ndarray, "rows k"]:
+    """A basis of what the columns span, without directions of which they have less than that share of the largest."""
     size = np.linalg.norm(columns, axis=0)
     used = size > 1e-9 * size.max()
     basis, values, _ = np.linalg.svd(columns[:, used] / size[used], full_matrices=False)
-    return basis[:, values > 1e-6 * values[0]]
+    return basis[:, values > least * values[0]]
 
 
 def least_squares(

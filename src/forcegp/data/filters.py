@@ -70,11 +70,13 @@ class LowPass:
 def lagged(values: Values, time: Times, seconds: float) -> Values:
     """What an actuator of first order makes of values, at rest with the first of them: T x' + x = values, T in s.
 
-    By Tustin's rule (trapezoids), for equal steps of time.
+    By Tustin's rule (trapezoids), for equal steps of time. Below zero, what such a filter had made the values of.
     """
     step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    if seconds <= 0.25 * step:
+    if abs(seconds) <= 0.25 * step:
         return values
+    if seconds < 0.0:
+        return values - seconds * np.gradient(values, step, axis=0)
     from scipy.signal import lfilter
 
     ratio = 2.0 * seconds / step

@@ -37,7 +37,8 @@ class Preparation:
         which v and a are computed anew; "auto" as `motion_spectrum` and `held_out_cutoff` find it, None for none.
     delay: how much later than it acts u was logged [s]: `u(t) := u_logged(t + delay)`; "auto": `estimate_delay`, 0
         where u does not hold the torques of all joints, or something is touched.
-    lag: time constant of the actuators [s], of thrusters where a base has them: T u_a' + u_a = u.
+    lag: time constant of the actuators [s], of thrusters where a base has them: T u_a' + u_a = u. Below zero, that of
+        a filter behind which u was logged, which is undone; a delay of "auto" finds one where `lag` is 0.
     every: keep every so many rows.
     trim: seconds to drop at both ends of each episode, where a filter has samples of one side only.
     differentiate: "q" computes v and a from the filtered positions, "v" only a from the filtered velocities. With "q"
@@ -63,11 +64,10 @@ class Preparation:
     def __post_init__(self) -> None:
         if self.cutoff not in (None, "auto") and not (_finite(self.cutoff) and self.cutoff > 0):
             raise InvalidInput(f"cutoff is {self.cutoff!r}; give a frequency > 0 in Hz, 'auto', or None for no filter.")
-        for name, least in (("delay", -np.inf), ("lag", 0.0), ("trim", 0.0)):
+        for name, limit in (("delay", ", or auto"), ("lag", ""), ("trim", ", at least 0")):
             given = getattr(self, name)
-            if not (_finite(given) and given >= least) and not (name == "delay" and given == "auto"):
-                limit = "or auto" if name == "delay" else "at least 0"
-                raise InvalidInput(f"{name} is {given!r}; give seconds, {limit}.")
+            if not (_finite(given) and (name != "trim" or given >= 0.0)) and not (name == "delay" and given == "auto"):
+                raise InvalidInput(f"{name} is {given!r}; give seconds{limit}.")
         whole_number("every", self.every, 1)
         for name, allowed in (("differentiate", ("q", "v")), ("stance", ("log", "auto"))):
             if getattr(self, name) not in allowed:
@@ -98,7 +98,8 @@ class Preparation:
             try:
                 cutoff = None if chosen.cutoff is None else float(chosen.cutoff)
                 found = estimate_delay(_filtered(chosen, dataset), cutoff)
-                chosen, reasons["delay"] = replace(chosen, delay=found.significant), found.reason
+                chosen = replace(chosen, delay=found.significant, lag=chosen.lag or -found.lag)
+                reasons["delay"] = found.reason
             except InvalidInput as error:
                 reasons["delay"] = f"u is taken to be on time: {error}"
         return replace(chosen, why=reasons)

@@ -21,8 +21,7 @@ def rate_of_waves(
     It is that of the largest power (Lomb 1976, Scargle 1982); 0 where no wave explains most, and what the best of so
     many would of noise: twice the logarithm of their number over that of the rows.
     """
-    reach = float(np.ptp(q))
-    left = force - basis @ (basis.T @ force)
+    reach, left = float(np.ptp(q)), force - basis @ (basis.T @ force)
     left = left - left.mean()
     if not reach > 0.0 or not np.square(left).sum() > LITTLE * np.square(force - force.mean()).sum():
         return 0.0

@@ -126,8 +126,7 @@ def _knee_and_floor(
     frequency: Frequencies, density: Frequencies, segments: float, derivatives: int
 ) -> tuple[float, float, float]:
     """Knee [Hz], floor [unit^2/Hz] and cut-off [Hz] of one joint; NaN where there are none."""
-    nothing = (np.nan, np.nan, np.nan)
-    power = np.cumsum(density)
+    nothing, power = (np.nan, np.nan, np.nan), np.cumsum(density)
     if not power[-1] > 0.0:
         return nothing
     # of bands of a sixth of an octave, or of single frequencies where those are wider

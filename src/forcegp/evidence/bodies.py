@@ -270,8 +270,7 @@ def with_bodies(robot: Robot, wanted: Mapping[int, Float[np.ndarray, "4 4"]]) ->
         # a congruence by [[A, t], [0, s]] moves the moments about the centre of mass by A alone: no cancellation
         own_moments = 0.5 * np.trace(link.inertia) * np.eye(3) - link.inertia
         A, shift, scale = there[:3, :3], there[:3, 3], there[3, 3]
-        center = (A @ link.center_of_mass + shift) / scale
-        second = A @ own_moments @ A.T
+        center, second = (A @ link.center_of_mass + shift) / scale, A @ own_moments @ A.T
         inertia = np.trace(second) * np.eye(3) - second
         text = replace_inertial(text, name, link.mass * scale**2, center, inertia, source=robot.source)
     return robot.with_text(text)

@@ -346,9 +346,7 @@ def _point(
             flat = without(np.asarray(jacobian) / noise[:, None], span).reshape(-1, len(x))
             gradient, curvature = flat.T @ white.ravel(), flat.T @ flat
         gradient, curvature = gradient + prior_jacobian.T @ prior_r, curvature + prior_jacobian.T @ prior_jacobian
-    if not (np.isfinite(cost) and np.isfinite(curvature).all()):
-        return bad
-    return _Point(x, cost, gradient, curvature)
+    return _Point(x, cost, gradient, curvature) if np.isfinite(cost) and np.isfinite(curvature).all() else bad
 
 
 def _noise(r: np.ndarray, span: np.ndarray | None) -> np.ndarray:

@@ -277,8 +277,7 @@ class RecordedRows:
             for k, values in self.space.values(x).items():
                 if not laws[k].in_gear:
                     beside = beside - laws[k].force_at(self.state, values).cpu().numpy()[:, self.links]
-            r = np.concatenate([r, beside], axis=1)
-            in_x = np.concatenate([in_x, beyond], axis=1)
+            r, in_x = np.concatenate([r, beside], axis=1), np.concatenate([in_x, beyond], axis=1)
         return r, regressor, in_x, response
 
     def acceleration(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

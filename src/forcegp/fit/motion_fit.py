@@ -150,8 +150,7 @@ class MotionFit:
         except (NumericalError, NonPhysicalInertia):  # a step that went too far
             nowhere = torch.full_like(q, math.nan)
             motions = WindowMotions(nowhere, nowhere, *guess, torch.zeros(len(q), dtype=torch.bool))
-        residual = (motions.q - self.q) / noise
-        away = (states - self.start) / self.spread(sigma)
+        residual, away = (motions.q - self.q) / noise, (states - self.start) / self.spread(sigma)
         from_prior, _ = self.unknowns.prior(x)
         cost = 0.5 * float(residual.square().sum() + away.square().sum() + from_prior.square().sum())
         return _Point(x, states, motions, cost if bool(motions.found.all()) and math.isfinite(cost) else math.inf)

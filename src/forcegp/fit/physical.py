@@ -85,8 +85,7 @@ def fit_physical(
         near = near or (None if roughly else fit_physical(model, logs, evidence, some, roughly=True))
     logs = [log.rows(evenly(log, most if rows is None else rows)) for log in logs]
     typical = typical_sizes(model, logs) if near is None else near.typical
-    space = ParameterSpace(model, typical)
-    unseen = Unseen.of(model, logs[0], typical["force"])
+    space, unseen = ParameterSpace(model, typical), Unseen.of(model, logs[0], typical["force"])
     equations = Equations(space, logs, evidence, unseen.pushed)
     held = equations.hidden if evidence.of_torque and equations.held.shape[1] and equations.windows is None else None
     if held is not None and not unseen.pushed and held.any(-1).sum(1).min() == robot.nv:
@@ -115,8 +114,7 @@ def fit_physical(
         fit, noise = _with_accelerations_weighted(equations, search, x, note)
         for _ in range(1, REWEIGHTINGS):
             fit, noise = _with_accelerations_weighted(equations, search, fit.x, note)
-    found = space.model_at(fit.x)
-    residual = equations.a - equations.accelerations(fit.x)[0]
+    found, residual = space.model_at(fit.x), equations.a - equations.accelerations(fit.x)[0]
     doubts = list(doubts_of_memory(space, fit.x))
     cause = None  # noise of single rows hides what is left
     if equations.tell_bodies and any(each.payload is not None for each in space.carried):

@@ -206,9 +206,7 @@ class SharedInputs(ExpressedKernels):
 
 def as_names(given: object) -> tuple[Any, ...]:
     """One name, or several, as a tuple; empty for what is neither."""
-    if isinstance(given, str):
-        return (given,)
-    return tuple(given) if is_sequence(given) else ()
+    return (given,) if isinstance(given, str) else tuple(given) if is_sequence(given) else ()
 
 
 def has_few_inputs(prior: Unknown, robot: Robot) -> bool:

@@ -39,8 +39,7 @@ def pivoted_cholesky(
             pivot = int(score.argmax())
             if (indices and float(score.sum()) <= tolerance) or float(remainder[pivot]) <= floor:
                 break
-            done = len(indices)
-            column = kernel.cross(z[pivot : pivot + 1], z)[0]
+            done, column = len(indices), kernel.cross(z[pivot : pivot + 1], z)[0]
             column = column - rows[:done].mT @ rows[:done, pivot]
             rows[done] = column / column[pivot].clamp_min(floor).sqrt()
             rows[done, indices] = 0.0  # exactly

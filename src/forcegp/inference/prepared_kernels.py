@@ -312,8 +312,7 @@ def _squared_exponentials(centers: Float[Tensor, "N d"], scales: Sequence[tuple[
 
     def pair(z: Tensor, center: Tensor) -> Tensor:
         z, center = z - shift, center - shift  # or what cancels would be large
-        scaled = z * precisions
-        own = -0.5 * (precisions * center.square()).sum(-1)
+        scaled, own = z * precisions, -0.5 * (precisions * center.square()).sum(-1)
         return variances * (((scaled * center).sum(-1) + own) - 0.5 * (scaled * z).sum(-1)).expm1()
 
     return pair, lambda z: variances[None], tuple(variances.tolist())

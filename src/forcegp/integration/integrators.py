@@ -67,8 +67,7 @@ def rows_jacobian(function: Rows, x: Float[Tensor, "*n k"]) -> tuple[Float[Tenso
 
 def _length(residual: Rows, x: Tensor, d: Tensor, J: Tensor) -> Float[Tensor, " n"]:
     """The largest fraction tried of each step that does not overshoot."""
-    t = torch.ones_like(x[:, 0])
-    square = d.square().sum(-1).clamp_min(torch.finfo(d.dtype).tiny)
+    t, square = torch.ones_like(x[:, 0]), d.square().sum(-1).clamp_min(torch.finfo(d.dtype).tiny)
     for _ in range(MOST_TRIALS):
         ahead = -(d * _solve(J, residual(x + t[:, None] * d))).sum(-1) / square  # 1 at t = 0, < 0 beyond the root
         turned = ~(ahead >= -OVERSHOOT)

@@ -85,8 +85,7 @@ def sample_states(
 
     Rows moved by a fraction of the difference of two others; and positions, velocities and forces of different rows.
     """
-    generator = torch.Generator().manual_seed(seed)
-    states = [training.q, training.v, training.u]
+    generator, states = torch.Generator().manual_seed(seed), [training.q, training.v, training.u]
 
     def some(number: int) -> Tensor:
         return torch.randint(len(training.q), (number,), generator=generator)

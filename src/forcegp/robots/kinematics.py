@@ -76,8 +76,7 @@ def joint_twists(tree: Tree, poses: Bodies) -> tuple[Vectors, Twists]:
     axis, point = poses[:, :3, 2], poses[:, :3, 3]
     moment = torch.linalg.cross(point, axis, dim=1)
     if not tree.all_revolute:
-        moment = tree.revolute * moment + (1.0 - tree.revolute) * axis
-        axis = tree.revolute * axis
+        moment, axis = tree.revolute * moment + (1.0 - tree.revolute) * axis, tree.revolute * axis
     vectors = torch.cat([axis, moment], dim=1)
     if tree.groups:
         vectors = torch.cat(_replaced(tree, vectors, lambda group: _group_vectors(group, poses[group.bodies.stop - 1])))

@@ -196,8 +196,7 @@ class MjcfWriter:
 def _inertial(mass: float, center: np.ndarray, inertia: np.ndarray) -> str:
     """With principal moments, which MuJoCo keeps to the last digit."""
     moments, axes = np.linalg.eigh(inertia)
-    axes = axes * np.sign(np.linalg.det(axes))
-    moments = np.maximum(moments, SMALLEST)
+    axes, moments = axes * np.sign(np.linalg.det(axes)), np.maximum(moments, SMALLEST)
     moments[2] = min(moments[2], (moments[0] + moments[1]) * (1.0 - 1e-15))
     pose = _placed(transform(axes, center))
     pose = pose if "pos" in pose else f' pos="0 0 0"{pose}'

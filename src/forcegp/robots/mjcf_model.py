@@ -70,8 +70,7 @@ class CompiledModel:
             self._body(body)
         for site in range(self.model.nsite):
             if name := self.model.site(site).name:
-                body = self.bodies[self.model.site_bodyid[site]]
-                frame = self._named(name, self.links)
+                body, frame = self.bodies[self.model.site_bodyid[site]], self._named(name, self.links)
                 self._fixed(body, frame, self._pose(self.model.site_pos[site], self.model.site_quat[site]))
         loops, motors = tuple(self._loops()), self._motors() if self.for_system else ()
         self._note_losses(bool(motors))

@@ -107,8 +107,7 @@ class SegmentPath:
         ends = np.append(np.stack([starts[:-1], starts[:-1] + blend, starts[1:] - blend], axis=1), starts[-1])
         pushes = np.stack([push, 0.0 * push, -push], axis=1).reshape(1, -1, 3)
         change = PPoly(pushes, np.maximum.accumulate(ends))  # by rounding two blends may overlap
-        inside = ((time >= 0) & (time < starts[-1]))[:, None]
-        at = np.clip(time, 0.0, starts[-1])
+        inside, at = ((time >= 0) & (time < starts[-1]))[:, None], np.clip(time, 0.0, starts[-1])
         travelled, speed = change.antiderivative(2), change.antiderivative()
         return self.points[0] + travelled(at), speed(at) * inside, change(at) * inside
 

@@ -89,8 +89,7 @@ def friction_curves_figure(posterior: Posterior, dataset: Dataset | None = None)
     columns = min(4 if len(chosen) > 6 else 3, len(chosen))
     rows = math.ceil(len(chosen) / columns)
     figure = style.new_figure(max(3.1 * columns, 5.2), 1.1 + 2.3 * rows)
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    robot = posterior.model.robot
+    grid, robot = figure.subplots(rows, columns, squeeze=False).ravel(), posterior.model.robot
     short = dict(zip(robot.joint_names, style.short_joint_names(robot.joint_names), strict=True))
     several = len({panel.component for panel in chosen}) > 1
     for number, axes in enumerate(grid):
