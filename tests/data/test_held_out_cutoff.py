@@ -83,7 +83,7 @@ def test_a_torque_behind_a_filter_of_the_robot_is_told_from_one_that_is_late(lag
     keep = np.exp(-0.005 / lag) if lag else 0.0  # the filter's exact steps
     u = rows.u[0] + lfilter([1.0 - keep], [1.0, -keep], rows.u - rows.u[0], axis=0)
     u = np.stack([np.interp(rows.time - delay, rows.time, each) for each in u.T], axis=1)
-    late, plain = replace(rows, u=u), Preparation(cutoff=30.0, trim=0.3)
+    late, plain = replace(rows, u=u), Preparation(cutoff=15.0, trim=0.3)
     found = replace(plain, delay="auto").resolved(late)
     assert found.lag == pytest.approx(-lag, rel=0.1)
     assert found.delay == pytest.approx(delay, abs=6e-3)

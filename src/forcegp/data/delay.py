@@ -36,9 +36,9 @@ memory a delay is less sharp, though: where a low-pass filter of dry friction al
 ROWS_PER_PARAMETER = 3
 
 APART = 0.01  # width of the 95 % interval of a delay [s] beyond which the log is said not to tell it
-LAGS, LAGGING, LAG_ROWS = (0.5, 3.0), 0.6, 2_500
+LAGS, LAGGING, LAG_ROWS, IN_BAND = (0.5, 3.0), 0.6, 2_500, 1.5
 """Bounds of the lag of a filter, over the delay that it looks like; the share of what that leaves, below which it is a
-lag; and the rows that tell it."""
+lag; the rows that tell it; and times its corner that the cut-off is at least, for below it lags are delays."""
 WORTH = 0.95
 """Unexplained torque with the common delay, relative to that without, above which the delay explains nothing."""
 
@@ -95,15 +95,16 @@ class Delay:
         return f"{size}, but not more than three standard deviations in most joints: none is assumed"
 
 
-def estimate_delay(dataset: Dataset, cutoff: float | None = None) -> Delay:
+def estimate_delay(dataset: Dataset, cutoff: float | None = None, filters: bool = True) -> Delay:
     """The delay of u behind the motion, joint by joint: `u_logged(t + delay)` acts at t.
 
     For every shift up to .2 s, u is fitted by least squares to the torque regressor of the model's robot, a rotor,
     friction of several widths, a constant, and the model's laws; and to friction that remembers, which
     may take the delay's place. The best shift is the vertex of a parabola; its standard deviation is a block jackknife
-    (Kuensch 1989). Where a filter of first order explains a late torque far better, that is its `lag`. Filter q, v, u
-    and a alike before, by a `LowPass` at `cutoff` Hz: friction is filtered as u is, else it seems to turn late. Raises
-    InvalidInput with contacts, or without torques; DatasetError for a log shorter than .4 s.
+    (Kuensch 1989). Where a filter of first order explains a late torque far better, that is its `lag`, if `filters`
+    are sought. Filter q, v, u and a alike before, by a `LowPass` at `cutoff` Hz: friction is filtered as u is, else
+    it seems to turn late. Raises InvalidInput with contacts, or without torques; DatasetError for a log shorter than
+    .4 s.
     """
     if dataset.model.contacts:
         seen = "the forces of contacts are not known, so a delay cannot be found in this log"
@@ -115,13 +116,13 @@ def estimate_delay(dataset: Dataset, cutoff: float | None = None) -> Delay:
     open_ones = np.isnan(near.seconds) & np.array([bool(np.ptp(u)) for u in dataset.u.T])
     at_end = np.isnan(near.common + near.common_std)  # that of a part of the log lies beyond
     if not (open_ones.any() or at_end):
-        return _with_lag(dataset, near, cutoff)
+        return _with_lag(dataset, near, cutoff) if filters else near
     try:
         far = _told_apart(dataset, LARGEST_DELAY, cutoff)
     except DatasetError:  # too short for that
         return near
     if at_end:
-        return _with_lag(dataset, far, cutoff)
+        return far
     parts = {name: np.where(open_ones, getattr(far, name), getattr(near, name)) for name in ("seconds", "std")}
     return replace(near, **parts)
 
@@ -129,7 +130,7 @@ def estimate_delay(dataset: Dataset, cutoff: float | None = None) -> Delay:
 def _with_lag(dataset: Dataset, delay: Delay, cutoff: float | None) -> Delay:
     """The delay behind a filter of first order, where that leaves far less than the delay alone."""
     late = delay.significant
-    if not 0.0 < late < USUAL_DELAY:
+    if not 0.0 < late < USUAL_DELAY or (cutoff is not None and 2.0 * np.pi * cutoff * late < IN_BAND):
         return delay
     rate = max(1, int(late / (3.0 * float(np.median(np.diff(dataset.time))))))  # that still shows it
     some = dataset.rows(slice(0, rate * LAG_ROWS, rate))

@@ -187,7 +187,7 @@ def _judged(dataset: Dataset, cutoff: float, source: Source) -> tuple[float, dic
     def behind(frequency: float) -> Dataset:
         return with_strokes(differentiated(low_pass(log, frequency, signals=signals), source))
 
-    delay = np.nan_to_num(estimate_delay(behind(cutoff), cutoff).common)  # the best guess, sure or not
+    delay = np.nan_to_num(estimate_delay(behind(cutoff), cutoff, filters=False).common)  # the best guess, sure or not
     log = shifted(log, float(delay))
     away, times = SETTLED / tried[0] + abs(delay), [rows.time for _, rows, _ in episodes_in_order(log)]
     inner = np.concatenate([(time >= time[0] + away) & (time <= time[-1] - away) for time in times])
