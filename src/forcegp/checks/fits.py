@@ -36,7 +36,7 @@ class Explanation:
 
     @cached_property
     def _fits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Shares (nv, 4) that remain of every choice, NaN for a constant torque, and factors (nv,) of the chosen."""
+        """Shares (nv, 4) that remain of every choice, NaN for a constant torque, and factors (nv, 2) of both signs."""
         u, tau = (x - x.mean(axis=0) for x in (self.log.rows.u, self.log.tau))
         every = np.concatenate([self.log.friction, tau[..., None], u[..., None]], axis=-1).swapaxes(0, 1)
         products, power, count = every.mT @ every, np.square(u).sum(axis=0), every.shape[-1]
@@ -48,10 +48,8 @@ class Explanation:
         scaled = products / (size[..., None] * size[:, None])
         number = np.linalg.pinv(scaled[:, :-1, :-1], rcond=1e-10, hermitian=True) @ scaled[:, :-1, -1:]
         bound = power * (1.0 - (scaled[:, -1:, :-1] @ number)[:, 0, 0])
-        shares, factors = (
-            np.full((len(power), 4), np.inf),
-            np.repeat(number[:, -1] * (size[:, -1:] / size[:, -2:-1]), 2, 1),
-        )
+        shares = np.full((len(power), 4), np.inf)
+        factors = np.repeat(number[:, -1] * (size[:, -1:] / size[:, -2:-1]), 2, axis=1)
         shares[:, 0] = positive_solution(less.T @ products @ less)[1]
         worth = np.flatnonzero((bound * np.exp(SIGN) <= shares[:, 0]) & (shares[:, 0] >= LEAST * power))
         if len(worth):  # elsewhere neither sign nor factor is worth what it costs

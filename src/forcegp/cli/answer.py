@@ -62,11 +62,8 @@ def answer_lines(
     early = "early: a controller that holds u is half a time step" if -late * rate < 1.0 else "early, or q and v late"
     why = prepared["why"].get("delay", "u is taken to be on time").partition(";")[0].rstrip(".")
     on_time = why if why.startswith("u is") else f"delay of u: {why}"
-    shifted = (
-        f"u was logged {1e3 * abs(late):.1f} ms {'late' if late > 0.0 else early} (shifted)"
-        if late and lag >= 0.0
-        else on_time
-    )
+    late *= lag >= 0.0  # else it is part of a filter, of which `why` speaks
+    shifted = f"u was logged {1e3 * abs(late):.1f} ms {'late' if late > 0.0 else early} (shifted)" if late else on_time
     shifted += f", rotors follow within {1e3 * lag:.0f} ms" if lag > 0.0 else ""
     filtered = "no filter" if prepared["cutoff"] is None else f"filter at {prepared['cutoff']:.3g} Hz"
     joints, moving = robot.single_joint_names, robot.base != "fixed"

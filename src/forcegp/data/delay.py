@@ -72,7 +72,7 @@ class Delay:
 
     @property
     def behind(self) -> str:
-        """What a lag is."""
+        """The filter that the `lag` is of."""
         return f"behind a low-pass of first order at {0.5 / np.pi / self.lag:.2g} Hz"
 
     @property
