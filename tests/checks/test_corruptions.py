@@ -50,9 +50,8 @@ def log_of(place: int):
 def test_a_corruption_is_named_by_check_and_before_a_fit(name):
     corrupt, words = CORRUPTIONS[name]
     data = corrupt(log_of(list(CORRUPTIONS).index(name)))
-    report = check(data)
+    report, quick = check(data), quick_check(data)
     assert named(said_by(report), words), said_by(report)
-    quick = quick_check(data)
     found = {"joints": report.per_joint(), "quick": numbers(quick), **numbers(report.doubts)}
     assert_unchanged(f"checks/{name}", found, rtol=1e-3)
     line = said_by_fit(data, quick)
