@@ -1,4 +1,4 @@
-"""How much later than they act torques were logged."""
+"""How much later than they act torques were logged, and behind which filter."""
 
 from __future__ import annotations
 
@@ -78,12 +78,12 @@ class Delay:
     @property
     def reason(self) -> str:
         """The common delay and what became of it, for people."""
-        if not np.isfinite(self.common):
-            return "the torques show no common delay"
-        size, used = f"{1e3 * self.common:.1f} ms ± {1e3 * self.common_std:.1f} ms", self.significant
         if self.lag:
             left = f"{100.0 * self.remains:.2g} % of what inverse dynamics does not explain are left"
             return f"u is logged {self.behind}, which is undone; {left}"
+        if not np.isfinite(self.common):
+            return "the torques show no common delay"
+        size, used = f"{1e3 * self.common:.1f} ms ± {1e3 * self.common_std:.1f} ms", self.significant
         if used:
             return f"{size}, which leaves {100.0 * self.remains:.0f} % of what inverse dynamics does not explain"
         ends = (self.common - 2.0 * self.common_std, self.common + 2.0 * self.common_std)
@@ -146,6 +146,8 @@ def _with_lag(dataset: Dataset, delay: Delay, cutoff: float | None) -> Delay:
         return delay
     ends = LAGS[0] * late, LAGS[1] * late
     lag = float(minimize_scalar(left, bounds=ends, method="bounded", options={"xatol": 0.03 * late}).x)
+    if not 1.1 * ends[0] < lag < 0.9 * ends[1]:
+        return delay  # an end of what was tried is no estimate
     found = _told_apart(some, USUAL_DELAY, cutoff, lag)
     return replace(found, remains=delay.remains * found.left / before, lag=lag)
 

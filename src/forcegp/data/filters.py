@@ -73,7 +73,7 @@ def lagged(values: Values, time: Times, seconds: float) -> Values:
     By Tustin's rule (trapezoids), for equal steps of time. Below zero, what such a filter had made the values of.
     """
     step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    if abs(seconds) <= 0.25 * step:
+    if len(values) < 2 or abs(seconds) <= 0.25 * step:
         return values
     if seconds < 0.0:
         return values - seconds * np.gradient(values, step, axis=0)

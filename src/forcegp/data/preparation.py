@@ -98,7 +98,7 @@ class Preparation:
             try:
                 cutoff = None if chosen.cutoff is None else float(chosen.cutoff)
                 found = estimate_delay(_filtered(chosen, dataset), cutoff)
-                chosen = replace(chosen, delay=found.significant, lag=chosen.lag or -found.lag)
+                chosen = replace(chosen, delay=found.significant, lag=chosen.lag or 0.0 - found.lag)
                 reasons["delay"] = found.reason
             except InvalidInput as error:
                 reasons["delay"] = f"u is taken to be on time: {error}"
