@@ -192,6 +192,16 @@ class Explanation:
         return np.square(self.of_any_masses).sum(0) / np.maximum(len(self.log.rows) * self.log.rows.u.var(0), 1e-300)
 
     @property
+    def turned_free(self) -> Float[np.ndarray, " nv"]:
+        """The same of the turned torques, where friction brakes."""
+        rows, shares = self.log.rows, np.zeros(self.log.rows.nv)
+        for k, bodies in enumerate(regressor(self.log.robot, rows).swapaxes(0, 1)):
+            masses, both = np.c_[bodies, np.ones(len(rows))], np.c_[self.log.friction[:, k], -rows.u[:, k]]
+            left = both - masses @ np.linalg.lstsq(masses, both, rcond=1e-8)[0]
+            shares[k] = positive_fit(left[:, :-1], left[:, -1])[1] / max(len(rows) * rows.u[:, k].var(), 1e-300)
+        return shares
+
+    @property
     def good(self) -> np.ndarray:
         """Whether each joint is left with what a good log leaves (nv,)."""
         noise = np.minimum(NOISE * self.floor, WORSE)

@@ -89,19 +89,20 @@ def _all_turned(root: Explanation, inputs: CheckInput) -> tuple[Explanation, lis
     """
     log, left = root.log, list[np.ndarray]()
     moving = np.ptp(log.rows.u, axis=0) > 0.0
-    if root.free[moving].mean() > RESTS:
-        return None  # no masses explain them under any sign
+    least, turned = GAIN + SIGN * moving.sum(), np.maximum(root.turned_free[moving], LEAST)
+    if turned.mean() > RESTS or np.log(root.shares[moving] / turned).sum() < least:
+        return None  # not even masses that cannot exist explain the turned ones, or hardly better
     laws = Actuation(), RigidBodies("all"), *(Law() for Law in (Viscous, Coulomb, Offset, Rotor))
-    for sign in (1.0, -1.0):
+    for sign in (-1.0, 1.0):
         rows = replace(log.rows, u=sign * log.rows.u, model=Model(log.robot, (), laws), measured={})
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of numbers that these rows do not show
             found = fit(rows.model, rows, Torques())
         residual = motion_residuals(rows, found.model)[0][:, moving]
         left.append(residual.var(axis=0) / rows.u[:, moving].var(axis=0))
-    if np.log(left[0] / left[1]).sum() < GAIN + SIGN * moving.sum() or left[1].mean() > RESTS:
+    after, before = (100.0 * each.mean() for each in left)
+    if np.log(left[1] / left[0]).sum() < least or left[0].mean() > RESTS:
         return None
-    before, after = (100.0 * each.mean() for each in left)
     what = "the torques of all joints have the opposite sign of what any robot of these lengths needs: bodies and "
     what += f"friction that can exist leave {before:.2g} % of a torque, and {after:.2g} % of the turned one (mean of "
     what += "joints). Masses of the robot's file are wrong as well."

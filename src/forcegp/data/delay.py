@@ -219,14 +219,15 @@ def least_squares(
     basis: Float[np.ndarray, "rows columns"], targets: Float[np.ndarray, "rows targets"]
 ) -> Float[np.ndarray, "parts targets"]:
     """What columns leave of the square sum of every target: of all rows, then of all but each block of them."""
-    blocks = np.array_split(np.arange(len(targets)), BLOCKS)
-    normal = np.stack([basis[rows].T @ basis[rows] for rows in blocks])
-    right = np.stack([basis[rows].T @ targets[rows] for rows in blocks])
-    square = np.stack([np.square(targets[rows]).sum(axis=0) for rows in blocks])
-    sums = [part.sum(axis=0) for part in (normal, right, square)]
-    left_out = zip(normal, right, square, strict=True)
-    without = [_unexplained(sums[0] - n, sums[1] - r, sums[2] - s) for n, r, s in left_out]
-    return np.stack([_unexplained(*sums), *without])
+    blocks = list(zip(np.array_split(basis, BLOCKS), np.array_split(targets, BLOCKS), strict=True))
+    normal = np.stack([own.T @ own for own, _ in blocks])
+    right = np.stack([own.T @ target for own, target in blocks])
+    square = np.stack([np.einsum("rt,rt->t", target, target) for _, target in blocks])
+    sums = [np.concatenate([part.sum(axis=0)[None], part.sum(axis=0) - part]) for part in (normal, right, square)]
+    values, vectors = np.linalg.eigh(sums[0])
+    told = values > 1e-9 * values[:, -1:]
+    along = np.square(vectors.mT @ sums[1]) * (told / np.where(told, values, 1.0))[..., None]
+    return np.maximum(sums[2] - along.sum(axis=1), 0.0)
 
 
 def jackknife(each: Float[np.ndarray, "estimates blocks"]) -> np.ndarray:
@@ -260,11 +261,6 @@ def torque_columns(
         for there in (dataset.episode == number for number in dataset.episodes):
             forces[there] = LowPass(cutoff)(forces[there], dataset.time[there])
     return np.concatenate([torque.cpu().numpy(), forces[chosen]], axis=-1).transpose(1, 0, 2)
-
-
-def _unexplained(normal: np.ndarray, right: np.ndarray, square: np.ndarray) -> Float[np.ndarray, " shifts"]:
-    """Least sum of squares of every shift, from normal equations."""
-    return np.maximum(square - (right * np.linalg.lstsq(normal, right, rcond=1e-9)[0]).sum(axis=0), 0.0)
 
 
 def lowest(values: Float[np.ndarray, " shifts"], shifts: Float[np.ndarray, " shifts"]) -> float:

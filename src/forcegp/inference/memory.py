@@ -1,12 +1,13 @@
 """How much memory there is, the error that names what a computation would need, and threads of linear algebra."""
 
 from contextlib import AbstractContextManager, nullcontext
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import psutil
 import torch
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from forcegp.errors import NotEnoughMemory
 
@@ -53,4 +54,10 @@ SMALL_COVARIANCE = 2000
 
 def blas_threads(covariance_rows: int) -> AbstractContextManager[Any]:
     """One BLAS thread while the covariance is small: threads that wait for each other cost up to 10 times as much."""
-    return threadpool_limits(1) if covariance_rows <= SMALL_COVARIANCE else nullcontext()
+    return _libraries().limit(limits=1) if covariance_rows <= SMALL_COVARIANCE else nullcontext()
+
+
+@cache
+def _libraries() -> ThreadpoolController:
+    """Of linear algebra in this process; to find them anew takes a millisecond, as long as a small covariance does."""
+    return ThreadpoolController()

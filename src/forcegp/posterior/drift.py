@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.linalg import solve_triangular
 from torch import Tensor
 
 from forcegp.data import Dataset, with_memory
@@ -145,7 +146,7 @@ def with_drift(posterior: Posterior, log: Dataset) -> Posterior:
 def restricted_likelihood(y: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]) -> tuple[float, float]:
     """log density of what y holds beside its mean, but for a constant, and c, where c `covariance` maximises it."""
     lower = np.linalg.cholesky(covariance)
-    ones, white = np.linalg.solve(lower, np.stack([np.ones_like(y), y], axis=1)).T
+    ones, white = solve_triangular(lower, np.stack([np.ones_like(y), y], axis=1), lower=True, check_finite=False).T
     left = white - ones * (ones @ white) / (ones @ ones)
     c = max(float(left @ left) / (len(y) - 1), 1e-300)
     return float(-0.5 * ((len(y) - 1) * np.log(c) + np.log(ones @ ones)) - np.log(lower.diagonal()).sum()), c
@@ -170,10 +171,12 @@ def random_walk(
         [k * width for k in (1.0, 2.0, 4.0, 8.0) if k * width <= max(width, LASTING)],
     )
 
+    lasts = {seconds: same * np.exp(-lag / seconds) for seconds in grids[-1]}
+
     def nats(at: tuple[float, ...]) -> float:
         if at not in found:
             rate, between, lasting, seconds = at
-            of_record = same * (between + lasting * np.exp(-lag / seconds))
+            of_record = between * same + lasting * lasts[seconds]
             found[at] = restricted_likelihood(y, np.diag(1.0 / information) + rate * walked + of_record)
         return found[at][0]
 
