@@ -86,10 +86,11 @@ $(VENV)/.docs: EXTRAS := sim,test,logs,docs
 $(VENV)/.docs: STAMPS := $(VENV)/.demo $(VENV)/.test $(VENV)/.docs
 
 # torch first and alone, because only torch may come from TORCH_INDEX; where that index is out of reach, pip goes on without it.
+# Python compiles what is imported; to compile all that is installed takes half a minute.
 $(VENV)/.demo $(VENV)/.test $(VENV)/.check $(VENV)/.browser $(VENV)/.docs: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
 	@echo "Installing forcegp[$(EXTRAS)] in $(VENV): one to two minutes the first time."
-	$(BIN)/python -m pip install --quiet --quiet --retries 0 --no-deps --extra-index-url $(TORCH_INDEX) --constraint constraints.txt torch
-	$(BIN)/python -m pip install --quiet --quiet --constraint constraints.txt --editable '.[$(EXTRAS)]'
+	$(BIN)/python -m pip install --quiet --quiet --no-compile --retries 0 --no-deps --extra-index-url $(TORCH_INDEX) --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --quiet --no-compile --constraint constraints.txt --editable '.[$(EXTRAS)]'
 	@touch $(STAMPS)
 
 $(VENV)/pyvenv.cfg:

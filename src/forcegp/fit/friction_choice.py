@@ -295,19 +295,18 @@ class _Regression:
             own, squares = np.r_[0 : self.inner.shape[-1], n : b.shape[1]], summed(self.squares[:, j])
             own_A = _bordered(summed(self.inner[:, j]), across, inner)
             own_b = np.concatenate([summed(self.target[:, j]), right], axis=1)
-        whole, given, out = A.sum(0), b.sum(0), np.zeros(len(A))
+        whole, given = A.sum(0), b.sum(0)
         scale = np.sqrt(whole.diagonal().clip(1e-300))
-        for k in range(len(A)):
-            normal, right = (whole - A[k], given - b[k]) if held_out else (whole, given)
-            ridge = RIDGE * np.eye(len(scale))
-            x = np.linalg.solve(normal / np.outer(scale, scale) + ridge, right / scale) / scale
-            loads = "factor" not in parts or 0.0 <= x[n + 2] <= HIGHEST
-            slows = "root" not in parts or x[n + 1] + x[n + 2 + ("factor" in parts)] * self.root[j] >= 0.0
-            falls = "breakaway" not in parts or 0.0 <= x[-1] <= x[n + 1]  # by half at most
-            if not (loads and slows and falls):
-                return np.full(len(out), np.inf)
-            out[k] = squares[k] - 2.0 * x[own] @ own_b[k] + x[own] @ own_A[k] @ x[own]
-        return out
+        normal, right = (whole - A, given - b) if held_out else (A, b)
+        normal = normal / np.outer(scale, scale) + RIDGE * np.eye(len(scale))
+        x = np.linalg.solve(normal, (right / scale)[..., None])[..., 0].T / scale[:, None]
+        loads = "factor" not in parts or ((x[n + 2] >= 0.0) & (x[n + 2] <= HIGHEST)).all()
+        slows = "root" not in parts or (x[n + 1] + x[n + 2 + ("factor" in parts)] * self.root[j] >= 0.0).all()
+        falls = "breakaway" not in parts or ((x[-1] >= 0.0) & (x[-1] <= x[n + 1])).all()  # by half at most
+        if not (loads and slows and falls):
+            return np.full(len(A), np.inf)
+        x = x[own].T
+        return squares + (x * ((own_A @ x[..., None])[..., 0] - 2.0 * own_b)).sum(axis=1)
 
     def _places(self, parts: tuple[str, ...], fall: int) -> Int[np.ndarray, " k"]:
         breaks = ("breakaway" in parts and each == fall for each in range(len(FALLS)))
