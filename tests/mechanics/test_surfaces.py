@@ -88,9 +88,7 @@ def test_wrong_numbers_are_named(make, message):
         make()
 
 
-@pytest.mark.parametrize(
-    "function", [lambda p: p, lambda p: p[:1], lambda p: 3.0], ids=["vector", "one entry", "number"]
-)
+@pytest.mark.parametrize("function", [lambda p: p, lambda p: p[:1], lambda p: 3.0], ids=["vector", "entry", "number"])
 @pytest.mark.parametrize("batch", [(), (2,)], ids=str)
 @pytest.mark.parametrize("what", ["value", "gradient", "hessian"])
 def test_a_function_must_return_a_scalar_tensor(function, batch, what):

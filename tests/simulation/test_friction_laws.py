@@ -13,8 +13,8 @@ from forcegp.forces.force import Coefficient
 from forcegp.forces.joint_law import JointLaw
 from forcegp.forces.registry import FORCES
 from forcegp.simulation import KukaSurfaceConfig
-from forcegp.simulation.joint_friction import laws_of_joints
 from forcegp.simulation.kuka_surface import PointFriction, joint_friction_of, multiplier_with_friction
+from forcegp.simulation.trajectory import laws_of_joints
 
 STRIBECK = PointFriction(coulomb=0.3, static=0.5, breakaway_velocity=0.1, smoothing=1e-6)
 ROBOT = Robot.from_urdf_text(

@@ -54,7 +54,7 @@ class LowPass:
             which = f"a filter of order {self.order} with a cut-off at {self.cutoff} Hz"
             seen = f"{len(values)} rows are too few for {which}; more than {padding:g} are needed"
             raise DatasetError(f"{seen}. Use a higher cut-off, or leave the episode out.")
-        return sosfiltfilt(zpk2sos(*design), values, axis=0, padlen=padding)
+        return sosfiltfilt(zpk2sos(*design), values, axis=0, padlen=padding)  # type: ignore[arg-type]  # complex poles
 
     def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Float[np.ndarray, " k"]:
         """Of amplitudes at these frequencies [Hz], for rows at this rate [Hz]; 0 at half the rate."""

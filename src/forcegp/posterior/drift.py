@@ -146,7 +146,8 @@ def with_drift(posterior: Posterior, log: Dataset) -> Posterior:
 def restricted_likelihood(y: Float[np.ndarray, " n"], covariance: Float[np.ndarray, "n n"]) -> tuple[float, float]:
     """log density of what y holds beside its mean, but for a constant, and c, where c `covariance` maximises it."""
     lower = np.linalg.cholesky(covariance)
-    ones, white = solve_triangular(lower, np.stack([np.ones_like(y), y], axis=1), lower=True, check_finite=False).T
+    both = solve_triangular(lower, np.stack([np.ones_like(y), y], axis=1), lower=True, check_finite=False)
+    ones, white = both[:, 0], both[:, 1]
     left = white - ones * (ones @ white) / (ones @ ones)
     c = max(float(left @ left) / (len(y) - 1), 1e-300)
     return float(-0.5 * ((len(y) - 1) * np.log(c) + np.log(ones @ ones)) - np.log(lower.diagonal()).sum()), c

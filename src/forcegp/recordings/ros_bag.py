@@ -1,11 +1,14 @@
-"""Bags of ROS 1 and 2, .mcap and .db3, read with `rosbags` (extra "logs"); several topics on one clock."""
+"""Bags of ROS 1 and 2, .mcap (also cut ones) and .db3, by `rosbags` (extra "logs"); several topics on one clock."""
 
+import io
 import os
 import re
+import sys
 import tempfile
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -15,10 +18,14 @@ from jaxtyping import Bool, Float, Shaped
 from typing_extensions import override
 
 from forcegp.errors import DatasetError, DataWarning, FileFormatError, InvalidInput, required_extra
-from forcegp.recordings.cut_mcap import is_cut, whole_copy
 from forcegp.recordings.source import LONGEST_VECTOR, Columns, Source, element_names, reading
 from forcegp.sandbox import MEMORY, SECONDS, read_apart
 
+MAGIC = b"\x89MCAP0\r\n"
+CHUNK, DATA_END = 6, 15  # kinds of records; each begins with its kind and the length of its content
+END = b"\x0f" + (4).to_bytes(8, "little") + bytes(4) + b"\x02" + (20).to_bytes(8, "little") + bytes(20) + MAGIC
+ZSTD = "compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd"
+READERS = {"zstd": (ZSTD, "ZstdDecompressor"), "lz4": ("lz4.frame", "LZ4FrameDecompressor")}
 LOG_TIME = "log_time"
 ROWS_AT_A_TIME = 2**16  # numbers of Python take ten times the memory of those in an array
 LOOKED_AT = 100  # messages of each topic that decide which columns there are: publishers may share a topic
@@ -368,3 +375,37 @@ def _topics(columns: Columns, plan: Any) -> tuple[dict[str, str], dict[str, Bool
     first: dict[bytes, str] = {}
     topics = {name: first.setdefault(own.tobytes(), name) for name, own in filled.items()}
     return topics | dict.fromkeys(shared, topics[positions[0]]), filled
+
+
+def is_cut(path: Path) -> bool:
+    """Whether an MCAP file lacks its end."""
+    with path.open("rb") as file:
+        begin = file.read(len(MAGIC))
+        file.seek(-min(len(MAGIC), path.stat().st_size), io.SEEK_END)
+        return begin == MAGIC and file.read() != MAGIC
+
+
+def whole_copy(path: Path, folder: Path) -> Path:
+    """A copy of the records that are whole, those in the chunk at the cut among them. Raises FileFormatError."""
+    copy = folder / path.name
+    with reading(path, "a bag"), path.open("rb") as file, copy.open("wb") as made:
+        made.write(file.read(len(MAGIC)))
+        for kind, content, record in _records(file):
+            size, name = int.from_bytes(content[16:24], "little"), int.from_bytes(content[28:32], "little")
+            if kind == CHUNK and not record:
+                packed = content[40 + name :]
+                if name:
+                    module, reader = READERS[content[32 : 32 + name].decode()]
+                    packed = getattr(import_module(module), reader)().decompress(packed, max_length=size)
+                record = b"".join(inside for _, _, inside in _records(io.BytesIO(packed)))
+            made.write(b"" if kind >= DATA_END else record)
+        made.write(END)
+    return copy
+
+
+def _records(file: Any) -> Iterator[tuple[int, bytes, bytes]]:
+    """Kind, content, and the whole record, which is empty at the cut."""
+    while len(head := file.read(9)) == 9:
+        length = int.from_bytes(head[1:], "little")
+        content = file.read(min(length, sys.maxsize))
+        yield head[0], content, head + content if len(content) == length else b""

@@ -282,8 +282,8 @@ class Robot(RobotStructure, RigidBodyDynamics):
             given = {name: self.checked_input(name, x) for name, x in zip(names, arguments, strict=True)}
             batch = checks.broadcast_batch({name: x.shape[:-1] for name, x in given.items()})
             q, *others = (x.expand(*batch, -1) for x in given.values())
-        batches = {x.shape[:-1] if isinstance(x, Tensor) else None for x in (q, *others)}
-        if len(batches) == 1 and None not in batches and (batch := batches.pop()).numel() > AT_ONCE:
+        [batch, *more] = {x.shape[:-1] if isinstance(x, Tensor) else torch.Size() for x in (q, *others)}
+        if not more and batch.numel() > AT_ONCE:
             parts = zip(*(x.flatten(0, -2).split(AT_ONCE) for x in (q, *others)), strict=True)
             made = [self._dynamics(function, *some) for some in parts]
             several = isinstance(made[0], tuple)

@@ -21,8 +21,8 @@ from forcegp.robots.structure import RigidBodyDynamics
 from forcegp.robots.urdf import numbers
 from forcegp.robots.urdf_file import inertial_element
 from forcegp.simulation import trajectory
-from forcegp.simulation.joint_friction import Friction, laws_of_joints
 from forcegp.simulation.scenarios import KukaSurfaceConfig
+from forcegp.simulation.trajectory import Friction, laws_of_joints
 
 TOOL_LINK = "lbr_iiwa_link_7"
 BASE_LINK = "lbr_iiwa_link_0"

@@ -21,9 +21,8 @@ from forcegp.mechanics import fixed_point
 from forcegp.model import Model
 from forcegp.progress import tell
 from forcegp.robots import Robot
-from forcegp.simulation.joint_friction import laws_of_joints
 from forcegp.simulation.scenarios import QuadrotorConfig, QuadrupedConfig
-from forcegp.simulation.trajectory import RATE, recorded
+from forcegp.simulation.trajectory import RATE, laws_of_joints, recorded
 
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 STANCE = (0.0, 0.75, -1.5)  # roll, hip pitch and knee in rad
