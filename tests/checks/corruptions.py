@@ -213,14 +213,15 @@ def sticking(data: Dataset, weights: list[list[float]]) -> Dataset:
     return replace(moved, u=moved.u + 3.0 * np.std(moved.u, axis=0) * np.tanh(v / 0.05))
 
 
-def gripped(data: Dataset, begin: float) -> Dataset:
-    """A load of .6 kg on the last link from some time on."""
+def gripped(data: Dataset, begin: float, every: float = np.inf) -> Dataset:
+    """A load of .6 kg on the last link from some time on, or so long, then as long without, again and again."""
     assert data.model is not None
     needed = [
         robot.inverse_dynamics(*(torch.tensor(x) for x in (data.q, data.v, data.a))).numpy()
         for robot in (data.model.robot, loaded(data.model.robot, "link2", mass=0.2))
     ]
-    return replace(data, u=data.u + np.where(data.time[:, None] >= begin, needed[1] - needed[0], 0.0))
+    held = (data.time >= begin) & ((data.time - begin) % (2.0 * every) < every)
+    return replace(data, u=data.u + np.where(held[:, None], needed[1] - needed[0], 0.0))
 
 
 def moved(data: Dataset, by: tuple[float, float, float]) -> Dataset:

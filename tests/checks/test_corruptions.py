@@ -1,26 +1,15 @@
 """Every corruption of a two-joint log is named by `check`, and said in one line before a fit; clean logs are not."""
 
+import itertools
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from tests.checks import corruptions
 from tests.checks.clean_logs import between_postures, clean_logs, one_rests, rests, with_motion
-from tests.checks.corruptions import (
-    CORRUPTIONS,
-    ROBOTS,
-    at,
-    clean,
-    gripped,
-    invented,
-    named,
-    numbers,
-    recorded_under,
-    said_by,
-    said_by_fit,
-    two_links,
-)
+from tests.checks.corruptions import CORRUPTIONS, ROBOTS, at, clean, gripped, named, said_by, two_links
 from tests.checks.logs import clean as filtered_log
 from tests.goldens.compare import assert_unchanged
 from tests.posterior.arm import arm_model
@@ -31,6 +20,7 @@ from forcegp.checks.causes import like_units
 from forcegp.checks.check_input import CheckInput
 from forcegp.checks.couplings import _needed, _rounded
 from forcegp.checks.explanations import _units
+from forcegp.checks.residuals import two_levels
 from forcegp.checks.search import search
 from forcegp.checks.torque_doubts import _remembered, held_points, without_stops
 from forcegp.checks.torques import Comparison
@@ -52,18 +42,18 @@ def test_a_corruption_is_named_by_check_and_before_a_fit(name):
     data = corrupt(log_of(list(CORRUPTIONS).index(name)))
     report, quick = check(data), quick_check(data)
     assert named(said_by(report), words), said_by(report)
-    found = {"joints": report.per_joint(), "quick": numbers(quick), **numbers(report.doubts)}
+    found = {"joints": report.per_joint(), "quick": corruptions.numbers(quick), **corruptions.numbers(report.doubts)}
     assert_unchanged(f"checks/{name}", found, rtol=1e-3)
-    line = said_by_fit(data, quick)
+    line = corruptions.said_by_fit(data, quick)
     assert "\n" not in line
     assert named(line, words), line
     assert words not in ("register", "targets") or len(quick.at("wrong")) == 1, line
 
 
 def test_an_invented_contact_is_named_by_check_and_before_a_fit():
-    data = invented(clean(two_links(), 2))
+    data = corruptions.invented(clean(two_links(), 2))
     assert named(said_by(check(data)), "contact")
-    assert named(said_by_fit(data, quick_check(data)), "contact")
+    assert named(corruptions.said_by_fit(data, quick_check(data)), "contact")
 
 
 def test_a_contact_is_not_sought_where_velocities_are_wrong(monkeypatch):
@@ -135,7 +125,7 @@ def test_the_factor_of_a_torque_has_an_interval():
 def test_the_gravity_of_a_tilted_base_is_right(degrees):
     angle = np.deg2rad(degrees)
     true = 9.81 * np.array([np.sin(angle) * 0.6, np.sin(angle) * 0.8, -np.cos(angle)])
-    found = said(recorded_under(clean(ROBOTS["spatial"](), 3, noise="qvu"), tuple(true)))[0]
+    found = said(corruptions.recorded_under(clean(ROBOTS["spatial"](), 3, noise="qvu"), tuple(true)))[0]
     gravity = np.array(found.numbers["gravity"])
     stated = found.command.removeprefix("forcegp import --gravity=").split(",")
     np.testing.assert_allclose(np.array(stated, float), gravity, atol=1e-3)
@@ -192,7 +182,7 @@ def test_a_tilt_beside_a_load_is_as_right_as_without():
     heavy = loaded(plain.model.robot, plain.model.robot.layout.bodies[-1].child, mass=0.5)
     motion = [torch.tensor(x) for x in (plain.q, plain.v, plain.a)]
     u = plain.u + (heavy.inverse_dynamics(*motion) - plain.model.robot.inverse_dynamics(*motion)).numpy()
-    tilted = recorded_under(replace(plain, u=u, model=Model(heavy)), tuple(true))
+    tilted = corruptions.recorded_under(replace(plain, u=u, model=Model(heavy)), tuple(true))
     found = said(replace(tilted, model=plain.model))[0]
     gravity = np.array(found.numbers["gravity"])
     assert np.rad2deg(np.arccos(gravity @ true / np.linalg.norm(gravity) / 9.81)) < 1.0
@@ -225,8 +215,9 @@ def test_gears_that_stick_are_no_unknown_cause_and_more_than_they_hold_is_one(ti
         bristle += (v - abs(v) * bristle / 2e-3) / 4000.0
         held.append(bristle / 2e-3)
     force = np.std(data.u[:, 1]) * np.array(held)[19::20] * np.where(np.abs(data.v[:, 1]) < 1e-9, times, 1.0)
-    found = check(replace(data, u=data.u + np.stack([0.0 * force, force], axis=1))).doubts
-    assert [(each.about, each.joints) for each in found if each.level != "ok"] == [(about, ("joint2",))]
+    data = replace(data, u=data.u + np.stack([0.0 * force, force], axis=1))
+    assert [(each.about, each.joints) for each in check(data).doubts if each.level != "ok"] == [(about, ("joint2",))]
+    assert len(check(gripped(data, 6.1)).doubts.of("load")) == (times == 1.0)  # which such gears do not hide
 
 
 @pytest.mark.parametrize(("begin", "told"), [(12.0, True), (6.0, False)])
@@ -328,14 +319,26 @@ def test_torques_in_steps_are_right_and_friction_that_fades_is_named():
     assert [each.about for each in cold if each.level != "ok"] == ["drift"], "no push, either"
 
 
-@pytest.mark.parametrize(("at", "rest", "out"), [(7.0, 4, (0.0, 7.0)), (12.2, 4, (12.2, 14.99)), (11, -1, (11, 14.99))])
-def test_the_time_of_a_load_is_told_also_behind_a_rest(at, rest, out):
+LOADS = [((7.0,), 4, (0.0, 7.0)), ((12.2,), 4, (12.2, 14.99)), ((11,), -1, (11, 14.99)),
+         ((2.0, 2.0), -1, (2, 4, 6, 8, 10, 12, 14, 14.99)), ((14.2,), -1, (14.2, 14.99))]  # fmt: skip
+
+
+@pytest.mark.parametrize(("at", "rest", "out"), LOADS)
+def test_the_times_of_a_load_are_told_also_behind_a_rest(at, rest, out):
     time = np.arange(0.0, 15.0, 0.01)
     way = np.stack([np.sin(2.1 * time), 0.8 * np.sin(3.3 * time)], axis=1) * np.clip(time - rest, 0, 1)[:, None] ** 3
-    doubts = check(gripped(with_motion(two_links(), way, 100.0, 3, 0.0), at)).doubts
+    doubts = check(gripped(with_motion(two_links(), way, 100.0, 3, 0.0), *at)).doubts
     [found] = doubts.of("load")
     assert found.numbers["seconds"] == pytest.approx(out, abs=0.2)
     assert not doubts.of("push", "drift")  # a load that is taken up is none
+
+
+def test_rows_are_taken_where_they_and_the_changes_cost_least():
+    each = np.array([*itertools.product([0, 1], repeat=9)])
+    for seed in range(20):
+        cost, change = np.random.default_rng(seed).normal(size=9), 0.2 * seed
+        total = each @ cost + change * np.abs(np.diff(each, axis=1)).sum(axis=1)
+        assert two_levels(cost, change).tolist() == each[np.argmin(total)].astype(bool).tolist()
 
 
 def test_short_and_unordered_logs_are_looked_at_too():

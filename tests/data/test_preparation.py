@@ -10,7 +10,7 @@ from tests.data.samples import assert_equal, dataset, model
 from tests.posterior.arm import arm_model
 
 from forcegp.data import Dataset, Delay, Preparation, differentiated, estimate_delay, low_pass, motion_spectrum
-from forcegp.data.ripple import rate_of_waves
+from forcegp.data.delay import rate_of_waves
 from forcegp.data.spectrum import _knee_and_floor
 from forcegp.errors import DatasetError, DataWarning, InvalidInput
 

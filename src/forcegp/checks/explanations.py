@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from forcegp.checks.causes import NUMBER, SIGN, Candidate, Cause, changed, like_units, number
 from forcegp.checks.check_input import DEGREE, CheckInput
 from forcegp.checks.couplings import coupled_joints
-from forcegp.checks.residuals import cogging
+from forcegp.checks.residuals import cogging, loads
 from forcegp.checks.torques import Change, Comparison, inverse_dynamics, left_of, needed_torques, solved
 from forcegp.data import Dataset
 from forcegp.doubts import listed
@@ -31,8 +31,6 @@ TILTED = np.deg2rad(6.0)  # angle from which a direction of gravity is another
 HEAVIEST = 1.3  # times the assumed gravity, beyond which it is something else
 FACTORS = np.exp(np.linspace(-2.5, 2.5, 251))  # of lengths, its ends left out
 RATIOS = np.exp(np.linspace(-1.2, 1.2, 25))  # of gears: the steps are then divided by ten
-PARTS = 16  # of the log, at whose ends a load is sought that is not held all the time; then as many of a part
-UNSURE = 10.0  # nats within which a load may be taken up at another time
 MOST_ENDS = 4  # links that may hold something beside a tilt
 ALL_TRIED = 8  # joints up to which every pair is exchanged; of more, those that fit badly
 
@@ -296,9 +294,7 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
         size = float(P[3, 3])
         if body in ends:  # in kg and kg m, or in masses of the link
             unit = size or 1.0
-            columns = unit * columns_of[:, :, body, :4]
-            always = ": it holds something", columns, 2.5 * NUMBER, {}
-            for when, part, cost, told in (always, *_parts(now, inputs, columns)):
+            for when, part, cost, told in loads(now, inputs, unit * columns_of[:, :, body, :4]):
                 held = solved(now, part)
                 if held is None or held[0] <= 0.0:
                     continue
@@ -347,38 +343,6 @@ def _linear(now: Comparison, inputs: CheckInput) -> Iterator[Candidate]:
             do = "Describe it as `spring` (forcegp fit --forces spring estimates it)."
             cause = number("spring", text, joint, float(found[0]), NUMBER + 0.2, do=do)
             yield cause, replace(now, more=now.more + found[0] * only)
-
-
-def _parts(
-    now: Comparison, inputs: CheckInput, columns: Float[np.ndarray, "rows nv k"]
-) -> Iterator[tuple[str, Float[np.ndarray, "rows nv k"], float, dict[str, Any]]]:
-    """What a load needs that is held up to a time or from it on, where that leaves least."""
-    share, tried = (now.rows.time - now.rows.time[0]) / np.ptp(now.rows.time), list[tuple[float, float, bool]]()
-    if len(now.rows.episodes) > 1 or not inputs.log.time_ordered:
-        return
-    for middle, width in ((0.5, 1.0), (np.nan, 2.0 / PARTS)):
-        middle = min(tried)[1] if tried else middle
-        for at in middle + width * (np.arange(1, PARTS) / PARTS - 0.5):
-            for later in (False, True):
-                part = ((share >= at) == later)[:, None, None] * columns
-                if (found := solved(now, part)) is not None and found[0] > 0.0:
-                    left = left_of(now, np.stack([now.rows.u, now.tau + part @ found]), np.ones((1, 1)))
-                    tried.append((float(left[0]), float(at), later))
-        if not tried:
-            return
-    _, at, later = min(tried)
-    held, first = (share >= at) == later, int(np.searchsorted(share, at))
-    load = columns @ solved(now, held[:, None, None] * columns)
-    left = now.beside_friction((now.rows.u - now.tau - held[:, None] * load)[..., None])[..., 0].T
-    other = np.square(left + np.where(held[:, None], load, -load)) - np.square(left)  # on the other side of that time
-    cost = np.cumsum((0.5 * other / (left.var(axis=0) + 1e-300)).sum(axis=1))
-    cost = np.where(np.arange(len(cost)) < first, 1.0, -1.0) * (cost[first] - cost)
-    times, (begin, end), smeared = now.given.time, inputs.log.time[[0, -1]].tolist(), 1.5 / inputs.compared_cutoff
-    likely, time = times[cost < cost.min() + UNSURE], float(times[max(int(np.argmin(cost)) - 1, 0) :][:2].mean())
-    short = (float(likely[0]) - smeared, end) if at > 0.5 else (begin, float(likely[-1]) + smeared)
-    do = "Leave the shorter part out by forcegp import --without {:.2f},{:.2f}, as forcegp auto does.".format(*short)
-    when = f" from {time:.4g} s on: it takes up a load" if later else f" until {time:.4g} s: it lets go of a load"
-    yield when, ((times >= time) == later)[:, None, None] * columns, 3.5 * NUMBER, {"do": do, "seconds": short}
 
 
 def _gravities(

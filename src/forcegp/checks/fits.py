@@ -207,12 +207,15 @@ class Explanation:
         noise = np.minimum(NOISE * self.floor, WORSE)
         return self.exact <= np.maximum(np.minimum(FREE * self.free, EXPLAINED), np.maximum(GOOD, noise))
 
-    def stands(self, root: "Explanation") -> bool:
-        """Whether all joints are left with what a good log leaves; with rough masses, if mistakes were corrected."""
+    def stands(self, root: "Explanation", gears: Bool[np.ndarray, " nv"]) -> bool:
+        """Whether all joints but those of `gears` that stick are left with what a good log leaves.
+
+        With rough masses, if mistakes were corrected.
+        """
         far = {*np.flatnonzero((self.chosen >= 2) & (abs(np.log(np.abs(self.factors) + 1e-300)) > np.log(MUCH_MORE)))}
         if far & {*self.turned, *(k for cause in self.causes for k in cause.joints)}:
             return False  # nothing else is known of a torque in unknown units
-        if self.good.all():
+        if (self.good | gears & (self.exact <= WORSE * root.exact)).all():
             return True
         exactly = any(cause.number for cause in self.causes) or (self.chosen >= 2).any()
         return not exactly and root.rough.max() > EXPLAINED and bool((self.rough <= EXPLAINED).all())

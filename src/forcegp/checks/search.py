@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -63,10 +64,11 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
         if frontier[0].value > root.plain - GAIN and root.good.all():
             break  # of a good log, of which no cause explains much, two explain no more
     every.sort(key=lambda each: each.value)
+    sticking = cache(lambda: (root.rough > EXPLAINED) & [_sticks(root, k) for k in range(len(root.floor))])
     for best in every:
         near = best.value < every[0].value + 2.0 * GAIN
         clear = (np.log(np.clip(root.shares, LEAST, 1.0) / np.maximum(best.exact, LEAST)) >= GAIN).any()
-        if near and clear and root.plain - best.value >= GAIN and best.stands(root):
+        if near and clear and root.plain - best.value >= GAIN and best.stands(root, sticking()):
             return best, list(_said(best, root, inputs))
     signs = root.with_signs()
     sure = [k for k in signs.turned if signs.good[k]]

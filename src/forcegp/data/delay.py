@@ -1,4 +1,4 @@
-"""How much later than they act torques were logged, and behind which filter."""
+"""How much later than they act torques were logged, and behind which filter; and waves over positions, beside them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from scipy.optimize import minimize_scalar
 
 from forcegp.data.dataset import Dataset
 from forcegp.data.filters import LowPass, episodes_in_order, lagged
-from forcegp.data.ripple import rate_of_waves, waves
 from forcegp.data.strokes import joint_positions, with_strokes
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.forces.joint_laws import law_columns, usual_columns
@@ -35,6 +34,10 @@ memory a delay is less sharp, though: where a low-pass filter of dry friction al
 """
 ROWS_PER_PARAMETER = 3
 
+FEWEST, FINEST, STEP = 3.0, 300.0, 0.2
+"""Repetitions over the reach of a joint: fewest, most, and steps of what is tried."""
+REPEATS, LITTLE = 0.5, 0.02  # of what is left, that a wave explains (wrong friction: .26); of a force, to seek one
+PLACES = 2048  # bins of the reach, in which a wave is sought first: seven of the finest
 APART = 0.01  # width of the 95 % interval of a delay [s] beyond which the log is said not to tell it
 LAGS, LAGGING, LAG_ROWS, IN_BAND = (0.5, 3.0), 0.6, 2_500, 1.5
 """Bounds of the lag of a filter, over the delay that it looks like; the share of what that leaves, below which it is a
@@ -99,12 +102,11 @@ def estimate_delay(dataset: Dataset, cutoff: float | None = None, filters: bool 
     """The delay of u behind the motion, joint by joint: `u_logged(t + delay)` acts at t.
 
     For every shift up to .2 s, u is fitted by least squares to the torque regressor of the model's robot, a rotor,
-    friction of several widths, a constant, and the model's laws; and to friction that remembers, which
-    may take the delay's place. The best shift is the vertex of a parabola; its standard deviation is a block jackknife
-    (Kuensch 1989). Where a filter of first order explains a late torque far better, that is its `lag`, if `filters`
-    are sought. Filter q, v, u and a alike before, by a `LowPass` at `cutoff` Hz: friction is filtered as u is, else
-    it seems to turn late. Raises InvalidInput with contacts, or without torques; DatasetError for a log shorter than
-    .4 s.
+    friction of several widths, a constant, and the model's laws; and to friction that remembers, which may take the
+    delay's place. The best shift is the vertex of a parabola; its standard deviation is a block jackknife (Kuensch
+    1989). Where a filter of first order explains a late torque far better, that is its `lag`, if `filters` are sought.
+    Filter q, v, u and a alike before, by a `LowPass` at `cutoff` Hz: friction is filtered as u is, else it seems to
+    turn late. Raises InvalidInput with contacts, or without torques; DatasetError for a log shorter than .4 s.
     """
     if dataset.model.contacts:
         seen = "the forces of contacts are not known, so a delay cannot be found in this log"
@@ -278,3 +280,33 @@ def torques_of_joints(dataset: Dataset) -> bool:
     """Whether u has one torque per degree of freedom."""
     model = dataset.model
     return model.actuators == model.robot.joint_names and model.actuation.matrix is None
+
+
+def rate_of_waves(
+    q: Float[np.ndarray, " rows"], force: Float[np.ndarray, " rows"], basis: Float[np.ndarray, "rows k"]
+) -> float:
+    """The rate [1/rad or 1/m] of a wave over positions that explains most of what orthonormal columns leave of a force.
+
+    It is that of the largest power (Lomb 1976, Scargle 1982); 0 where no wave explains most, and what the best of so
+    many would of noise: twice the logarithm of their number over that of the rows.
+    """
+    reach, left = float(np.ptp(q)), force - basis @ (basis.T @ force)
+    left = left - left.mean()
+    if not reach > 0.0 or not np.square(left).sum() > LITTLE * np.square(force - force.mean()).sum():
+        return 0.0
+    from scipy.signal import lombscargle  # half a second, which only few logs should cost
+
+    bins = np.bincount(((q - q.min()) / reach * (PLACES - 1)).round().astype(int), left, PLACES)
+    size = round((PLACES - 1) / STEP)  # of which one frequency is a step of repetitions
+    tried = np.abs(np.fft.rfft(bins, size))[round(FEWEST / STEP) : round(FINEST / STEP)]
+    repetitions = FEWEST + STEP * int(np.argmax(tried)) + np.linspace(-STEP, STEP, 41)  # then closer
+    rates = 2.0 * np.pi / reach * repetitions
+    found = lombscargle(q - q.mean(), left, rates)
+    best, power = float(rates[int(np.argmax(found))]), float(found.max())
+    by_chance = 2.0 * np.log(len(tried)) / len(q)
+    return best if 2.0 * power > (REPEATS + by_chance) * np.square(left).sum() else 0.0
+
+
+def waves(q: Float[np.ndarray, " rows"], rate: float) -> Float[np.ndarray, "rows 2"]:
+    """Sine and cosine over positions."""
+    return np.stack([np.sin(rate * q), np.cos(rate * q)], axis=1)

@@ -50,14 +50,9 @@ def _free_in_container() -> int:
 
 SMALL_COVARIANCE = 2000
 """Rows of the full covariance below which one thread is faster than several (measured on 2 cores)."""
+LIBRARIES = cache(ThreadpoolController)  # to find them anew takes a millisecond, as long as a small covariance does
 
 
 def blas_threads(covariance_rows: int) -> AbstractContextManager[Any]:
     """One BLAS thread while the covariance is small: threads that wait for each other cost up to 10 times as much."""
-    return _libraries().limit(limits=1) if covariance_rows <= SMALL_COVARIANCE else nullcontext()
-
-
-@cache
-def _libraries() -> ThreadpoolController:
-    """Of linear algebra in this process; to find them anew takes a millisecond, as long as a small covariance does."""
-    return ThreadpoolController()
+    return LIBRARIES().limit(limits=1) if covariance_rows <= SMALL_COVARIANCE else nullcontext()

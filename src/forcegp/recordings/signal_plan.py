@@ -14,12 +14,12 @@ from forcegp.data import differentiate
 from forcegp.data.configurations import in_base
 from forcegp.data.dataset import FORCE, IMU, ROTATION, TORQUE, TRANSLATION, imu_place
 from forcegp.errors import FileFormatError, InvalidInput, require_known
-from forcegp.recordings.expression import Expression, parse_expression
 from forcegp.recordings.mapping import (
     ORIENTATIONS,
     SIGNALS,
     UNITS,
     ColumnMapping,
+    Expression,
     LogUnit,
     counted_columns,
     expanded,
@@ -29,6 +29,7 @@ from forcegp.recordings.mapping import (
     log_unit,
     named_after,
     named_unit,
+    parse_expression,
 )
 from forcegp.recordings.source import Columns, Source
 from forcegp.robots import Robot
