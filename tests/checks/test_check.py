@@ -310,7 +310,9 @@ def test_torques_that_repeat_over_equal_ways_are_named():
     assert found.numbers["size"] == pytest.approx([0.6 * size[1]], rel=0.1)
 
 
-@pytest.mark.parametrize(("size", "still", "about"), [(4e-4, 0, ""), (0.1, 4, "jumps"), (0.1, 6, "frozen")])
+@pytest.mark.parametrize(
+    ("size", "still", "about"), [(0.1, 0, "jumps"), (4e-4, 0, ""), (0.1, 4, "jumps"), (0.1, 6, "frozen")]
+)
 def test_an_encoder_that_slips_or_stops_is_named(size, still, about):
     data, row = clean(0), np.arange(1400)
     q = data.q + np.outer(row > 902, [0.0, size, 0.0])

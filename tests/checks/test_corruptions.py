@@ -102,7 +102,9 @@ def test_two_mistakes_are_both_named():
     assert after < 0.1 * before  # of the log as it is, without any factor
 
 
-@pytest.mark.parametrize("x", ["1e3 -9.55 mm/s,rpm", "1e3 10 mm/s,rad/s", "1e2 1 cm/s,rad/s", "1 9 ", "2 9.5 mm/s,rpm"])
+@pytest.mark.parametrize(
+    "x", ["1e3 -9.55 mm/s,rpm", "1e3 10 mm/s,rad/s", "1e2 1 cm/s,rad/s", "1 10 ", "2 9.5 mm/s,rpm"]
+)
 def test_units_of_velocities_are_found_joint_by_joint_and_before_those_of_torques(x):
     rail, gear, unit = x.split(" ")
     data = at(clean(ROBOTS["crane"](), 4, noise="qvu"), "v", [float(rail), float(gear)])

@@ -160,7 +160,7 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
             within = unknown[0].numbers.get("where") if unknown else (-np.inf, np.inf)
             pushes = list(push(found, inputs, *within)) if within else []
             loads = np.array([s for x in Doubts(said).of("load") for s in x.numbers["seconds"]]).reshape(-1, 2)
-            apart = (x for x in pushes if not any(a <= x.numbers["seconds"][0] <= b for a, b in loads))  # and so loads
+            apart = (x for x in pushes if not any(a <= x.numbers["seconds"][0] <= b for a, b in loads))  # of a load
             said = [*(x for x in said if x.about != UNKNOWN or not pushes), *apart]
         if not moved or {"degrees", "turns", "time unit"} & {doubt.about for doubt in said}:  # torques follow
             said = [doubt for doubt in said if doubt.about not in ("torque unit", "torque constant")]

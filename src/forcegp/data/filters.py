@@ -43,10 +43,10 @@ class LowPass:
         if not 0 < self.cutoff < rate / 2:
             seen = f"cutoff is {self.cutoff} Hz"
             raise InvalidInput(f"{seen}; it must be > 0 and below {rate / 2:.6g} Hz, half the sample rate.")
-        from scipy.signal import butter, sosfiltfilt, zpk2sos  # half a second, which only filtering should cost
+        from scipy.signal import butter, sosfiltfilt  # half a second, which only filtering should cost
 
-        design = butter(self.order, self.cutoff, fs=rate, output="zpk")
-        slowest = np.abs(design[1]).max()
+        sections = butter(self.order, self.cutoff, fs=rate, output="sos")
+        slowest = float(np.sqrt(sections[:, 5].max()))  # the product of two conjugate poles is the last coefficient
         with np.errstate(all="ignore"):  # it never dies out at a cut-off of almost 0
             dies = np.ceil(np.log(TRANSIENT) / np.log(slowest)) if slowest < 1.0 else np.inf
         padding = int(max(min(dies, 1e15), self.order + 1))
@@ -54,7 +54,7 @@ class LowPass:
             which = f"a filter of order {self.order} with a cut-off at {self.cutoff} Hz"
             seen = f"{len(values)} rows are too few for {which}; more than {padding:g} are needed"
             raise DatasetError(f"{seen}. Use a higher cut-off, or leave the episode out.")
-        return sosfiltfilt(zpk2sos(*design), values, axis=0, padlen=padding)  # type: ignore[arg-type]  # complex poles
+        return sosfiltfilt(sections, values, axis=0, padlen=padding)
 
     def gain(self, frequency: Float[np.ndarray, " k"], rate: float) -> Float[np.ndarray, " k"]:
         """Of amplitudes at these frequencies [Hz], for rows at this rate [Hz]; 0 at half the rate."""
