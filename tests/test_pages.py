@@ -106,6 +106,7 @@ def test_the_commands_of_the_page_on_identification_run(tmp_path: Path):
     assert (tmp_path / "identified" / "identified.urdf").exists()
 
 
+@pytest.mark.nightly
 def test_the_page_on_rollouts_runs(tmp_path: Path):
     printed = run_example("\n".join(blocks("rollouts")), tmp_path)
     states, more, diverged, free, held = printed.splitlines()[-5:]
@@ -121,6 +122,7 @@ def test_the_page_on_learning_while_working_runs(tmp_path: Path):
     assert [text.splitlines()[-1] for text in printed] == ["100 40", "True True"]
 
 
+@pytest.mark.nightly
 def test_the_page_on_large_data_runs(tmp_path: Path):
     (example,) = blocks("large-data")
     engine, left_out = run_example(example, tmp_path).splitlines()
@@ -128,6 +130,7 @@ def test_the_page_on_large_data_runs(tmp_path: Path):
     assert float(left_out.split()[2]) <= 1.0
 
 
+@pytest.mark.nightly
 def test_the_page_on_gpus_runs_on_the_cpu(tmp_path: Path):
     (example,) = blocks("gpu")
     assert run_example(example, tmp_path).splitlines()[-1] == "cpu"

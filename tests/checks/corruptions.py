@@ -108,8 +108,7 @@ def on_a_line(seed: int, *, rate: float = 250.0, seconds: float = 8, noise: floa
     u = u + force[:, None] * J[:, 0] + 3.0 * dz[:, None] * J[:, 1]
     noisy = a + noise * generator.normal(size=a.shape)
     model = Model(robot, (Contact("link2", POINT, LINE),))
-    stated = np.full(2, noise) if noise else None
-    return Dataset(q=q, v=v, u=u, a=noisy, time=time, model=model, noise_std=stated)
+    return Dataset(q=q, v=v, u=u, a=noisy, time=time, model=model, noise_std=np.full(2, noise) if noise else None)
 
 
 def at(data: Dataset, names: str, sign: list[float]) -> Dataset:
@@ -171,8 +170,7 @@ def recorded_under(data: Dataset, gravity: tuple[float, float, float]) -> Datase
     robot = data.model.robot
     there = Robot.from_urdf_text(robot.urdf_text, gravity=gravity, armature=robot.armature)
     tensors = [torch.tensor(x) for x in (data.q, data.v, data.a)]
-    change = there.inverse_dynamics(*tensors) - robot.inverse_dynamics(*tensors)
-    return replace(data, u=data.u + change.numpy())
+    return replace(data, u=data.u + (there.inverse_dynamics(*tensors) - robot.inverse_dynamics(*tensors)).numpy())
 
 
 def dropped(data: Dataset, names: str, share: float, seed: int = 0) -> Dataset:

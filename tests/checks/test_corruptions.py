@@ -80,7 +80,7 @@ def said(data):
 
 
 @pytest.mark.filterwarnings("ignore:.*are lengths in metres")
-@pytest.mark.parametrize("size", [3e-3, 30.0])
+@pytest.mark.parametrize("size", [3e-3, pytest.param(30.0, marks=pytest.mark.nightly)])
 def test_units_of_mass_and_length_change_nothing(size):
     data = clean(two_links(size=size), 1, noise="qvu")
     assert said(data) == []
@@ -421,7 +421,7 @@ def test_another_unit_of_time_is_asked_for_only_at_rates_that_no_log_has(rate, u
     assert (unit in found) if unit else not found
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("sign", [-1.0, pytest.param(1.0, marks=pytest.mark.nightly)])
 def test_turned_torques_are_named_though_all_masses_are_wrong(sign):
     data = filtered_log(5, arm_model(contacts=0))
     robot = data.model.robot

@@ -47,8 +47,7 @@ def test_velocities_in_the_axes_of_the_world_are_named(log):
     turned, rotation = turned_about_z(log, 1.2)  # far from upright, where body and world differ
 
     def found(q=turned.q, **v):
-        v = np.hstack([v["linear"], v["angular"], turned.v[:, 6:]])
-        return quick_check(replace(turned, q=q, v=v)).of("base")
+        return quick_check(replace(turned, q=q, v=np.hstack([v["linear"], v["angular"], turned.v[:, 6:]]))).of("base")
 
     linear, angular = turned.v[:, :3].copy(), turned.v[:, 3:6].copy()
     assert not found(linear=linear, angular=angular)
@@ -129,7 +128,7 @@ def test_a_base_that_does_not_fall_although_nothing_acts_on_it(log):
     assert "--feet" in carried.advice
 
 
-@pytest.mark.parametrize(("order", "shift"), [("wxyz", -1), ("xyzw", 1)])
+@pytest.mark.parametrize(("order", "shift"), [("wxyz", -1), pytest.param("xyzw", 1, marks=pytest.mark.nightly)])
 def test_the_order_of_quaternions_of_a_robot_that_stays_upright(order, shift):
     """Its rates are a small part of its speed, and either order of the log may have been stated."""
     time, robot = np.arange(2000) / 200, Robot.from_urdf_text(BODY, base="floating")

@@ -38,8 +38,7 @@ def folder(forcegp, tmp_path_factory):
 @pytest.fixture(scope="module")
 def found(forcegp, folder):
     words = ("score", "joint", "log.h5", "--split", "episodes:1", "--every", 2, "--seeds", 2, *QUICK, *FORCES)
-    done = forcegp(*words, "--out", "results", "--json", folder=folder).ok()
-    return json.loads(done.stdout)
+    return json.loads(forcegp(*words, "--out", "results", "--json", folder=folder).ok().stdout)
 
 
 def test_what_is_known_of_the_arm_comes_out(found):

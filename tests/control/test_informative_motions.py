@@ -33,8 +33,7 @@ def chosen(posterior):
 
 def rnea(q, v, a):
     model = pinocchio.buildModelFromXML(URDF)
-    data = model.createData()
-    return np.array([pinocchio.rnea(model, data, *x) for x in zip(q, v, a, strict=True)])
+    return np.array([pinocchio.rnea(model, model.createData(), *x) for x in zip(q, v, a, strict=True)])
 
 
 @pytest.mark.parametrize("seed", range(3))

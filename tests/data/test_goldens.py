@@ -33,7 +33,7 @@ def arm() -> data.Dataset:
     return replace(data.differentiated(replace(log, q=q), "q"), episode=(log.time > 2.5).astype(int))
 
 
-@pytest.mark.parametrize("source", ["q", "v"])
+@pytest.mark.parametrize("source", ["q", pytest.param("v", marks=pytest.mark.nightly)])
 def test_spectra_and_cutoffs(arm, source):
     spectrum = data.motion_spectrum(arm, source)
     best, shares = held_out_cutoff(arm, 8.0, source)

@@ -22,8 +22,7 @@ def drawn(rows: int, acceleration, force, seed: int = 0):
     factors = generator.normal(0.0, 0.5, (rows, 2, 2))
     M = factors @ factors.swapaxes(-1, -2) + np.diag([0.3, 0.01])
     noise = generator.normal(0.0, 1.0, (rows, 2)) * force
-    residual = np.linalg.solve(M, noise[..., None])[..., 0] + generator.normal(0.0, 1.0, (rows, 2)) * acceleration
-    return residual, M
+    return np.linalg.solve(M, noise[..., None])[..., 0] + generator.normal(0.0, 1.0, (rows, 2)) * acceleration, M
 
 
 def test_no_levels_are_likelier():

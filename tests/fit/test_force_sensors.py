@@ -144,7 +144,7 @@ def test_a_tool_shows_a_delay_and_columns_keep_their_names(monkeypatch):
     assert "hand=-F[0],-F[1],-F[2]," in doubt.do
 
 
-@pytest.mark.parametrize("seed", range(1, 5))
+@pytest.mark.parametrize("seed", [1, *(pytest.param(k, marks=pytest.mark.nightly) for k in range(2, 5))])
 def test_a_right_sensor_gets_no_false_word(seed):
     log, force, R = carrying(seed)
     noise = np.random.default_rng(seed).normal(size=force.shape)

@@ -16,7 +16,7 @@ from forcegp.evidence import motion_residuals
 from forcegp.fit.friction_choice import WIDTHS, _precision, _Regression, choose_friction
 from forcegp.fit.friction_in_words import friction_in_words
 from forcegp.fit.transmission_choice import SHARE, _clearly
-from forcegp.forces import Actuation, Coulomb, DirectionalFriction, GearFriction, JointFriction, Rotor, Viscous
+from forcegp.forces import Actuation, Coulomb, DirectionalFriction, GearFriction, JointFriction, Offset, Rotor, Viscous
 from forcegp.inference import OptimizerOptions
 from forcegp.noise import Noise
 from forcegp.summary import within
@@ -102,6 +102,13 @@ def test_wide_intervals_of_what_is_told_stand_beside_it():
     expected = zip(found[0], halves, narrow, strict=True)
     assert words == ", ".join(f"{x.value:.3g}" + f" ± {half:.1g}" * (not few) for x, half, few in expected) + " Nm"
     assert [within(1.0, 0.099), within(-1.0, 0.15), within(0.0, 0.0)] == ["1", "-1 ± 0.1", "0"]
+
+
+def test_friction_that_differs_by_direction_is_told():
+    log = log_with(lambda v, rigid: LEVEL * (sign(v) - [0.0, 0.075, -0.025]))
+    log = replace(log, u=log.u + 0.2 * np.random.default_rng(0).standard_normal(log.u.shape))
+    words = friction_in_words(parts_of(log, Offset())[0], log, "Nm")[0].partition("; ")[2]
+    assert words == "lift 0.072 Nm more backwards, or its torque has another zero"
 
 
 COUPLED = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 1.0]])
@@ -260,8 +267,7 @@ def test_normal_equations_are_those_of_weighted_least_squares(noise):
 def gains(share: float, errors: float) -> tuple[np.ndarray, np.ndarray]:
     """Squared residuals of ten stretches without and with a part that explains a share of them, so clearly."""
     way = np.array([1.0, -1.0] * 5)
-    spread = 10.0 * share / (errors * np.sqrt(10.0) * way.std(ddof=1))
-    return np.ones(10), 1.0 - share - spread * way
+    return np.ones(10), 1.0 - share - (10.0 * share / (errors * np.sqrt(10.0) * way.std(ddof=1))) * way
 
 
 @pytest.mark.parametrize(

@@ -52,8 +52,7 @@ def tracking_error(arm: LuGreArm, posterior, seed: int) -> float:
         seen = np.round(q / ENCODER) * ENCODER, v + NOISE_V * noise.standard_normal(7)
         return controller(*seen, q_d[k], v_d[k], a_d[k]).numpy()
 
-    found = arm.move(q_d[0], len(q_d), control)[500:, 0] - q_d[500:]
-    return float(np.sqrt(np.square(found).mean()))
+    return float(np.sqrt(np.square(arm.move(q_d[0], len(q_d), control)[500:, 0] - q_d[500:]).mean()))
 
 
 @pytest.mark.nightly

@@ -97,6 +97,7 @@ def floating():
     return fit(log.model, log, points=20, restarts=1), log
 
 
+@pytest.mark.nightly
 def test_where_the_base_moves_they_hold_as_steps(floating):
     fitted, log = floating
     calibrated = with_intervals(fitted, log, HORIZONS)

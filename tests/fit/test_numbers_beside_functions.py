@@ -30,7 +30,7 @@ def with_wrong_hand(model, factor):
     return replace(model, robot=with_bodies(model.robot, {body: pose @ P @ pose.T}))
 
 
-@pytest.mark.parametrize(("contacts", "factor"), [(0, 2.0), (1, 0.5)])
+@pytest.mark.parametrize(("contacts", "factor"), [(0, 2.0), pytest.param(1, 0.5, marks=pytest.mark.nightly)])
 def test_a_tool_is_found_from_far_off(contacts, factor):
     """Friction that is no draw of the prior; functions of q, v and u can do what gravity of a wrong tool does."""
     data = arm_data(60, 0, arm_model(contacts))

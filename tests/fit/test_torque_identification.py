@@ -48,8 +48,7 @@ def recorded(rows: int, seed: int, noise: float = 0.0, torque_noise: float = 0.0
     a = data.model.dynamics(*states).acceleration_map().offset.numpy()
     generator = np.random.default_rng(seed + 100)
     a = a + noise * generator.normal(size=a.shape)
-    u = data.u + torque_noise * generator.normal(size=a.shape)
-    return replace(data, a=a, u=u, truth={}, noise_std=None)
+    return replace(data, a=a, u=data.u + torque_noise * generator.normal(size=a.shape), truth={}, noise_std=None)
 
 
 def given() -> Model:

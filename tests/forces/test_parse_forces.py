@@ -87,10 +87,8 @@ def test_several_are_written_with_commas():
         forces.Payload("hand"),
     )
     assert list(map(force_to_dict, several)) == list(map(force_to_dict, wanted))
-    assert [force.title for force in forces.parse_forces(["viscous", "gp:joint-friction"])] == [
-        "viscous",
-        "joint-friction",
-    ]
+    several = forces.parse_forces(["viscous", "gp:joint-friction"])
+    assert [force.title for force in several] == ["viscous", "joint-friction"]
 
 
 @pytest.mark.parametrize("expression", MISTAKES)

@@ -101,11 +101,7 @@ def test_a_gear_with_bristles_is_explained_better_and_its_numbers_are_near(lugre
     assert left[True, "Coulomb"] < 0.5 * min(left[False, "Coulomb"], left[False, "Stribeck"])
     values = {name: each.value for name, each in found.parameters.items()}
     np.testing.assert_allclose([values[f"coulomb.level.{joint}"] for joint in JOINTS], [0.8, 0.5, 0.3], rtol=0.1)
-    expected = np.array([800.0, 500.0, 300.0]) / [
-        0.8,
-        0.5,
-        0.3,
-    ]  # stiffness over level: the slope at a reversal, halved
+    expected = np.array([800.0, 500.0, 300.0]) / [0.8, 0.5, 0.3]  # over level: the slope at a reversal, halved
     np.testing.assert_allclose([values[f"coulomb.sigma.{joint}"] for joint in JOINTS], expected, rtol=0.5)
 
 
@@ -197,6 +193,15 @@ def test_noise_of_an_encoder_does_not_wear_the_state_down():
             past.see(torch.tensor(0.01 + 1e-5 * chance.standard_normal(3)))
     assert bool((quiet.z > 0.99).all())
     assert bool((every.z < 0.5).all())
+
+
+def test_rows_at_once_are_rows_one_by_one():
+    model = arm_model(0).with_forces(Coulomb(1.0, sigma=10.0, memory=["pan", "bend"]))
+    q, single, together = torch.randn(50, 3, dtype=torch.float64).cumsum(0) / 20.0, Past(model), Past(model)
+    wanted = [torch.stack(each) for each in zip(*((single.see(row), single.open) for row in q), strict=True)]
+    found = map(torch.cat, zip(together.over(q[:20]), together.over(q[20:]), strict=True))
+    torch.testing.assert_close([*found], wanted, rtol=0.0, atol=1e-14)
+    torch.testing.assert_close(together.see(q[7]), single.see(q[7]))
 
 
 @pytest.mark.parametrize("kind", ["short", "coarse", "sharp"])

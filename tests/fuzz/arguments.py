@@ -108,8 +108,7 @@ def _forces(kind: Any, **arguments: Any) -> None:
 
 
 def _surface(kind: Any, **arguments: Any) -> Any:
-    model = arm_model(0).with_contacts((forcegp.Contact("hand", (0.0, 0.0, 0.2), kind(**arguments)),))
-    return model.dynamics(*STATE).A
+    return arm_model(0).with_contacts((forcegp.Contact("hand", (0.0, 0.0, 0.2), kind(**arguments)),)).dynamics(*STATE).A
 
 
 def _drone() -> Any:

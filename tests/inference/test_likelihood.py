@@ -82,8 +82,7 @@ def test_force_level_noise(constraints, monkeypatch):
 
     def force_noise(p):
         log_force.requires_grad_()
-        covariance = (p.W * (2.0 * log_force).exp()) @ p.W.mT
-        return torch.diag_embed(p.noise) + covariance, [p.noise, log_force]
+        return torch.diag_embed(p.noise) + ((p.W * (2.0 * log_force).exp()) @ p.W.mT), [p.noise, log_force]
 
     assert_same_value_and_gradients(given_problem, force_noise)
 

@@ -48,8 +48,7 @@ INDEPENDENT, REDUNDANT = ["none", "one", "three"], ["same twice", "four corners"
 
 def model_with(model: str = "iiwa", kind: str = "one", **options: object) -> Model:
     """Without friction that the URDF may state."""
-    forces = (Actuation(), RigidBodies())
-    return Model(robot(model), contacts(kind, FRAMES[model]), **{"forces": forces, **options})
+    return Model(robot(model), contacts(kind, FRAMES[model]), **{"forces": (Actuation(), RigidBodies()), **options})
 
 
 def states(nv: int, *batch: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -56,8 +56,7 @@ def along(motion, step: float):
     """First and second derivative at 0 by central differences of fourth order."""
     values = [motion(k * step) for k in (-2, -1, 0, 1, 2)]
     first = (values[0] - 8.0 * values[1] + 8.0 * values[3] - values[4]) / (12.0 * step)
-    second = (-values[0] + 16.0 * values[1] - 30.0 * values[2] + 16.0 * values[3] - values[4]) / (12.0 * step**2)
-    return first, second
+    return first, (-values[0] + 16.0 * values[1] - 30.0 * values[2] + 16.0 * values[3] - values[4]) / (12.0 * step**2)
 
 
 @pytest.mark.parametrize(("omega", "zeta"), [(10.0, 1.0), (3.0, 0.2), (0.0, 1.0), (4.0, 0.0)])

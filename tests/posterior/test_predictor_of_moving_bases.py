@@ -5,7 +5,7 @@ import ctypes
 import numpy as np
 import pytest
 import torch
-from tests.posterior.exported_program import PLAIN_AND_SANITIZED, compiled, ran
+from tests.posterior.exported_program import PLAIN_AND_SANITIZED, RK4, compiled, ran
 from tests.robots.random_positions import random_positions
 
 from forcegp import Contact, Dataset, JointFriction, Model, Noise, Plane, Robot, export_c, fit
@@ -136,7 +136,7 @@ def test_compiled_motions_stay_on_the_manifold(case, integrator):
     close(v_next, found.v[:, 1], 1e-9)
 
 
-@pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", "implicit-midpoint"])
+@pytest.mark.parametrize("integrator", ["symplectic-euler", RK4, "implicit-midpoint"])
 def test_a_linear_step_is_that_of_differences(case, integrator):
     posterior, *states = case
     q, v, u = (x[:2] for x in states)
@@ -212,7 +212,7 @@ def test_what_is_refused(floating):
 
 
 @pytest.mark.filterwarnings("ignore:half of the training points:forcegp.errors.DataWarning")
-@pytest.mark.parametrize("integrator", ["rk4", "implicit-midpoint"])
+@pytest.mark.parametrize("integrator", [RK4, "implicit-midpoint"])
 def test_an_arm_with_a_switch(integrator, tmp_path):
     """Its base is fixed, and u has more entries than v."""
     robot = Robot.from_urdf_text(ARM)

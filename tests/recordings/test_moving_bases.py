@@ -111,8 +111,7 @@ CONVENTIONS = (
 
 def imported(folder, flight, changes=None, mapping=PLAIN, model=None, **options) -> Dataset:
     path = write_text(folder / "log.csv", columns(flight, **(changes or {})))
-    model = model or flight.model
-    return import_recordings([path], mapping, model=model, options=ImportOptions(**options))
+    return import_recordings([path], mapping, model=model or flight.model, options=ImportOptions(**options))
 
 
 @pytest.mark.parametrize("convention", [lambda _: ({}, {}), *CONVENTIONS])
@@ -245,8 +244,7 @@ def walking_log(tmp_path, u: np.ndarray):
     """A log of a walker that has these columns of u, its dataset, and the mapping."""
     walk = simulate_quadruped(QuadrupedConfig(seconds=1.0, seed=2))
     write_text(tmp_path / "walk.csv", columns(walk, u=u(walk)))
-    mapping = ColumnMapping(time="time", q=("q{0..18}",), v=("v{0..17}",), u=(f"u{{0..{u(walk).shape[1] - 1}}}",))
-    return walk, mapping
+    return walk, ColumnMapping(time="time", q=("q{0..18}",), v=("v{0..17}",), u=(f"u{{0..{u(walk).shape[1] - 1}}}",))
 
 
 def test_flags_that_a_log_lacks_are_open(tmp_path):

@@ -32,5 +32,4 @@ def on_plane():
 @pytest.fixture(scope="session")
 def page(swinging, friction):
     scores = score(friction, swinging)
-    best = scores_sentence(scores)
-    return model_page(friction, swinging, title="pendulum", best=best, tables=[scores_table(scores)])
+    return model_page(friction, swinging, title="pendulum", best=scores_sentence(scores), tables=[scores_table(scores)])

@@ -54,8 +54,7 @@ class Oracle:
         return pin.computeGeneralizedGravity(self.model, self.data, self.configuration(q))[self.columns]
 
     def inverse_dynamics(self, q, v, a):
-        args = self.configuration(q), self._theirs(v), self._theirs(a)
-        return pin.rnea(self.model, self.data, *args)[self.columns]
+        return pin.rnea(self.model, self.data, *self.configuration(q), self._theirs(v), self._theirs(a))[self.columns]
 
     def forward_dynamics(self, q, v, tau):
         args = self.configuration(q), self._theirs(v), self._theirs(tau)
@@ -95,5 +94,4 @@ class Oracle:
         jacobian = pin.computeFrameJacobian(self.model, self.data, q, index, WORLD_ALIGNED)[:, self.columns]
         pin.forwardKinematics(self.model, self.data, q, v, np.zeros(self.model.nv))
         pose = pin.updateFramePlacement(self.model, self.data, index).homogeneous
-        acceleration = pin.getFrameClassicalAcceleration(self.model, self.data, index, WORLD_ALIGNED).vector
-        return pose, jacobian, acceleration
+        return pose, jacobian, pin.getFrameClassicalAcceleration(self.model, self.data, index, WORLD_ALIGNED).vector

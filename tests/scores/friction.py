@@ -42,8 +42,7 @@ def friction_data(rows: int, seed: int, model: Model | None = None) -> Dataset:
         "a": a, "lambda": dynamics.multiplier(tool + joints).numpy(), "Q_U": (tool + joints).numpy(),
         "Q_U.tool-friction": tool.numpy(), "force.tool-friction": force.numpy(), "Q_U.joint-friction": joints.numpy(),
     }  # fmt: skip
-    noise = np.random.default_rng(seed + 100).normal(0.0, NOISE, a.shape)
-    return dataclasses.replace(data, a=a + noise, truth=truth)
+    return dataclasses.replace(data, a=a + np.random.default_rng(seed + 100).normal(0.0, NOISE, a.shape), truth=truth)
 
 
 def fitted(*forces: Unknown, points: int = 40, iterations: int = 60, mean: bool = True) -> Posterior:

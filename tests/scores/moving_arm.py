@@ -31,8 +31,7 @@ def true_system(stribeck: bool = False) -> Model:
     dry = Coulomb((0.5, 0.5, 0.1), 0.1)
     if stribeck:
         dry = Stribeck((0.4, 0.4, 0.06), (1.0, 1.0, 0.15), 0.5, 0.1)
-    friction = (Viscous((0.3, 0.3, 0.05)), dry)
-    return Model(Robot.from_urdf_text(heavier), (), (Actuation(), RigidBodies(), *friction))
+    return Model(Robot.from_urdf_text(heavier), (), (Actuation(), RigidBodies(), Viscous((0.3, 0.3, 0.05)), dry))
 
 
 def moving_arm(seconds: float = 2.0, episodes: int = 2, seed: int = 0, stribeck: bool = False) -> Dataset:

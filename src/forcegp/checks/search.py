@@ -112,8 +112,7 @@ def _all_turned(root: Explanation, inputs: CheckInput) -> tuple[Explanation, lis
     doubt = wrong(
         about="torque sign", what=what, do=do, joints=inputs.names, correction={"sign": {"u": (-1.0,) * log.rows.nv}}
     )
-    turned = log.with_torques(changed("u", factor=-1.0))
-    return replace(root, log=turned, turned=tuple(range(log.rows.nv))), [doubt]
+    return replace(root, log=log.with_torques(changed("u", factor=-1.0)), turned=tuple(range(log.rows.nv))), [doubt]
 
 
 def moving(rows: Dataset) -> Dataset:

@@ -35,7 +35,7 @@ MOST_ROWS = 2000  # on which that is judged
 STIFFNESS = 50.0, 200.0, 800.0  # of what friction remembers, over the reciprocal deviation of positions
 SURE, TELLS = 150.0, 30.0
 """Nats that a stretch of time in which something is touched explains: in all, or one of each row, and of a joint."""
-BRIEF = 0.05  # of the rows, for which a torque is another
+BRIEF = 0.05  # of the rows, the least for which a torque is another
 ENDS = 5  # times that the ends of such a stretch are sought anew, as those that are most likely (Page 1954)
 SEEN, WARMER = 1e-3, 0.1  # share of the largest direction of columns; logarithm of a ratio of friction that is told
 PRESSED, IDLE = 0.1, 0.1
@@ -262,7 +262,8 @@ def jump(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         return
     left = found.left_beside(more := _remembered(found, inputs))
     after = np.cumsum(left[::-1], axis=0)[::-1]  # of all rows from each on
-    begins = np.argmax(np.square(after) / np.maximum(place * (1.0 - place / len(rows)), BRIEF * len(rows)), axis=0)
+    spread = place * (1.0 - place / len(rows))  # a few rows at an end show what friction was at before the log
+    begins = np.argmax(np.square(after) / np.maximum(spread, 1.0) * (spread > BRIEF * len(rows)), axis=0)
     step = place >= begins
     beside = found.left_beside(np.concatenate([more, step[..., None]], axis=-1))
     powers = [np.square(x).sum(axis=0) + 1e-300 for x in (left, beside)]
@@ -392,8 +393,7 @@ def without_stops(log: Dataset, model: Model | None = None, late: bool = True) -
     what = f"all joints stand still from {', '.join(f'{x:.4g} to {y:.4g}' for x, y in rested)} s, and their torques "
     what += f"are not those that this posture needs by what the motion tells: {why}."
     do = "These rows are left out of all checks, and of forcegp auto; of other fits leave them out yourself."
-    doubt = look(about="stop", what=what, do=do, numbers={"seconds": spans})
-    return _cut(log, out), [doubt]
+    return _cut(log, out), [look(about="stop", what=what, do=do, numbers={"seconds": spans})]
 
 
 def without_pushes(log: Dataset, doubts: Sequence[Doubt]) -> Dataset:

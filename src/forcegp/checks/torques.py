@@ -57,8 +57,7 @@ class Comparison:
             own, here = dense.episode == number, self.rows.episode == number
             for joint, values in enumerate(dense.u[own].T):
                 u[here, joint] = np.interp(self.rows.time[here] + seconds, dense.time[own], values)
-        new = replace(self, rows=self._changed(replace(self.given, u=u)), shift=seconds)
-        return self._at_the_same_motion(new)
+        return self._at_the_same_motion(replace(self, rows=self._changed(replace(self.given, u=u)), shift=seconds))
 
     def _at_the_same_motion(self, new: "Comparison") -> "Comparison":
         vars(new).update(tau=self.tau, friction=self.friction, basis=self.basis)

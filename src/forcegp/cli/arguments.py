@@ -63,8 +63,7 @@ NOT_NUMBERS = {
 def command_class(name: str) -> type[Command]:
     """The class of a command; only its own module is imported, so that --help and errors come at once."""
     place = next((module for module, held in MODULES.items() if name in held), name)
-    module = importlib.import_module(f"forcegp.cli.{place}")
-    return getattr(module, name.capitalize())
+    return getattr(importlib.import_module(f"forcegp.cli.{place}"), name.capitalize())
 
 
 def parsed(words: Sequence[str]) -> Command:

@@ -289,7 +289,7 @@ class ContactMonitor:
         """M a - Q_K - Q_U at rows, M, M Cov(a) M of what the posterior leaves open, and `Past.open`."""
         unknown = q.new_zeros(len(q), 0)
         if self.past.memory.names:
-            seen, unknown = map(torch.stack, zip(*((self.past.see(row), self.past.open) for row in q), strict=True))
+            seen, unknown = self.past.over(q)
             u = self.past.beside(u, seen)
         at = joint_forces(self.model, q, v, u)
         M = at.M

@@ -6,6 +6,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -189,6 +190,18 @@ class Past:
             q = self.memory.robot.space.integrate(self._last, moved)
         self._last = q.clone()
         return self.z
+
+    def over(self, q: Float[Tensor, "T nq"]) -> tuple[Float[Tensor, "T m"], Float[Tensor, "T m"]]:
+        """What is remembered at these rows, one after the other, and `open` there; without an encoder's noise."""
+        before = torch.cat([q[:1] if self._last is None else self._last[None], q[:-1]])
+        step, each = self.memory.robot.difference(before, q), self.z.expand(len(q), -1)
+        shift = self.memory.after(0.0 * each, step, 0.0)  # a step is linear in what was before
+        share, found = self.memory.after(0.0 * each + 1.0, step, 0.0) - shift, [(self.z.numpy(), self.open.numpy())]
+        for b, w in zip(shift.numpy(), share.numpy(), strict=True):
+            found.append((b + w * found[-1][0], w * found[-1][1]))
+        z, opened = (torch.from_numpy(np.stack(each[1:])) for each in zip(*found, strict=True))
+        self.z, self.open, self._last = z[-1], opened[-1], q[-1].clone()
+        return z, opened
 
     def beside(self, u: Float[Tensor, "*batch k"], z: Float[Tensor, "*#batch m"]) -> Float[Tensor, "*batch nu"]:
         """u of the actuators with the columns of the memory."""

@@ -215,12 +215,8 @@ def _of_numbers(model: Model, logs: Sequence[Dataset], evidence: Any, rows: int 
     training = TrainingData.of(found.rows, model.robot.device)
     result = OptimizationResult({}, found.history[-1], found.history, "Gauss-Newton steps", found.estimates.settled,
                                 found.estimates.evaluations, 0.0)  # fmt: skip
-    settings = searching.described_rows(found.rows, logs[0]) | {
-        "seed": seed,
-        "evidence": str(evidence),
-        "noise": found.noise.to_dict(),
-        "doubts": list(found.doubts),
-    }
+    settings = {"seed": seed, "evidence": str(evidence), "noise": found.noise.to_dict(), "doubts": list(found.doubts)}
+    settings = searching.described_rows(found.rows, logs[0]) | settings
     noise = found.noise.parameters(model.robot.nv, model.robot.device)
     return Posterior.conditioned(trained, training, noise, result, settings, estimates=found.estimates)
 

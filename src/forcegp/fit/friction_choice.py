@@ -128,8 +128,7 @@ def _precision(model: Model, log: Dataset, noise: Noise | None) -> Float[np.ndar
     """Inverse covariances of residual forces: M N_a M + N_f."""
     if noise is None or noise.force is None or noise.acceleration is None:
         left = np.sqrt((motion_residuals(log, model)[0] ** 2).mean(0))
-        weight = np.maximum(left, 1e-6 * max(float(left.max()), 1e-12)) ** -2.0
-        return np.tile(np.diag(weight), (len(log), 1, 1))
+        return np.tile(np.diag(np.maximum(left, 1e-6 * max(float(left.max()), 1e-12)) ** -2.0), (len(log), 1, 1))
     q, v, u, *_ = tensors(with_memory(log, model), model.robot.device)
     M = model.dynamics(q, v, u).M.cpu().numpy()
     return np.linalg.inv(M * np.square(noise.acceleration) @ M + np.diag(np.square(noise.force)))

@@ -17,6 +17,7 @@ from forcegp.summary import within
 SLIDES = 0.1  # of the root mean square speed: below it friction sticks, or turns
 RISES = 1.01  # times dry friction, from which that near rest is another
 STEP = 1e-3  # deviations of a number over which words are differentiated
+UNEVEN, SURELY = 0.1, 2.0  # share of dry friction, and 95 % intervals, beyond which it differs by direction
 
 
 def friction_in_words(
@@ -64,6 +65,11 @@ def friction_in_words(
     ]
     text = f"{', '.join(told[0])} {unit}"
     text += f", near rest {', '.join(told[1])}" if bool((here[1] > RISES * here[0]).any()) else ""
+    for name, level in zip(names, here[0].tolist(), strict=True):
+        each = None if name in still else found.estimates.get(f"offset.{name}")  # a force: along it friction is less
+        if each is not None and abs(each.value) > max(0.5 * UNEVEN * level, SURELY * REACH * each.std):
+            way = "backwards" if each.value > 0.0 else "forwards"
+            text += f"; {name} {2.0 * abs(each.value):.2g} {unit} more {way}, or its torque has another zero"
     for name, row in zip(log.joint_names, law.turning(torch.eye(log.nv).to(v)).mT.tolist(), strict=True):
         terms = [f"{x:+.3g} {other}" for other, x in zip(log.joint_names, row, strict=True) if x]
         text += f"; the motor of {name} turns with {' '.join(terms)}" if len(terms) > 1 else ""

@@ -39,8 +39,7 @@ class Whitening:
     def of(cls, terms: Terms, matrices: Sequence[Float[Tensor, "N N"]]) -> "Whitening":
         """That of rows. Raises NumericalError without a factorisation."""
         found = terms.deflated()
-        factor = factorize(lambda: deflated_covariance(found.C, matrices)) if found.rank else None
-        return cls(terms, found.U, factor)
+        return cls(terms, found.U, factorize(lambda: deflated_covariance(found.C, matrices)) if found.rank else None)
 
     def __call__(self, values: Float[Tensor, "rows D k"]) -> Float[Tensor, "n k"]:
         """Of every state."""

@@ -13,6 +13,7 @@ from forcegp.data.views import RecordedMotions, decided, recorded_motions, requi
 from forcegp.errors import InvalidInput, require_type
 from forcegp.evidence.likelihood import TrainingData
 from forcegp.fit.motion_fit import refine_on_motions
+from forcegp.forces import has_few_inputs
 from forcegp.forces.joint_laws import DryFriction, Viscous
 from forcegp.posterior import Posterior
 from forcegp.posterior.drift import scaled
@@ -22,9 +23,9 @@ from forcegp.posterior.rollout import Rollout
 from forcegp.progress import part
 
 FOLDS = 4
-SAMPLES = 16
+SAMPLES, STARTS = (16, 8), (4, 2)
+"""Of functions, and motions that begin within one longest horizon: of few inputs, and of many, 50 times as slow."""
 STEP = 0.005  # s, the longest; of several rows where the recording has shorter ones
-STARTS = 4  # motions that begin within one longest horizon
 LEVEL = 0.95
 
 
@@ -57,10 +58,11 @@ def calibrated(
         seen = f"intervals need two stretches of {wanted[-1]:g} s at least, of which one is left out in turn"
         raise InvalidInput(f"{seen}; give shorter horizons, or a longer recording.")
     errors, spreads, shifts, kept, inputs = [], [], [], tuple(wanted), posterior.model.inputs
+    slow = bool(posterior.latent_names) and not has_few_inputs(posterior.trained.unknown, posterior.model.robot)
     drift = posterior.settings.get("drift") if _records(dataset, wanted[-1]) == 1 else None
-    for other, motions in _left_out(posterior, dataset, parts, wanted[-1]):
+    for other, motions in _left_out(posterior, dataset, parts, wanted[-1], STARTS[slow]):
         kept = tuple(h for h in wanted if h >= motions.dt)
-        how: dict[str, Any] = {"integrator": integrator, "samples": SAMPLES if len(other.latent_names) else 0}
+        how: dict[str, Any] = {"integrator": integrator, "samples": SAMPLES[slow] * bool(other.latent_names)}
         rollout: Rollout = other.rollout(motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, **how)
         at = [min(round(h / motions.dt), motions.u.shape[1]) for h in kept]
         inputs, sampled = other.model.inputs, rollout.samples is not None
@@ -94,14 +96,14 @@ def calibrated(
 
 
 def _left_out(
-    posterior: Posterior, dataset: Dataset, parts: Sequence[np.ndarray], seconds: float
+    posterior: Posterior, dataset: Dataset, parts: Sequence[np.ndarray], seconds: float, starts: int
 ) -> Iterator[tuple[Posterior, RecordedMotions]]:
     """Models without each part of the rows, and motions in it; in one where no row changes a model, which is faster."""
     found = list[tuple[Posterior, RecordedMotions]]()
     for number, inside in enumerate(parts):
         with part(number, len(parts)):
             other, rows = observing(_without(posterior, dataset.rows(~inside)), dataset.rows(inside))
-        found.append((other, _motions(rows, seconds)))
+        found.append((other, _motions(rows, seconds, starts)))
         if posterior.latent_names or posterior.settings.get("motions"):
             yield found.pop()
             del other  # of which two would need twice the memory
@@ -131,9 +133,9 @@ def _lasts(dataset: Dataset, part: np.ndarray, seconds: float) -> bool:
     return any(np.ptp(dataset.time[rows]) >= seconds for rows in stretches_without_gap(dataset, part))
 
 
-def _motions(part: Dataset, seconds: float) -> RecordedMotions:
-    """Motions of that length all over the rows, `STARTS` in the time of one."""
-    count = max(1, int(STARTS * sum(np.ptp(part.time[part.episode == e]) for e in part.episodes) / seconds))
+def _motions(part: Dataset, seconds: float, starts: int) -> RecordedMotions:
+    """Motions of that length all over the rows, so many in the time of one."""
+    count = max(1, int(starts * sum(np.ptp(part.time[part.episode == e]) for e in part.episodes) / seconds))
     found = recorded_motions(part, count, seconds)
     stride = max(1, int(STEP / found.dt))
     steps = found.u.shape[1] // stride

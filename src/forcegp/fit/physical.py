@@ -29,7 +29,7 @@ from forcegp.progress import tell
 
 ROWS = 5_000  # rows that are used at most, evenly spread: more of a filtered recording add little
 EQUATIONS = 40_000  # as many rows hold these equations, one per degree of freedom, at most
-ROUGH_EQUATIONS = 7_000  # of acceleration, where a search begins or is rough: they take thrice the time of torques
+ROUGH_EQUATIONS = 7_000  # where a search begins, or is rough among accelerations: they take thrice the time of torques
 WINDOWED, PER_WINDOW = 2_000, 10
 """Of means over windows so many rows are enough, or so many in each: half a second of a filtered log has few more."""
 REWEIGHTINGS = 2  # searches in which accelerations are weighted by noise of both kinds
@@ -80,9 +80,9 @@ def fit_physical(
     if robot.space.is_vector_space and evidence.of_torque and not evidence.noisy_in_both:
         logs = [one_row_per_rest(log) for log in logs]
     some = ROUGH_EQUATIONS // robot.nv
-    if rows is None and not evidence.of_torque and max(map(len, logs)) > some:
-        rows = some if roughly else None
-        near = near or (None if roughly else fit_physical(model, logs, evidence, some, roughly=True))
+    if rows is None and not seconds and max(map(len, logs)) > some:
+        rows = some if roughly and not evidence.of_torque else None
+        near = near or (None if rows else fit_physical(model, logs, evidence, some, roughly=True))
     logs = [log.rows(evenly(log, most if rows is None else rows)) for log in logs]
     typical = typical_sizes(model, logs) if near is None else near.typical
     space, unseen = ParameterSpace(model, typical), Unseen.of(model, logs[0], typical["force"])
@@ -135,8 +135,7 @@ def fit_physical(
         found_levels = Noise(tuple(np.sqrt((residual**2).mean(0)).clip(1e-12)))
         level = found_levels if noise is None else Noise(tuple(noise.acceleration), tuple(noise.force))
         level = unseen.with_pushes(level)
-    found_rows = with_memory(logs[0], found)
-    return Solution(found, estimates, level, found_rows, tuple(history), fit.x, typical, told)
+    return Solution(found, estimates, level, with_memory(logs[0], found), tuple(history), fit.x, typical, told)
 
 
 def _with_accelerations_weighted(

@@ -388,5 +388,4 @@ class _States:
         S = latent.covariance(self.features)
         gain = torch.linalg.solve(B, C @ S).mT
         f = latent.mean(self.features) - (gain @ alpha[..., None])[..., 0]
-        covariance = self.W @ (S + gain @ C @ S) @ self.W.mT
-        return (self.W @ f[..., None])[..., 0], covariance.diagonal(dim1=-2, dim2=-1)
+        return (self.W @ f[..., None])[..., 0], (self.W @ (S + gain @ C @ S) @ self.W.mT).diagonal(dim1=-2, dim2=-1)

@@ -261,7 +261,7 @@ class Law(Force):
         return state.u[..., first : first + len(names)]
 
     def remember(self, memory: Remembered, step: Tensor, dt: float | Tensor) -> Remembered:
-        """The memory after the joints have moved by `step` (..., nv) in dt: exact and differentiable."""
+        """The memory after a `step` (..., nv) of the joints in dt: exact, differentiable, linear in each number."""
         return memory
 
     def past_of(self, strokes: Float[Tensor, "*batch nv strokes"]) -> Remembered:

@@ -140,8 +140,7 @@ class DryFriction(JointLaw):
     @override
     def acts_on(self, name: str, robot: Robot) -> Bool[np.ndarray, " nv"]:
         acts = super().acts_on(name, robot)
-        remembers = np.array(self._mask or [False] * robot.nv)
-        return acts & (remembers == (name == "sigma")) if name in SIGN else acts
+        return acts & (np.array(self._mask or [False] * robot.nv) == (name == "sigma")) if name in SIGN else acts
 
     @override
     def memory_names(self, robot: Robot) -> tuple[str, ...]:
@@ -242,9 +241,8 @@ class Spring(JointLaw):
     stiffness: Number = None
     rest: Number = None
     coefficients: ClassVar[Mapping[str, Coefficient]] = {
-        "stiffness": Coefficient("force/position"),
-        "rest": Coefficient("position", factor=1.0, lowest=-np.inf),
-    }
+        "stiffness": Coefficient("force/position"), "rest": Coefficient("position", factor=1.0, lowest=-np.inf)
+    }  # fmt: skip
 
     @override
     def features(self, state: State) -> tuple[Tensor, ...]:

@@ -124,8 +124,7 @@ class ExactPosterior(LatentPosterior):
         given = list(zip(which, features, strict=True))
         C = torch.cat([self.data_covariance(c, z) for c, z in given], dim=1)
         V = self.factor.solve_lower(C).unflatten(1, (len(features), -1)).permute(2, 1, 0)
-        prior = torch.stack([self.kernels.dense[c].diagonal(z) for c, z in given], dim=-1)
-        return torch.diag_embed(prior) - V @ V.mT
+        return torch.diag_embed(torch.stack([self.kernels.dense[c].diagonal(z) for c, z in given], dim=-1)) - V @ V.mT
 
     @override
     def function_weights(

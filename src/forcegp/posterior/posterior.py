@@ -340,8 +340,7 @@ class Posterior(Fitted):
             with suppress(InvalidInput):  # without its contact a force is zero
                 force.check(model.robot, model.contacts)
                 there.append(force)
-        model = replace(model, forces=(*model.laws, *there), noise=trained.noise)
-        return replace(self, target=model, settings=kept)
+        return replace(self, target=replace(model, forces=(*model.laws, *there), noise=trained.noise), settings=kept)
 
     def with_contacts(self, contacts: Sequence[Contact | Sequence[Contact]]) -> "Posterior":
         """The same knowledge under other contacts, without another fit: another surface, or none at all, `[]`.

@@ -204,8 +204,7 @@ def difference(start: Float[Tensor, "*batch 7"], end: Float[Tensor, "*batch 7"])
     angular = 2.0 * arc * turn[..., :3]
     square, linear = (angular * angular).sum(-1, keepdim=True), (first.mT @ (to - from_)[..., None])[..., 0]
     once = torch.linalg.cross(angular, linear)
-    linear = linear - 0.5 * once + _cotangent(square) * torch.linalg.cross(angular, once)
-    return torch.cat([linear, angular], -1)
+    return torch.cat([linear - 0.5 * once + _cotangent(square) * torch.linalg.cross(angular, once), angular], -1)
 
 
 def chart_velocity(step: Float[Tensor, "*#batch 6"], v: Float[Tensor, "*#batch 6"]) -> Tensor:

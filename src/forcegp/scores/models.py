@@ -382,5 +382,4 @@ def identified_model(name: str, model: Model, rows: Dataset, before: Posterior |
     if before is None:
         opened, _ = with_friction_chosen(opened, rows, evidence)  # once, for all parts of the rows
     found: Any = fit(opened, rows, evidence) if before is None else before
-    opened = with_choice_of(opened, found)
-    return replace(found.model, noise=held_out_noise(opened, rows, evidence))
+    return replace(found.model, noise=held_out_noise(with_choice_of(opened, found), rows, evidence))

@@ -152,8 +152,7 @@ def _lost(scores: Scores, model: str, quantity: str) -> str:  # motions that had
 def unit_of(scores: Scores, quantity: str) -> str:
     """`Nm`, or `Nm or N` where joints differ."""
     units = scores.units.get(quantity, "")
-    each = [units] if isinstance(units, str) else list(dict.fromkeys(units))
-    return " or ".join(each).replace("^2", "²")
+    return " or ".join([units] if isinstance(units, str) else list(dict.fromkeys(units))).replace("^2", "²")
 
 
 def preparation_lines(metadata: Mapping[str, Any]) -> list[str]:
