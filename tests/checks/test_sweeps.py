@@ -267,5 +267,7 @@ def test_products_that_rounding_makes_singular_have_a_solution():
 def test_factors_of_torques_are_looked_at_or_wrong():
     log, found = clean(ROBOTS["planar"](), 1, noise="qvu"), {}
     for factors in ([1.0, 0.3], [1.0, 0.36], [1.4, 1.0], [1.0, 28.0], [1.0, 33.0], [0.5, 0.6]):
-        found[f"{factors}"] = numbers(search(CheckInput.quick(replace(log, u=log.u * factors), log.model))[1])
+        doubts = search(CheckInput.quick(replace(log, u=log.u * factors), log.model))[1]
+        found[f"{factors}"] = numbers(doubts)
+    assert "% of rated torques (200, 167)" in doubts[0].do
     assert_unchanged("checks/factors", found, rtol=1e-4)

@@ -39,8 +39,7 @@ def latents(expression: str, centers: torch.Tensor, weights: torch.Tensor | None
             if scale is not None and name.endswith("lengthscale"):
                 value.fill_(math.log(scale))
     kernels.requires_grad_(False)
-    weights = normal(len(centers), seed=8) if weights is None else weights
-    return Latents(kernels, (centers[:, None],), (weights,))
+    return Latents(kernels, (centers[:, None],), (normal(len(centers), seed=8) if weights is None else weights,))
 
 
 def summed(given, s: torch.Tensor) -> torch.Tensor:

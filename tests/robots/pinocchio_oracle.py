@@ -54,7 +54,7 @@ class Oracle:
         return pin.computeGeneralizedGravity(self.model, self.data, self.configuration(q))[self.columns]
 
     def inverse_dynamics(self, q, v, a):
-        return pin.rnea(self.model, self.data, *self.configuration(q), self._theirs(v), self._theirs(a))[self.columns]
+        return pin.rnea(self.model, self.data, self.configuration(q), self._theirs(v), self._theirs(a))[self.columns]
 
     def forward_dynamics(self, q, v, tau):
         args = self.configuration(q), self._theirs(v), self._theirs(tau)

@@ -187,8 +187,9 @@ def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -
         what=f"the measured torque is a multiple of what the motion needs, if masses are right: {each}"
         f"{f': it looks like {listed(like)}' if like else ''}.",
         do=f"{loaded}Such factors point to torque before the gears (multiply by the gear ratio), motor current "
-        "(multiply by the torque constant), a missing rotor inertia, or wrong masses; compare with the data sheet, or "
-        "let forcegp payload --forces gain,viscous,gear,offset,rotor estimate the constants of all joints.",
+        f"(multiply by the torque constant), % of rated torques ({', '.join(f'{100 / x:.3g}' for x in factors)}), "
+        "a missing rotor inertia, or wrong masses; compare with the data sheet, or let forcegp payload --forces "
+        "gain,viscous,gear,offset,rotor estimate the constants of all joints.",
         joints=joints,
         numbers={"factor": dict(zip(joints, factors.tolist(), strict=True)), "error_95": errors},
         correction={"unit": {"u": like}} if like else {},
