@@ -97,8 +97,7 @@ def _told_of_dead_processes() -> Iterator[None]:
     try:
         yield
     except BrokenExecutor as error:
-        cause = " ".join(str(error).split())
-        remedy = "try fewer jobs if memory is short, or jobs=1"
+        cause, remedy = " ".join(str(error).split()), "try fewer jobs if memory is short, or jobs=1"
         raise BackendError(f"the processes broke off, which ends what was at work; {remedy} ({cause})") from error
 
 

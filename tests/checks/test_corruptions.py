@@ -316,12 +316,18 @@ def test_torques_in_steps_are_right_and_friction_that_fades_is_named():
         told = [each.numbers["ratio"] == pytest.approx({"joint1": ratio, "joint2": ratio}, abs=0.05) for each in drift]
         assert told == [True] * bool(fade)
     alone = check(replace(data, u=data.u + dry * (1.0 - np.array([0.0, 0.05]) * data.time[:, None]))).doubts.of("drift")
-    assert [each.joints for each in alone] == [("joint2",)]
+    assert [(each.joints, "seconds" in each.numbers) for each in alone] == [(("joint2",), False)]
+    later = check(replace(data, u=data.u + dry * (1.0 + np.outer(data.time > 5.0, [0.0, 1.0])))).doubts
+    [since] = [each for each in later if each.level != "ok"]  # no unknown cause, either
+    assert since.numbers == {
+        "ratio": {"joint2": pytest.approx(1.9, abs=0.1)},
+        "seconds": pytest.approx([5, 8], abs=0.3),
+    }
     cold = check(replace(data, u=data.u + dry * (1.0 + np.exp(-np.square(data.time / 2.0)))[:, None])).doubts
     assert [each.about for each in cold if each.level != "ok"] == ["drift"], "no push, either"
 
 
-LOADS = [((7.0,), 4, (0.0, 7.0)), ((12.2,), 4, (12.2, 14.99)), ((11,), -1, (11, 14.99)),
+LOADS = [((7.0,), 4, (0.0, 7.0)), ((12.2,), 4, (12.2, 14.99)), ((11,), -1, (11, 14.99)), ((6.0, 5.0), -1, (6, 11)),
          ((2.0, 2.0), -1, (2, 4, 6, 8, 10, 12, 14, 14.99)), ((14.65,), -1, (14.65, 14.99))]  # fmt: skip
 
 
@@ -332,6 +338,7 @@ def test_the_times_of_a_load_are_told_also_behind_a_rest(at, rest, out):
     doubts = check(gripped(with_motion(two_links(), way, 100.0, 3, 0.0), *at)).doubts
     [found] = doubts.of("load")
     assert found.numbers["seconds"] == pytest.approx(out, abs=0.2)
+    assert ("or something pulls like one" in found.what) == (out == (6, 11))
     assert not doubts.of("push", "drift")  # a load that is taken up is none
 
 

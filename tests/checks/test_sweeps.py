@@ -270,4 +270,7 @@ def test_factors_of_torques_are_looked_at_or_wrong():
         doubts = search(CheckInput.quick(replace(log, u=log.u * factors), log.model))[1]
         found[f"{factors}"] = numbers(doubts)
     assert "% of rated torques (200, 167)" in doubts[0].do
+    hidden = replace(log, u=np.c_[log.u[:, 0], 0.02 * np.tanh(log.v[:, 1] / 0.02)])  # of which friction is all
+    [told] = [each.numbers for each in search(CheckInput.quick(hidden, log.model))[1] if "factor" in each.numbers]
+    assert 0.0 < told["factor"]["joint2"] == told["error_95"][0] < 0.1
     assert_unchanged("checks/factors", found, rtol=1e-4)

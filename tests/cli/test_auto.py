@@ -31,8 +31,7 @@ COLUMNS = shlex.split("--time Zeit --q Winkel_{1..2} --v Tempo_{1..2} --u Moment
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A log of a double pendulum in ms, degrees and degrees per second, with one torque turned, and its URDF."""
-    place = tmp_path_factory.mktemp("auto")
-    data = double_pendulum(8.0, seed=1, noise=0.0)
+    place, data = tmp_path_factory.mktemp("auto"), double_pendulum(8.0, seed=1, noise=0.0)
     (place / "arm.urdf").write_text(data.model.robot.urdf_text)
     q = data.q + 1e-5 * np.random.default_rng(0).standard_normal(data.q.shape)
     table = np.column_stack([1e3 * data.time, np.rad2deg(q), np.rad2deg(data.v), data.u * [1.0, -1.0]])

@@ -16,8 +16,7 @@ def looked(stderr: str) -> list[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    place = tmp_path_factory.mktemp("looks")
-    data = clean(two_links(), 0, seconds=5.0)
+    place, data = tmp_path_factory.mktemp("looks"), clean(two_links(), 0, seconds=5.0)
     data.save(place / "clean.h5")
     column(at(data, "q", [1.0, 1.0]), "u", 1, np.negative).save(place / "sign.h5")
     on_a_line(0, seconds=5.0).save(place / "line.h5")

@@ -98,8 +98,7 @@ def test_functions_far_from_where_they_are_easy(compiled):
     graph = Graph(1)
     outputs = [graph.apply(name, graph.inputs[0]) for name in names]
     x = torch.tensor([-1e-300, 1e-9, -3e-5, 0.3, -0.6, 1.1, 30.0, -40.0, 700.0, -745.0, 1e5, 3e7, -1e17, 1e200])
-    x = x.double()[:, None]
-    function = compiled(Program(graph, {"x": 1}, {"y": outputs}))
+    x, function = x.double()[:, None], compiled(Program(graph, {"x": 1}, {"y": outputs}))
     values = torch.empty(len(x), len(names), dtype=torch.float64)
     function.rows([x], [values])
     theirs = torch.cat([getattr(torch, {"absolute": "abs"}.get(name, name))(x) for name in names], dim=1)

@@ -22,8 +22,7 @@ STEP = 0.004
 def raw(seed, noise, late=0.0, seconds=10.0):
     """The motion at 250 Hz with noise of the positions, and torques that are logged late."""
     rows = log(TEXT, seed, seconds=seconds)
-    time = np.arange(rows.time[0], rows.time[-1], STEP)
-    rng = np.random.default_rng(seed)
+    time, rng = np.arange(rows.time[0], rows.time[-1], STEP), np.random.default_rng(seed)
     from scipy.interpolate import CubicSpline
 
     q = CubicSpline(rows.time, rows.q)(time) + noise * rng.standard_normal((len(time), 6))

@@ -170,8 +170,7 @@ def test_the_cutoff_of_a_robot_on_feet_is_not_far_beyond_that_of_its_base():
     noise = np.random.default_rng(0).normal(size=log.v.shape) * np.array([1e-3] * 6 + [1e-4] * 12)
     noise[:, 8] += 0.02 * np.sin(2.0 * np.pi * 30.0 * log.time)  # a knee shakes
     noisy = replace(log, q=log.model.robot.integrate(torch.tensor(log.q), torch.tensor(noise)).numpy(), noise_std=None)
-    each = motion_spectrum(noisy).cutoff
-    found = Preparation(cutoff="auto").apply(noisy)
+    each, found = motion_spectrum(noisy).cutoff, Preparation(cutoff="auto").apply(noisy)
     assert found.metadata["preparation"]["cutoff"] == pytest.approx(1.5 * np.nanmax(each[:6]), rel=0.01)
     assert "joints do up to" in found.metadata["preparation"]["why"]["cutoff"]
     free = replace(noisy, u=noisy.u[:, :12], model=log.model.with_contacts([]))

@@ -70,8 +70,7 @@ def test_few_features_take_inducing_points(data, monkeypatch):
     assert posterior.engine == Inducing()
     assert posterior.latent.left_out <= 0.02
     there = {"start": posterior.hyperparameters, "options": OptimizerOptions(iterations=0)}
-    exact = fit(data, "exact", prior=JointFriction(), **there)
-    test = arm_data(8, seed=2)
+    exact, test = fit(data, "exact", prior=JointFriction(), **there), arm_data(8, seed=2)
     expected, given = (p.predict(test.q, test.v, test.u).mean for p in (exact, posterior))
     torch.testing.assert_close(given, expected, rtol=0.0, atol=2e-2)
     with pytest.raises(InvalidInput, match="the likelihood of all rows needs the factorised covariance"):

@@ -76,7 +76,6 @@ def make(folder: Path) -> None:
 
 def switched() -> Model:
     """A contact with a switch, and forces of every kind that files carry."""
-    robot = Robot.from_mjcf_text(OPEN_BARS)
-    push = Thrusters("coupler", [[0.0, 0.0, 0.1]])
+    robot, push = Robot.from_mjcf_text(OPEN_BARS), Thrusters("coupler", [[0.0, 0.0, 0.1]])
     forces = (Actuation([[1.0], [0.0], [0.0]], ("motor",)), push, ObservedWrench("rocker"), RigidBodies())
     return Model(robot, fixed_point("crank", (0.0, 0.0, 0.1), switch="held"), forces)

@@ -130,8 +130,7 @@ def pushed(forces, rows, seed=4, noise=0.0):
     """Flights in still air, each with a constant force of the world."""
     dataset = flight([(0.0, 0.0, 0.0)] * len(forces), episodes=len(forces), rows=rows, seed=seed, noise=noise)
     state = dataset.model.dynamics(*map(torch.tensor, (dataset.q, dataset.v, dataset.u))).state
-    rotation = state.kinematics.frame_pose("body")[:, :3, :3].numpy()
-    a = dataset.a.copy()
+    rotation, a = state.kinematics.frame_pose("body")[:, :3, :3].numpy(), dataset.a.copy()
     a[:, :3] += np.einsum("nji,nj->ni", rotation, np.array(forces)[dataset.episode]) / 1.2
     return replace(dataset, a=a)
 

@@ -67,8 +67,7 @@ def test_a_decimated_recording_is_divided_at_the_same_moments():
 @pytest.mark.parametrize(("share", "count"), [(0.4, 5), (0.08, 5), (0.03, 10), (0.97, 10), (0.0, 10), (1.0, 10)])
 def test_both_sides_show_the_motion_of_every_joint(share, count):
     data = recording(300, 1)
-    held = split_named(data, "blocks:5:3,5")[0].test_rows(data)
-    v = data.v.copy()
+    held, v = split_named(data, "blocks:5:3,5")[0].test_rows(data), data.v.copy()
     v[:, 0] = np.sqrt(np.where(held, share / held.sum(), (1.0 - share) / (~held).sum()))
     split = split_named(dataclasses.replace(data, v=v), "auto")[0]
     assert len(split.held_out) == 2 * count // 5

@@ -353,8 +353,7 @@ def _gravities(
 ) -> Iterator[Candidate]:
     """The gravity that the torques show: its direction, its size, or both, also beside a load, which would bend it."""
     nominal = now.robot.gravity.cpu().numpy()
-    size = float(np.linalg.norm(nominal))
-    found = solved(now, pulls)
+    size, found = float(np.linalg.norm(nominal)), solved(now, pulls)
     if found is None:
         return
     estimate = nominal + found

@@ -165,15 +165,10 @@ class Explanation:
         found = [positive_fit(columns[x] - columns[x].mean(axis=0), u[x] - u[x].mean())[0][0] for x in rests]
         return float(np.hypot(T_95 * np.std(found) * (BLOCKS - 1) ** 0.5, ATTENUATED * np.mean(found)))
 
-    @cached_property
-    def of_any_masses(self) -> Float[np.ndarray, "rows nv"]:
-        """What is left of each torque by a robot with any masses and friction."""
-        return self.left_beside(np.ones((*self.log.rows.q.shape, 1)))
-
     def left_beside(
         self, more: Float[np.ndarray, "rows nv k"], told: Bool[np.ndarray, " rows"] | None = None
     ) -> Float[np.ndarray, "rows nv"]:
-        """The same with these columns of each joint, too, whose numbers the rows `told` tell."""
+        """What any masses, friction and these columns leave of each torque, by numbers that the rows `told` tell."""
         rows, bodies = self.log.rows, regressor(self.log.robot, self.log.rows)
         if self.log.drives is not None:
             bodies = np.einsum("rmp,mk->rkp", bodies, np.linalg.inv(self.log.drives))
@@ -186,10 +181,11 @@ class Explanation:
             left.append(u - columns @ np.linalg.lstsq(columns[own], u[own], rcond=1e-8)[0])
         return np.stack(left, axis=1)
 
-    @property
+    @cached_property
     def free(self) -> Float[np.ndarray, " nv"]:
-        """The share that this is."""
-        return np.square(self.of_any_masses).sum(0) / np.maximum(len(self.log.rows) * self.log.rows.u.var(0), 1e-300)
+        """The share of each torque that a robot with any masses and friction leaves."""
+        left = np.square(self.left_beside(np.ones((*self.log.rows.q.shape, 1)))).sum(0)
+        return left / np.maximum(len(self.log.rows) * self.log.rows.u.var(0), 1e-300)
 
     @property
     def turned_free(self) -> Float[np.ndarray, " nv"]:

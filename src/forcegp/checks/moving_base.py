@@ -51,8 +51,7 @@ class _Windows:
         """`turning`: columns of v that are rates."""
         after = np.flatnonzero(consecutive(dataset)[:-1])
         rate = float(np.linalg.norm(dataset.v[:, turning], axis=1).mean()) if len(turning) else 0.0
-        seconds = min(WINDOW, MOST_TURN / max(rate, 1e-9))
-        steps = np.diff(dataset.time)[after]
+        seconds, steps = min(WINDOW, MOST_TURN / max(rate, 1e-9)), np.diff(dataset.time)[after]
         most = min(len(dataset) // 10, most_rows // 100)
         length = int(np.clip(seconds / np.median(steps), 1, max(1, most))) + 1 if len(steps) else 2
         length = length if dataset.time_ordered else 1

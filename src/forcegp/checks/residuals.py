@@ -119,9 +119,11 @@ def loads(
     at, (begin, end), count = now.given.time, inputs.log.time[[0, -1]].tolist(), len(held)
     turned, changes = np.where(held, -nats, nats), np.flatnonzero(np.diff(held)) + 1
     when = f" in {len(runs(held))} stretches of time: it takes up a load and puts it down"
-    if len(changes) == 1:
-        x = float(at[changes[0] - 1 : changes[0] + 1].mean())
+    x, *others = (float(at[k - 1 : k + 1].mean()) for k in changes)
+    if not others:
         when = f" until {x:.4g} s: it lets go of a load" if held[0] else f" from {x:.4g} s on: it takes up a load"
+    elif len(others) == 1 and not held[0]:
+        when = f" from {x:.4g} to {others[0]:.4g} s: it takes up a load and puts it down, or something pulls like one"
     smeared, spans = 1.5 / inputs.compared_cutoff, list[float]()
     for a, b in runs(held == (2 * held.sum() <= count)):  # and as far as it may reach
         a -= int(np.argmax(np.append(np.cumsum(turned[:a][::-1]), np.inf) >= UNSURE))

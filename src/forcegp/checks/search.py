@@ -57,8 +57,7 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
                 before = now.value if cause.number else max(now.value, now.unscaled)  # mistakes first, factors then
                 if made.value < before - 0.5 * GAIN:
                     grown.append(made)
-        every = every + grown
-        frontier = sorted(grown, key=lambda each: each.value)[:BEAM]
+        every, frontier = every + grown, sorted(grown, key=lambda each: each.value)[:BEAM]
         if not grown or (frontier[0].shares <= np.maximum(NOISE * root.floor, DOUBTFUL)).all():
             break
         if frontier[0].value > root.plain - GAIN and root.good.all():
@@ -179,7 +178,9 @@ def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -
     units = [less + si for si in inputs.unit_of_each("u")]
     unit = units[0] if len({*units}) == 1 else ",".join(units)
     loaded = f"With a load it may be in {unit}: forcegp import --unit u={unit}. " if less and not like else ""
-    joints, factors, errors = inputs.named(off), factors[off], [*map(best.error_of_factor, off.tolist())]
+    joints, errors = inputs.named(off), np.array([*map(best.error_of_factor, off.tolist())])
+    most = best.log.rows.u[:, off].std(axis=0) / best.log.tau[:, off].std(axis=0)  # where friction hides any factor
+    factors, errors = (np.where(factors[off] > 0.0, x, most) for x in (factors[off], errors))
     each = ", ".join(f"{name} {x:.4g} ± {error:.1g}" for name, x, error in zip(joints, factors, errors, strict=True))
     yield Doubt(
         level="wrong" if not explained or factors.min() < 1.0 / FAR or factors.max() > MUCH_MORE else "look",
@@ -191,7 +192,7 @@ def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -
         "a missing rotor inertia, or wrong masses; compare with the data sheet, or let forcegp payload --forces "
         "gain,viscous,gear,offset,rotor estimate the constants of all joints.",
         joints=joints,
-        numbers={"factor": dict(zip(joints, factors.tolist(), strict=True)), "error_95": errors},
+        numbers={"factor": dict(zip(joints, factors.tolist(), strict=True)), "error_95": errors.tolist()},
         correction={"unit": {"u": like}} if like else {},
     )
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 
 from forcegp.checks.check_input import QUICK_ROWS, CheckInput
-from forcegp.checks.fits import RARELY
+from forcegp.checks.fits import EXPLAINED, RARELY
 from forcegp.checks.search import DOUBTFUL, FEWEST_ROWS, HELD, SHORT, UNKNOWN, Explanation, held_at_rest
 from forcegp.checks.torques import WIDTHS, Comparison, in_motion, regressor, stretch
 from forcegp.data import Dataset, Delay, estimate_delay, with_strokes
@@ -35,6 +35,7 @@ MOST_ROWS = 2000  # on which that is judged
 STIFFNESS = 50.0, 200.0, 800.0  # of what friction remembers, over the reciprocal deviation of positions
 SURE, TELLS = 150.0, 30.0
 """Nats that a stretch of time in which something is touched explains: in all, or one of each row, and of a joint."""
+TIMES = tuple(np.linspace(-0.45, 0.45, 37).tolist())  # shares of a log, from its middle, where friction may change
 BRIEF = 0.05  # of the rows, the least for which a torque is another
 ENDS = 5  # times that the ends of such a stretch are sought anew, as those that are most likely (Page 1954)
 SEEN, WARMER = 1e-3, 0.1  # share of the largest direction of columns; logarithm of a ratio of friction that is told
@@ -73,18 +74,22 @@ def _drift(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         return
     bodies = regressor(found.log.robot, rows)
     time = (rows.time - rows.time.mean()) / max(float(np.ptp(rows.time)), 1e-300)
-    block, changed, told = np.arange(count) * BLOCKS // count, dict[str, float](), dict[str, float]()
+    block, changed, told, since = np.arange(count) * BLOCKS // count, *(dict[str, float]() for _ in range(3))
     friction_of = np.concatenate([found.log.friction, _remembered(found, inputs)], axis=-1)
     often = in_motion(rows).mean(axis=0) >= RARELY
     for joint in np.flatnonzero((found.chosen == 0) & (found.shares > DOUBTFUL) & often):
         u, friction, name = (rows.u - found.log.more)[:, joint], friction_of[:, joint], rows.joint_names[joint]
-        steady, moved = np.c_[bodies[:, joint], np.ones(count)], np.c_[friction, friction * time[:, None]]
-        left = []
-        for columns in (np.c_[steady, friction], np.c_[steady, moved]):
-            basis = orthonormal(columns, SEEN)
+        steady, left = np.c_[bodies[:, joint], np.ones(count)], list[float]()
+        for way in (ways := [0.0 * time, time, *(np.sign(time - x) / 2.0 for x in TIMES)]):
+            if len(left) == 2 and left[1] >= MUCH * left[0] and found.rough[joint] <= EXPLAINED:
+                break
+            basis = orthonormal(np.c_[steady, friction, friction * way[:, None]], SEEN)
             numbers = [np.linalg.lstsq(basis[block != k], u[block != k])[0] for k in range(BLOCKS)]
             left.append(sum(np.square((u - basis @ x)[block == k]).sum() for k, x in enumerate(numbers)))
-        told[name] = float(np.log(left[1] / max(left[0], 1e-300)))
+        if (best := int(np.argmin(left)) if min(left[2:], default=np.inf) < MUCH * left[1] else 1) > 1:
+            since[name] = float(rows.time[np.argmax(ways[best] > 0.0)])
+        moved = np.c_[friction, friction * ways[best][:, None]]
+        told[name] = float(np.log(left[best] / max(left[0], 1e-300)))
         basis, size = orthonormal(steady, SEEN), np.linalg.norm(moved, axis=0) + 1e-300
         rest = (moved - basis @ (basis.T @ moved)) / size
         level, slope = np.split(np.linalg.lstsq(rest, u - basis @ (basis.T @ u), rcond=SEEN)[0] / size, 2)
@@ -93,10 +98,21 @@ def _drift(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     if sum(told.values()) >= np.log(MUCH) or abs(np.log(np.median([*changed.values()]))) <= WARMER:
         changed = {k: x for k, x in changed.items() if told[k] < np.log(MUCH) and abs(np.log(x)) > WARMER}
     if changed:
-        each = ", ".join(f"{name} {ratio:.2g}" for name, ratio in changed.items())
-        what = f"friction changes, perhaps with temperature: at the end it is so many times the first: {each}."
-        do = "Record the warm robot; updates of a posterior follow the level of friction."
-        yield look(about="drift", what=what, do=do, joints=tuple(changed), numbers={"ratio": changed})
+        when = {name: f", from about {since[name]:.3g} s on" for name in changed if name in since}
+        each = ", ".join(f"{name} {ratio:.2g}{when.get(name, '')}" for name, ratio in changed.items())
+        why = "as of a bearing, a gear or a brake" if when else "perhaps with temperature"
+        what = f"friction changes, {why}: at the end it is so many times the first: {each}."
+        do, span = "Record the warm robot; updates of a posterior follow the level of friction.", list[float]()
+        for name in [*when][:1]:
+            x, wide, (begin, end) = (
+                since[name],
+                float(np.ptp(rows.time)) / len(TIMES),
+                inputs.log.time[[0, -1]].tolist(),
+            )
+            span = [begin, x + wide] if x - begin < end - x else [x - wide, end]
+            do = f"Leave a part out by forcegp import --without {span[0]:.2f},{span[1]:.2f}, as forcegp auto does."
+        numbers = {"ratio": changed, **({"seconds": span} if span else {})}
+        yield look(about="drift", what=what, do=do, joints=tuple(changed), numbers=numbers)
 
 
 def elastic_doubts(inputs: CheckInput, log: Comparison) -> list[Doubt]:
@@ -398,7 +414,11 @@ def without_stops(log: Dataset, model: Model | None = None, late: bool = True) -
 
 def without_pushes(log: Dataset, doubts: Sequence[Doubt]) -> Dataset:
     """The log without the seconds of pushes and loads; where times of episodes repeat, as it is."""
-    seen = [each for each in doubts if each.about in ("push", "load", "offset", UNKNOWN) and "seconds" in each.numbers]
+    seen = [
+        each
+        for each in doubts
+        if each.about in ("push", "load", "offset", "drift", UNKNOWN) and "seconds" in each.numbers
+    ]
     spans = np.array([x for each in seen if (np.diff(log.time) > 0.0).all() for x in each.numbers["seconds"]])
     touched = [np.flatnonzero((log.time >= begin) & (log.time <= end)) for begin, end in spans.reshape(-1, 2)]
     if not touched:

@@ -169,8 +169,7 @@ def stretch(signals: Float[np.ndarray, "rows k"]) -> tuple[float, float, int, in
 
     What two levels of what is left explain [nats], the share in these rows, the first of them and the end.
     """
-    count = len(signals)
-    sums = np.cumsum(np.einsum("ri,rj->rij", signals, signals), axis=0)
+    count, sums = len(signals), np.cumsum(np.einsum("ri,rj->rij", signals, signals), axis=0)
     sums = np.concatenate([np.zeros_like(sums[:1]), sums])
     whole = positive_solution(sums[-1])[1]
 

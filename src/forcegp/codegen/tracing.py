@@ -187,8 +187,7 @@ class _Recording(TorchDispatchMode):
                 found = _decompositions().get(func, func.decompose)(*args, **kwargs)  # type: ignore[reportOptionalCall]  # it is a method
             if found is not NotImplemented:
                 return found
-        result = func(*args, **kwargs)
-        given = _pytree.tree_map(self.numbers_of, (args, kwargs))
+        result, given = func(*args, **kwargs), _pytree.tree_map(self.numbers_of, (args, kwargs))
         if any(isinstance(value, _Numbers) for value in _pytree.tree_leaves(given)):
             numbers = _apply(self.graph, func, *given)
             tensors, found = (x if isinstance(x, list | tuple) else [x] for x in (result, numbers))

@@ -60,8 +60,7 @@ class NoiseLevels:
             both = across @ inverse
             left = torch.cat([precision.diagonal(dim1=-2, dim2=-1), both.diagonal(dim1=-2, dim2=-1)], -1).sum(0)
             explained = torch.cat([weighted, (inverse @ weighted[..., None])[..., 0]], -1).square().sum(0)
-            squares = torch.cat([acceleration, force]).square()
-            mixed = across.square().sum(0)
+            squares, mixed = torch.cat([acceleration, force]).square(), across.square().sum(0)
             parts = torch.cat([precision.square().sum(0), mixed.mT], 1), torch.cat([mixed, both.square().sum(0)], 1)
             curvature = torch.cat(parts)
             curvature = (2.0 * squares * squares[:, None] * curvature).numpy() + np.eye(len(x))

@@ -208,8 +208,7 @@ class Equations:
         if self.rests:
             return self.rests
         lengths = [len(log) for log in self.logs] if self.windows is None else self.windows.lengths
-        starts = np.concatenate([[0], np.cumsum(lengths)])
-        numbers = []
+        starts, numbers = np.concatenate([[0], np.cumsum(lengths)]), []
         for log, start, length in zip(self.logs, starts, lengths, strict=False):
             order = np.lexsort((log.time, log.episode)) if self.windows is None else np.arange(length)
             numbers.append(np.array_split(start + order, min(STRETCHES, sum(lengths))))

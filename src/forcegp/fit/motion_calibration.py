@@ -148,8 +148,7 @@ def _without(posterior: Posterior, rest: Dataset) -> Posterior:
     """The model from the other rows: as many of them, at the same hyper-parameters; refined on motions if it was."""
     if (refined := posterior.settings.get("motions")) is not None:
         return refine_on_motions(posterior, rest, refined["seconds"], refined["bodies"])
-    own = posterior.training
-    rest = in_own_air(posterior, rest)
+    own, rest = posterior.training, in_own_air(posterior, rest)
     rows = farthest_rows(rest, len(own)) if len(own) < len(rest) else rest
     given = replace(TrainingData.of(rows, own.q.device, own.sensed), reference=own.reference or own)
     how = posterior.hyperparameters, posterior.result, posterior.settings, posterior.engine, None, posterior.latent

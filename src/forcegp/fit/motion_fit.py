@@ -83,8 +83,7 @@ class Unknowns:
             if not parameters:
                 return Linear(a, a_q, a_v)
             with torch.no_grad():
-                dynamics = posterior.dynamics(q, v, u)
-                columns = []
+                dynamics, columns = posterior.dynamics(q, v, u), []
                 if bodies.size:
                     Y = dynamics.state.kinematics.torque_regressor(a)[:, :, carriers].cpu().numpy()
                     columns.append(-torch.as_tensor(bodies.chained(numbers[: bodies.size], Y)))

@@ -127,8 +127,7 @@ def fit_physical(
     estimates = Estimates() if roughly else _estimates(space, fit, equations, evidence, thick, changes, move)
     doubts += unseen.doubts(model)
     Doubts(doubts).warn(stacklevel=4)
-    told = tuple(doubt.to_dict() for doubt in doubts)
-    level = model.noise
+    told, level = tuple(doubt.to_dict() for doubt in doubts), model.noise
     if evidence.of_torque and model.contacts and noise is None:
         noise = unseen.levels(equations.a, equations.accelerations(fit.x), equations.held, fit.noise[: robot.nv])
     if level is None or level.learn or level.acceleration is None:

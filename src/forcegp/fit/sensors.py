@@ -23,8 +23,7 @@ PERIODS = 1.3
 
 def usual_evidence(model: Model, dataset: Dataset) -> tuple[Evidence, ...]:
     """That of a fit where none is named, beside sensors of the log: force sensors at contacts, and all IMUs."""
-    measured = dataset.measured
-    touched = dict.fromkeys(contact.frame for contact in model.contacts)
+    measured, touched = dataset.measured, dict.fromkeys(contact.frame for contact in model.contacts)
     felt = [FrameAcceleration()] if any(name.startswith(IMU) for name in measured) else []
     sensors = [*(ContactForces(frame) for frame in touched if f"{FORCE}{frame}" in measured), *felt]
     if model.unknown_forces or not model.is_open:

@@ -147,8 +147,7 @@ class PerJoint(ExpressedKernels):
         state = dynamics.state
         if self.depends_on == "v":
             return tuple(state.v[..., index, None] for index in joint_indices(self.joints, state.robot))
-        singles = state.robot.single_joint_names
-        position = state.robot.space.singles(state.q)
+        singles, position = state.robot.single_joint_names, state.robot.space.singles(state.q)
         return tuple(position[..., singles.index(name), None] for name in self.latent_names(state.robot))
 
     @override

@@ -119,8 +119,7 @@ def friction(dimension: int, variance: float | Tensor) -> AdditiveKernel:
     change = ScaleKernel(LogVelocityKernel(), outputscale_constraint=log_scale()).double()
     change.outputscale = share
     register_log_normal_prior(change, "outputscale", share, LOG_VARIANCE_SPREAD)
-    level = AdditiveKernel(constant(1, share), change)
-    viscous = linear(1, share)
+    level, viscous = AdditiveKernel(constant(1, share), change), linear(1, share)
     return AdditiveKernel(SmoothSignKernel() * level, viscous, BeyondVisitedKernel(level, viscous))
 
 

@@ -176,8 +176,7 @@ def deflate(W_white: Float[Tensor, "N D C"], y_white: Float[Tensor, "N D"]) -> D
         if singular.numel():
             rank = int((singular > RANK_TOLERANCE * singular.amax(dim=-1, keepdim=True)).sum(-1).max())
         U = U[..., :rank].contiguous()
-        C = U.mT @ W_white
-        t = (U.mT @ y_white[..., None])[..., 0]
+        C, t = U.mT @ W_white, (U.mT @ y_white[..., None])[..., 0]
         remainder = y_white - (U @ t[..., None])[..., 0]
     return Deflation(U, C, t, remainder)
 

@@ -69,8 +69,7 @@ class LatentPosterior(ABC):
         kernel, centers, weights = self.kernels.dense[index], self.features[index], self.weights[index]
         if not len(centers):
             return z.new_zeros(len(z))
-        height = max(1, BLOCK_BYTES // (8 * len(centers)))
-        blocks = []
+        height, blocks = max(1, BLOCK_BYTES // (8 * len(centers))), []
         for i in range(0, len(z), height):
             K = kernel.cross(z[i : i + height], centers)
             level = K.detach().mean(1, keepdim=True)  # with long length scales K is nearly constant, and all cancels

@@ -90,8 +90,7 @@ def sample_states(
     def some(number: int) -> Tensor:
         return torch.randint(len(training.q), (number,), generator=generator)
 
-    own = torch.randperm(len(training.q), generator=generator)[:rows]
-    third = count // 3
+    own, third = torch.randperm(len(training.q), generator=generator)[:rows], count // 3
     i, j, k = some(third), some(third), some(third)
     mixed = [some(count - 2 * third) for _ in states]
     moved = [x[i] + STEP * (x[j] - x[k]) for x in states]

@@ -126,8 +126,7 @@ def learned_forces(posterior: Posterior, dynamics: ConstrainedDynamics) -> list[
     """What the model found at these states: joint forces, with the laws of its system, point and contact forces."""
     prior, robot = posterior.trained.unknown, posterior.model.robot
     B, latents = prior.direction(dynamics), posterior.latents(dynamics, True)
-    of_joints = torch.zeros(B.shape[-1], dtype=torch.bool)
-    groups = []
+    of_joints, groups = torch.zeros(B.shape[-1], dtype=torch.bool), []
     for name, term, which in prior.named(robot):
         if (point := term.point_force(dynamics)) is None:
             of_joints[which] = True

@@ -43,8 +43,7 @@ def simulate_quadruped(config: QuadrupedConfig) -> Dataset:
     model = Model(robot, contacts, (Actuation(), RigidBodies()))
     box = config.payload / 12.0 * np.diag([0.1**2 + 0.1**2, 0.2**2 + 0.1**2, 0.2**2 + 0.1**2])  # on its trunk
     loaded = carrying(robot, [Payload("trunk", config.payload, PLACE, box.tolist())]) if config.payload else robot
-    steps = max(2, round(config.seconds * RATE))
-    parts = []
+    steps, parts = max(2, round(config.seconds * RATE)), []
     for episode in range(config.episodes):
         parts.append(_episode(loaded, model, config, episode, steps))
         tell(episode + 1, config.episodes)
@@ -56,8 +55,7 @@ def simulate_quadruped(config: QuadrupedConfig) -> Dataset:
 
 def _episode(robot: Robot, model: Model, config: QuadrupedConfig, episode: int, steps: int) -> tuple[Tensor, ...]:
     rng = np.random.default_rng([config.seed, episode])
-    time = torch.arange(steps, dtype=torch.float64) / RATE
-    home = robot.neutral()
+    time, home = torch.arange(steps, dtype=torch.float64) / RATE, robot.neutral()
     home[7:] = torch.tensor(STANCE * len(LEGS))
     feet = torch.stack([robot.frame_pose(home, f"{leg}_foot")[:3, 3] for leg in LEGS])
     home[2] = -feet[0, 2]
@@ -80,8 +78,7 @@ def _episode(robot: Robot, model: Model, config: QuadrupedConfig, episode: int, 
     drift = torch.stack([kinematics.frame_bias_acceleration(f"{leg}_foot")[:, :3] for leg in LEGS], 1)
     a = torch.cat([dV, joints(dV, ddx - drift)], -1)
     Q_U = torch.as_tensor(laws_of_joints(str(config.joint_friction), robot, FRICTION)(v.numpy(), q=q.numpy()))
-    needed = robot.inverse_dynamics(q, v, a) - Q_U
-    A = (J * stands[..., None, None]).flatten(1, 2)
+    needed, A = robot.inverse_dynamics(q, v, a) - Q_U, (J * stands[..., None, None]).flatten(1, 2)
     weight = -float(robot.gravity[2]) * robot.mass
     even = torch.zeros(steps, len(LEGS), 3, dtype=torch.float64)
     even[..., 2] = weight * stands / stands.sum(-1, keepdim=True)
@@ -226,8 +223,7 @@ def _flight(robot: Robot, config: QuadrotorConfig, episode: int, steps: int) -> 
         error = target - x
         missing = np.clip(missing + error / RATE, -8.0, 8.0)
         wanted = thrown + POSITION[0] * error + POSITION[1] * (rush - R @ V[:3]) + POSITION[2] * missing - gravity
-        up = wanted / np.linalg.norm(wanted)
-        yaw = 0.5 * math.sin(turn[0] * k / RATE + turn[1])
+        up, yaw = wanted / np.linalg.norm(wanted), 0.5 * math.sin(turn[0] * k / RATE + turn[1])
         side = np.cross(up, [math.cos(yaw), math.sin(yaw), 0.0])
         side /= np.linalg.norm(side)
         lean = Rotation.from_matrix(R.T @ np.stack([np.cross(side, up), side, up], 1)).as_rotvec()
