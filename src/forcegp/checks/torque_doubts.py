@@ -104,11 +104,8 @@ def _drift(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         what = f"friction changes, {why}: at the end it is so many times the first: {each}."
         do, span = "Record the warm robot; updates of a posterior follow the level of friction.", list[float]()
         for name in [*when][:1]:
-            x, wide, (begin, end) = (
-                since[name],
-                float(np.ptp(rows.time)) / len(TIMES),
-                inputs.log.time[[0, -1]].tolist(),
-            )
+            x, (begin, end) = since[name], inputs.log.time[[0, -1]].tolist()
+            wide = np.ptp(rows.time).item() / len(TIMES)  # as far as it may be off
             span = [begin, x + wide] if x - begin < end - x else [x - wide, end]
             do = f"Leave a part out by forcegp import --without {span[0]:.2f},{span[1]:.2f}, as forcegp auto does."
         numbers = {"ratio": changed, **({"seconds": span} if span else {})}
@@ -414,11 +411,8 @@ def without_stops(log: Dataset, model: Model | None = None, late: bool = True) -
 
 def without_pushes(log: Dataset, doubts: Sequence[Doubt]) -> Dataset:
     """The log without the seconds of pushes and loads; where times of episodes repeat, as it is."""
-    seen = [
-        each
-        for each in doubts
-        if each.about in ("push", "load", "offset", "drift", UNKNOWN) and "seconds" in each.numbers
-    ]
+    kinds = "push", "load", "offset", "drift", UNKNOWN
+    seen = [each for each in doubts if each.about in kinds and "seconds" in each.numbers]
     spans = np.array([x for each in seen if (np.diff(log.time) > 0.0).all() for x in each.numbers["seconds"]])
     touched = [np.flatnonzero((log.time >= begin) & (log.time <= end)) for begin, end in spans.reshape(-1, 2)]
     if not touched:

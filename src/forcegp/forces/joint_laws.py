@@ -241,8 +241,9 @@ class Spring(JointLaw):
     stiffness: Number = None
     rest: Number = None
     coefficients: ClassVar[Mapping[str, Coefficient]] = {
-        "stiffness": Coefficient("force/position"), "rest": Coefficient("position", factor=1.0, lowest=-np.inf)
-    }  # fmt: skip
+        "stiffness": Coefficient("force/position"),
+        "rest": Coefficient("position", factor=1.0, lowest=-np.inf),
+    }
 
     @override
     def features(self, state: State) -> tuple[Tensor, ...]:

@@ -158,8 +158,11 @@ def implicit_midpoint(space: ConfigurationSpace, acceleration: Acceleration, q: 
     return Step(moved(middle, 1.0), 2.0 * middle - v, acceleration(q, v), found)
 
 
-INTEGRATORS: dict[str, Callable[..., Step]] = {"symplectic-euler": symplectic_euler, "rk4": rk4}
-INTEGRATORS["implicit-midpoint"] = implicit_midpoint
+INTEGRATORS: dict[str, Callable[..., Step]] = {
+    "symplectic-euler": symplectic_euler,
+    "rk4": rk4,
+    "implicit-midpoint": implicit_midpoint,
+}
 """Methods, whose first argument is the space, by the name that rollouts and the command line use."""
 
 
