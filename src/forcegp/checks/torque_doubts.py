@@ -86,7 +86,8 @@ def _drift(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
             basis = orthonormal(np.c_[steady, friction, friction * way[:, None]], SEEN)
             numbers = [np.linalg.lstsq(basis[block != k], u[block != k])[0] for k in range(BLOCKS)]
             left.append(sum(np.square((u - basis @ x)[block == k]).sum() for k, x in enumerate(numbers)))
-        if (best := int(np.argmin(left)) if min(left[2:], default=np.inf) < MUCH * left[1] else 1) > 1:
+        most = min(MUCH * left[1], EXPLAINED**2 * count * u.var())  # what a step leaves, which explains all the rest
+        if (best := int(np.argmin(left)) if min(left[2:], default=np.inf) < most else 1) > 1:
             since[name] = float(rows.time[np.argmax(ways[best] > 0.0)])
         moved = np.c_[friction, friction * ways[best][:, None]]
         told[name] = float(np.log(left[best] / max(left[0], 1e-300)))
