@@ -11,7 +11,7 @@ import pytest
 import torch
 from tests.goldens.compare import assert_unchanged
 from tests.posterior.arm import arm_data, arm_model, arm_that_remembers, quick_fit
-from tests.posterior.exported_program import PLAIN_AND_SANITIZED, RK4, compiled, ran
+from tests.posterior.exported_program import PLAIN_AND_SANITIZED, compiled, ran
 
 from forcegp import ContactMonitor, Dataset, Model, Robot, export_c
 from forcegp.codegen.c_writer import write_function
@@ -104,7 +104,7 @@ def test_every_function_computes_what_the_model_does(posterior, library, states)
         np.testing.assert_allclose(again, (q, v), rtol=1e-13)
 
 
-@pytest.mark.parametrize("integrator", [RK4, "implicit-midpoint"])
+@pytest.mark.parametrize("integrator", ["rk4", "implicit-midpoint"])
 def test_steps_of_friction_and_their_derivatives(friction, states, integrator, tmp_path):
     made = export_c(friction, tmp_path / "arm", jacobian=True, steps=DT, integrator=integrator)
     library = compiled(tmp_path / "arm", "arm.c")

@@ -212,7 +212,7 @@ def test_what_is_refused(floating):
 
 
 @pytest.mark.filterwarnings("ignore:half of the training points:forcegp.errors.DataWarning")
-@pytest.mark.parametrize("integrator", [RK4, "implicit-midpoint"])
+@pytest.mark.parametrize("integrator", ["rk4", "implicit-midpoint"])
 def test_an_arm_with_a_switch(integrator, tmp_path):
     """Its base is fixed, and u has more entries than v."""
     robot = Robot.from_urdf_text(ARM)
