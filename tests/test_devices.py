@@ -152,7 +152,9 @@ def likelihood_and_gradients(model, data, device, trips=None):
 @pytest.mark.parametrize(
     ("prior", "integrators"),
     [
-        ("gp:load-friction:expected=0.1,gp:joint-friction", ["symplectic-euler"]),
+        pytest.param(
+            "gp:load-friction:expected=0.1,gp:joint-friction", ["symplectic-euler"], marks=pytest.mark.nightly
+        ),
         ("gp:joint:kernel=matern-3/2", ["rk4"]),
     ],
 )

@@ -238,7 +238,7 @@ LOGS = {
 }
 
 
-@pytest.mark.parametrize("name", LOGS)
+@pytest.mark.parametrize("name", [pytest.param(k, marks=[pytest.mark.nightly] * (k == "arm")) for k in LOGS])
 def test_what_every_cause_explains(name):
     log = LOGS[name]()
     inputs = CheckInput.quick(log, log.model)
@@ -264,6 +264,7 @@ def test_products_that_rounding_makes_singular_have_a_solution():
     assert left < 1e-3 * products[-1, -1]
 
 
+@pytest.mark.nightly
 def test_factors_of_torques_are_looked_at_or_wrong():
     log, found = clean(ROBOTS["planar"](), 1, noise="qvu"), {}
     for factors in ([1.0, 0.3], [1.0, 0.36], [1.4, 1.0], [1.0, 28.0], [1.0, 33.0], [0.5, 0.6]):

@@ -85,6 +85,7 @@ def test_the_answer_holds_what_was_simulated(answered):
     assert 8 <= len(content["answer"]) <= 12
 
 
+@pytest.mark.nightly
 def test_correct_does_it_at_once(folder, forcegp, monkeypatch):
     """Up to the check: what comes after it is the same."""
     monkeypatch.setattr("forcegp.cli.auto.Auto._prepared_rows", _stopped)

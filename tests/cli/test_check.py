@@ -87,6 +87,7 @@ def test_what_cannot_be_done_is_refused_in_one_line(forcegp, folder, words):
     assert not (folder / "x.h5").exists()
 
 
+@pytest.mark.nightly
 def test_laws_of_a_saved_posterior_belong_to_the_torques_that_are_expected(forcegp, folder):
     data = clean(1)
     sprung = replace(data, u=data.u + 40.0 * data.q, truth={})

@@ -101,6 +101,7 @@ def test_models_by_name(forcegp, folder, forces, description):
     assert (model["scores"]["constraint"]["mae"]["all"]["median"] > 1e-6) == black_box
 
 
+@pytest.mark.nightly
 def test_motions_refine_what_was_found(forcegp, folder):
     """A cart with friction of 3 Ns/m and 4 N, whose model has 1 and 1."""
     recording(line, 1, seconds=4.0).save(folder / "cart.h5")

@@ -90,6 +90,7 @@ def test_the_payload_is_printed_and_written(folder, forcegp, held):
 LIGHT = ("--forces", "viscous,coulomb,offset,rotor")  # laws that are found sooner
 
 
+@pytest.mark.nightly
 def test_a_baseline_replaces_the_robot_file_and_people_see_millimetres(folder, forcegp):
     shown = forcegp(*WORDS, *LIGHT, "--baseline", "empty.h5", "--out", "both", folder=folder).ok()
     content = json.loads((folder / "both" / "payload.json").read_text())

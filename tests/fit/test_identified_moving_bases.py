@@ -353,6 +353,7 @@ def test_noise_under_constraints_stays_within_doubles(seed):
     assert np.isfinite(found.whitening(H)).all()
 
 
+@pytest.mark.nightly
 def test_masses_of_a_noisy_trot():
     """MuJoCo's own contacts: noise of accelerations must not lower the mass, nor windows hide the rotors."""
     model = quadruped.walker()

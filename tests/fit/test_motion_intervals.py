@@ -23,7 +23,10 @@ def log():
     return recording(bump, 1)
 
 
-@pytest.fixture(scope="module", params=["analytical", "refined", "friction"])
+REFINED = pytest.param("refined", marks=pytest.mark.nightly)
+
+
+@pytest.fixture(scope="module", params=["analytical", REFINED, "friction"])
 def calibrated(request, log):
     """A model that cannot have the bump, the same refined on motions, and one that learns it from a few rows."""
     model = slide(3.0, 4.0)

@@ -9,6 +9,7 @@ import pytest
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 SANITIZED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 RK4 = pytest.param("rk4", marks=pytest.mark.nightly)  # the other explicit step covers it
+IMPLICIT = pytest.param("implicit-midpoint", marks=pytest.mark.nightly)
 PLAIN_AND_SANITIZED = pytest.mark.parametrize("options", [("-O1",), pytest.param(SANITIZED, marks=pytest.mark.nightly)])
 
 

@@ -20,7 +20,11 @@ from forcegp.posterior import casadi_function
 
 @pytest.mark.parametrize(
     ("integrator", "transmission"),
-    [("symplectic-euler", None), ("rk4", None), ("implicit-midpoint", None), ("rk4", "bend+lift")],
+    [
+        ("symplectic-euler", None),
+        ("rk4", "bend+lift"),
+        *(pytest.param(name, None, marks=pytest.mark.nightly) for name in ("rk4", "implicit-midpoint")),
+    ],
 )
 def test_compiled_motions_carry_the_state_along(integrator, transmission, lugre_log):  # noqa: F811  # the fixture
     law = Coulomb([0.8, 0.5, 0.3], 0.1, sigma=300.0, memory=("pan", "bend"), transmission=transmission)

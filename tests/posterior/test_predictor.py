@@ -60,7 +60,10 @@ def check(posterior: Posterior, states: tuple[torch.Tensor, ...]):
             assert float((found - derivative).abs().max()) <= 1e-9 * (1.0 + float(derivative.abs().max()))
 
 
-@pytest.mark.parametrize("contacts", CONTACTS)
+@pytest.mark.parametrize(
+    "contacts",
+    ["two", "redundant", *(pytest.param(k, marks=pytest.mark.nightly) for k in ("none", "sphere", "implicit"))],
+)
 def test_it_is_predict_under_any_contacts(posterior, states, contacts: str):
     check(posterior.with_contacts(CONTACTS[contacts]), states)
 

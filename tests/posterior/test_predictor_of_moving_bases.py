@@ -5,7 +5,7 @@ import ctypes
 import numpy as np
 import pytest
 import torch
-from tests.posterior.exported_program import PLAIN_AND_SANITIZED, RK4, compiled, ran
+from tests.posterior.exported_program import IMPLICIT, PLAIN_AND_SANITIZED, RK4, compiled, ran
 from tests.robots.random_positions import random_positions
 
 from forcegp import Contact, Dataset, JointFriction, Model, Noise, Plane, Robot, export_c, fit
@@ -123,7 +123,7 @@ def test_gradients_are_those_of_predict(case):
         close(mine, other)
 
 
-@pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", "implicit-midpoint"])
+@pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", IMPLICIT])
 def test_compiled_motions_stay_on_the_manifold(case, integrator):
     posterior, q, v, u = case
     u = u[:3, None].expand(-1, 6, -1).clone()
@@ -136,7 +136,7 @@ def test_compiled_motions_stay_on_the_manifold(case, integrator):
     close(v_next, found.v[:, 1], 1e-9)
 
 
-@pytest.mark.parametrize("integrator", ["symplectic-euler", RK4, "implicit-midpoint"])
+@pytest.mark.parametrize("integrator", ["symplectic-euler", RK4, IMPLICIT])
 def test_a_linear_step_is_that_of_differences(case, integrator):
     posterior, *states = case
     q, v, u = (x[:2] for x in states)
@@ -174,6 +174,7 @@ def test_the_program_in_c(floating, tmp_path, options):
 
 
 @pytest.mark.usefixtures("unchecked")  # explicit steps add and scale CasADi's expressions as they do tensors
+@pytest.mark.nightly
 def test_functions_of_casadi(case, tmp_path):
     posterior, q, v, u = case
     casadi = pytest.importorskip("casadi")

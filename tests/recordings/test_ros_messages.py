@@ -102,7 +102,7 @@ def test_messages_come_in_the_order_of_time(tmp_path, order):
     np.testing.assert_array_equal(positions, motion()["q"][:, 1])
 
 
-@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("packed", [pytest.param(False, marks=pytest.mark.nightly), True])
 @pytest.mark.parametrize("share", [pytest.param(0.1, marks=pytest.mark.nightly), 0.6])
 def test_whole_messages_before_a_cut_are_read_with_a_warning(tmp_path, packed, share):
     """Several chunks of 1 MiB; which messages are whole is seen in the bytes, or of packed ones estimated."""

@@ -53,7 +53,10 @@ ATTACKS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("attack", ATTACKS)
+SLOW = "copies of a model", "many copies", "copies of a file"  # each at its limit, as other copies are
+
+
+@pytest.mark.parametrize("attack", [pytest.param(k, marks=[pytest.mark.nightly] * (k in SLOW)) for k in ATTACKS])
 def test_files_of_mujoco_cost_no_more_than_their_limits_and_read_only_their_folder(attack, tmp_path, monkeypatch):
     text, beside, message = ATTACKS[attack]
     monkeypatch.setattr(sandbox, "SECONDS", 1 if "more than 1 s" in message else 30)  # a busy machine is slow

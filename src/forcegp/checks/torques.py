@@ -137,7 +137,7 @@ def positive_solution(
     products: Float[np.ndarray, "*batch k1 k1"],
 ) -> tuple[Float[np.ndarray, "*batch k"], Float[np.ndarray, "*batch"]]:
     """The same of the products of all columns, of which the last is the target."""
-    size = np.sqrt(np.diagonal(products, axis1=-2, axis2=-1))
+    size = np.sqrt(np.maximum(np.diagonal(products, axis1=-2, axis2=-1), 0.0))  # rounding may be negative
     size = np.where(size > 0.0, size, 1.0)
     scaled = products / (size[..., None] * size[..., None, :])
     normal, right = scaled[..., :-1, :-1], scaled[..., :-1, -1]

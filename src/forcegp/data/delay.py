@@ -252,17 +252,19 @@ def torque_columns(
         else:  # factors of the robot's own torques, of which there are three
             gravity, bias = robot.gravity_forces(q), robot.bias_forces(q, v)
             torque = torch.stack((robot.inverse_dynamics(q, v, a) - bias, bias - gravity, gravity), dim=-1)
-    rows = dataset.q, dataset.v, dataset.u, dataset.a
+    rows, kept = (dataset.q, dataset.v, dataset.u, dataset.a), chosen if cutoff is None else slice(None)
     own = [*usual_columns(robot, *rows, FRICTION_WIDTHS), *law_columns(dataset.model.laws, robot, *rows)]
+    own = [column[kept] for column in own]
     if dataset.strokes is not None:  # friction that remembers, of several stiffnesses and as it rises with speed
-        past, spread = torch.tensor(dataset.strokes), torch.tensor(joint_positions(dataset).std(0)).clamp_min(1e-9)
-        states = [after_strokes(past, sigma / spread).numpy() for sigma in STIFFNESSES]
-        own += [part for z in states for part in (z, z * np.sqrt(np.abs(dataset.v)))]
+        past, spread = torch.tensor(dataset.strokes[kept]), torch.tensor(joint_positions(dataset).std(0))
+        states = [after_strokes(past, sigma / spread.clamp_min(1e-9)).numpy() for sigma in STIFFNESSES]
+        own += [part for z in states for part in (z, z * np.sqrt(np.abs(dataset.v[kept])))]
     forces = np.stack(own, axis=-1)
     if cutoff is not None:
         for there in (dataset.episode == number for number in dataset.episodes):
             forces[there] = LowPass(cutoff)(forces[there], dataset.time[there])
-    return np.concatenate([torque.cpu().numpy(), forces[chosen]], axis=-1).transpose(1, 0, 2)
+        forces = forces[chosen]
+    return np.concatenate([torque.cpu().numpy(), forces], axis=-1).transpose(1, 0, 2)
 
 
 def lowest(values: Float[np.ndarray, " shifts"], shifts: Float[np.ndarray, " shifts"]) -> float:
