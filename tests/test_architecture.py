@@ -207,6 +207,7 @@ def test_slow_and_optional_packages_are_imported_where_they_are_used(package):
     assert not offences, f"import {package} inside the function that needs it: {', '.join(offences)}"
 
 
+@pytest.mark.nightly
 def test_an_exported_name_that_is_a_module_too_comes_from_there():
     """`forcegp.fit` of `forcegp.fit.fit`: then lazy_loader keeps the module from taking the place of the name."""
     parts = [name.rpartition(".") for name in MODULES]

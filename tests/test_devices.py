@@ -189,6 +189,7 @@ def test_inducing_points_on_the_pretended_device():
         assert_close(found.covariance.inner, expected.covariance, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.nightly
 def test_independent_processes_on_the_pretended_device():
     data, how = arm_data(24, seed=5), {"restarts": 1, "options": QUICK}
     expected = fit(data.model.black_box(), data, **how)

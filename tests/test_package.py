@@ -25,8 +25,7 @@ def test_one_version_everywhere(repository):
 
 @pytest.mark.parametrize("name", forcegp.__all__)
 def test_public_names_are_public_in_their_rooms_and_documented(name, repository):
-    value = getattr(forcegp, name)
-    page = (repository / "src/forcegp/__init__.pyi").read_text()
+    value, page = getattr(forcegp, name), (repository / "src/forcegp/__init__.pyi").read_text()
     (package,) = [
         node.module
         for node in ast.parse(page).body

@@ -73,6 +73,7 @@ def test_the_page_on_scoring_runs(repository: Path, tmp_path: Path):
     assert len(candidates(command.models.names(), model, usual_identification(model))) == len(named) >= 8
 
 
+@pytest.mark.nightly
 def test_the_page_on_reports_runs(tmp_path: Path):
     (example,) = blocks("reports")
     assert run_example(example, tmp_path).splitlines() == re.findall(r"print\(.*\)  # (.*)", example)

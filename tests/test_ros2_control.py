@@ -47,8 +47,7 @@ def test_the_controller_commands_what_computed_torque_does(tmp_path):
 
 
 def test_the_package_names_what_it_needs():
-    needs = (EXAMPLE / "package.xml").read_text()
-    cmake = (EXAMPLE / "CMakeLists.txt").read_text()
+    needs, cmake = (EXAMPLE / "package.xml").read_text(), (EXAMPLE / "CMakeLists.txt").read_text()
     for package in (header.partition("/")[0] for header in HEADERS):
         assert f"<depend>{package}</depend>" in needs
         assert package in cmake

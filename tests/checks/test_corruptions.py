@@ -36,7 +36,13 @@ def log_of(place: int):
     return clean(ROBOTS[name](), place, rate=(100.0, 250.0)[place % 2], seconds=7.0, noise=("a", "qvu")[place // 3 % 2])
 
 
-@pytest.mark.parametrize("name", CORRUPTIONS)
+def every(count, first):
+    """All corruptions, of which each so-manieth is fast."""
+    marks = [[pytest.mark.nightly] * (k % count != first) for k in range(len(CORRUPTIONS))]
+    return [pytest.param(name, marks=own) for name, own in zip(CORRUPTIONS, marks, strict=True)]
+
+
+@pytest.mark.parametrize("name", every(2, 1))
 def test_a_corruption_is_named_by_check(name):
     corrupt, words = CORRUPTIONS[name]
     report = check(corrupt(log_of(list(CORRUPTIONS).index(name))))
@@ -45,18 +51,8 @@ def test_a_corruption_is_named_by_check(name):
     assert_unchanged(f"checks/{name}", found, rtol=1e-3)
 
 
-@pytest.mark.parametrize("name", [each for k, each in enumerate(CORRUPTIONS) if k % 4 == 0])
+@pytest.mark.parametrize("name", every(4, 0))
 def test_a_corruption_is_named_before_a_fit(name):
-    _named_before_a_fit(name)
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", [each for k, each in enumerate(CORRUPTIONS) if k % 4])
-def test_every_corruption_is_named_before_a_fit(name):
-    _named_before_a_fit(name)
-
-
-def _named_before_a_fit(name):
     corrupt, words = CORRUPTIONS[name]
     data = corrupt(log_of(list(CORRUPTIONS).index(name)))
     quick = quick_check(data)
@@ -73,6 +69,7 @@ def test_an_invented_contact_is_named_by_check_and_before_a_fit():
     assert named(corruptions.said_by_fit(data, quick_check(data)), "contact")
 
 
+@pytest.mark.nightly
 def test_a_contact_is_not_sought_where_velocities_are_wrong(monkeypatch):
     asked = []
     monkeypatch.setattr("forcegp.checks.report.held_points", lambda inputs: asked.append(inputs) or [])
@@ -382,6 +379,12 @@ def test_clean_logs_raise_no_alarm(seed):
     for name, data in clean_logs(seed):
         assert len(data) <= 300 or not check(data).doubts.at("wrong"), name
         assert quick_check(data) == (), name
+
+
+def test_a_joint_that_is_held_throughout_is_at_no_end_of_its_motion():
+    torch.manual_seed(9)
+    [stop] = check(dict(clean_logs(9))["a joint is held"]).doubts.of("stop")
+    assert stop.numbers["seconds"] == [pytest.approx([7.04, 7.34], abs=0.05)]
 
 
 ROUND = '<inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>'

@@ -54,8 +54,7 @@ def test_laws_and_bodies_are_estimated(identified, folder):
     test = Dataset.load(folder / "test.h5")
     before, after = (np.sqrt((motion_residuals(test, each)[0] ** 2).mean(0)) for each in (test.model, model))
     assert (after < 0.3 * before).all()
-    robot = Robot.from_urdf(folder / "found" / "identified.urdf")
-    q = torch.zeros(2).double()
+    robot, q = Robot.from_urdf(folder / "found" / "identified.urdf"), torch.zeros(2).double()
     torch.testing.assert_close(robot.mass_matrix(q), model.robot.mass_matrix(q))
     assert robot.joint("upper_hinge").friction == kept["parameters"]["coulomb.level.upper_hinge"]["value"]
     config = json.loads((folder / "found" / "config.json").read_text())

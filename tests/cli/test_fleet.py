@@ -59,8 +59,7 @@ def test_each_log_is_a_row_and_one_that_fails_says_so(listed, capsys):
     assert Path("out/robot1/model.json").is_file()
 
     # what is finished stays, what is mended is run
-    written = Path("out/robot1/model.json").stat().st_mtime_ns
-    first = listed.read_text().split()[3]
+    written, first = Path("out/robot1/model.json").stat().st_mtime_ns, listed.read_text().split()[3]
     assert len(Dataset.load(first)) == 60
     broken.write_bytes(Path(first).read_bytes())
     assert main(words("out")) == 0

@@ -46,6 +46,7 @@ def folder(tmp_path_factory):
     return place
 
 
+@pytest.mark.nightly
 def test_a_walker_is_identified_and_a_fit_begins_with_it(folder, forcegp):
     words = ("fit", "walk.h5", "--forces", "bodies,viscous,coulomb,rotor", "--out", "found")
     done = forcegp(*words, "--json", folder=folder).ok()
@@ -60,8 +61,7 @@ def test_a_walker_is_identified_and_a_fit_begins_with_it(folder, forcegp):
 
 def test_a_load_on_the_trunk(folder, forcegp):
     done = forcegp("payload", "walk.h5", "--cutoff", "none", "--forces", "coulomb", "--json", folder=folder).ok()
-    trunk = Robot.from_urdf_text(LIMBS, base="floating").link("trunk")
-    content = json.loads(done.stdout)
+    trunk, content = Robot.from_urdf_text(LIMBS, base="floating").link("trunk"), json.loads(done.stdout)
     assert content["link"] == "trunk"
     assert content["parameters"]["payload.mass"]["value"] == pytest.approx(0.6 * trunk.mass, rel=0.05)
 
@@ -123,8 +123,7 @@ def test_what_cannot_be_is_one_line_before_the_work(folder, forcegp, words, mess
 def test_a_base_that_was_not_measured_is_told_what_to_record(tmp_path, forcegp):
     """And what can be learned without: doing so works."""
     (tmp_path / "hopper.urdf").write_text(LIMBS)
-    joints = Robot.from_urdf_text(LIMBS, base="floating").single_joint_names
-    time = np.arange(200) / 100
+    joints, time = Robot.from_urdf_text(LIMBS, base="floating").single_joint_names, np.arange(200) / 100
     table = np.column_stack([time, *(np.sin((k + 1) * time) for k in range(2 * len(joints)))])
     names = ["t", *(f"q_{name}" for name in joints), *(f"u_{name}" for name in joints)]
     np.savetxt(tmp_path / "log.csv", table, "%.9g", ",", header=",".join(names), comments="")

@@ -84,8 +84,7 @@ def test_strokes_and_noise_of_positions(arm):
 def test_stance(noise):
     log, _ = walk(2, noise, seconds=4.5)
     hopping = hop("floating", 50.0, 0.14)[0]
-    quiet = replace(hopping, v=0.05 * hopping.v)
-    still = walk(3, noise, seconds=1.0, lift=False)[0]
+    quiet, still = replace(hopping, v=0.05 * hopping.v), walk(3, noise, seconds=1.0, lift=False)[0]
     found = {name: data.estimate_stance(each) for name, each in (("walk", log), ("hop", quiet), ("still", still))}
     assert_unchanged(f"data/stance {noise:g}", found)
 

@@ -24,8 +24,7 @@ SWITCHES = slice(-4, None)
 def walk(seed: int, noise: float = 0.0, **config):
     """Rows without their flags, with white noise on all velocities, and the flags."""
     log = simulate_quadruped(QuadrupedConfig(**{"seconds": 6.0, "seed": seed, "noise": 0.1, **config}))
-    v = log.v + noise * np.random.default_rng(seed).normal(size=log.v.shape)
-    u = log.u.copy()
+    v, u = log.v + noise * np.random.default_rng(seed).normal(size=log.v.shape), log.u.copy()
     u[:, SWITCHES] = 0.0
     return replace(log, v=v, u=u, truth={}), log.u[:, SWITCHES]
 
@@ -117,12 +116,10 @@ def test_stance_as_short_as_what_a_filter_smears_is_never_called_swing(rate, sta
 
 def test_prepared_rows_carry_the_flags_and_open_ones_half():
     log, flags = walk(9)
-    prepared = Preparation(stance="auto", every=2).apply(log)
-    found = estimate_stance(log).flags[::2]
+    prepared, found = Preparation(stance="auto", every=2).apply(log), estimate_stance(log).flags[::2]
     np.testing.assert_array_equal(prepared.u[:, SWITCHES], np.where(np.isnan(found), 0.5, found))
     np.testing.assert_array_equal(prepared.time, log.time[::2])
-    known = np.isfinite(found).all(axis=1)
-    report = prepared.metadata["preparation"]["stance"]
+    known, report = np.isfinite(found).all(axis=1), prepared.metadata["preparation"]["stance"]
     assert report["open_rows"] == (~known).sum() > 10
     assert report["standing"]["front_left_stands"] == pytest.approx(flags[:, 0].mean(), abs=0.03)
     np.testing.assert_array_equal(decided(prepared).time, prepared.time[known])

@@ -38,8 +38,7 @@ def test_zero_is_the_reference():
 
 def test_derivatives():
     ours, x = bodies(), 0.4 * np.random.default_rng(0).normal(size=30)
-    wanted = difference(lambda at: ours.parameters(at).ravel(), x)
-    found = np.zeros((30, 30))
+    wanted, found = difference(lambda at: ours.parameters(at).ravel(), x), np.zeros((30, 30))
     for body, block in enumerate(derivatives(ours, x)):
         found[10 * body : 10 * body + 10, 10 * body : 10 * body + 10] = block
     np.testing.assert_allclose(found, wanted, atol=1e-8)

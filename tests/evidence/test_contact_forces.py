@@ -39,8 +39,7 @@ def measured(truth, given, rows=150, seed=0, noise=0.0, push=None):
     rng = np.random.default_rng(seed)
     state = arm_data(rows, seed, arm_model(0 if len(given.contacts) == 2 else 1))
     log = replace(state, model=given, truth={}, noise_std=None, u=4.0 * state.u)
-    v = np.array(log.v)
-    A = given.constraint(given.state(*tensors(log, "q", "v", "u")))[0].numpy()
+    v, A = np.array(log.v), given.constraint(given.state(*tensors(log, "q", "v", "u")))[0].numpy()
     v -= (np.linalg.pinv(A) @ (A @ v[..., None]))[..., 0]  # along the contact
     log = replace(log, v=v)
     at = truth.dynamics(*tensors(log, "q", "v", "u"))

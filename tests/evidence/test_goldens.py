@@ -47,8 +47,7 @@ def test_every_step_of_a_search(start):
 
 def test_levels_of_noise_and_rows_that_resemble_each_other():
     residual, M = drawn(60, ACCELERATION, FORCE)
-    H = np.linalg.inv(M) * [1.0, 0.0]
-    near = NoiseLevels(np.array([3.0, 0.1]), np.array([1e-9, 40.0]))
+    H, near = np.linalg.inv(M) * [1.0, 0.0], NoiseLevels(np.array([3.0, 0.1]), np.array([1e-9, 40.0]))
     found = {"of": NoiseLevels.of(residual, M), "near": NoiseLevels.of(residual, M, H, near)}
     found |= {"many": NoiseLevels.of(*drawn(2100, ACCELERATION, FORCE)), "white": near.scaled(2.0).whitening(H)}
     waves = np.cumsum(np.random.default_rng(0).normal(size=(80, 3)), axis=0) * [1.0, 0.1, 0.01] + [0.0, 1.0, 0.0]
@@ -101,8 +100,7 @@ def test_rows_of_a_marginal_likelihood():
         likelihood = MarginalLikelihood(model, rows)
         learned, stays = likelihood.split_noise
         parameters = {**likelihood.kernels.initial_parameters(), **learned, **stays}
-        terms = likelihood.terms(parameters)
-        value = likelihood(likelihood.kernels, parameters)
+        terms, value = likelihood.terms(parameters), likelihood(likelihood.kernels, parameters)
         posterior = likelihood.condition(likelihood.kernels, parameters)
         values = {**learned, "kernels": [x.detach() for x in likelihood.kernels.initial_parameters().values()]}
         found[name] = [values, float(value.detach()), posterior.weights, terms.noise, terms.residual, terms.W]

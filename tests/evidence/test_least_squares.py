@@ -52,8 +52,7 @@ def test_steps_within_bounds_are_nearly_those_of_lsq_linear(seed):
     A, y, low = generator.normal(size=(20, 2, 5)), generator.normal(size=(20, 2)), -generator.uniform(0.0, 0.2, 5)
     bounds = low * [1.0, 1.0, 0.0, 1.0, 1.0], low + 0.2
     J, target = (A / noise[:, None]).reshape(-1, 5), (y / noise).ravel()
-    best = lsq_linear(J, target, bounds, tol=1e-12)
-    step = step_within(-J.T @ target, J.T @ J, *bounds)
+    best, step = lsq_linear(J, target, bounds, tol=1e-12), step_within(-J.T @ target, J.T @ J, *bounds)
     slope, inside = J.T @ (J @ step - target), (step > bounds[0]) & (step < bounds[1])
     np.testing.assert_allclose(slope[inside], 0.0, atol=1e-9 * abs(J.T @ target).max())
     assert ((bounds[0] <= step) & (step <= bounds[1])).all()

@@ -154,6 +154,7 @@ def test_a_right_sensor_gets_no_false_word(seed):
     assert (doubt.level, "is off by" in doubt.what) == ("look", True)
 
 
+@pytest.mark.nightly
 def test_a_sensor_that_does_not_teach_is_no_force():
     log, force, _ = carrying()
     rows = replace(log, measured={"force.hand": force}).rows(np.arange(0, 3000, 6))

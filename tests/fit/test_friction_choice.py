@@ -70,8 +70,7 @@ def test_all_points_are_all_rows_whose_past_is_known():
     u = arm_model(0).robot.inverse_dynamics(*map(torch.tensor, (q, v, a))).numpy() + LEVEL * sign(v)
     log = log_of(q, v, a, u, time)
     forces = Coulomb(LEVEL, sigma=3000.0, memory=True), JointFriction()
-    options = OptimizerOptions(iterations=3)
-    model = arm_model(0).with_forces(*forces, noise=Noise(0.1))
+    options, model = OptimizerOptions(iterations=3), arm_model(0).with_forces(*forces, noise=Noise(0.1))
     assert 150 < len(fit(model, log, points=len(log), restarts=1, options=options).training) < len(log)
 
 
@@ -244,8 +243,7 @@ def test_normal_equations_are_those_of_weighted_least_squares(noise):
     regression = _Regression(P, Coulomb(), log, state, torque)
     regression.beside, regression.across = regression._beside(0), {}
     at, parts = (-WIDTHS[3], 5), ("root", "direction")
-    L = np.linalg.cholesky(P).swapaxes(1, 2)
-    columns = [np.linalg.solve(P, regression.bodies)]
+    L, columns = np.linalg.cholesky(P).swapaxes(1, 2), [np.linalg.solve(P, regression.bodies)]
     for j in range(3):
         chosen, sign_of = (parts, at[0]) if j == 0 else ((), regression.at[j])
         s = np.tanh(log.v[:, j] / (-sign_of * regression.speed[j]))

@@ -23,10 +23,10 @@ def log():
     return recording(bump, 1)
 
 
-REFINED = pytest.param("refined", marks=pytest.mark.nightly)
+OTHERS = "refined", "friction"
 
 
-@pytest.fixture(scope="module", params=["analytical", REFINED, "friction"])
+@pytest.fixture(scope="module", params=["analytical", *(pytest.param(k, marks=pytest.mark.nightly) for k in OTHERS)])
 def calibrated(request, log):
     """A model that cannot have the bump, the same refined on motions, and one that learns it from a few rows."""
     model = slide(3.0, 4.0)

@@ -25,8 +25,7 @@ def with_wrong_hand(model, factor):
     """The model whose hand has another mass, 6 cm away."""
     pose = np.eye(4)
     pose[[0, 2], 3] = 0.04, -0.05
-    body = carrying(model.robot)[2]
-    P = factor * body_pseudo_inertias(model.robot).numpy()[2]
+    body, P = carrying(model.robot)[2], factor * body_pseudo_inertias(model.robot).numpy()[2]
     return replace(model, robot=with_bodies(model.robot, {body: pose @ P @ pose.T}))
 
 
@@ -63,8 +62,7 @@ def test_rounds_end_unsettled_after_the_tenth(monkeypatch):
 
 def likelihood_of(model, data, points=12):
     """With the noise of the data, and a space about a hand that is wrong."""
-    rows = data.rows(slice(points))
-    model = replace(model, noise=Noise(tuple(data.noise_std)))
+    rows, model = data.rows(slice(points)), replace(model, noise=Noise(tuple(data.noise_std)))
     space = ParameterSpace(model, typical_sizes(model, [data]))
     closed = replace(space.model_at(space.start), noise=model.noise)
     return MarginalLikelihood(closed, TrainingData.of(rows, model.robot.device)), space

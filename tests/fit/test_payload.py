@@ -307,8 +307,7 @@ def test_causes_are_named_from_ten_nats_on_and_from_a_twentieth_of_what_is_left(
 
 def test_constants_of_currents_are_found_with_the_payload():
     """Beside the masses of the URDF, whatever the unit; friction and rotors are unknown, too."""
-    constants = np.array([12.0, 3.0, 0.4, 0.05, 1.7, 0.2])
-    data = log(loaded(), 1, noise=0.05)
+    constants, data = np.array([12.0, 3.0, 0.4, 0.05, 1.7, 0.2]), log(loaded(), 1, noise=0.05)
     estimate = Found(replace(data, u=data.u / constants), laws=(*LAWS, Actuation(gain=None)), rows=800)
     found = [estimate.estimates[f"gain.{joint}"].value for joint in ROBOT.joint_names]
     assert np.array(found) / constants == pytest.approx(np.ones(6), rel=0.02)

@@ -16,8 +16,7 @@ from forcegp.scores.held_out import held_out_motions, motion_scores
 
 def test_published_numbers_of_a_pendulum_predict_its_motion(shared):
     """nRMSE .0085 and .0094 of the absolute angles' accelerations, from URDF and friction objects alone."""
-    folder = shared("realdata")
-    model = multiarm_system(Viscous([2.37142783e-4, 1.00000019e-5]))
+    folder, model = shared("realdata"), multiarm_system(Viscous([2.37142783e-4, 1.00000019e-5]))
     data = multiarm(folder, model)
     _, residual = motion_residuals(data, model)
     absolute = [x.cumsum(axis=1) for x in (residual, data.a)]

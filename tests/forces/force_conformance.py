@@ -176,8 +176,7 @@ class UnknownConformance:
 
     def test_sums_with_another_prior(self, model):
         other = JointPositionForces(kernel="matern-1/2")
-        total = UnknownForces((self.prior, other))
-        dynamics = model.dynamics(*some_states(4))
+        total, dynamics = UnknownForces((self.prior, other)), model.dynamics(*some_states(4))
         parts = (self.prior, other)
         assert torch.equal(total.direction(dynamics), torch.cat([part.direction(dynamics) for part in parts], -1))
         given = [z for part in parts for z in part.features(dynamics)]
@@ -200,8 +199,7 @@ class UnknownConformance:
     def test_a_fit_predicts_and_comes_back_from_a_folder(self, fitted, data, tmp_path):
         test = some_data(data.model, 6, 2)
         states = test.q, test.v, test.u
-        prediction = fitted.predict(*states)
-        dynamics = data.model.dynamics(*map(torch.tensor, states))
+        prediction, dynamics = fitted.predict(*states), data.model.dynamics(*map(torch.tensor, states))
         violation = (dynamics.A @ prediction.mean[..., None])[..., 0] - dynamics.b
         assert float(violation.abs().max()) < 1e-8
         for gaussian in (prediction, prediction.unknown_force):

@@ -137,8 +137,7 @@ class KernelConformance:
             start = latent.initial_parameters()
             start = dict(started(start, start, 0, index))
             leaves = {name: value.requires_grad_() for name, value in start.items()}
-            noise = torch.full((1, 1), 0.01, dtype=torch.float64)
-            W = torch.ones(8, 1, 1, dtype=torch.float64)
+            noise, W = torch.full((1, 1), 0.01, dtype=torch.float64), torch.ones(8, 1, 1, dtype=torch.float64)
             value = negative_log_likelihood(W, target, noise, latent.matrices(leaves, z)) - latent.log_prior(leaves)
             gradients = torch.autograd.grad(value, list(leaves.values()))
             assert bool(torch.isfinite(value))

@@ -159,8 +159,7 @@ class LawConformance:
 
         posterior = fit(model.with_forces(noise=STILL), log)
         states = [x.numpy()[0] for x in self.states(log)]
-        function = casadi_function(posterior)
-        expected = posterior.predict(*states).mean.numpy()
+        function, expected = casadi_function(posterior), posterior.predict(*states).mean.numpy()
         np.testing.assert_allclose(np.array(function(*states)).ravel()[:3], expected, rtol=1e-9, atol=1e-9)
         assert isinstance(function, casadi.Function)
         export_c(posterior, tmp_path / "made", name="arm")  # compiled and compared with the model where it is written
@@ -172,8 +171,7 @@ class LawConformance:
     def test_a_log_that_does_not_show_it_is_named(self, opened, log):
         if not isinstance(self.law, JointLaw) or not set(self.law.coefficients) - set(self.shows_at_rest):
             pytest.skip("it is no law of single joints, or shows at rest")
-        still = replace(log, q=np.zeros_like(log.q), v=np.zeros_like(log.v))
-        name = force_name(self.law)
+        still, name = replace(log, q=np.zeros_like(log.q), v=np.zeros_like(log.v)), force_name(self.law)
         found = fit(arm_model(0).with_forces(opened), still, Torques()).parameters
         seen = tuple(f"{name}.{coefficient}." for coefficient in self.shows_at_rest)
         assert {each.decided_by for each in found.values() if not each.name.startswith(seen)} == {"prior"}

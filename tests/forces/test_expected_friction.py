@@ -101,11 +101,9 @@ def test_the_normal_force_solves_the_equations_with_friction_in_them(surface):
     dynamics = rows_of(surface)
     _, speed = friction_direction(dynamics)
     coefficients = torch.tensor(np.interp(speed.numpy(), COEFFICIENT.at, COEFFICIENT.values))
-    names = dynamics.state.robot.joint_names
-    joint_force = torch.zeros_like(dynamics.state.v)
+    names, joint_force = dynamics.state.robot.joint_names, torch.zeros_like(dynamics.state.v)
     for name, curve in JOINTS:
-        k = names.index(name)
-        line = interp1d(curve.at, curve.values, fill_value="extrapolate")
+        k, line = names.index(name), interp1d(curve.at, curve.values, fill_value="extrapolate")
         joint_force[:, k] = -torch.tensor(line(dynamics.state.v[:, k].numpy()))
     solved = [coupled_multiplier(dynamics, coefficients, joint_force, row) for row in range(len(speed))]
     expected = torch.tensor(solved, dtype=torch.float64).abs() * dynamics.normals[:, 0].norm(dim=-1)

@@ -165,8 +165,7 @@ def test_the_width_of_friction_has_a_hyperprior():
 
 def test_the_hyperprior_is_normal_in_the_logarithm_of_the_length_scales():
     latent = LatentKernels(JointForces().kernels(arm_model().robot, (4,), torch.ones(1).double()))
-    parameters = latent.initial_parameters()
-    raw = torch.tensor([[0.0, 1.0, 2.0, 5.0]]).double()
+    parameters, raw = latent.initial_parameters(), torch.tensor([[0.0, 1.0, 2.0, 5.0]]).double()
     parameters["kernels.0.base_kernel.raw_lengthscale"] = raw.requires_grad_()
     expected = torch.distributions.Normal(torch.tensor(0.5).double() * torch.tensor(4.0).double().log() + 3.0, 2.0)
     value = latent.log_prior(parameters)

@@ -126,8 +126,7 @@ def test_load_and_speed_change_its_level(law, lugre_log):
     if law is GearFriction:
         given["root"] = [0.2, -0.05, 0.1]
     model = arm_model(0).with_forces(law(**given))
-    z = torch.tensor(with_memory(lugre_log, model).u[:, 3:])
-    rigid = torch.tensor(lugre_log.u[:, :3])
+    z, rigid = torch.tensor(with_memory(lugre_log, model).u[:, 3:]), torch.tensor(lugre_log.u[:, :3])
     torch_of = partial(torch.tensor, dtype=torch.float64)
     level = torch_of(given["level"]) + torch_of(given.get("root", 0.0)) * torch.tensor(lugre_log.v).abs().sqrt()
     u = rigid + level * z  # solve u = rigid + (level + mu |u|) z

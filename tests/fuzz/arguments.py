@@ -94,8 +94,7 @@ def _robot() -> Any:
 
 def _prior(kind: Any, **arguments: Any) -> Any:
     """A prior shows what is wrong with it where it meets a robot."""
-    dynamics = INPUTS.data.model.dynamics(*(x[None] for x in STATE))
-    made = kind(**arguments)
+    dynamics, made = INPUTS.data.model.dynamics(*(x[None] for x in STATE)), kind(**arguments)
     made.direction(dynamics), made.features(dynamics)
     made.latent_names(_robot())
     return made

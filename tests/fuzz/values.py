@@ -97,8 +97,7 @@ DAMAGE = st.builds(
 
 def damaged(content: bytes, damage: Damage) -> bytes:
     generator = random.Random(damage.seed)
-    place = generator.randrange(len(content) + 1)
-    count = generator.choice((1, 4, 40, 1000))
+    place, count = generator.randrange(len(content) + 1), generator.choice((1, 4, 40, 1000))
     match damage.how:
         case "flip" if content:
             place = min(place, len(content) - 1)

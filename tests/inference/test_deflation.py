@@ -36,8 +36,7 @@ def test_any_other_basis_gives_the_same(seed):
     given_problem = problem(count=5, outputs=4, constraints=1, seed=seed)
     W_white, y_white, _ = whiten(*given_problem.data)
     with torch.no_grad():
-        deflation = deflate(W_white, y_white)
-        matrices = given_problem.kernels(given_problem.features)
+        deflation, matrices = deflate(W_white, y_white), given_problem.kernels(given_problem.features)
         Q = torch.linalg.qr(normal(5, deflation.rank, deflation.rank, seed=seed)).Q
         t = (Q @ deflation.t[..., None])[..., 0]
         turned = Deflation(deflation.U @ Q.mT, Q @ deflation.C, t, deflation.remainder)

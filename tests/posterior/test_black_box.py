@@ -50,8 +50,7 @@ def test_equals_dense_conditioning_on_a_block_diagonal_covariance():
         def kernel(a, b, length=length, variance=variance):
             return variance * torch.exp(-0.5 * ((a[:, None] - b[None]) / length).square().sum(-1))
 
-        S = kernel(z, z) + NOISE**2 * torch.eye(25, dtype=torch.float64)
-        cross = kernel(new, z)
+        S, cross = kernel(z, z) + NOISE**2 * torch.eye(25, dtype=torch.float64), kernel(new, z)
         assert_close(found.mean[:, joint], cross @ torch.linalg.solve(S, y[:, joint]))
         spread = variance - (cross * torch.linalg.solve(S, cross.mT).mT).sum(-1)
         assert_close(found.covariance[:, joint, joint], spread, rtol=1e-7, atol=1e-9)
@@ -63,8 +62,7 @@ def test_joints_that_share_nothing_are_taken_apart_and_give_the_same(monkeypatch
     """Value and gradients with the shortcut and without."""
     generator = torch.Generator().manual_seed(0)
     residual = torch.randn(12, 3, generator=generator, dtype=torch.float64)
-    W = torch.diag_embed(0.5 + torch.rand(12, 3, generator=generator, dtype=torch.float64))
-    found = []
+    W, found = torch.diag_embed(0.5 + torch.rand(12, 3, generator=generator, dtype=torch.float64)), []
     for apart in (True, False):
         noise = torch.full((1, 3), 0.3, dtype=torch.float64, requires_grad=True)
         roots = torch.randn(3, 12, 12, generator=torch.Generator().manual_seed(1), dtype=torch.float64)

@@ -63,6 +63,7 @@ def complete(posterior, tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.nightly
 def test_what_is_said_of_a_program_is_what_it_was(complete, friction, tmp_path):
     export_c(friction, tmp_path / "other", covariance=True, name="other")
     texts = {path.name: path.read_text() for path in (complete / "arm.h", tmp_path / "other" / "other.h")}

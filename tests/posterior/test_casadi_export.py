@@ -7,7 +7,7 @@ import pytest
 import torch
 from numpy.testing import assert_allclose
 from tests.posterior.arm import arm_data, arm_model, quick_fit
-from tests.posterior.exported_program import RK4
+from tests.posterior.exported_program import IMPLICIT, RK4
 
 from forcegp.codegen.library import compile_library
 from forcegp.errors import InvalidInput, MissingExtra, NumericalError
@@ -36,8 +36,7 @@ def friction() -> Posterior:
 
 def test_it_is_predict_with_the_derivatives_of_a_predictor(posterior, states):
     function = casadi_function(posterior)
-    slopes = function.jacobian()
-    expected = posterior.predict(*states, covariance=False).mean.numpy()
+    slopes, expected = function.jacobian(), posterior.predict(*states, covariance=False).mean.numpy()
     linear = posterior.predictor(covariance="none").linearize(*states)
     jacobians = torch.cat([linear.da_dq, linear.da_dv, linear.da_du], dim=-1).numpy()
     for k, state in enumerate(zip(*(x.numpy() for x in states), strict=True)):
@@ -47,7 +46,7 @@ def test_it_is_predict_with_the_derivatives_of_a_predictor(posterior, states):
 
 
 @pytest.mark.usefixtures("unchecked")  # explicit steps add and scale CasADi's expressions as they do tensors
-@pytest.mark.parametrize("integrator", ["symplectic-euler", RK4, "implicit-midpoint"])
+@pytest.mark.parametrize("integrator", ["symplectic-euler", RK4, IMPLICIT])
 def test_steps_are_those_of_a_predictor(posterior, states, integrator):
     function = casadi_function(posterior, steps=0.01, integrator=integrator)
     expected = posterior.predictor(covariance="none").step(*states, 0.01, integrator)

@@ -131,8 +131,7 @@ def test_update_is_conditioning_on_all_rows(steady):
     missed = M * (rows.a - posterior.predict(q, v, u).mean.numpy())[:, 0] - given.bias[0] * f
     walk = BETWEEN**2 + 0.02**2 * np.minimum.outer(rows.time, rows.time)
     joint = f[:, None] * walk * f + given.noise[0][0] / DT * np.eye(len(f))
-    gain = np.linalg.solve(joint, f[:, None] * walk[:, -1:])[:, 0]
-    found = drift_of(updated)
+    gain, found = np.linalg.solve(joint, f[:, None] * walk[:, -1:])[:, 0], drift_of(updated)
     np.testing.assert_allclose(found.level, [gain @ missed], rtol=1e-6)
     np.testing.assert_allclose(found.std, [np.sqrt(walk[-1, -1] - gain @ (f * walk[-1]))], rtol=1e-6)
     assert found.level[0] == pytest.approx(0.05, abs=0.03)
@@ -158,8 +157,7 @@ def test_the_level_is_that_of_motors():
 def test_another_record_is_predicted_better(steady, tmp_path):
     _, posterior = steady
     other = recording(5, level=0.15, seconds=24.0)
-    rest = other.rows(other.time >= 8.0)
-    updated = posterior.update(other.rows(other.time < 8.0))
+    rest, updated = other.rows(other.time >= 8.0), posterior.update(other.rows(other.time < 8.0))
     again = updated.update(rest.rows(rest.time < 16.0))
     assert abs(drift_of(again).level[0] - 0.15) < 0.03
     assert drift_of(again).std[0] < drift_of(updated).std[0]

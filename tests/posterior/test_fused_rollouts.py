@@ -5,13 +5,14 @@ import warnings
 import pytest
 import torch
 from tests.posterior.arm import arm_data, arm_model, quick_fit
+from tests.posterior.exported_program import IMPLICIT
 
 from forcegp.errors import NumericalWarning
 from forcegp.forces import JointForces, JointFriction
 from forcegp.posterior import Posterior, Predictor, rollout
 
 DT, STEPS = 0.01, 12
-INTEGRATORS = ["symplectic-euler", "rk4", "implicit-midpoint"]
+INTEGRATORS = ["symplectic-euler", "rk4", IMPLICIT]
 
 
 @pytest.fixture(scope="module")

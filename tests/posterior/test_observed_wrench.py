@@ -54,14 +54,14 @@ def test_each_component_takes_the_time_that_missed_least():
 
 @pytest.fixture(scope="module")
 def posterior():
-    train = simulate_quadrotor(QuadrotorConfig(seconds=12.0, seed=1))
+    train = simulate_quadrotor(QuadrotorConfig(seconds=8.0, seed=1))
     with warnings.catch_warnings(action="ignore"):
         return fit(train.model.with_forces(AerodynamicForce()), acting(train), points=50, restarts=1)
 
 
 @pytest.fixture(scope="module")
 def test():
-    return simulate_quadrotor(QuadrotorConfig(seconds=6.0, seed=2, wind=8.0))
+    return simulate_quadrotor(QuadrotorConfig(seconds=4.5, seed=2, wind=8.0))
 
 
 def acting(dataset, lag=0.06):

@@ -42,8 +42,7 @@ def assert_close(found: torch.Tensor, expected: torch.Tensor, tolerance: float =
 
 def check(posterior: Posterior, states: tuple[torch.Tensor, ...]):
     """Mean, exact covariance and derivatives are those of `predict`, for one state and for several."""
-    predictor = posterior.predictor(covariance="exact")
-    expected = posterior.predict(*states)
+    predictor, expected = posterior.predictor(covariance="exact"), posterior.predict(*states)
     mean, covariance = predictor(*states)
     assert_close(mean, expected.mean)
     assert_close(predictor.mean(*states), expected.mean)

@@ -126,8 +126,7 @@ def test_gradients_are_those_of_predict(case):
 @pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", IMPLICIT])
 def test_compiled_motions_stay_on_the_manifold(case, integrator):
     posterior, q, v, u = case
-    u = u[:3, None].expand(-1, 6, -1).clone()
-    predictor = posterior.predictor(covariance="none")
+    u, predictor = u[:3, None].expand(-1, 6, -1).clone(), posterior.predictor(covariance="none")
     found = assert_motions_of_torch(predictor, posterior, (q[:3], v[:3], u, 0.004), integrator)
     close(posterior.model.robot.space.normalized(found.q[:, 1:].contiguous()), found.q[:, 1:], 1e-14)
     assert isinstance(predictor._made.get((integrator, 0, 0)), list) == (integrator != "implicit-midpoint")
@@ -213,7 +212,7 @@ def test_what_is_refused(floating):
 
 
 @pytest.mark.filterwarnings("ignore:half of the training points:forcegp.errors.DataWarning")
-@pytest.mark.parametrize("integrator", ["rk4", "implicit-midpoint"])
+@pytest.mark.parametrize("integrator", ["rk4", IMPLICIT])
 def test_an_arm_with_a_switch(integrator, tmp_path):
     """Its base is fixed, and u has more entries than v."""
     robot = Robot.from_urdf_text(ARM)
@@ -230,6 +229,7 @@ def test_an_arm_with_a_switch(integrator, tmp_path):
     assert max(export_c(posterior, tmp_path / "c", steps=dt, integrator=integrator).differences.values()) < 1e-8
 
 
+@pytest.mark.nightly
 def test_redundant_contacts_have_right_derivatives():
     """A foot that neither moves nor turns: nine rows of rank six, which velocities contradict."""
     robot = Robot.from_urdf_text(HOPPER, base="floating")

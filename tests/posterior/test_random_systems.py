@@ -43,8 +43,7 @@ def system(seed: int) -> tuple[Model, Dataset, Dataset, np.ndarray]:
     rng = np.random.default_rng(seed)
     base = "floating" if seed % 3 == 2 else "fixed"
     robot = random_robot(rng, int(rng.integers(1, 4 if base == "floating" else 7)), base)
-    model = Model(robot, (), (Actuation(), RigidBodies(), Viscous(rng.uniform(0.1, 1.0))))
-    count = 160
+    model, count = Model(robot, (), (Actuation(), RigidBodies(), Viscous(rng.uniform(0.1, 1.0)))), 160
     q = robot.space.integrate(robot.neutral().expand(count, -1), torch.tensor(rng.normal(0.0, 0.7, (count, robot.nv))))
     v = torch.tensor(rng.normal(size=(count, robot.nv)))
     u = torch.tensor(3.0 * rng.normal(size=(count, model.sizes[2])))

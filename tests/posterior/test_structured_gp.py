@@ -85,8 +85,7 @@ def test_equals_dense_gaussian_conditioning(posterior, train, test):
         S += torch.einsum("id,ij,je->idje", w, kernel(z, z).to_dense(), w)
         cross += torch.einsum("id,ij,je->idje", w_new, kernel(z_new, z).to_dense(), w)
         prior += torch.einsum("id,ie->ide", w_new, w_new) * kernel.outputscale
-    S = S.reshape(180, 180) + NOISE**2 * torch.eye(180).double()
-    cross = cross.reshape(5, 3, 180)
+    S, cross = S.reshape(180, 180) + NOISE**2 * torch.eye(180).double(), cross.reshape(5, 3, 180)
     mean = m_new + cross @ torch.linalg.solve(S, (torch.tensor(train.a) - m).reshape(-1))
     covariance = prior - cross @ torch.linalg.solve(S, cross.mT)
 

@@ -57,8 +57,7 @@ class TestHeaderInComment(TestCsv):
 
 class TestHeaderless(TestCsv):
     def write(self, folder):
-        values = np.stack(list(table(motion()).values()), axis=1)
-        path = folder / "log.txt"
+        values, path = np.stack(list(table(motion()).values()), axis=1), folder / "log.txt"
         path.write_text("\n".join(repr(float(value)) for value in values.ravel()) + "\n")
         return path
 

@@ -107,8 +107,7 @@ def test_a_file_that_is_no_urdf_is_refused(tmp_path):
 
 
 def test_a_box_without_size_is_drawn(tmp_path):
-    path = tmp_path / "arm.urdf"
-    nothing = '<visual><geometry><box size="0 0 0"/></geometry></visual>'
+    path, nothing = tmp_path / "arm.urdf", '<visual><geometry><box size="0 0 0"/></geometry></visual>'
     trunk = URDF[URDF.index("<inertial>") : URDF.index("</inertial>")]
     path.write_text(URDF.replace('<link name="base"/>', f'<link name="base">{nothing}{trunk}</inertial></link>'))
     robot = Robot.from_urdf(path, base="floating")

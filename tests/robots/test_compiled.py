@@ -86,8 +86,7 @@ compiled = pickle.load(sys.stdin.buffer)
 q, v, tau = torch.full((3, 3), 0.3, dtype=torch.float64)
 print(compiled.forward_dynamics(q, v, tau).tolist())
 """
-    environment = os.environ | {"CC": "no-compiler-at-all"}
-    command = [sys.executable, "-c", script]
+    environment, command = os.environ | {"CC": "no-compiler-at-all"}, [sys.executable, "-c", script]
     done = subprocess.run(command, input=pickle.dumps(compiled), capture_output=True, check=True, env=environment)
     assert eval(done.stdout) == compiled.forward_dynamics(*torch.full((3, 3), 0.3, dtype=torch.float64)).tolist()
     assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == before

@@ -99,8 +99,7 @@ def test_dynamics_are_those_of_the_projected_model(case):
 
 def test_frames_move_with_the_coordinates(case):
     robot, oracle, q, v, _ = case
-    frame = robot.link_names[-1]
-    at = robot.kinematics(torch.from_numpy(q[0]), torch.from_numpy(v[0]))
+    frame, at = robot.link_names[-1], robot.kinematics(torch.from_numpy(q[0]), torch.from_numpy(v[0]))
     index = oracle.model.getFrameId(frame, pin.FrameType.BODY)
     place, G = oracle.at(q[0])
     world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED

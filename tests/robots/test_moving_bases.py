@@ -76,8 +76,7 @@ def close(found, expected, scale=1.0):
 def test_mass_matrix_bias_and_both_dynamics(pair, compiled, how):
     of = pair.robot if how == "by torch" or pair.robot.base == "fixed" else compiled
     M, bias = of.mass_matrix_and_bias(pair.q, pair.v)
-    tau = of.inverse_dynamics(pair.q, pair.v, pair.a)
-    a = of.forward_dynamics(pair.q, pair.v, pair.tau)
+    tau, a = of.inverse_dynamics(pair.q, pair.v, pair.a), of.forward_dynamics(pair.q, pair.v, pair.tau)
     gravity, order = of.gravity_forces(pair.q), pair.to_v
     for k, q, v, acceleration, force in pair.states():
         expected = pin.crba(pair.model, pair.data, q)
@@ -107,8 +106,7 @@ def test_integrate_and_difference(pair):
     flipped = [q for _, q, *_ in pair.states()][::-1]
     for k, q, v, _, _ in pair.states():
         expected = pin.integrate(pair.model, q, v)[pair.to_q]
-        inside = torch.linalg.vector_norm(moved[k] - torch.as_tensor(expected))
-        other = expected.copy()
+        inside, other = torch.linalg.vector_norm(moved[k] - torch.as_tensor(expected)), expected.copy()
         turn = [place for place, name in enumerate(pair.robot.position_names) if ".q" in name]
         other[turn] *= -1.0  # the same turn
         assert min(inside, torch.linalg.vector_norm(moved[k] - torch.as_tensor(other))) < 1e-11

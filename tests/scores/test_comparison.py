@@ -176,6 +176,7 @@ def test_what_makes_no_sense_is_refused_before_anything_is_written(data, tmp_pat
 NAMES = "identified", "identified@motions:.5"
 
 
+@pytest.mark.nightly
 def test_models_refined_on_motions_move_better_and_laws_stand_side_by_side():
     data = recording(line, 1, seconds=8.0)
     dry, viscous = "bodies+viscous+coulomb", "bodies+viscous+coulomb:0"

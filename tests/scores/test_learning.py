@@ -45,8 +45,7 @@ def test_robots_that_fly_have_air_and_feet_that_stand_do_not_slide():
 
 
 def test_rows_that_resemble_each_other_are_worth_less(bare, tmp_path):
-    log = recording(bump, 1, seconds=6.0)
-    model = bare.with_forces(JointFriction(), noise=Noise(0.5))
+    log, model = recording(bump, 1, seconds=6.0), bare.with_forces(JointFriction(), noise=Noise(0.5))
     fitted = fit(model, log, restarts=1)
     assert models.allowing_for_correlation(fitted, log) == (fitted, None), "white noise"
     smooth = np.convolve(np.random.default_rng(0).standard_normal(len(log) + 8), np.ones(9) / 3.0, "valid")
@@ -90,6 +89,7 @@ def test_noise_of_forces_is_learned_where_rows_show_it():
     np.testing.assert_allclose(model.noise.force, lacking.std(axis=0, ddof=1), rtol=1e-8)
 
 
+@pytest.mark.nightly
 def test_laws_are_refined_on_motions_and_a_short_log_says_how_far_intervals_are_calibrated():
     recorded = recording(line, 1, seconds=3.0)
     model, told = replace(slide(1.0, 1.0), forces=(Actuation(), RigidBodies())), []

@@ -181,8 +181,7 @@ def _mended(dataset: Dataset) -> dict[str, Any]:
     dropped, changed = {name: _drop_outs(dataset, name) for name in ("q", "v", "u", "a")}, dict[str, np.ndarray]()
     for name, lost in dropped.items():
         for joint in np.flatnonzero(lost.any(axis=0)):
-            values = changed.setdefault(name, getattr(dataset, name).copy())
-            gone = lost[:, joint]
+            values, gone = changed.setdefault(name, getattr(dataset, name).copy()), lost[:, joint]
             values[gone, joint] = np.interp(np.flatnonzero(gone), np.flatnonzero(~gone), values[~gone, joint])
     mended = replace(dataset, **changed, truth={}) if changed else dataset
     change = np.abs(np.diff(mended.q, axis=0, append=mended.q[-1:]))

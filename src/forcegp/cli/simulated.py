@@ -73,8 +73,7 @@ class Simulate(Command):
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Simulate and save."""
         self.require_free_file(self.out)
-        start = time.monotonic()
-        dataset = simulate_with_progress(terminal, self.scenario, **self._config())
+        start, dataset = time.monotonic(), simulate_with_progress(terminal, self.scenario, **self._config())
         with atomic_file(self.out, overwrite=self.overwrite) as temporary:
             dataset.save(temporary)
         seconds = time.monotonic() - start

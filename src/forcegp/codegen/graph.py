@@ -216,8 +216,7 @@ def jacobian(
     """d outputs_i / d inputs_j, (outputs, inputs); with `seeds` (inputs, directions) that matrix times this one."""
     if seeds is None:
         seeds = [[ONE if i == j else ZERO for j in range(len(inputs))] for i in range(len(inputs))]
-    directions = range(len(seeds[0]) if seeds else 0)
-    given = zip(inputs, seeds, strict=True)
+    directions, given = range(len(seeds[0]) if seeds else 0), zip(inputs, seeds, strict=True)
     tangents = {node: {j: row[j] for j in directions if row[j] != ZERO} for node, row in given}
     for node in graph.needed(outputs):
         if node in tangents:

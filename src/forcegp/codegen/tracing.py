@@ -12,7 +12,6 @@ from typing import Any
 import torch
 from torch import Tensor, _decomp
 from torch.overrides import TorchFunctionMode
-from torch.utils import _pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 from typing_extensions import override
 
@@ -187,8 +186,8 @@ class _Recording(TorchDispatchMode):
                 found = _decompositions().get(func, func.decompose)(*args, **kwargs)  # type: ignore[reportOptionalCall]  # it is a method
             if found is not NotImplemented:
                 return found
-        result, given = func(*args, **kwargs), _pytree.tree_map(self.numbers_of, (args, kwargs))
-        if any(isinstance(value, _Numbers) for value in _pytree.tree_leaves(given)):
+        result, given = func(*args, **kwargs), _mapped(self.numbers_of, (args, kwargs))
+        if _holds_numbers(given):
             numbers = _apply(self.graph, func, *given)
             tensors, found = (x if isinstance(x, list | tuple) else [x] for x in (result, numbers))
             for tensor, part in zip(tensors, found, strict=True):
@@ -203,6 +202,7 @@ def _decompositions() -> dict[Any, Callable[..., Any]]:
     return getattr(_decomp, "_core_aten_decompositions_post_autograd", _decomp.core_aten_decompositions)()
 
 
+@cache
 def _name(target: Any) -> str:
     return getattr(target, "__name__", str(target)).split(".")[0]
 
@@ -212,6 +212,21 @@ class _Numbers:
 
     def __init__(self, nodes: Tensor) -> None:
         self.nodes = nodes
+
+
+def _mapped(function: Callable[[Any], Any], value: Any) -> Any:
+    """The function of every leaf; `torch.utils._pytree` takes ten times as long for these small ones."""
+    if isinstance(value, tuple | list):
+        return type(value)(_mapped(function, each) for each in value)
+    return {k: _mapped(function, each) for k, each in value.items()} if isinstance(value, dict) else function(value)
+
+
+def _holds_numbers(value: Any) -> bool:
+    if isinstance(value, dict):
+        value = value.values()
+    elif not isinstance(value, tuple | list):
+        return isinstance(value, _Numbers)
+    return any(map(_holds_numbers, value))
 
 
 def _numbers(graph: Graph, value: _Numbers | Tensor | float | int) -> _Numbers:
@@ -224,7 +239,7 @@ def _numbers(graph: Graph, value: _Numbers | Tensor | float | int) -> _Numbers:
 def _apply(graph: Graph, target: Any, args: tuple, kwargs: dict[str, Any]) -> Any:
     """One operation of torch on constants or node numbers."""
     name = _name(target)
-    known = not any(isinstance(value, _Numbers) for value in _pytree.tree_leaves(args[1:]))
+    known = not _holds_numbers(args[1:])
     if name in MOVING and (known or name not in INDEXED):
         return _moved(graph, target, args, kwargs, name in INDEXED)
     if name == "_to_copy" and kwargs.get("dtype", torch.float64) in (torch.float64, torch.bool):
@@ -247,7 +262,7 @@ def _moved(graph: Graph, target: Any, args: tuple, kwargs: dict[str, Any], index
     def nodes(value: Any) -> Any:
         return _numbers(graph, value).nodes if isinstance(value, _Numbers | Tensor) else value
 
-    args = (nodes(args[0]), *args[1:]) if indexed else _pytree.tree_map(nodes, args)
+    args = (nodes(args[0]), *args[1:]) if indexed else _mapped(nodes, args)
     result = target(*args, **{key: value for key, value in kwargs.items() if key not in CREATION})
     return _Numbers(result) if isinstance(result, Tensor) else [_Numbers(part) for part in result]
 

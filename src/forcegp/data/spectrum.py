@@ -207,8 +207,7 @@ def _judged(dataset: Dataset, cutoff: float, source: Source) -> tuple[float, dic
     for k, frequency in enumerate(tried):
         smooth = behind(frequency)
         for joint, each in enumerate(torque_columns(smooth, chosen)):
-            size = np.linalg.norm(each, axis=0)
-            size = np.maximum(size, 1e-9 * size.max() + 1e-300)  # rounding is no column
+            size = np.linalg.norm(each, axis=0) + 1e-300
             learned, u, left = each / size, smooth.u[chosen, joint], 0.0
             for one, other in folds:
                 theta = np.linalg.lstsq(learned[one], u[one], rcond=1e-2)[0] / size

@@ -176,8 +176,7 @@ class Bodies:
 
     def number_slopes(self, x: Coordinates, frames: Float[np.ndarray, "n 4 4"]) -> np.ndarray:
         """Derivatives of `numbers` in the coordinates."""
-        changes = _in_frames(self._congruent(_log_cholesky(x)[1]), frames[:, None])
-        blocks = [np.zeros((0, 0))]
+        changes, blocks = _in_frames(self._congruent(_log_cholesky(x)[1]), frames[:, None]), [np.zeros((0, 0))]
         for pseudo, change in zip(_in_frames(self.pseudo_inertias(x), frames), changes, strict=True):
             mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
             about = np.column_stack([np.eye(3), -center])  # of second moments, to those about the centre of mass

@@ -245,8 +245,7 @@ class _Functions:
 
     def _of_rows(self, dataset: Dataset, points: int | None) -> Posterior:
         """From accelerations: hyper-parameters from some of the rows, the posterior from all."""
-        chosen = engine_of(self.engine)
-        all_rows = dataset
+        chosen, all_rows = engine_of(self.engine), dataset
         if points is not None:
             points = whole_number("points", points, 2, len(dataset), "the rows of the dataset")
             all_rows = dataset if points == len(dataset) else farthest_rows(dataset, points)

@@ -74,8 +74,7 @@ def doubts_of_payloads(space: ParameterSpace, fit: Fit, least: float) -> Iterato
         free = free / np.linalg.norm(free, axis=0).clip(1e-300)
         left = white.ravel() - free @ np.linalg.lstsq(free, white.ravel(), rcond=1e-10)[0]
         cost = 0.5 * float((white**2).sum())
-        more = cost - 0.5 * float((left**2).sum())
-        moves = payload @ space.standard_parameters(fit.x)[body]
+        more, moves = cost - 0.5 * float((left**2).sum()), payload @ space.standard_parameters(fit.x)[body]
         clearly = max(NO_BODY, LEAST * cost, least + 4.5 * np.log(white.size))  # nine numbers more than one cause
         if np.linalg.norm(fit.residual) > RIGHT * np.linalg.norm(moves) and more > clearly:
             what = f"no body on {getattr(space.model.laws[each.payload], 'link', '')} explains the log: free numbers "

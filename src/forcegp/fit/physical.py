@@ -186,8 +186,7 @@ def _estimates(
 ) -> Estimates:
     white = np.concatenate([fit.white_jacobian, fit.white[..., None]], axis=-1)
     columns = np.arange(white.shape[1])  # equations of a row: of joints, and of sensors
-    prior = space.prior(fit.x)[1]
-    by_body = None
+    prior, by_body = space.prior(fit.x)[1], None
     everything = len(space.carried) == len(space.own) and all(each.payload is None for each in space.carried)
     if everything and space.carried:
         # of ten directions of each body, those of which the data hold less than the prior, as if others were known
