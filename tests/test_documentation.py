@@ -75,7 +75,6 @@ def test_every_public_package_has_a_page_of_reference():
 
 
 def test_a_long_sentence_is_found():
-    short = "It has `code of many words` and [a link of many words](x.md). "
-    long = "word " * (LONGEST + 1)
+    short, long = "It has `code of many words` and [a link of many words](x.md). ", "word " * (LONGEST + 1)
     page = f"# {long}\n\n```sh\n{long}\n```\n\n| {short} | cell |\n|---|---|\n\n* {short}\n* {long}\n\n    {long}\n"
     assert [sentence.strip() for sentence in sentences(page) if len(words(sentence)) > LONGEST] == [long.strip()]

@@ -63,8 +63,7 @@ def test_velocities_in_the_axes_of_the_world_are_named(log):
 
 
 def test_an_accelerometer_is_no_acceleration(log):
-    a = log.a.copy()
-    rotation = log.model.robot.frame_pose(torch.tensor(log.q), "trunk")[:, :3, :3].numpy()
+    a, rotation = log.a.copy(), log.model.robot.frame_pose(torch.tensor(log.q), "trunk")[:, :3, :3].numpy()
     a[:, :3] += np.cross(log.v[:, 3:6], log.v[:, :3]) + 9.81 * rotation[:, 2, :]
     (doubt,) = quick_check(replace(log, a=a))
     assert (doubt.about, doubt.level) == ("base acceleration", "wrong")

@@ -20,8 +20,7 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def test_simulate_writes_the_dataset_that_its_summary_describes(workshop):
-    summary = json.loads((workshop / "train.json").read_text())
-    data = Dataset.load(workshop / "train.h5")
+    summary, data = json.loads((workshop / "train.json").read_text()), Dataset.load(workshop / "train.h5")
     assert summary["rows"] == len(data) == 480
     assert summary["joint_names"] == list(data.joint_names)
     assert summary["config"]["seed"] == data.metadata["config"]["seed"] == 1

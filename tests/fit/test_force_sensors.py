@@ -52,8 +52,7 @@ def recorded(pushed=True, seed=0):
 
     (q, v, u, a, sensed), rng = followed(prepare, 12, RATE, 4, taken, seed)
     force = pushed * np.array([*map(pushes, q)]) + 0.02 * rng.standard_normal(q.shape)
-    R = Rotation.from_quat(sensed[:, [4, 5, 6, 3]]).as_matrix()
-    model = replace(arm_model(0), contacts=())
+    R, model = Rotation.from_quat(sensed[:, [4, 5, 6, 3]]).as_matrix(), replace(arm_model(0), contacts=())
     log = Dataset(q=q, v=v, u=u + 0.01 * rng.standard_normal(u.shape), a=a, time=np.arange(len(q)) / RATE, model=model)
     return log, force, R, (R @ sensed[:, :3, None])[..., 0]
 

@@ -28,8 +28,7 @@ def test_eleven_parameters_of_a_driven_pendulum_from_accelerations(shared):
     """At least as good on other runs as eleven analytical parameters of the pendulum: nRMSE .156 and .111."""
     folder = shared("realdata")
     model = dfki_system(folder)
-    train = dfki(folder, model, 143524, 143601, 143704, 144115)
-    test = dfki(folder, model, 143339, 143747)
+    train, test = dfki(folder, model, 143524, 143601, 143704, 144115), dfki(folder, model, 143339, 143747)
     laws = RigidBodies("all"), Viscous(), Coulomb(), open_rotors(model)
     _, residual = motion_residuals(test, fit(model.with_forces(*laws), train, Accelerations(), rows=2000).model)
     assert (np.sqrt((residual**2).mean(0)) / test.a.std(0) < [0.157, 0.112]).all()

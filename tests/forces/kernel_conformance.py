@@ -81,8 +81,7 @@ class KernelConformance:
         assert torch.autograd.gradcheck(likelihood, leaves, rtol=1e-4, atol=1e-6)
         dense = dense_negative_log_likelihood(*given.data, matrices(*leaves))
         torch.testing.assert_close(likelihood(*leaves), dense)
-        expected = torch.autograd.grad(dense, leaves)
-        found = torch.autograd.grad(likelihood(*leaves), leaves)
+        expected, found = torch.autograd.grad(dense, leaves), torch.autograd.grad(likelihood(*leaves), leaves)
         for gradient, reference in zip(found, expected, strict=True):
             torch.testing.assert_close(gradient, reference, rtol=1e-8, atol=1e-9)
 

@@ -133,8 +133,7 @@ class TestContactFriction:
         force_of_contact = multiplier[:, 0].abs() * scale
         _, force = self.friction(dynamics, ContactFriction(load=True), 0.3)
         torch.testing.assert_close(force.norm(dim=-1), 0.3 * force_of_contact, rtol=1e-8, atol=0.0)
-        plain = ContactFriction().direction(dynamics)
-        loaded = ContactFriction(load=True).direction(dynamics)
+        plain, loaded = ContactFriction().direction(dynamics), ContactFriction(load=True).direction(dynamics)
         torch.testing.assert_close(loaded, force_of_contact[:, None, None] * plain, rtol=1e-8, atol=1e-12)
 
     def test_isotropic_friction_knows_no_direction(self, model, rows):
@@ -145,8 +144,7 @@ class TestContactFriction:
         quarter += '<parent link="ground"/><child link="rail"/></joint><link name="rail"/>'
         assert '<link name="rail"/>' in text
         turned = Robot.from_urdf_text(text.replace('<link name="rail"/>', quarter))
-        here = Model(model.robot, (first,)).dynamics(*rows)
-        there = Model(turned, (second,)).dynamics(*rows)
+        here, there = Model(model.robot, (first,)).dynamics(*rows), Model(turned, (second,)).dynamics(*rows)
         for prior in (ContactFriction(), ContactFriction(load=True)):
             torch.testing.assert_close(prior.direction(there), prior.direction(here), rtol=1e-9, atol=1e-9)
             torch.testing.assert_close(prior.features(there)[0], prior.features(here)[0], rtol=1e-9, atol=1e-9)

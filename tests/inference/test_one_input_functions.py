@@ -108,8 +108,7 @@ def test_what_has_no_form():
 def posterior(expression: str, dimension: int = 1) -> ExactPosterior:
     kernels = LatentKernels([kernel_of(expression, dimension, 1.0)])
     kernels.requires_grad_(False)
-    W = torch.ones(12, 1, 1, dtype=torch.float64)
-    noise = torch.full((12, 1), 0.01, dtype=torch.float64)
+    W, noise = torch.ones(12, 1, 1, dtype=torch.float64), torch.full((12, 1), 0.01, dtype=torch.float64)
     return ExactPosterior.condition(kernels, Terms([normal(12, dimension, seed=2)], W, normal(12, 1, seed=1), noise))
 
 

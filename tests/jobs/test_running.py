@@ -83,8 +83,7 @@ def test_a_process_that_dies_is_reported_and_what_was_done_is_kept(results, tmp_
 
 def test_other_settings_of_an_input_are_seen_and_computed_anew_with_one_sentence(results):
     run_jobs(results, [square(3), next_to(square(3)), square(4)])
-    kept = results.load("square/4")
-    changed = Job("square/3", f"{TOY}:square", {"number": 3, "more": 1})
+    kept, changed = results.load("square/4"), Job("square/3", f"{TOY}:square", {"number": 3, "more": 1})
     assert digests([changed, next_to(square(3))])["next/3"] != digests([square(3), next_to(square(3))])["next/3"]
     with pytest.warns(DataWarning, match="2 of the results in .* for example, were computed by other code or with"):
         assert run_jobs(results, [changed, next_to(changed), square(4)]) == 2

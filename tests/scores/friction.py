@@ -31,8 +31,7 @@ def friction_data(rows: int, seed: int, model: Model | None = None) -> Dataset:
     states = [torch.tensor(x) for x in (data.q, data.v, data.u)]
     dynamics = data.model.dynamics(*states)
     where = ToolPoint.of(dynamics, "hand", (0.0, 0.0, 0.2))
-    velocity = where.velocity(states[1])[:, :3]
-    normal = torch.tensor([0.2, 0.0, 1.0], dtype=torch.float64)
+    velocity, normal = where.velocity(states[1])[:, :3], torch.tensor([0.2, 0.0, 1.0], dtype=torch.float64)
     normal = normal / normal.norm()
     force = -VISCOUS * (velocity - (velocity @ normal)[:, None] * normal)
     tool = (where.jacobian[:, :3].mT @ force[..., None])[..., 0]

@@ -128,8 +128,7 @@ def known(swinging):
 
 
 def off(data) -> np.ndarray:
-    robot = given_system().robot
-    states = zip(*map(torch.tensor, (data.q, data.v)), data.u, strict=True)
+    robot, states = given_system().robot, zip(*map(torch.tensor, (data.q, data.v)), data.u, strict=True)
     forces = [(robot.mass_matrix(q).numpy(), u - robot.bias_forces(q, v).numpy()) for q, v, u in states]
     return np.array([np.linalg.solve(mass, force) for mass, force in forces]) - data.a
 

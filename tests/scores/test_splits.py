@@ -33,8 +33,7 @@ def recording(rows: int = 60, episodes: int = 3, seed: int = 0, **changes) -> Da
     episodes=st.integers(1, 3), seed=st.integers(0, 50),
 )  # fmt: skip
 def test_blocks_share_no_row_and_keep_their_distance(blocks, wanted, guard, episodes, seed):
-    data = recording(60, episodes, seed)
-    wanted = sorted(number for number in wanted if number <= blocks)
+    data, wanted = recording(60, episodes, seed), sorted(number for number in wanted if number <= blocks)
     if not wanted or len(wanted) == blocks:
         return
     split = split_named(data, f"blocks:{blocks}:{','.join(map(str, wanted))}", guard)[0]

@@ -53,8 +53,7 @@ def test_feet_push_and_never_pull(clean):
 
 def test_payload_friction_and_foot_forces_are_found():
     train = simulate_quadruped(QuadrupedConfig(seconds=6.0, seed=1))
-    test = simulate_quadruped(QuadrupedConfig(seconds=3.0, seed=2))
-    trunk = train.model.robot.link("trunk")
+    test, trunk = simulate_quadruped(QuadrupedConfig(seconds=3.0, seed=2)), train.model.robot.link("trunk")
     model = train.model.with_forces(RigidBodies({"trunk": Body(0.01)}), Viscous(), Stribeck())
     posterior = fit(model, train, Accelerations(), rows=200)
     assert posterior.parameters["trunk.mass"].value - trunk.mass == pytest.approx(2.0, rel=0.02)

@@ -68,8 +68,7 @@ def doubts_of_payloads(space: ParameterSpace, fit: Fit, least: float) -> Iterato
             continue
         own, one = space.bodies.slices[body], np.eye(10 * number)[10 * body : 10 * body + 10].reshape(10, 1, number, 10)
         slopes = space.bodies.chained(fit.x[: space.bodies.size], one)[:, 0, own]
-        payload = fit.jacobian[..., own] @ np.linalg.inv(slopes)
-        others = np.delete(fit.jacobian, np.r_[own], axis=-1)
+        payload, others = fit.jacobian[..., own] @ np.linalg.inv(slopes), np.delete(fit.jacobian, np.r_[own], axis=-1)
         free = (np.concatenate([payload, others], axis=-1) / fit.noise[:, None]).reshape(white.size, -1)
         free = free / np.linalg.norm(free, axis=0).clip(1e-300)
         left = white.ravel() - free @ np.linalg.lstsq(free, white.ravel(), rcond=1e-10)[0]

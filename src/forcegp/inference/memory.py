@@ -40,8 +40,7 @@ def gib(size: int) -> str:
 def _free_in_container() -> int:
     """What the limit of the control group leaves; file caches, which are given back on demand, count as free."""
     try:
-        limit = (CGROUP / "memory.max").read_text().strip()
-        used = int((CGROUP / "memory.current").read_text())
+        limit, used = (CGROUP / "memory.max").read_text().strip(), int((CGROUP / "memory.current").read_text())
         cached = dict(line.split() for line in (CGROUP / "memory.stat").read_text().splitlines())["inactive_file"]
     except (OSError, ValueError, KeyError):
         return 2**63

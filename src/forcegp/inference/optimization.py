@@ -172,8 +172,7 @@ def minimize_objective(
             status = "rolled back to the best point: no step from there could be evaluated and lowered the objective"
         elif converged and steep and search.failures > failures_before + SOME_FAILURES:
             # Steps that shrink before a region without values look like convergence to the line search.
-            converged = False
-            status = "stopped beside parameters at which the objective cannot be evaluated"
+            converged, status = False, "stopped beside parameters at which the objective cannot be evaluated"
         if result.status != LINE_SEARCH_FAILED or result.nit == 0:
             break  # a line search that fails at once, with an empty memory, has nothing left to try
     if search.failures:

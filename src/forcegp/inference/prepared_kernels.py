@@ -252,8 +252,7 @@ def compress(
         excess = (total - (B @ at.mT).square_().cumsum_(0)).clamp_min_(0.0)
         enough = torch.nonzero(excess.amax(1) <= allowed)
         B = B[: int(enough[0]) + 1] if len(enough) else B
-        S = latent.system.factor.solve_upper(B.mT.contiguous())
-        C = latent.system.deflation.C
+        S, C = latent.system.factor.solve_upper(B.mT.contiguous()), latent.system.deflation.C
         factors = torch.einsum("jac,jar->cjr", C, S.reshape(*C.shape[:2], -1))
         chosen = tuple(factors[list(group)].contiguous() for group in kernel_groups(latent))
     return CompressedCovariance(chosen, (1.0 + excess[len(B) - 1]).sqrt() - 1.0)

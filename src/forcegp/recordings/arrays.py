@@ -291,8 +291,7 @@ def parquet_arrays(path: Path) -> Arrays:
             if types.is_floating(field.type) or types.is_integer(field.type):
                 widths[field.name] = None
             elif types.is_list(field.type) or types.is_large_list(field.type) or types.is_fixed_size_list(field.type):
-                first = next(file.iter_batches(1, columns=[field.name])).column(0)[0]
-                kind = field.type.value_type
+                first, kind = next(file.iter_batches(1, columns=[field.name])).column(0)[0], field.type.value_type
                 if first.is_valid and len(first) and (types.is_floating(kind) or types.is_integer(kind)):
                     widths[field.name] = len(first)
         elements = [

@@ -49,8 +49,7 @@ WORDS = {
 def log_unit(quantity: str, name: str) -> LogUnit:
     """The unit of that name. Raises InvalidInput listing those of the quantity."""
     spelled = name.replace(" ", "").replace("**", "^").replace("²", "^2").replace("µ", "u").replace("·", "")
-    spelled = spelled.replace("°", "deg")
-    units = UNITS[quantity]
+    spelled, units = spelled.replace("°", "deg"), UNITS[quantity]
     meant = {known.lower(): known for known in units}
     require_known("unit", spelled, f"the units of {quantity}", units, synonyms=meant)
     return units[spelled]

@@ -68,8 +68,7 @@ class DelimitedText(Source):
         """The bytes of the file, expanded if it is called .gz. Raises FileFormatError for bytes that are no text."""
         path = self.path
         raw: Any = gzip.GzipFile(path, "rb") if self._compressed else io.FileIO(path)
-        stream = io.BufferedReader(raw, 2**20)
-        first = b""
+        stream, first = io.BufferedReader(raw, 2**20), b""
         try:
             first = stream.peek(FIRST_BYTES)[:FIRST_BYTES]
             if not first.strip():

@@ -116,8 +116,7 @@ def recorded_scene(
         else:
             dynamics = model.dynamics(q, v, u)
             arrows = [_at_joints(dynamics, "recorded u", dynamics.state.delivered, None)]
-    poses = poses_of_links(model.robot, q, [shape.link for shape in drawn])
-    time = rows.time - rows.time[0]
+    poses, time = poses_of_links(model.robot, q, [shape.link for shape in drawn]), rows.time - rows.time[0]
     alone = [2.0 * float(np.linalg.norm(shape.vertices, axis=1).max()) for shape in drawn if len(drawn) == 1]
     return RecordedScene(model.robot, time, rows.q, drawn, poses, arrows, max(reach(model.robot), *alone, 0.0), doubts)
 

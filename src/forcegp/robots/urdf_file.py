@@ -187,8 +187,7 @@ def with_chosen_inertias(
             advice = lacks if objection is None else f"{IN_THE_FILE}, or take the nearest inertia that a body has."
             problems.errors.append(NonPhysicalInertia(seen, advice, {"inertias": "nearest"}))
             continue
-        changed = True
-        text = replace_inertial(text, name, inertial.mass, center, nearest, source=source)
+        changed, text = True, replace_inertial(text, name, inertial.mass, center, nearest, source=source)
         if objection is None:
             problems.note("a mass without <inertia> is taken as a point", f"link {name!r}")
             continue

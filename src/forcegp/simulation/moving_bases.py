@@ -79,8 +79,7 @@ def _episode(robot: Robot, model: Model, config: QuadrupedConfig, episode: int, 
     a = torch.cat([dV, joints(dV, ddx - drift)], -1)
     Q_U = torch.as_tensor(laws_of_joints(str(config.joint_friction), robot, FRICTION)(v.numpy(), q=q.numpy()))
     needed, A = robot.inverse_dynamics(q, v, a) - Q_U, (J * stands[..., None, None]).flatten(1, 2)
-    weight = -float(robot.gravity[2]) * robot.mass
-    even = torch.zeros(steps, len(LEGS), 3, dtype=torch.float64)
+    weight, even = -float(robot.gravity[2]) * robot.mass, torch.zeros(steps, len(LEGS), 3, dtype=torch.float64)
     even[..., 2] = weight * stands / stands.sum(-1, keepdim=True)
     even = even.flatten(1)
     left = needed[:, :6] - (A[..., :6].mT @ even[..., None])[..., 0]
@@ -229,8 +228,7 @@ def _flight(robot: Robot, config: QuadrotorConfig, episode: int, steps: int) -> 
         lean = Rotation.from_matrix(R.T @ np.stack([np.cross(side, up), side, up], 1)).as_rotvec()
         moment = inertia @ ((turning**2 * lean - 2.0 * turning * V[3:]) * [1.0, 1.0, 0.3])
         share = mixer @ np.concatenate([[mass * (wanted @ R[:, 2])], moment])
-        u = np.sqrt(np.clip(share / DATASHEET, LOWEST**2, HIGHEST**2))
-        air = mean + gust
+        u, air = np.sqrt(np.clip(share / DATASHEET, LOWEST**2, HIGHEST**2)), mean + gust
         if k >= 0:
             q = np.concatenate([x, Rotation.from_matrix(R).as_quat()])
             rows.append((q, V, u, accelerations(R, x, V, speeds, air), air))
