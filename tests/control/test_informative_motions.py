@@ -4,13 +4,15 @@ import numpy as np
 import pinocchio
 import pytest
 import scipy.linalg
+import torch
 from tests.goldens.compare import assert_unchanged
-from tests.posterior.arm import URDF, arm_data, arm_model, quick_fit
+from tests.posterior.arm import URDF, arm_data, arm_model, arm_that_remembers, quick_fit
 
 from forcegp import Contact, Dataset, Plane, excitation
 from forcegp.control.informative_motions import BaseParameters, far_apart
+from forcegp.control.tracking import Past
 from forcegp.errors import InvalidInput
-from forcegp.forces import JointFriction
+from forcegp.forces import Coulomb, JointFriction
 
 FREE, START = arm_model(0), [0.3, 0.8, -0.6]
 FEW = {"motions": 9, "start": START, "seconds": 4.0}
@@ -169,3 +171,27 @@ def test_chosen_motions_are_what_they_were(chosen):
         for name, each in (("learned", chosen), ("bare", bare))
     }  # fmt: skip
     assert_unchanged("control/motions", found | {"ends": ends}, rtol=1e-3)
+
+
+def test_gears_that_remember_are_met_as_the_motion_leaves_them():
+    """z+ = s + (z - s) exp(-sigma |dq|) sample by sample, from 0; torques against Pinocchio."""
+    law = Coulomb(0.8, 0.05, sigma=20.0, memory=("pan", "bend"))
+    model = FREE.with_forces(law)
+    found = excitation(model, **FEW, limits=LIMITS | {"torque": 60.0})
+    z, last = np.zeros((len(found.motion.q), 3)), np.zeros(3)
+    for k in range(1, len(z)):
+        step = np.diff(found.motion.q[k - 1 : k + 1], axis=0)[0]
+        z[k] = last = np.sign(step) + (last - np.sign(step)) * np.exp(-20.0 * np.abs(step))
+    z[:, 1] = np.tanh(found.motion.v[:, 1] / 0.05)
+    q, v, a = found.motion[1:4]
+    np.testing.assert_allclose(found.motion.u, rnea(q, v, a) + 0.8 * z, atol=1e-9)
+    np.testing.assert_allclose(BaseParameters(model, np.ones(3)).dry(found.motion), z, atol=1e-12)
+    assert np.abs(z - np.tanh(v / 0.05)).max() > 0.5, "which velocities alone do not tell"
+
+    learned, _ = arm_that_remembers()
+    best = excitation(learned, **FEW | {"motions": 3}, limits=LIMITS | {"torque": 60.0}, rows=20)
+    rows, known = best.expected.training, len(learned.training)
+    place = [int(np.abs(best.motion.q - each).sum(1).argmin()) for each in rows.q[known:].numpy()]
+    assert len(place) == 20
+    past = Past(learned.model).over(torch.as_tensor(best.motion.q))[0]
+    np.testing.assert_allclose(rows.u[known:, 3:], past[place], atol=1e-9)

@@ -15,11 +15,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from scipy.interpolate import BSpline
+from torch import Tensor
 from typing_extensions import override
 
 from forcegp.atomic_files import atomic_file
-from forcegp.control.tracking import per_joint
-from forcegp.data import Dataset
+from forcegp.control.tracking import Past, per_joint
+from forcegp.data import Dataset, with_memory
 from forcegp.data.dataset import require_rows
 from forcegp.data.views import farthest_point_sampling
 from forcegp.errors import InvalidInput, require_known, require_number, require_type, usable_arguments
@@ -71,13 +72,24 @@ class LearnedForces:
         self.few = replace(self.posterior, latent=with_only(latent, torch.as_tensor(kept)))
 
     def torques(self, *states: Values) -> Values:
-        """u (n, nv) in Nm or N of q, v and a."""
-        return inverse_dynamics(self.posterior, [torch.as_tensor(x) for x in states], None, False).mean.numpy()
+        """u (n, nv) in Nm or N of q, v and a of a motion from rest."""
+        q, v, a = map(torch.as_tensor, states)
+        return inverse_dynamics(
+            self.posterior, [q, v, a], None, False, Past(self.posterior.model).over(q)[0]
+        ).mean.numpy()
+
+    def steady(self, q: Values, v: Values) -> tuple[Values, Values, Values]:
+        """The states of joints that have long moved so, with the u of no acceleration."""
+        past, states = Past(self.posterior.model), [torch.as_tensor(x) for x in (q, v, 0.0 * v)]
+        z = past.over(torch.stack([states[0] - states[1], states[0]], dim=1).flatten(0, 1))[0][1::2]
+        u = inverse_dynamics(self.posterior, states, None, False, z).mean
+        return q, v, past.beside(u, z).numpy()
 
     def after(self, motion: Motion, posterior: Posterior) -> Posterior:
         """`posterior` with rows of the motion, far apart, at which just what it predicts was measured."""
-        some = far_apart(motion.q, motion.v, motion.u, self.rows)
-        q, v, _, u = (x[some] for x in motion[1:])
+        some, past = far_apart(motion.q, motion.v, motion.u, self.rows), Past(self.posterior.model)
+        u = past.beside(torch.as_tensor(motion.u), past.over(torch.as_tensor(motion.q))[0]).numpy()
+        q, v, u = motion.q[some], motion.v[some], u[some]
         a, time = posterior.predict(q, v, u, covariance=False).mean.numpy(), np.arange(float(len(q)))
         noise, model = posterior.noise_std.numpy(), posterior.model
         return posterior.with_rows(Dataset(q=q, v=v, u=u, a=a, time=time, noise_std=noise, model=model))
@@ -99,19 +111,29 @@ class BaseParameters:
         self.columns = list(base_parameters(model.robot))
 
     def torques(self, *states: Values) -> Values:
-        """u (n, nv) in Nm or N of q, v and a, against known forces as they are without u."""
-        q, v, a = map(torch.as_tensor, states)
-        at = self.model.dynamics(q, v, 0.0 * a)
+        """u (n, nv) in Nm or N of q, v and a of a motion from rest, against known forces as they are without u."""
+        (q, v, a), past = map(torch.as_tensor, states), Past(self.model)
+        at = self.model.dynamics(q, v, past.beside(0.0 * a, past.over(q)[0]))
         return ((at.M @ a[..., None])[..., 0] - at.Q_K).numpy()
+
+    def dry(self, motion: Motion) -> Tensor:
+        """Dry friction (m, nv) over its level: as the laws of the model remember, else of velocities alone."""
+        dry, first = (torch.as_tensor(motion.v) / DRY).tanh(), 0
+        z = Past(self.model).over(torch.as_tensor(motion.q))[0]
+        for law in self.model.laws:
+            if (joints := law.memory_joints(self.model.robot)) is not None and law.transmission is None:
+                dry[:, list(joints)] = z[:, first : first + len(joints)]
+            first += len(law.memory_names(self.model.robot))
+        return dry
 
     def triangle(self, motion: Motion) -> np.ndarray:
         """R (k, k) of the QR decomposition of the regressor, of some samples after the other: all would fill GB."""
         nv, R = len(self.scale), np.zeros((0, len(self.columns) + 2 * len(self.scale)))
-        some = max(1, ENTRIES // (10 * nv**2))
+        some, dry = max(1, ENTRIES // (10 * nv**2)), self.dry(motion)
         for begin in range(0, len(motion.q), some):
             q, v, a = (torch.as_tensor(x[begin : begin + some]) for x in motion[1:4])
             Y = torque_regressor(self.model.robot, q, v, a)[..., self.columns]
-            Y = torch.cat([Y, torch.diag_embed(v), torch.diag_embed((v / DRY).tanh())], dim=-1)
+            Y = torch.cat([Y, torch.diag_embed(v), torch.diag_embed(dry[begin : begin + some])], dim=-1)
             Y = (Y.numpy() / self.scale[:, None]).reshape(-1, Y.shape[-1])
             R = np.asarray(np.linalg.qr(np.concatenate([R, Y]), mode="r"))
         return R
@@ -307,11 +329,12 @@ def excitation(
     best, least, size = draft.kept(0.0 * draft.random(rng)), np.inf, 0.3  # refuses the start
     if isinstance(teaches, LearnedForces) and task is not None:
         require_rows("task", task, robot.joint_names, "the model", "")
+        task = with_memory(task, known)
         some = np.linspace(0, len(task) - 1, min(STATES, len(task))).astype(int)
         teaches.judged_at = task.q[some], task.v[some], task.u[some]
     elif isinstance(teaches, LearnedForces):
         q, v = (rng.uniform(low, high, (STATES, robot.nv)) for low, high in (bounds[x] for x in QUANTITIES[:2]))
-        teaches.judged_at = start + q, v, teaches.torques(start + q, v, 0.0 * v)
+        teaches.judged_at = teaches.steady(start + q, v)
     with blas_threads(MOST_ROWS):
         for k in range(motions):
             points, changed = draft.random(rng), k >= max(1, motions // 3)

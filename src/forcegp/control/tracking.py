@@ -193,6 +193,8 @@ class Past:
 
     def over(self, q: Float[Tensor, "T nq"]) -> tuple[Float[Tensor, "T m"], Float[Tensor, "T m"]]:
         """What is remembered at these rows, one after the other, and `open` there; without an encoder's noise."""
+        if not self.memory.names:
+            return q[:, :0], q[:, :0]
         before = torch.cat([q[:1] if self._last is None else self._last[None], q[:-1]])
         step, each = self.memory.robot.difference(before, q), self.z.expand(len(q), -1)
         shift = self.memory.after(0.0 * each, step, 0.0)  # a step is linear in what was before
