@@ -106,8 +106,7 @@ def on_a_line(seed: int, *, rate: float = 250.0, seconds: float = 8, noise: floa
     force = push * (1.0 + 0.4 * np.sin(1.7 * time + seed))
     u = robot.inverse_dynamics(tensors, torch.tensor(v), torch.tensor(a)).numpy()
     u = u + force[:, None] * J[:, 0] + 3.0 * dz[:, None] * J[:, 1]
-    noisy = a + noise * generator.normal(size=a.shape)
-    model = Model(robot, (Contact("link2", POINT, LINE),))
+    noisy, model = a + noise * generator.normal(size=a.shape), Model(robot, (Contact("link2", POINT, LINE),))
     return Dataset(q=q, v=v, u=u, a=noisy, time=time, model=model, noise_std=np.full(2, noise) if noise else None)
 
 

@@ -36,8 +36,7 @@ def clean(seed: int, model: Model | None = None, *, seconds: float = 7.0, noise:
     """Sums of sines; torques of inverse dynamics, viscous and dry friction; white noise on q, v and u."""
     model = model or arm()
     generator, nv = np.random.default_rng(seed), model.robot.nv
-    time = np.arange(round(seconds * RATE)) / RATE
-    omega = 2 * np.pi * generator.uniform(0.1, 1.2, (6, 1, nv))
+    time, omega = np.arange(round(seconds * RATE)) / RATE, 2 * np.pi * generator.uniform(0.1, 1.2, (6, 1, nv))
     size, phase = generator.uniform(0.05, 0.2, (6, 1, nv)), generator.uniform(0, 2 * np.pi, (6, 1, nv))
     angle = omega * time[:, None] + phase
     q, v = (size * np.sin(angle)).sum(0), (size * omega * np.cos(angle)).sum(0)

@@ -217,8 +217,7 @@ def test_the_answer_repeats_what_concerns_sensors_and_velocities():
         wrong(about="saturation", what="one is clipped."),  # but accepted
         wrong(about="delay", what="u is shifted."),
     ]
-    seen = seen_in([doubt.to_dict() for doubt in found])
-    off = "one is in kgf. State it. one is off. Tare it."
+    seen, off = seen_in([doubt.to_dict() for doubt in found]), "one is in kgf. State it. one is off. Tare it."
     told = {"sensor": "one agrees.", "force sensor": off, "push": "a push.", "saturation": "one is clipped."}
     assert seen == {"velocity": "v is late. Shift it.", "stop": "its end.", **told}
     assert FIRST & {*seen} == {"force sensor"}

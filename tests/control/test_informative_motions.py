@@ -85,8 +85,7 @@ def test_samples_one_after_the_other_show_what_all_show(monkeypatch):
 
 def test_what_is_expected_is_what_an_update_gives_whatever_is_measured(posterior, chosen):
     motion = chosen.motion
-    some = far_apart(motion.q, motion.v, motion.u, 20)
-    a = np.random.default_rng(0).normal(0.0, 5.0, (20, 3))
+    some, a = far_apart(motion.q, motion.v, motion.u, 20), np.random.default_rng(0).normal(0.0, 5.0, (20, 3))
     rows = Dataset(q=motion.q[some], v=motion.v[some], u=motion.u[some], a=a, time=np.arange(20) * 0.1, model=FREE)
     measured, at = posterior.update(rows), arm_data(30, 5, FREE)
     after, before = (x.predict(at.q, at.v, at.u) for x in (chosen.expected, posterior))
@@ -104,8 +103,7 @@ def test_torques_are_those_of_the_learned_friction(posterior, chosen):
 
 def height(found):
     """Of the point of the tool above z = 0, at many times."""
-    q = found.trajectory(np.linspace(0.0, found.seconds, 2001))[0]
-    model = pinocchio.buildModelFromXML(URDF)
+    q, model = found.trajectory(np.linspace(0.0, found.seconds, 2001))[0], pinocchio.buildModelFromXML(URDF)
     data, frame, heights = model.createData(), model.getFrameId("hand"), []
     for x in q:
         pinocchio.framesForwardKinematics(model, data, x)

@@ -26,8 +26,7 @@ def test_a_kill_at_any_moment_costs_nothing_but_the_run(inputs, tmp_path, name):
             (out.unlink if out.is_file() else lambda: shutil.rmtree(out))()
         elif command.kind == "store":  # begin with a part of the jobs
             shutil.rmtree(next((out / "jobs").glob("*")))
-        process = start(command.line(out, again=not fresh), inputs)
-        moment = generator.uniform(0.2, 1.0) * longest
+        process, moment = start(command.line(out, again=not fresh), inputs), generator.uniform(0.2, 1.0) * longest
         time.sleep(moment)
         process.kill()
         process.communicate()

@@ -143,8 +143,7 @@ def test_from_columns_that_are_clipped_to_a_fit(tmp_path):
     (tmp_path / "arm.urdf").write_text(URDF)
     words = ["--time", "t", "--q", "q1,q2,q3", "--u", "i1,i2,i3", "--robot", "arm.urdf", "--unit", "torque=mNm"]
     words += ["--force", "torque=s1,s2,s3", "--cutoff", "15", "--every", "3", "--trim", ".04", "--out", "log.h5"]
-    done = run_here("import", "log.csv", *words, folder=tmp_path)
-    clipped = int((at_links[1] == -2900.0).sum())
+    done, clipped = run_here("import", "log.csv", *words, folder=tmp_path), int((at_links[1] == -2900.0).sum())
     assert (
         f"torque.lift (torque) stays at -2.9, an end of its range: {clipped} rows left out; --trim their" in done.stderr
     ), done

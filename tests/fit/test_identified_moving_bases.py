@@ -243,8 +243,7 @@ def test_a_drone_without_joints(walker):
     model = Model(locked, (), (Actuation(), rotors, RigidBodies()))
     heavier = replace(model, robot=scaled(locked, [1.3]))
     log = recorded(heavier, 200, switches=0)
-    found = identified(log, model)
-    carried = fit(model.with_forces(Payload()), log).parameters["payload.mass"]
+    found, carried = identified(log, model), fit(model.with_forces(Payload()), log).parameters["payload.mass"]
     assert carried.value == pytest.approx(0.3 * locked.mass, rel=0.05)
     assert_allclose(parameters_of(found), standard_parameters(heavier.robot), atol=1e-3)
     assert [type(force) for force in found.model.forces] == [type(force) for force in model.forces]
@@ -319,8 +318,7 @@ def test_masses_of_links_that_motions_do_not_show_stay_those_of_the_file():
         links = LINK.format("body", 0.01, 2.5, 0.04, 0.05, 0.07), LINK.format("upper", -0.1, 0.3, 0.002, 0.002, 0.0004)
         fore = pin.Inertia(0.2, np.array([0, 0, -0.08]), np.diag([0.001, 0.001, 0.0002]))
         fore += pin.Inertia(load, np.array([0, 0, -0.2]), load * np.diag([0.0015, 0.0015, 0.001]))
-        inertia = np.diag(fore.inertia)
-        hinges = HINGE.format("shoulder", "body", "upper", "0.05 0 -0.05", "0 1 0")
+        inertia, hinges = np.diag(fore.inertia), HINGE.format("shoulder", "body", "upper", "0.05 0 -0.05", "0 1 0")
         hinges += HINGE.format("elbow", "upper", "fore", "0 0 -0.2", "1 0 0")
         last = LINK.format("fore", fore.lever[2], fore.mass, *inertia)
         robot = Robot.from_urdf_text(f'<robot name="r">{"".join(links)}{last}{hinges}</robot>', base="floating")

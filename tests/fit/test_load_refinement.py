@@ -64,8 +64,7 @@ def first_fit(model: Model, data: Dataset):
 
 def errors(posterior, test: Dataset) -> dict[str, float]:
     """Root-mean-square errors: acceleration without noise, lambda relative to itself, and the coefficient."""
-    predicted = posterior.predict(test.q, test.v, test.u, covariance=False)
-    name = posterior.latent_names[-1]
+    predicted, name = posterior.predict(test.q, test.v, test.u, covariance=False), posterior.latent_names[-1]
     speeds = torch.linspace(0.05, float(posterior.curve(name).visited[1, 0]), 50, dtype=torch.float64)
 
     def size(values: torch.Tensor) -> float:

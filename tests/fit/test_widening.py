@@ -43,8 +43,7 @@ def one_slope(rows: int, noise: float):
 def test_one_unknown_number_has_the_factor_of_one_normal_variable():
     """All states are inside or none: the slope has to be inside in `CONFIDENCE` of the cases, not in 95 %."""
     posterior = one_slope(30, 0.1)
-    states = widening._States(posterior)
-    expected = norm.ppf(0.5 + 0.5 * widening.CONFIDENCE) / norm.ppf(0.975)
+    states, expected = widening._States(posterior), norm.ppf(0.5 + 0.5 * widening.CONFIDENCE) / norm.ppf(0.975)
     assert states.content_factor(posterior.latent) == pytest.approx(expected, rel=0.06)  # of 2000 draws
 
 

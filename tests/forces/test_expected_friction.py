@@ -181,8 +181,7 @@ class TestRefinedLoads:
         return TabulatedCurve((0.0, 1.0), (float(len(name)), 0.0))
 
     def test_it_expects_the_friction_of_joints_and_tool(self):
-        robot = model_of(MODEL).robot
-        prior = UnknownForces((JointFriction(("tilt",)), ContactFriction(load=True)))
+        robot, prior = model_of(MODEL).robot, UnknownForces((JointFriction(("tilt",)), ContactFriction(load=True)))
         refined = refined_loads(prior, robot, self.table)
         assert refined.terms[0] == prior.terms[0]
         first, second = prior.latent_names(robot)

@@ -102,8 +102,7 @@ def limited() -> Iterator[None]:
     def stop(*_: object) -> None:
         raise DefectError("hangs")
 
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    handler = signal.signal(signal.SIGPROF, stop)
+    before, handler = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, signal.signal(signal.SIGPROF, stop)
     signal.setitimer(signal.ITIMER_PROF, LONGEST)
     try:
         yield

@@ -147,8 +147,7 @@ def test_the_old_posterior_stays_as_it_was():
 
 
 def test_repeated_rows_without_noise_need_jitter_and_say_so():
-    T = torch.ones(3, 3, dtype=torch.float64)
-    factor = factorize(lambda: torch.ones(1, 1, dtype=torch.float64))
+    T, factor = torch.ones(3, 3, dtype=torch.float64), factorize(lambda: torch.ones(1, 1, dtype=torch.float64))
     with pytest.raises(NumericalError, match="not positive definite"):
         appended(factor, T[1:, :1], T[1:, 1:] - 0.5)
 

@@ -67,8 +67,7 @@ class Weight(Unknown):
 
 def arm_model(contacts: int = 1, **changes) -> Model:
     """The arm with its tool on up to one plane, without the damping and dry friction of its file."""
-    robot = Robot.from_urdf_text(URDF)
-    contact = Contact("hand", (0.0, 0.0, 0.2), Plane((0.2, 0.0, 1.0), 0.4))
+    robot, contact = Robot.from_urdf_text(URDF), Contact("hand", (0.0, 0.0, 0.2), Plane((0.2, 0.0, 1.0), 0.4))
     return Model(
         robot, (contact,) * contacts, **{"forces": (Actuation(), RigidBodies()), "baumgarte": Baumgarte(5.0), **changes}
     )

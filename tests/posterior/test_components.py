@@ -124,8 +124,7 @@ def test_components_are_those_of_dense_conditioning(posterior, dense, states, co
 
 
 def test_components_of_any_batch_and_their_names(posterior, states):
-    flat = posterior.components(*states)
-    folded = posterior.components(*(x.reshape(2, 2, 3) for x in states))
+    flat, folded = posterior.components(*states), posterior.components(*(x.reshape(2, 2, 3) for x in states))
     close(folded["contact-friction"].point_force.mean.reshape(4, 3), flat["contact-friction"].point_force.mean, 1e-12)
     single = posterior.components(*(x[1].tolist() for x in states))
     close(single["weight"].joint_force.covariance, flat["weight"].joint_force.covariance[1], 1e-12)

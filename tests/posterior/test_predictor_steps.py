@@ -91,8 +91,7 @@ def test_wrong_arguments_of_a_step_are_named(smooth, states, changed, message):
 
 def test_inverse_dynamics_is_predict_read_backwards(posterior, states):
     q, v, u = states
-    predictor = posterior.predictor(covariance="exact", compile=False)
-    expected = posterior.predict(q, v, u)
+    predictor, expected = posterior.predictor(covariance="exact", compile=False), posterior.predict(q, v, u)
     back = predictor.inverse_dynamics(q, v, expected.mean, expected.multiplier.mean)
     torch.testing.assert_close(back.mean, u, rtol=1e-9, atol=1e-9)
     for wanted in ([12.0], torch.tensor([[3.0], [-2.0], [7.0], [40.0], [1.0]]).double(), None):

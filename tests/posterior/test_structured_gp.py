@@ -55,8 +55,7 @@ def test_every_prediction_obeys_the_constraint(posterior, test):
 
 def test_forces_and_acceleration_belong_together(posterior, test):
     prediction = posterior.predict(test.q, test.v, test.u)
-    dynamics = test.model.dynamics(*map(torch.tensor, (test.q, test.v, test.u)))
-    Q_U = prediction.unknown_force
+    dynamics, Q_U = test.model.dynamics(*map(torch.tensor, (test.q, test.v, test.u))), prediction.unknown_force
     assert torch.allclose(dynamics.acceleration(Q_U.mean), prediction.mean, atol=1e-10)
     assert torch.allclose(dynamics.H @ Q_U.covariance @ dynamics.H.mT, prediction.covariance, atol=1e-10)
     assert torch.allclose(dynamics.multiplier(Q_U.mean), prediction.multiplier.mean, atol=1e-10)

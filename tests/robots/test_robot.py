@@ -46,8 +46,7 @@ def test_locked_joint_is_fixed_where_it_is_locked(tree):
 
 
 def test_armature_by_name_and_in_order(chain):
-    named = chain.with_armature({"spin": 0.2})
-    ordered = Robot.from_urdf_text(CHAIN, armature=(0, 0.2, 0, 0))
+    named, ordered = chain.with_armature({"spin": 0.2}), Robot.from_urdf_text(CHAIN, armature=(0, 0.2, 0, 0))
     assert named.armature.tolist() == ordered.armature.tolist() == [0.0, 0.2, 0.0, 0.0]
     assert named.with_armature({"skew": 0.3}).armature.tolist() == [0.0, 0.2, 0.3, 0.0]
     q = torch.zeros(4, dtype=torch.float64)

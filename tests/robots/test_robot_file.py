@@ -23,8 +23,7 @@ from forcegp.robots.urdf_file import MARGIN, nearest_inertia, replace_dynamics, 
 
 
 def test_rotor_inertias_are_written_and_read_back(tmp_path):
-    robot = Robot.from_urdf_text(CHAIN, armature={"spin": 0.1, "tilt": 1 / 3})
-    path = tmp_path / "chain.urdf"
+    robot, path = Robot.from_urdf_text(CHAIN, armature={"spin": 0.1, "tilt": 1 / 3}), tmp_path / "chain.urdf"
     with pytest.warns(RobotFileWarning, match="^chain.urdf: only forcegp reads rotor inertias .* of spin, tilt"):
         text = robot.to_urdf(path)
     again = Robot.from_urdf(path)

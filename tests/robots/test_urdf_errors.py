@@ -158,8 +158,7 @@ def test_rounding_of_an_ideal_plate_is_forgiven():
 
 
 def test_a_rod_turns_about_another_axis_slides_along_its_own_or_has_a_rotor():
-    rod = re.sub("<inertia .*/>", ROD, changed("0.1 0 0", "0 0 0.3"))
-    q = torch.zeros(1, dtype=torch.float64)
+    rod, q = re.sub("<inertia .*/>", ROD, changed("0.1 0 0", "0 0 0.3")), torch.zeros(1, dtype=torch.float64)
     across = Robot.from_urdf_text(rod.replace('<axis xyz="0 0 1"/>', '<axis xyz="1 0 0"/>'))
     assert across.mass_matrix(q).item() == pytest.approx(0.1 + 2 * 0.3**2)
     assert Robot.from_urdf_text(rod.replace("revolute", "prismatic")).mass_matrix(q).item() == pytest.approx(2.0)

@@ -75,8 +75,7 @@ def test_a_joint_that_hides_in_the_mean_is_named(friction):
     a, measured = data.truth["a"].copy(), data.a.copy()
     a[:, 0] = known[:, 0]
     measured[:, 0] = known[:, 0] + (data.a - data.truth["a"])[:, 0]
-    names = data.joint_names
-    found = scored(friction, dataclasses.replace(data, a=measured, truth={"a": a}))
+    names, found = data.joint_names, scored(friction, dataclasses.replace(data, a=measured, truth={"a": a}))
     assert found.value("mae", TRUE) < found.value("known_physics_mae", TRUE)
     (sentence,) = about(found.warnings, "worse here than")
     assert f"at 1 of {len(names)} joints, {names[0]} " in sentence

@@ -39,8 +39,7 @@ def test_torques_are_those_of_inverse_dynamics_beside_the_recorded_ones():
     model = arm_model().with_contacts([])
     data = dataclasses.replace(arm_data(40, 3), model=model, truth={})
     posterior = fit(model.with_forces(Rotor(0.01), noise=Noise(0.1)), data)
-    urdf = pinocchio.buildModelFromXML(model.robot.urdf_text)
-    each = zip(data.q, data.v, data.a, strict=True)
+    urdf, each = pinocchio.buildModelFromXML(model.robot.urdf_text), zip(data.q, data.v, data.a, strict=True)
     needed = np.array([pinocchio.rnea(urdf, urdf.createData(), *row) for row in each]) + 0.01 * data.a
     error, found = np.sqrt(np.square(needed - data.u).mean(0)), scored(posterior, data)
     np.testing.assert_allclose(found.columns("rmse", "torque"), error, rtol=1e-9)

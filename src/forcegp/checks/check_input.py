@@ -194,8 +194,7 @@ def _drop_outs(dataset: Dataset, name: str) -> Bool[np.ndarray, "rows nv"]:
     values = getattr(dataset, name)
     if name == "u":  # the last columns may be switches of contacts, which are 0 by right
         values = values[:, : min(dataset.nv, len(dataset.model.actuators))]
-    lost = np.zeros(values.shape if name == "q" else dataset.v.shape, dtype=bool)
-    follows = consecutive(dataset)[:-1]
+    lost, follows = np.zeros(values.shape if name == "q" else dataset.v.shape, dtype=bool), consecutive(dataset)[:-1]
     for joint in np.flatnonzero(((values == 0.0).sum(axis=0) >= FEWEST_DROPS) & (np.ptp(values, axis=0) > 0.0)):
         x = values[:, joint]
         steps = np.abs(np.diff(x))
@@ -258,8 +257,7 @@ def _even(dataset: Dataset, jumps: np.ndarray) -> Dataset:  # stretches without 
     if not pieces:
         seen = f"no stretch of {FEWEST_ROWS} rows without a gap; a check needs one"
         raise InvalidInput(f"{seen}. Give a longer recording, or number the episodes.")
-    rows = np.concatenate(pieces)
-    numbers = np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
+    rows, numbers = np.concatenate(pieces), np.repeat(np.arange(len(pieces)), [len(piece) for piece in pieces])
     even = replace(dataset.rows(rows), episode=numbers, noise_std=None, truth={}, time_ordered=True)
     with contextlib.suppress(DatasetError):
         steps = [uniform_step(even.time[even.episode == number]) for number in even.episodes]

@@ -47,8 +47,7 @@ class Explanation:
         size = np.where(size > 0.0, size, 1.0)
         scaled = products / (size[..., None] * size[:, None])
         number = np.linalg.pinv(scaled[:, :-1, :-1], rcond=1e-10, hermitian=True) @ scaled[:, :-1, -1:]
-        bound = power * (1.0 - (scaled[:, -1:, :-1] @ number)[:, 0, 0])
-        shares = np.full((len(power), 4), np.inf)
+        bound, shares = power * (1.0 - (scaled[:, -1:, :-1] @ number)[:, 0, 0]), np.full((len(power), 4), np.inf)
         factors = np.repeat(number[:, -1] * (size[:, -1:] / size[:, -2:-1]), 2, axis=1)
         shares[:, 0] = positive_solution(less.T @ products @ less)[1]
         worth = np.flatnonzero((bound * np.exp(SIGN) <= shares[:, 0]) & (shares[:, 0] >= LEAST * power))

@@ -222,8 +222,7 @@ def least_squares(
 ) -> Float[np.ndarray, "parts targets"]:
     """What columns leave of the square sum of every target: of all rows, then of all but each block of them."""
     blocks = list(zip(np.array_split(basis, BLOCKS), np.array_split(targets, BLOCKS), strict=True))
-    normal = np.stack([own.T @ own for own, _ in blocks])
-    right = np.stack([own.T @ target for own, target in blocks])
+    normal, right = np.stack([own.T @ own for own, _ in blocks]), np.stack([own.T @ target for own, target in blocks])
     square = np.stack([np.einsum("rt,rt->t", target, target) for _, target in blocks])
     sums = [np.concatenate([part.sum(axis=0)[None], part.sum(axis=0) - part]) for part in (normal, right, square)]
     values, vectors = np.linalg.eigh(sums[0])

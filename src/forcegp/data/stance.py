@@ -171,8 +171,7 @@ def _motion_and_force(
         u[:, places] = 1.0
         dynamics = model.dynamics(q, v, u)
         white = dynamics.inverse_lower @ (dynamics.M @ a[..., None] - dynamics.Q_K[..., None])
-        forces = dynamics.normals * (dynamics.pseudo_inverse.mT @ white)
-        rates = (dynamics.A @ v[..., None])[..., 0]
+        forces, rates = dynamics.normals * (dynamics.pseudo_inverse.mT @ white), (dynamics.A @ v[..., None])[..., 0]
         poses = [dynamics.state.kinematics.frame_pose(each.frame) @ points[..., None] for each, points in held]
         high = torch.stack([pose[..., :3, 0] @ up for pose in poses], -1)
         return *(rates[:, rows] for rows in of), *(forces[:, rows].sum(1) for rows in of), high

@@ -127,8 +127,7 @@ class _Forces:
 
     def causes(self, wind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What the law of all degrees of freedom may depend on, and how many of them hold along x and y."""
-        air = self.velocity[:, :3] - np.einsum("nji,nj->ni", self.rotation, wind)
-        push = self.delivered[:, 2:3]
+        air, push = self.velocity[:, :3] - np.einsum("nji,nj->ni", self.rotation, wind), self.delivered[:, 2:3]
         share = np.sqrt(np.abs(push))  # as the speed of rotors
         speed = np.linalg.norm(air, axis=1, keepdims=True)
         moving = [air, speed * air, share * air, self.velocity[:, 3:]]  # without any of these no force along x and y

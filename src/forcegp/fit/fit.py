@@ -211,8 +211,7 @@ def _of_numbers(model: Model, logs: Sequence[Dataset], evidence: Any, rows: int 
         whole_number("rows", rows, 1)
     checked.refuse_what_has_no_answer(model)
     found = fit_physical(model, logs, evidence, rows)
-    trained = replace(found.model, noise=found.noise)
-    training = TrainingData.of(found.rows, model.robot.device)
+    trained, training = replace(found.model, noise=found.noise), TrainingData.of(found.rows, model.robot.device)
     result = OptimizationResult({}, found.history[-1], found.history, "Gauss-Newton steps", found.estimates.settled,
                                 found.estimates.evaluations, 0.0)  # fmt: skip
     settings = {"seed": seed, "evidence": str(evidence), "noise": found.noise.to_dict(), "doubts": list(found.doubts)}

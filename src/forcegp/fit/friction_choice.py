@@ -173,8 +173,7 @@ class _Regression:
         numbers = [np.flatnonzero(fold == k) for k in range(self.count)]  # mostly rows that follow each other
         self.rows = [slice(at[0], at[-1] + 1) if at[-1] - at[0] < len(at) else at for at in numbers]
         torque, given = motors(torque), motors(state.delivered)
-        v = law.turning(state.v).cpu().numpy()
-        turned = law.turning(torch.as_tensor(precision, device=state.q.device))
+        v, turned = law.turning(state.v).cpu().numpy(), law.turning(torch.as_tensor(precision, device=state.q.device))
         self.precision = P = law.turning(turned.mT).cpu().numpy()
         self.coupled = bool((P * (1.0 - np.eye(self.nv))).any())
         load = np.abs(given if self.coupled else given - torque)  # by what has less noise: u, or the model

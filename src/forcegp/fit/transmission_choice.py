@@ -41,8 +41,7 @@ def choose_transmission(
         v, a, w = log.v @ row, log.a @ row, row * weight
         speed = np.sqrt((v**2).mean()).clip(1e-12)
         signs = [np.tanh(v / (width * speed)) for width in WIDTHS]
-        C = np.stack([v, a, np.ones_like(v), *signs, np.sqrt(abs(v)) * signs[0]], axis=-1)
-        at = np.flatnonzero(w)
+        C, at = np.stack([v, a, np.ones_like(v), *signs, np.sqrt(abs(v)) * signs[0]], axis=-1), np.flatnonzero(w)
         own, asked = np.einsum("nkc,k->nc", bodies[:, at], w[at]), torque[:, at] @ w[at]
         return C, *(np.stack([C[k].T @ each[k] for k in rows]) for each in (own, asked[:, None]))
 
@@ -65,8 +64,7 @@ def choose_transmission(
         for m, n in np.argwhere(shared):
             block = np.stack([C[k, m].T @ C[k, n] for k in rows]) * shared[m, n]
             normal[:, count + m * size :, count + n * size :][:, :size, :size] = block
-        right = np.concatenate([asked, *of_motors], axis=1)
-        scale = np.sqrt(np.diagonal(normal.sum(0))).clip(1e-100)
+        right, scale = np.concatenate([asked, *of_motors], axis=1), np.sqrt(np.diagonal(normal.sum(0))).clip(1e-100)
         normal, right = normal / np.outer(scale, scale), right / scale[:, None]
         others = normal.sum(0) - normal + RIDGE * np.eye(len(scale))
         each = np.linalg.solve(others, right.sum(0) - right)[..., 0] / scale

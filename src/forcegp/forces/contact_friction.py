@@ -201,8 +201,7 @@ class ContactFriction(ExpressedKernels):
 
     def _sliding(self, dynamics: ConstrainedDynamics) -> tuple[Tensor, Tensor, Tensor]:
         """Tangents (..., 3, 2), the velocity of the contact point along them (..., 2), and its size (..., 1)."""
-        where = ToolPoint.of_contact(dynamics, self.contact)
-        tangents = contact_axes(dynamics, self.contact)[..., :2]
+        where, tangents = ToolPoint.of_contact(dynamics, self.contact), contact_axes(dynamics, self.contact)[..., :2]
         sliding = (tangents.mT @ where.velocity(dynamics.state.v)[..., :3, None])[..., 0]
         return tangents, sliding, (sliding.square().sum(-1, keepdim=True) + SMALLEST_SPEED**2).sqrt()
 

@@ -68,8 +68,7 @@ def matern(dimension: int, variance: float | Tensor, *, smoothness: float) -> Sc
 
 
 def _scaled(base: Kernel, variance: float | Tensor) -> ScaleKernel:
-    kernel = ScaleKernel(base, outputscale_constraint=log_scale()).double()
-    dimension = int(base.ard_num_dims or 1)
+    kernel, dimension = ScaleKernel(base, outputscale_constraint=log_scale()).double(), int(base.ard_num_dims or 1)
     # standardised points are about sqrt(2 d) apart in d dimensions: gradients of shorter length scales vanish
     base.lengthscale = float64(math.sqrt(dimension)).expand(1, dimension)
     kernel.outputscale = float64(variance)

@@ -165,7 +165,6 @@ class InducingPosterior(LatentPosterior):
         # functions have there is taken off
         size = len(self.mean_weights), len(prior[0])
         draws = torch.randn(size, generator=generator, dtype=torch.float64, device=self.mean_weights.device)
-        drawn = self.mean_weights[:, None] + self.factor.solve_upper(draws)
-        own = zip(self.lowers, prior, strict=True)
+        drawn, own = self.mean_weights[:, None] + self.factor.solve_upper(draws), zip(self.lowers, prior, strict=True)
         whitened = [torch.linalg.solve_triangular(lower, values.mT, upper=False) for lower, values in own]
         return tuple(w.mT for w in self.center_weights(drawn - torch.cat(whitened)))

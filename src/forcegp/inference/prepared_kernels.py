@@ -245,8 +245,7 @@ def compress(
             U = torch.linalg.svd(X, full_matrices=False)[2][: min(DIRECTIONS // 2, most - len(B))]
             U = torch.linalg.qr((U - (U @ B.mT) @ B).mT)[0].mT
             left -= (U @ D.mT).square_().sum(0)
-            excess = excess - (U @ at.mT).square_().sum(0)
-            B = torch.cat([B, U])
+            excess, B = excess - (U @ at.mT).square_().sum(0), torch.cat([B, U])
         # in the order of what they explain at all states, fewer of the same are enough
         B = torch.linalg.svd(torch.linalg.qr(D @ B.mT, mode="r")[1])[2] @ B
         excess = (total - (B @ at.mT).square_().cumsum_(0)).clamp_min_(0.0)

@@ -66,8 +66,7 @@ def window_motions(
     Windows that `MOST_PASSES` do not find are stepped through if `patient`; where that fails, too, `found` is False.
     """
     middle_q, middle_v = (x.clone() for x in guess)
-    found = torch.zeros(len(q0), dtype=torch.bool, device=q0.device)
-    left = torch.arange(len(q0), device=q0.device)
+    found, left = torch.zeros(len(q0), dtype=torch.bool, device=q0.device), torch.arange(len(q0), device=q0.device)
     for _ in range(MOST_PASSES):  # of those that are not found: a turn of dry friction is met one pass after the other
         middles = middle_q[left], middle_v[left]
         there_q, there_v = _pass(accelerations, q0[left], v0[left], u[left], middles, h, False)[2:4]

@@ -121,11 +121,9 @@ class Contact:
         A = s_p J_p, A' v = s_p Jdot_p v + (J_p v)^T s_pp (J_p v), b = -A' v - 2 zeta omega A v - omega^2 c (Rath 2021).
         """
         p, v = self.position(state.kinematics), state.v
-        J = self._touching(state.kinematics.frame_jacobian(self.frame, self.point))
-        gradient = self.surface.gradient(p)
+        J, gradient = self._touching(state.kinematics.frame_jacobian(self.frame, self.point)), self.surface.gradient(p)
         A = (gradient[..., None, :] @ J)[..., 0, :]
-        bias = state.kinematics.frame_bias_acceleration(self.frame, self.point)
-        velocity = (J @ v[..., None])[..., 0]
+        bias, velocity = state.kinematics.frame_bias_acceleration(self.frame, self.point), (J @ v[..., None])[..., 0]
         curvature = (velocity[..., None, :] @ self.surface.hessian(p) @ velocity[..., None])[..., 0, 0]
         b = -(gradient * self._touching(bias[..., None])[..., 0]).sum(-1) - curvature
         if baumgarte is not None:
@@ -263,8 +261,7 @@ class ConstrainedDynamics:
         else:
             pseudo_inverse = A_white.mT
         H = inverse_lower.mT @ (identity - pseudo_inverse @ A_white) @ inverse_lower
-        H = 0.5 * (H + H.mT)
-        offset = (inverse_lower.mT @ (pseudo_inverse @ self.b[..., None]))[..., 0]
+        H, offset = 0.5 * (H + H.mT), (inverse_lower.mT @ (pseudo_inverse @ self.b[..., None]))[..., 0]
         made = {"H": H, "constrained_offset": offset, "inverse_lower": inverse_lower, "pseudo_inverse": pseudo_inverse}
         vars(self).update(made)  # of a frozen value
 

@@ -131,8 +131,7 @@ def _checks(export: CFiles) -> list[Check]:
     if not space.is_vector_space:
         moved[:, : sizes[0]] = space.normalized(moved[:, : sizes[0]])
     between = moved[rows : 2 * rows][finite[rows : 2 * rows]][:: 1 + rows // 33]
-    tolerance = max(MEAN_TOLERANCE, rounding(own, *sampled[finite].split(sizes, dim=-1)))
-    found = []
+    tolerance, found = max(MEAN_TOLERANCE, rounding(own, *sampled[finite].split(sizes, dim=-1))), []
     for kind in export.kinds:
         states = between if kind in BETWEEN else sampled[finite]
         (q, v, u), given = states.split(sizes, dim=-1), sizes

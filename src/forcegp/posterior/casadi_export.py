@@ -59,8 +59,7 @@ def casadi_function(
         moved = _of_space(casadi, lambda q, v: (space.tangent(q) @ v[..., None])[..., 0], code.sizes[:2])
         return casadi.Function(name, x, [*results, moved(*x[:2])], ["q", "v", "u"], [*names, "q_dot"])
     require_step(steps, integrator, posterior.model)
-    there = _stepped(casadi, code, acceleration, x, float(steps), integrator)
-    names = ["q_next", "v_next"]
+    there, names = _stepped(casadi, code, acceleration, x, float(steps), integrator), ["q_next", "v_next"]
     if code.remembered is not None:
         graph, nodes, sizes = code.remembered
         first = posterior.model.memory_column

@@ -231,12 +231,10 @@ def followed(posterior: Posterior, rows: Dataset) -> Posterior:
         for row, age in zip(record, ages, strict=True):
             P, f = P + age * np.diag(rate[own] ** 2), friction[row]
             gain = np.linalg.solve(f[:, None] * P * f + noise, f[:, None] * P).T
-            d = d + gain @ (missed[row] - (bias[own] + d) * f)
-            P = P - gain @ (f[:, None] * P)
+            d, P = d + gain @ (missed[row] - (bias[own] + d) * f), P - gain @ (f[:, None] * P)
     moved, std = np.zeros_like(level), np.zeros_like(level)
     moved[own], std[own] = np.maximum(d, -1.0), np.sqrt(P.diagonal())  # friction never pushes
-    level = (1.0 + level) * (1.0 + moved) - 1.0
-    until = float(rows.time[rows.episode == rows.episodes[-1]].max())
+    level, until = (1.0 + level) * (1.0 + moved) - 1.0, float(rows.time[rows.episode == rows.episodes[-1]].max())
     drift = replace(drift, level=level.tolist(), std=std.tolist(), until=until, here=here)
     louder = scaled(posterior.model, torch.as_tensor(1.0 + moved))
     laws = [law for law in posterior.trained.laws if isinstance(law, DryFriction)]

@@ -293,8 +293,7 @@ class Posterior(Fitted):
         # with the standardization at hand instead of one that is computed again
         reference = training if training.reference is None else training.reference
         added = TrainingData.of(rows, training.q.device, training.sensed)
-        added = replace(added, reference=reference, correlated_rows=training.correlated_rows)
-        known = self.likelihood
+        added, known = replace(added, reference=reference, correlated_rows=training.correlated_rows), self.likelihood
         known.model.check_states(added.q, added.v, added.u)
         check_distance(known.model, added)
         more = replace(known, training=added, fixed_standardization=known.standardization)

@@ -51,8 +51,7 @@ def prepared_predictor(posterior: Any, covariance: str, compile: bool) -> Predic
             usable = torch.isfinite(W).flatten(1).all(1)  # no state of its own has a surface without a normal
             return Sample([z[usable] for z in features], W[usable])
 
-        chosen = sample(SAMPLES, 0, len(training.q) if rough else SAMPLES // 3)
-        check = sample(CHECKS, 1, CHECKS // 3)
+        chosen, check = sample(SAMPLES, 0, len(training.q) if rough else SAMPLES // 3), sample(CHECKS, 1, CHECKS // 3)
         compressed = compress(latent, chosen, check, tolerance=TOLERANCE, largest=LARGEST_RANK)
         reached = float(compressed.inflation.max()) if len(compressed.inflation) else 0.0
         if reached > TOLERANCE:

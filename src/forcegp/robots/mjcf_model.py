@@ -112,8 +112,7 @@ class CompiledModel:
 
     def _body(self, body: int) -> None:
         model, name = self.model, self.bodies[body]
-        upper = self.bodies[model.body_parentid[body]]
-        at = self._pose(model.body_pos[body], model.body_quat[body])
+        upper, at = self.bodies[model.body_parentid[body]], self._pose(model.body_pos[body], model.body_quat[body])
         inside, first = self._inertial(body), model.body_jntadr[body]
         for joint in range(first, first + model.body_jntnum[body]):
             kind, anchor = KINDS[model.jnt_type[joint]], np.array(model.jnt_pos[joint])

@@ -155,8 +155,7 @@ def joint_acceleration(
     aim, aim_velocity, aim_acceleration = reference
     omega, gain = config.controller_omega, 2.0 * config.controller_zeta * config.controller_omega
     jacobian, task = state.jacobian, np.empty(6)
-    velocity = jacobian @ state.v
-    turn = Rotation.from_matrix(TOOL_ORIENTATION @ state.rotation.T).as_rotvec()
+    velocity, turn = jacobian @ state.v, Rotation.from_matrix(TOOL_ORIENTATION @ state.rotation.T).as_rotvec()
     task[:3] = aim_acceleration + gain * (aim_velocity - velocity[:3]) + omega**2 * (aim - state.position)
     task[3:] = -gain * velocity[3:] + omega**2 * turn
     pull = config.null_space_stiffness * (np.deg2rad(config.start_degrees) - state.q)
