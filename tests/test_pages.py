@@ -41,8 +41,7 @@ def test_the_page_on_moving_bases_runs(tmp_path: Path):
     for name in ("poses.h5", "flight.h5"):
         log = Dataset.load(tmp_path / name)
         t, turned = log.time, 0.4 * log.time
-        velocity = np.cos(t) * np.cos(turned) - np.sin(t) * np.sin(turned)
-        acceleration = -1.4 * np.sin(t + turned)
+        velocity, acceleration = np.cos(t) * np.cos(turned) - np.sin(t) * np.sin(turned), -1.4 * np.sin(t + turned)
         np.testing.assert_allclose(log.v[:, 0], velocity, rtol=0, atol=1e-3)
         np.testing.assert_allclose(log.a[:, 0], acceleration, rtol=0, atol=2e-2)
         np.testing.assert_allclose(log.v[:, 5], 0.4, rtol=0, atol=1e-3)

@@ -22,8 +22,7 @@ def shown(data):
     quick = {"restarts": 1, "options": OptimizerOptions(iterations=3)}
     posterior = fit(data.model.with_forces(JointForces()), data, **quick)
     in_air = arm_model(0, forces=(Actuation(), RigidBodies(), Viscous()), baumgarte=None)
-    learned = fit(in_air, arm_data(20, 0, arm_model(0)))
-    prediction = posterior.predict(data.q, data.v, data.u)
+    learned, prediction = fit(in_air, arm_data(20, 0, arm_model(0))), posterior.predict(data.q, data.v, data.u)
     return {
         "Dataset": data, "Posterior": posterior, "Prediction": prediction, "Gaussian": prediction.unknown_force,
         "Scores": score(posterior, arm_data(10, 1), horizons=()), "Robot": data.model.robot, "Model": data.model,

@@ -31,8 +31,7 @@ def with_motion(robot: Robot, q: np.ndarray, rate: float, seed: int, noise: floa
 def rests(robot: Robot, seed: int, noise: float = 0.05, jitter: float = 0.0) -> Dataset:
     """Moves from point to point and waits there; with `jitter` on u, as sensors have it at rest."""
     generator = np.random.default_rng(seed)
-    points = np.cumsum(generator.uniform(-0.7, 0.7, (8, robot.nv)), axis=0) * 0.6
-    rise = np.linspace(0.0, 1.0, 200)
+    points, rise = np.cumsum(generator.uniform(-0.7, 0.7, (8, robot.nv)), axis=0) * 0.6, np.linspace(0.0, 1.0, 200)
     blend, pieces = 10 * rise**3 - 15 * rise**4 + 6 * rise**5, []
     for start, stop in pairwise(points):
         pieces += [start + blend[:, None] * (stop - start), np.repeat(stop[None], 150, axis=0)]

@@ -248,6 +248,11 @@ def test_a_torque_that_is_zeroed_anew_is_named_and_the_shorter_part_left_out(at,
     assert (found.joints, found.numbers["offset"]) == (("lift",), pytest.approx(0.5, rel=0.05))
     assert found.numbers["seconds"] == pytest.approx(left_out, abs=0.2)
     assert len(without_pushes(log, doubts)) == pytest.approx(len(log) * (1.0 - np.ptp(left_out) / 12.0), abs=40)
+
+
+@pytest.mark.nightly
+def test_an_offset_of_all_or_of_the_first_rows_is_no_torque_that_is_zeroed_anew():
+    log, at = clean(4, seconds=12.0), 3.0
     begins = column(log, "u", 1, lambda u: u + 5.0 * (log.time < 0.1))  # friction from another place
     for quiet in (replace(log, u=log.u + 0.5 * (log.time > at)[:, None]), begins):
         assert not check(quiet).doubts.of("offset")

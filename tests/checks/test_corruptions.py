@@ -133,6 +133,11 @@ def test_the_factor_of_a_torque_has_an_interval():
     [found] = said(replace(data, u=data.u * np.array([1.0, 1.6])))
     assert found.numbers["factor"]["joint2"] == pytest.approx(1.6, abs=found.numbers["error_95"][0])
     assert found.numbers["error_95"][0] < 0.03
+
+
+@pytest.mark.nightly
+def test_a_factor_of_a_thousand_is_a_unit_beside_a_load():
+    data = clean(two_links(), 1, noise="qvu")
     for largest, told in ((4.5e-3, True), (8e-3, False)):  # a load makes more of kNm than masses do
         assert ("--unit u=kNm." in said(replace(data, u=data.u * np.array([1.2e-3, largest])))[0].do) == told
 
@@ -307,6 +312,7 @@ def test_what_carries_a_sliding_joint_is_told(share, told):
     assert [x.numbers["offset"] for x in found] == ([pytest.approx(-carried, rel=0.05)] if told else [])
 
 
+@pytest.mark.nightly
 def test_friction_that_remembers_is_no_push():
     """About a turn it is far from any that velocities make, for seconds here."""
     data = between_postures(arm_model().robot, 3, 24.0)
@@ -320,23 +326,33 @@ def test_friction_that_remembers_is_no_push():
     assert np.corrcoef(again.ravel(), _remembered(found, inputs).ravel())[0, 1] > 0.9
 
 
-def test_torques_in_steps_are_right_and_friction_that_fades_is_named():
+def test_torques_in_steps_are_right_and_friction_that_is_another_later_is_named():
     data = clean(two_links(), 5, noise="qvu")
     step = np.ptp(data.u) / 100.0
     assert not check(replace(data, u=step * np.round(data.u / step))).doubts.at("wrong")
-    dry = np.std(data.u, axis=0) * np.tanh(data.v / 0.05)
-    for fade, ratio in ((0.1, 0.34), (0.02, 0.87), (0.0, 1.0)):  # beside .1 that stays
-        drift = check(replace(data, u=data.u + dry * (1.0 - fade * data.time)[:, None])).doubts.of("drift")
-        told = [each.numbers["ratio"] == pytest.approx({"joint1": ratio, "joint2": ratio}, abs=0.05) for each in drift]
-        assert told == [True] * bool(fade)
-    alone = check(replace(data, u=data.u + dry * (1.0 - np.array([0.0, 0.05]) * data.time[:, None]))).doubts.of("drift")
-    assert [(each.joints, "seconds" in each.numbers) for each in alone] == [(("joint2",), False)]
-    later = check(replace(data, u=data.u + dry * (1.0 + np.outer(data.time > 5.0, [0.0, 1.0])))).doubts
+    assert not check(replace(data, u=data.u + _dry(data))).doubts.of("drift")
+    later = check(replace(data, u=data.u + _dry(data) * (1.0 + np.outer(data.time > 5.0, [0.0, 1.0])))).doubts
     [since] = [each for each in later if each.level != "ok"]  # no unknown cause, either
     assert since.numbers == {
         "ratio": {"joint2": pytest.approx(1.9, abs=0.1)},
         "seconds": pytest.approx([5, 8], abs=0.3),
     }
+
+
+def _dry(data):
+    return np.std(data.u, axis=0) * np.tanh(data.v / 0.05)
+
+
+@pytest.mark.nightly
+def test_friction_that_fades_is_named():
+    data = clean(two_links(), 5, noise="qvu")
+    dry = _dry(data)
+    for fade, ratio in ((0.1, 0.34), (0.02, 0.87)):  # beside .1 that stays
+        drift = check(replace(data, u=data.u + dry * (1.0 - fade * data.time)[:, None])).doubts.of("drift")
+        told = [each.numbers["ratio"] == pytest.approx({"joint1": ratio, "joint2": ratio}, abs=0.05) for each in drift]
+        assert told == [True]
+    alone = check(replace(data, u=data.u + dry * (1.0 - np.array([0.0, 0.05]) * data.time[:, None]))).doubts.of("drift")
+    assert [(each.joints, "seconds" in each.numbers) for each in alone] == [(("joint2",), False)]
     cold = check(replace(data, u=data.u + dry * (1.0 + np.exp(-np.square(data.time / 2.0)))[:, None])).doubts
     assert [each.about for each in cold if each.level != "ok"] == ["drift"], "no push, either"
 

@@ -35,6 +35,7 @@ def test_a_clean_log_is_told_so(forcegp, folder):
     assert_unchanged("cli/check", numbers_in(done.stdout), rtol=1e-2)
 
 
+@pytest.mark.nightly
 def test_defects_are_told_but_are_no_error(forcegp, folder):
     done = forcegp("check", "defects.h5", "--json", folder=folder).ok()
     strict = forcegp("check", "defects.h5", "--strict", folder=folder)

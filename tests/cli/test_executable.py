@@ -63,6 +63,7 @@ def test_a_stream_that_is_closed_is_no_error(executable, folder, closed):
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.nightly
 def test_a_reader_that_has_seen_enough_is_no_error(executable, folder):
     words = [executable, "robot", "arm.urdf"]
     with subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as running:

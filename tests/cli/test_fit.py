@@ -50,8 +50,7 @@ def test_laws_and_bodies_are_estimated(identified, folder):
     assert kept["settled"]
     posterior = load_posterior(folder / "found")
     assert posterior.parameters["viscous.upper_hinge"].value == kept["parameters"]["viscous.upper_hinge"]["value"]
-    model = Model.from_json((folder / "found" / "system.json").read_text())
-    test = Dataset.load(folder / "test.h5")
+    model, test = Model.from_json((folder / "found" / "system.json").read_text()), Dataset.load(folder / "test.h5")
     before, after = (np.sqrt((motion_residuals(test, each)[0] ** 2).mean(0)) for each in (test.model, model))
     assert (after < 0.3 * before).all()
     robot, q = Robot.from_urdf(folder / "found" / "identified.urdf"), torch.zeros(2).double()

@@ -22,8 +22,7 @@ FIT = ("--points", "8", "--restarts", "1", "--iterations", "2", "--noise", "0.1"
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("logs")
-    whole = simulate_kuka_surface(KukaSurfaceConfig(seconds=1.0, seed=1))
+    folder, whole = tmp_path_factory.mktemp("logs"), simulate_kuka_surface(KukaSurfaceConfig(seconds=1.0, seed=1))
     for k in range(4):
         whole.rows(slice(50 * k, 50 * k + 60)).save(folder / f"robot{k}.h5")
     return folder

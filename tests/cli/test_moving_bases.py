@@ -23,8 +23,7 @@ COLUMNS = ("--time", "t", "--q", "x,y,z,qx,qy,qz,qw", "--v", "v{1..6}", "--u", "
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Rows of a walker that carries 1.6 times its trunk, and the log of a drone in calm air with its system."""
-    place = tmp_path_factory.mktemp("moving")
-    walker = Model(Robot.from_urdf_text(LIMBS, base="floating"), FEET)
+    place, walker = tmp_path_factory.mktemp("moving"), Model(Robot.from_urdf_text(LIMBS, base="floating"), FEET)
     heavier = body_pseudo_inertias(walker.robot).numpy() * np.array([1.6, 1.0, 1.0, 1.0])[:, None, None]
     known = (*walker.forces, Coulomb(0.5, 0.2))
     truth = replace(

@@ -166,8 +166,7 @@ def test_free_motion_raises_as_many_alarms_as_asked_for():
 def test_pushes_are_found(monitor):
     q, v, u = motion(4.0, 7)
     where, point, force = "fore", torch.tensor([0.0, 0.0, 0.0], dtype=torch.float64), np.array([4.0, 3.0, 2.0])
-    J = ROBOT.kinematics(torch.from_numpy(q)).frame_jacobian(where, point)[:, :3].numpy()
-    push = np.zeros_like(u)
+    J, push = ROBOT.kinematics(torch.from_numpy(q)).frame_jacobian(where, point)[:, :3].numpy(), np.zeros_like(u)
     push[200:] = np.einsum("tij,i->tj", J, force)[200:]
     state = monitor.run(q, v, u - push)
     assert not state.alarm[:200].any()
@@ -194,8 +193,7 @@ def test_a_place_explains_the_torque_by_the_least_force():
         force = [B @ tau for B in inverse]
         misfit = np.array([np.sum((tau - J @ f) ** 2) for J, f in zip(levers, force, strict=True)])
         alike = np.flatnonzero(misfit <= misfit.min() + 3.8414588)  # as 95 in 100 that are right
-        best = min(alike, key=lambda k: round(float(np.linalg.norm(force[k])), 7))
-        found = observer.place(q, L @ tau)
+        best, found = min(alike, key=lambda k: round(float(np.linalg.norm(force[k])), 7)), observer.place(q, L @ tau)
         assert found.link == places[best][0]
         assert set(found.also) == {places[k][0] for k in alike} - {found.link}
         wanted = [places[best][1], force[best], np.sqrt((inverse[best] ** 2).sum(1))]

@@ -45,8 +45,7 @@ def hopping(v, a, height, time):
     """Rows of one body on a point foot, from its velocity, acceleration and height."""
     body = '<inertial><mass value="2"/><inertia ixx=".02" iyy=".02" izz=".02" ixy="0" ixz="0" iyz="0"/></inertial>'
     robot = Robot.from_urdf_text(f'<robot name="hopper"><link name="foot">{body}</link></robot>', base="floating")
-    model = Model(robot, fixed_point("foot", switch="stands"))
-    q = np.tile(robot.neutral().numpy(), (len(time), 1))
+    model, q = Model(robot, fixed_point("foot", switch="stands")), np.tile(robot.neutral().numpy(), (len(time), 1))
     q[:, 2] += height
     return Dataset(q=q, v=v, u=np.zeros((len(time), 1)), a=a, time=time, model=model)
 
@@ -125,6 +124,7 @@ def test_prepared_rows_carry_the_flags_and_open_ones_half():
     np.testing.assert_array_equal(decided(prepared).time, prepared.time[known])
 
 
+@pytest.mark.nightly
 def test_open_rows_show_torques_beside_what_feet_may_bear_and_nothing_else():
     """Forces of feet that stand or may stand are taken out by least squares; accelerations learn from decided rows."""
     rows = Preparation(stance="auto", every=5).apply(walk(9, seconds=3.0)[0])

@@ -94,8 +94,7 @@ def test_a_read_only_disk_is_one_line(inputs, disk, name):
 
 @pytest.mark.nightly
 def test_a_predictor_where_nothing_may_be_run(inputs, disk):
-    place = disk("size=64m,noexec")
-    code = "import sys, forcegp; forcegp.load_posterior(sys.argv[1]).predictor()"
+    place, code = disk("size=64m,noexec"), "import sys, forcegp; forcegp.load_posterior(sys.argv[1]).predictor()"
     environment = {**os.environ, "XDG_CACHE_HOME": str(place)}
     command = [sys.executable, "-c", code, inputs / "run"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)

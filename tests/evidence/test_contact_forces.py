@@ -36,8 +36,7 @@ def tensors(log, *names):
 
 def measured(truth, given, rows=150, seed=0, noise=0.0, push=None):
     """States of an arm whose hand is on a plane or held, its accelerations and the force at the hand."""
-    rng = np.random.default_rng(seed)
-    state = arm_data(rows, seed, arm_model(0 if len(given.contacts) == 2 else 1))
+    rng, state = np.random.default_rng(seed), arm_data(rows, seed, arm_model(0 if len(given.contacts) == 2 else 1))
     log = replace(state, model=given, truth={}, noise_std=None, u=4.0 * state.u)
     v, A = np.array(log.v), given.constraint(given.state(*tensors(log, "q", "v", "u")))[0].numpy()
     v -= (np.linalg.pinv(A) @ (A @ v[..., None]))[..., 0]  # along the contact

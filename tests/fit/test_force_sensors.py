@@ -156,8 +156,7 @@ def test_a_right_sensor_gets_no_false_word(seed):
 @pytest.mark.nightly
 def test_a_sensor_that_does_not_teach_is_no_force():
     log, force, _ = carrying()
-    rows = replace(log, measured={"force.hand": force}).rows(np.arange(0, 3000, 6))
-    words = "bodies+viscous+gear"
+    rows, words = replace(log, measured={"force.hand": force}).rows(np.arange(0, 3000, 6)), "bodies+viscous+gear"
     with_sensor, without = (
         identified_model(f"{words}@accelerations", log.model, each).noise for each in (rows, replace(rows, measured={}))
     )

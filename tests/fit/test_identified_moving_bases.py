@@ -182,11 +182,9 @@ def test_likely_accelerations_cost_least(walker):
     What moves the base without an actuator is an error of a, whose covariance stays that of the last estimates.
     """
     q, v, u = (x.numpy() for x in rows_of(walker, 6))
-    a = np.random.default_rng(1).normal(size=v.shape)
-    opened = walker.with_forces(RigidBodies("all"), Viscous())
+    a, opened = np.random.default_rng(1).normal(size=v.shape), walker.with_forces(RigidBodies("all"), Viscous())
     space = ParameterSpace(opened, dict.fromkeys(("force", "position", "velocity", "inertia"), np.ones(v.shape[1])))
-    rows = RecordedRows(space, q, v, u)
-    x = space.start + np.random.default_rng(2).uniform(0.05, 0.2, space.size)
+    rows, x = RecordedRows(space, q, v, u), space.start + np.random.default_rng(2).uniform(0.05, 0.2, space.size)
     levels, measured = NoiseLevels(np.full(9, 0.3), np.full(9, 0.2)), rows.moving(a)
     likely = rows.likely(x, measured, levels)
     of_base, of_joints = np.split(levels.force**2, [6])
@@ -234,6 +232,7 @@ def test_noise_of_accelerations_takes_no_mass_away(walker):
     assert found.parameters.total_mass[0] == pytest.approx(mass, rel=0.02)
 
 
+@pytest.mark.nightly
 def test_a_drone_without_joints(walker):
     """Nothing but the ten numbers of one body, from thrusts."""
     places = ((0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (-0.2, 0.0, 0.0), (0.0, -0.2, 0.1))

@@ -44,8 +44,7 @@ def log(text, seed, *, seconds=30.0, noise=0.0, friction=1.0):
     at = w * time[:, None, None] + phase
     q = MIDDLE + (size * np.sin(at)).sum(1)
     v, a = (size * w * np.cos(at)).sum(1), -(size * w**2 * np.sin(at)).sum(1)
-    oracle = Oracle(text, ROBOT)
-    dry = 2.0 * ROTORS * (1.0 + 0.5 * np.exp(-((v / 0.1) ** 2))) * np.tanh(v / 0.02)
+    oracle, dry = Oracle(text, ROBOT), 2.0 * ROTORS * (1.0 + 0.5 * np.exp(-((v / 0.1) ** 2))) * np.tanh(v / 0.02)
     u = np.array([oracle.inverse_dynamics(*row) for row in zip(q, v, a, strict=True)])
     u += ROTORS * a + friction * (dry + ROTORS * v) + noise * rng.standard_normal(u.shape)
     return Dataset(q=q, v=v, u=u, a=a, time=time, model=Model(ROBOT))

@@ -29,8 +29,7 @@ def spinning(rows: int, noise: float) -> Dataset:
     """A disc with viscous friction of 0.4 Nms/rad; a = (u - 0.4 v) / 0.5 + noise."""
     generator = np.random.default_rng(0)
     q, v, u = generator.normal(size=(3, rows, 1))
-    a = (u - 0.4 * v) / 0.5 + noise * generator.normal(size=(rows, 1))
-    model = Model(Robot.from_urdf_text(WHEEL))
+    a, model = (u - 0.4 * v) / 0.5 + noise * generator.normal(size=(rows, 1)), Model(Robot.from_urdf_text(WHEEL))
     return Dataset(q=q, v=v, u=u, a=a, time=0.1 * np.arange(rows), model=model, noise_std=np.full(1, noise))
 
 

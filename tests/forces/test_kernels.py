@@ -145,8 +145,7 @@ def test_a_kernel_of_ones_own(monkeypatch):
 def test_hyperpriors_are_normal_in_the_logarithm(expression, part, center, spread):
     latent = LatentKernels([kernel_of(expression, 2, 0.6)])
     start, name = latent.initial_parameters(), f"kernels.0.{part}"
-    moved = start | {name: start[name] + 0.7}
-    normal_prior = torch.distributions.Normal(float64(center), spread)
+    moved, normal_prior = start | {name: start[name] + 0.7}, torch.distributions.Normal(float64(center), spread)
     difference = normal_prior.log_prob(moved[name]).sum() - normal_prior.log_prob(start[name]).sum()
     assert float(latent.log_prior(moved) - latent.log_prior(start)) == pytest.approx(float(difference), rel=1e-9)
 

@@ -72,8 +72,7 @@ def test_it_is_the_solution_of_dahls_equation():
     time, q, v, a = motion(1500, 3)
     past = torch.tensor(strokes(log_of(q, v, a, a, time)))
     for j in range(3):
-        expected = dahl(time, q[:, j], v[:, j], float(SIGMA[j]))
-        found = after_strokes(past[:, j], SIGMA[j]).numpy()
+        expected, found = dahl(time, q[:, j], v[:, j], float(SIGMA[j])), after_strokes(past[:, j], SIGMA[j]).numpy()
         np.testing.assert_allclose(found, expected, atol=0.01)  # the reversal lies between two rows
         by_steps, z = np.zeros(len(q)), torch.zeros(1, dtype=torch.float64)
         for k in range(1, len(q)):

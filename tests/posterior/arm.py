@@ -83,8 +83,7 @@ def on_the_plane(model: Model, q: np.ndarray) -> np.ndarray:
     at = torch.tensor(q)
     rest = torch.zeros_like(at)
     for _ in range(20 if model.contacts else 0):
-        A = model.dynamics(at, rest, rest).A[:, :1]
-        distance = model.contacts[0].distance(model.robot.kinematics(at))
+        A, distance = model.dynamics(at, rest, rest).A[:, :1], model.contacts[0].distance(model.robot.kinematics(at))
         at = at - (torch.linalg.pinv(A) @ distance[:, None, None])[..., 0]
     return at.numpy()
 

@@ -127,8 +127,7 @@ class ModelConformance:
             assert again.settings["points"] == self.points
 
     def test_it_can_be_scored(self, fitted, test):
-        found = score(fitted, test, horizons=())
-        errors = fitted.predict(test.q, test.v, test.u).mean.numpy() - test.a
+        found, errors = score(fitted, test, horizons=()), fitted.predict(test.q, test.v, test.u).mean.numpy() - test.a
         np.testing.assert_allclose(found.columns("mae"), np.abs(errors).mean(0), rtol=1e-9)
         assert np.isfinite(found.value("nlpd", "all joints"))
         assert not any("of the data" in warning or "training rows" in warning for warning in found.warnings)

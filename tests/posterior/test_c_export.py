@@ -275,8 +275,7 @@ def test_sums_that_cancel_may_differ_by_their_rounding(tmp_path, states):
     q, v, u = (x[None] if x.dim() == 1 else x for x in [torch.tensor(x) for x in states])
     dynamics = smooth.dynamics(q, v, u)
     W = dynamics.H @ smooth.model.unknown.direction(dynamics)
-    features = smooth.likelihood.standardization(smooth.model.unknown.features(dynamics))
-    latent = smooth.latent
+    features, latent = smooth.likelihood.standardization(smooth.model.unknown.features(dynamics)), smooth.latent
     terms = [
         (kernel.cross(z, at) * w).abs().sum(-1)
         for kernel, z, at, w in zip(latent.kernels.dense, features, latent.features, latent.weights, strict=True)

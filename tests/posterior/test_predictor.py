@@ -143,8 +143,7 @@ TRANSFORMS = {
 @pytest.mark.parametrize("transform", TRANSFORMS)
 def test_transforms_are_refused_by_code_and_taken_by_torch(posterior, means, compressed, states, transform):
     q, v, u = (x[0] for x in states)
-    take = TRANSFORMS[transform]
-    refused = r"does not support transforms of torch\.func .*linearize.*compile=False"
+    take, refused = TRANSFORMS[transform], r"does not support transforms of torch\.func .*linearize.*compile=False"
     for function in (means.mean, compressed, means.linearize):
         with pytest.raises(InvalidInput, match=refused):
             take(lambda y, f=function: f(y, v, u), q)

@@ -101,6 +101,7 @@ def test_means_and_covariances_are_those_of_predict(floating, covariance, monkey
         close(found, expected.covariance, 1e-5)
 
 
+@pytest.mark.nightly
 def test_derivatives_are_those_in_a_step_from_q(case):
     posterior, q, v, u = case
     space, size = posterior.model.robot.space, 1e-5

@@ -63,7 +63,7 @@ def system(seed: int) -> tuple[Model, Dataset, Dataset, np.ndarray]:
     return model, rows(slice(0, 60)), rows(slice(60, None)), a[60:]
 
 
-@pytest.mark.parametrize("seed", [2, *(pytest.param(k, marks=pytest.mark.nightly) for k in range(60) if k != 2)])
+@pytest.mark.parametrize("seed", [3, *(pytest.param(k, marks=pytest.mark.nightly) for k in range(60) if k != 3)])
 def test_every_path_computes_the_same(seed, tmp_path):
     model, rows, test, truth = system(seed)
     forces = JointFriction() if seed % 2 else JointForces()

@@ -157,8 +157,7 @@ def test_predictions_given_accelerations_are_those_of_one_large_gaussian():
     whole = G @ S @ G.mT
     gain = whole[:, 3:, :3] @ torch.linalg.inv(whole[:, :3, :3] + 0.05**2 * torch.eye(3))
     expected = mean[:, 3:] + (gain @ (a - mean[:, :3])[..., None])[..., 0]
-    spread = whole[:, 3:, 3:] - gain @ whole[:, :3, 3:]
-    found = posterior.predict(*states, a=a).force_at("hand")
+    spread, found = whole[:, 3:, 3:] - gain @ whole[:, :3, 3:], posterior.predict(*states, a=a).force_at("hand")
     torch.testing.assert_close(found.mean, expected, rtol=0.0, atol=1e-8)
     torch.testing.assert_close(found.covariance, spread, rtol=0.0, atol=1e-8)
     with pytest.raises(InvalidInput, match=r"no contact at 'fore'.*; there is hand"):

@@ -71,8 +71,7 @@ MODELS = {
 def test_updates_are_conditioning_on_all_rows(make):
     data, test = arm_data(20, seed=1), arm_data(5, seed=2)
     posterior = learned(data, model=make(data.model))
-    grown = posterior.update(data.rows([12])).update(data.rows(slice(13, 20)))
-    expected = at_once(posterior, data)
+    grown, expected = posterior.update(data.rows([12])).update(data.rows(slice(13, 20))), at_once(posterior, data)
     assert_same(grown, expected, test)
     assert grown.negative_log_likelihood == pytest.approx(expected.negative_log_likelihood, rel=1e-9)
     shifts = (each.likelihood.standardization.shift for each in (grown, posterior))

@@ -93,8 +93,7 @@ def test_a_single_gap_of_ten_steps_is_bridged_and_one_more_is_not(tmp_path):
 
 def test_start_and_end_count_from_the_first_row_of_each_episode(tmp_path):
     data = motion()
-    columns = table(data) | {"run": np.repeat([4.0, 7.0], 100)}
-    mapping = dataclasses.replace(NAMES, episode="run")
+    columns, mapping = table(data) | {"run": np.repeat([4.0, 7.0], 100)}, dataclasses.replace(NAMES, episode="run")
     span = {"start": 10 * STEP, "end": 40 * STEP, "without": tuple(STEP * np.array([15.5, 20.5, 20.5, 27.5]))}
     found = imported(write_text(tmp_path / "log.csv", columns), mapping, **span)
     np.testing.assert_array_equal(found.q, data["q"][np.r_[10:16, 28:41, 110:116, 128:141]])

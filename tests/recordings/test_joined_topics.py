@@ -35,8 +35,7 @@ def header(stamp):
 
 def odometry(stamp, q, v):
     pose = message("geometry_msgs/msg/Pose", position=vector(q[:3], "Point"), orientation=vector(q[3:], "Quaternion"))
-    twist = message("geometry_msgs/msg/Twist", linear=vector(v[:3]), angular=vector(v[3:]))
-    none = np.zeros(36)
+    twist, none = message("geometry_msgs/msg/Twist", linear=vector(v[:3]), angular=vector(v[3:])), np.zeros(36)
     own = {
         "pose": message("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=none),
         "twist": message("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=none),
@@ -100,6 +99,7 @@ def imported(path, flight, mapping=POSE, **options):
     return found, found.metadata["import"]
 
 
+@pytest.mark.nightly
 def test_poses_and_twists_are_named_by_their_topic(tmp_path, flight):
     source = open_source(bag_of(tmp_path, flight, [0.0, 0.1], [0.0, 0.1]))
     place, turn = "/odom:pose.pose.position.", "/odom:pose.pose.orientation."
@@ -185,6 +185,7 @@ def test_angles_that_wrap_are_not_interpolated_across(tmp_path):
     assert off.max() < 3.0 / 70
 
 
+@pytest.mark.nightly
 def test_a_pause_of_a_topic_is_a_gap(tmp_path, flight):
     at = np.concatenate([np.arange(0, 0.4, 0.01), np.arange(0.7, 1.0, 0.01)])
     found, done = imported(bag_of(tmp_path, flight, at), flight, gap=0.05)
@@ -201,6 +202,7 @@ def test_topics_that_cannot_be_joined_are_refused(tmp_path, flight):
         imported(path, flight)
 
 
+@pytest.mark.nightly
 def test_stamps_that_run_backwards_are_refused(tmp_path, flight):
     stamps = nanoseconds(flight.time).tolist()
     order = [*stamps[:50], stamps[20], *stamps[51:]]

@@ -24,8 +24,7 @@ ROS2 = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 
 
 def joint_state(names, positions, efforts=()):
-    header = ROS2.types["std_msgs/msg/Header"]
-    stamp = ROS2.types["builtin_interfaces/msg/Time"](sec=5, nanosec=7)
+    header, stamp = ROS2.types["std_msgs/msg/Header"], ROS2.types["builtin_interfaces/msg/Time"](sec=5, nanosec=7)
     position, effort = (np.array(values, dtype=np.float64) for values in (positions, efforts))
     return ROS2.types["sensor_msgs/msg/JointState"](
         header=header(stamp=stamp, frame_id="base"),

@@ -83,8 +83,7 @@ def test_a_file_that_says_so_itself_is_not_asked():
     free = Robot.from_urdf_text(text.replace('"fixed"', '"floating"'))
     assert (free.base, free.nq, free.nv) == ("floating", 9, 8)
     assert Robot.from_stored(free.to_stored()).tree.equals(free.tree)
-    welded = Robot.from_urdf_text(text.replace('"fixed"', '"floating"'), base="fixed")
-    q = torch.zeros(2).double()
+    welded, q = Robot.from_urdf_text(text.replace('"fixed"', '"floating"'), base="fixed"), torch.zeros(2).double()
     assert torch.equal(welded.mass_matrix(q), Robot.from_urdf_text(text).mass_matrix(q))
 
 

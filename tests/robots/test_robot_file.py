@@ -168,8 +168,7 @@ def test_written_files_have_the_limits_without_which_others_refuse_them(tmp_path
     with pytest.raises(ValueError, match=r"."):
         pinocchio.buildModelFromXML(robot.urdf_text)
     robot.to_urdf(tmp_path / "r.urdf")
-    model = pinocchio.buildModelFromUrdf(str(tmp_path / "r.urdf"))
-    again = Robot.from_urdf(tmp_path / "r.urdf")
+    model, again = pinocchio.buildModelFromUrdf(str(tmp_path / "r.urdf")), Robot.from_urdf(tmp_path / "r.urdf")
     assert model.upperPositionLimit.tolist() == [LARGEST, 2.0, LARGEST]
     for one, other in zip(robot.joints, again.joints, strict=True):
         limits, written = ((x.lower, x.upper, x.velocity_limit, x.effort_limit) for x in (one, other))
