@@ -31,7 +31,7 @@ COLUMNS = shlex.split("--time Zeit --q Winkel_{1..2} --v Tempo_{1..2} --u Moment
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A log of a double pendulum in ms, degrees and degrees per second, with one torque turned, and its URDF."""
-    place, data = tmp_path_factory.mktemp("auto"), double_pendulum(5.0, seed=1, noise=0.0)
+    place, data = tmp_path_factory.mktemp("auto"), double_pendulum(8.0, seed=1, noise=0.0)
     (place / "arm.urdf").write_text(data.model.robot.urdf_text)
     q = data.q + 1e-5 * np.random.default_rng(0).standard_normal(data.q.shape)
     table = np.column_stack([1e3 * data.time, np.rad2deg(q), np.rad2deg(data.v), data.u * [1.0, -1.0]])
@@ -66,7 +66,7 @@ def test_the_corrected_command_gives_a_model_that_works(folder, answered):
     test, model = double_pendulum(3.0, seed=2, noise=0.0), load_posterior(folder / "answer" / "model")
     error = np.abs(model.predict(test.q, test.v, test.u).mean.numpy() - test.a).mean()
     assert error < 0.1 * np.abs(motion_residuals(test, test.model)[1]).mean()  # of the URDF
-    assert len(Dataset.load(folder / "answer" / "log.h5")) == 1200
+    assert len(Dataset.load(folder / "answer" / "log.h5")) == 1920
     assert Robot.from_urdf(folder / "answer" / "identified.urdf").joint_names == test.joint_names
     assert (folder / "answer" / "validation" / "report.md").is_file()
 
@@ -93,7 +93,7 @@ def test_correct_does_it_at_once(folder, forcegp, monkeypatch):
     assert "reached" in done.stderr
     rows = Dataset.load(folder / "other" / "log.h5")
     assert np.abs(rows.q).max() < 4.0
-    assert rows.time[-1] == pytest.approx(5.0, abs=0.01)
+    assert rows.time[-1] == pytest.approx(8.0, abs=0.01)
 
 
 def test_a_base_on_a_wall_is_corrected(tmp_path, forcegp, monkeypatch):
