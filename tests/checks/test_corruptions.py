@@ -397,10 +397,9 @@ def test_clean_logs_raise_no_alarm(seed):
         assert quick_check(data) == (), name
 
 
-def test_a_joint_that_is_held_throughout_is_at_no_end_of_its_motion():
+def test_a_joint_that_is_held_throughout_is_at_no_end_of_its_motion_and_says_nothing_of_stops():
     torch.manual_seed(9)
-    [stop] = check(dict(clean_logs(9))["a joint is held"]).doubts.of("stop")
-    assert stop.numbers["seconds"] == [pytest.approx([7.04, 7.34], abs=0.05)]
+    assert not check(dict(clean_logs(9))["a joint is held"]).doubts.of("stop")
 
 
 ROUND = '<inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>'

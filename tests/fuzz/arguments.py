@@ -293,7 +293,7 @@ CALLS: dict[str, tuple[Callable[..., Any], Callable[[], dict[str, Any]]]] = {
         given=lambda: {"learn": ("hand",)},
     ),
     "with_forces": (
-        lambda **k: INPUTS.data.model.with_forces(k["forces"], noise=k["noise"]),
+        lambda forces, noise: INPUTS.data.model.with_forces(forces, noise=noise),
         lambda: {"forces": forcegp.Viscous(), "noise": 0.1},
     ),
     "parse_forces": _call(forces.parse_forces, given=lambda: {"expression": "gp:joint"}),

@@ -366,6 +366,8 @@ def without_stops(log: Dataset, model: Model | None = None, late: bool = True) -
     places = [np.searchsorted(still, x) for x in found]
     for k, (u, v, a, moves) in enumerate(zip(rows.u.T, rows.v.T, rows.a.T, in_motion(rows).T, strict=True)):
         slow = np.sqrt(np.square(v).mean()) + 1e-300
+        if slow < 1e-9 * np.abs(rows.v).max():  # but for rounding it never moves: what holds it bears what it must
+            continue
         dry = np.stack([np.tanh(v / (width * slow)) for width in WIDTHS], axis=1)
         both = np.c_[columns[:, k], a, v, dry]
         slides = moves | (moves.sum() < both.shape[1])  # elsewhere stiction holds it, which may be less than friction

@@ -152,8 +152,7 @@ def estimate_stance(dataset: Dataset, model: forcegp.Model | None = None) -> Sta
 
 def _mean(values: Float[np.ndarray, "rows k"], width: int) -> Float[np.ndarray, "rows k"]:
     """Over windows of `width` rows about each, an odd number; windows are shorter at the ends."""
-    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    place = np.arange(len(values))
+    total, place = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)]), np.arange(len(values))
     first, last = np.maximum(place - width // 2, 0), np.minimum(place + width // 2 + 1, len(values))
     return (total[last] - total[first]) / (last - first)[:, None]
 

@@ -173,8 +173,7 @@ def ends_of_range(values: Float[np.ndarray, " rows"], moves: Marked) -> Iterator
 
 def whole_windows(dataset: Dataset, width: int) -> Int[np.ndarray, " windows"]:
     """First rows of the windows of so many rows that lie within an episode."""
-    breaks = np.cumsum(np.insert(~consecutive(dataset), 0, False))
-    first = np.arange(max(0, len(dataset) - width + 1))
+    breaks, first = np.cumsum(np.insert(~consecutive(dataset), 0, False)), np.arange(max(0, len(dataset) - width + 1))
     return first[breaks[first + width - 1] == breaks[first]]
 
 

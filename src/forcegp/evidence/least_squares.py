@@ -7,7 +7,7 @@ covariance diag(sigma_a^2) + H diag(sigma_F^2) H^T. Forces along A^T are integra
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +32,9 @@ class NoiseLevels:
     force: Float[np.ndarray, " nv"]
 
     @classmethod
-    def of(cls, residual: Rows, M: Matrices, H: Matrices | None = None, near: "NoiseLevels | None" = None) -> Self:
+    def of(
+        cls, residual: Rows, M: Matrices, H: Matrices | None = None, near: "NoiseLevels | None" = None
+    ) -> "NoiseLevels":
         """Those of largest likelihood, each between `LEAST` and `MOST` times the whole: Fisher scoring of logarithms.
 
         `H` is that of Gauss' principle under constraints; None is M^-1. The search begins `near` others, if given.

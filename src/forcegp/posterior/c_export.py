@@ -80,8 +80,7 @@ def export_c(
     require_replaceable(folder, "export_c", lambda _: False, overwrite=False)
     require_writable(folder)
     reference = posterior.predictor(covariance="compressed" if covariance else "none", compile=False)
-    code = posterior.programs(compressed=reference.compressed)
-    called = identifier(name or posterior.model.robot.name)
+    code, called = posterior.programs(compressed=reference.compressed), identifier(name or posterior.model.robot.name)
     if monitor is not None:
         known: Any = getattr(monitor, "calibrated", None) and monitor.model
         same = known is posterior.model or getattr(known, "posterior", None) is posterior

@@ -45,8 +45,7 @@ def casadi_function(
     """
     casadi: Any = required_extra("casadi", "casadi", "casadi_function")
     require_type("posterior", posterior, Posterior)
-    code = posterior.programs()
-    name = casadi.Function.fix_name(name or ("acceleration" if steps is None else "step"))
+    code, name = posterior.programs(), casadi.Function.fix_name(name or ("acceleration" if steps is None else "step"))
     x = [casadi.MX.sym(symbol, size) for symbol, size in zip("qvu", code.sizes, strict=True)]
     f = casadi.vertcat(*_latents(casadi, code, x)) if code.sums else casadi.MX(0, 1)
     given = *code.sizes, sum(len(part.latents) for part in code.sums)

@@ -336,8 +336,7 @@ def _stretches(
     kept = ~read.lost
     kept[kept] = np.diff(time[kept], prepend=-np.inf) >= REPEATED * typical
     kept[begins] = ~read.lost[begins]
-    repeated = int((~read.lost & ~kept).sum())
-    since = time - np.repeat(time[begins], np.diff([*begins, len(time)]))
+    repeated, since = int((~read.lost & ~kept).sum()), time - np.repeat(time[begins], np.diff([*begins, len(time)]))
     start, end = -np.inf if options.start is None else options.start, np.inf if options.end is None else options.end
     kept &= (since >= start) & (since <= end) & (np.searchsorted(options.without, since) % 2 == 0)
     if not kept.any():

@@ -354,8 +354,7 @@ def _at(
     values, later = table[first], table[after]
     for turn in turns:
         later[:, turn] *= np.where((values[:, turn] * later[:, turn]).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
-    span = stamps[after] - stamps[first]
-    change = np.where(np.abs(later - values) < most, later - values, 0.0)
+    span, change = stamps[after] - stamps[first], np.where(np.abs(later - values) < most, later - values, 0.0)
     share = np.divide(since, span, out=np.zeros(len(time)), where=span > 0)
     return values + share[:, None] * change, np.where(span > 0, span, since), there
 
