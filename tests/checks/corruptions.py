@@ -76,8 +76,7 @@ def clean(robot: Robot, seed: int, *, rate: float = 250.0, seconds: float = 8.0,
         a = a + noise_std * generator.normal(size=a.shape)
     elif noise == "qvu":
         q, v = q + 2e-5 * generator.normal(size=q.shape), v + 3e-4 * generator.normal(size=v.shape)
-        u = u + 0.01 * np.std(u, axis=0) * generator.normal(size=u.shape)
-        a = np.gradient(v, time, axis=0, edge_order=2)
+        u, a = u + 0.01 * np.std(u, axis=0) * generator.normal(size=u.shape), np.gradient(v, time, axis=0, edge_order=2)
     return Dataset(q=q, v=v, u=u, a=a, time=time, model=Model(robot), noise_std=noise_std)
 
 
@@ -91,8 +90,7 @@ def on_a_line(seed: int, *, rate: float = 250.0, seconds: float = 8, noise: floa
     time = np.arange(round(seconds * rate)) / rate
     omega, phase = 2 * np.pi * generator.uniform(0.15, 0.8, (4, 1)), generator.uniform(0, 2 * np.pi, (4, 1))
     size = generator.uniform(0.02, 0.05, (4, 1))
-    z = -0.4 + (size * np.sin(omega * time + phase)).sum(0)
-    dz = (size * omega * np.cos(omega * time + phase)).sum(0)
+    z, dz = -0.4 + (size * np.sin(omega * time + phase)).sum(0), (size * omega * np.cos(omega * time + phase)).sum(0)
     ddz = (-size * omega**2 * np.sin(omega * time + phase)).sum(0)
     # the tip lies at -(l1 sin q1 + l2 sin(q1 + q2)), -(l1 cos q1 + l2 cos(q1 + q2)) in x and z
     bend = np.arccos((np.hypot(0.35, z) ** 2 - 0.4**2 - 0.3**2) / (2 * 0.4 * 0.3))

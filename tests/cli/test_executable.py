@@ -56,7 +56,8 @@ def test_version_and_help_through_the_module(installed):
     assert (done.returncode, done.stderr, "kg m?" in done.stdout) == (0, "", True)
 
 
-@pytest.mark.parametrize("closed", [pytest.param(">&-", marks=pytest.mark.nightly), ">&- 2>&- <&-"])
+@pytest.mark.parametrize("closed", [">&-", ">&- 2>&- <&-"])
+@pytest.mark.nightly
 def test_a_stream_that_is_closed_is_no_error(executable, folder, closed):
     words = ["sh", "-c", f"{executable} robot arm.urdf {closed}"]
     done = subprocess.run(words, cwd=folder, stderr=subprocess.PIPE, text=True, check=False)

@@ -58,6 +58,7 @@ def test_a_walker_is_identified_and_a_fit_begins_with_it(folder, forcegp):
             "--restarts", 1, "--noise", 0.01, "--out", "run", folder=folder).ok()  # fmt: skip
 
 
+@pytest.mark.nightly
 def test_a_load_on_the_trunk(folder, forcegp):
     done = forcegp("payload", "walk.h5", "--cutoff", "none", "--forces", "coulomb", "--json", folder=folder).ok()
     trunk, content = Robot.from_urdf_text(LIMBS, base="floating").link("trunk"), json.loads(done.stdout)

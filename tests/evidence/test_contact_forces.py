@@ -87,8 +87,7 @@ def test_stacked_rows_have_the_density_of_one_large_gaussian():
     B = model.unknown.direction(at)
     W = torch.block_diag(*(G @ B))
     n, C = len(log), B.shape[-1]
-    K = torch.zeros(n, C, n, C, dtype=torch.float64)
-    features = likelihood.standardization(model.unknown.features(at))
+    K, features = torch.zeros(n, C, n, C, dtype=torch.float64), likelihood.standardization(model.unknown.features(at))
     for c, matrix in enumerate(kernels.matrices(parameters, features)):
         K[:, c, :, c] = matrix.detach()
     level = torch.diag(torch.tensor([0.05, 0.05, 0.05, 0.3, 0.2, 0.2, 0.2], dtype=torch.float64).square())

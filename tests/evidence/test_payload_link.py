@@ -56,8 +56,7 @@ def rows(base: str, loaded: str, noise: float) -> Dataset:
     draw = torch.Generator().manual_seed(0)
     q = random_positions(given.robot, draw, 400)
     v = torch.randn(400, given.robot.nv, generator=draw, dtype=torch.float64)
-    u = 8.0 * torch.randn(400, len(given.inputs), generator=draw, dtype=torch.float64)
-    friction = torch.zeros_like(v)
+    u, friction = 8.0 * torch.randn(400, len(given.inputs), generator=draw, dtype=torch.float64), torch.zeros_like(v)
     friction[:, -4:] = -0.2 * v[:, -4:]
     a = heavier.dynamics(q, v, u).acceleration(friction)
     a = a + noise * torch.randn(a.shape, generator=draw, dtype=torch.float64)

@@ -279,8 +279,7 @@ def test_noise_under_constraints_is_that_of_the_rows(walker):
     moved = (dynamics.H.numpy() @ (force * rng.normal(size=(400, 9)))[..., None])[..., 0]
     residual = moved + acceleration * rng.normal(size=(400, 9))
     H, truth = dynamics.H.numpy(), NoiseLevels(acceleration, force)
-    found = NoiseLevels.of(residual, dynamics.M.numpy(), H)
-    white = (truth.whitening(H) @ residual[..., None])[..., 0]
+    found, white = NoiseLevels.of(residual, dynamics.M.numpy(), H), (truth.whitening(H) @ residual[..., None])[..., 0]
     assert_allclose(white.T @ white / len(white), np.eye(9), atol=0.25)
 
     def cost(levels):

@@ -128,6 +128,7 @@ def test_beyond_the_visited_speeds_it_expects_what_the_curve_says():
     assert float(curve.std()) > 1e-3  # it is no constant, which any continuation would meet
 
 
+@pytest.mark.nightly
 def test_joint_friction_beside_it_counts_for_the_normal_force():
     data, test = sliding_data(60, 0, 1.5), sliding_data(80, 7, 1.5)
     model = data.model.with_forces(JointFriction(kernel="linear"), LOAD)

@@ -116,6 +116,7 @@ def test_where_the_base_moves_they_hold_as_steps(floating):
     np.testing.assert_array_equal(found.contains(recorded)[:, 1:], ((low <= off) & (off <= high)).numpy()[:, 1:])
 
 
+@pytest.mark.nightly
 def test_where_the_base_moves_samples_spread_as_steps(floating):
     fitted, log = floating
     robot, widths = log.model.robot, MotionIntervals(np.ones(1), np.zeros((1, 2, 7)), np.ones((2, 1, 2, 7)))

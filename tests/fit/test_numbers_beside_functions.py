@@ -54,6 +54,7 @@ def test_rounds_end_where_numbers_stay_within_a_tenth_of_their_deviations():
     assert (found.settings["rounds"], found.parameters.settled) == (6, True)
 
 
+@pytest.mark.nightly
 def test_rounds_end_unsettled_after_the_tenth(monkeypatch):
     monkeypatch.setattr(importlib.import_module("forcegp.fit.fit"), "CHANGE", 0.0)
     found = beside_functions_of_v(16, 1)

@@ -45,8 +45,7 @@ def recorded(rows: int, seed: int, noise: float = 0.0, torque_noise: float = 0.0
     """Random states of the arm in the air with all true forces; noise on a and on u."""
     data = arm_data(rows, seed, arm_model(0, forces=TRUE_FORCES))
     states = [torch.tensor(np.array(x)) for x in (data.q, data.v, data.u)]
-    a = data.model.dynamics(*states).acceleration_map().offset.numpy()
-    generator = np.random.default_rng(seed + 100)
+    a, generator = data.model.dynamics(*states).acceleration_map().offset.numpy(), np.random.default_rng(seed + 100)
     a = a + noise * generator.normal(size=a.shape)
     return replace(data, a=a, u=data.u + torque_noise * generator.normal(size=a.shape), truth={}, noise_std=None)
 

@@ -16,8 +16,7 @@ def test_feet_that_stand_resist_their_own_sliding_and_no_other():
         Contact(f"{leg}_foot", (0.0, 0.0, 0.0), Plane((0.0, 0.0, 1.0), 0.0), f"{leg}_stands") for leg in feet
     )
     model, generator = Model(robot, contacts, held.forces), torch.Generator().manual_seed(0)
-    q = random_positions(robot, generator, 3)
-    v = torch.randn(3, robot.nv, generator=generator, dtype=torch.float64)
+    q, v = random_positions(robot, generator, 3), torch.randn(3, robot.nv, generator=generator, dtype=torch.float64)
     u = torch.zeros(3, 14, dtype=torch.float64)
     u[:, 12:] = torch.tensor([[1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
     dynamics = model.dynamics(q, v, u)

@@ -22,8 +22,7 @@ def conditioned(kernels: list, dimensions: tuple[int, ...]) -> ExactPosterior:
     W = torch.randn(POINTS, OUTPUTS, len(dimensions), dtype=torch.float64, generator=generator)
     hidden = torch.randn(POINTS, OUTPUTS, 1, dtype=torch.float64, generator=generator)
     hidden = hidden / hidden.norm(dim=1, keepdim=True)
-    W = W - hidden @ hidden.mT @ W
-    residual = torch.randn(POINTS, OUTPUTS, dtype=torch.float64, generator=generator)
+    W, residual = W - hidden @ hidden.mT @ W, torch.randn(POINTS, OUTPUTS, dtype=torch.float64, generator=generator)
     noise = torch.full((1, OUTPUTS), 0.09, dtype=torch.float64)
     latent = LatentKernels([kernel.double() for kernel in kernels])
     return ExactPosterior.condition(latent.at(latent.initial_parameters()), Terms(features, W, residual, noise))

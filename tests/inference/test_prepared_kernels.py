@@ -80,8 +80,7 @@ def test_it_is_the_smallest_rank_of_the_tolerance_and_never_below_the_exact_cova
     chosen_at, checked_at = sample(20, seed=50), sample(7, seed=90)
     compressed = compress(compressible, chosen_at, checked_at, tolerance=tolerance, largest=1000)
     assert 1 < compressed.rank < 40
-    at_check = compressed.at(compressible, checked_at.features)
-    exact = compressible.covariance(checked_at.features)
+    at_check, exact = compressed.at(compressible, checked_at.features), compressible.covariance(checked_at.features)
     assert float(torch.linalg.eigvalsh(at_check - exact).min()) > -1e-9
     inflation = deviations(at_check, checked_at) / deviations(exact, checked_at) - 1.0
     torch.testing.assert_close(compressed.inflation, inflation.flatten(), rtol=0.0, atol=1e-7)

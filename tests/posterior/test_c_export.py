@@ -105,7 +105,9 @@ def test_every_function_computes_what_the_model_does(posterior, library, states)
         np.testing.assert_allclose(again, (q, v), rtol=1e-13)
 
 
-@pytest.mark.parametrize("integrator", [pytest.param("rk4", marks=pytest.mark.nightly), "implicit-midpoint"])
+@pytest.mark.parametrize(
+    "integrator", [pytest.param(k, marks=pytest.mark.nightly) for k in ("rk4", "implicit-midpoint")]
+)
 def test_steps_of_friction_and_their_derivatives(friction, states, integrator, tmp_path):
     made = export_c(friction, tmp_path / "arm", jacobian=True, steps=DT, integrator=integrator)
     library = compiled(tmp_path / "arm", "arm.c")
@@ -226,6 +228,7 @@ def pointer(x):
 
 
 @PLAIN_AND_SANITIZED
+@pytest.mark.nightly
 def test_the_self_test_the_example_and_the_commands_of_the_readme_work(complete, tmp_path, options):
     folder = tmp_path / "copy"
     shutil.copytree(complete, folder)

@@ -74,6 +74,10 @@ def test_where_nothing_drifts_none_is_found(steady):
     assert (drift.rate, drift.records) == ([0.0], 1)
     assert drift.between == drift.std == pytest.approx([0.03]), "what is assumed of another record"
     assert "5.9% between records (assumed)" in str(posterior)
+
+
+@pytest.mark.nightly
+def test_what_is_no_random_walk_is_hardly_ever_told_as_one():
     generator, found = np.random.default_rng(0), 0
     for _ in range(200):
         y, information = generator.standard_normal(40), np.ones(40)

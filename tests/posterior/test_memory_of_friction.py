@@ -92,8 +92,7 @@ def test_a_past_that_is_not_known_is_in_the_interval(lugre_log):  # noqa: F811  
         drawn = z[torch.randint(len(z), (200,), generator=chance)].numpy() * np.sign(test.v)
         draws.append(posterior.predict(test.q, test.v, np.concatenate([test.u, drawn], 1)).mean)
     # joints are drawn together here, and apart in the prediction: variances of the diagonal agree
-    spread = torch.stack(draws).var(0)
-    added = unknown.variance - posterior.predict(seen.q, seen.v, seen.u).variance
+    spread, added = torch.stack(draws).var(0), unknown.variance - posterior.predict(seen.q, seen.v, seen.u).variance
     assert float((added.sqrt() / spread.sqrt()).median()) == pytest.approx(1.0, abs=0.15)
 
 

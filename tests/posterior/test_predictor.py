@@ -71,9 +71,9 @@ def test_it_is_predict_under_any_contacts(posterior, states, contacts: str):
     "model",
     [
         arm_model().with_forces(JointFriction(), ContactFriction(load=True, expected=0.2)),
-        arm_model().with_forces(ToolForces(inputs=("velocity", "position"))),
+        pytest.param(arm_model().with_forces(ToolForces(inputs=("velocity", "position"))), marks=pytest.mark.nightly),
         arm_model(),
-        arm_model().with_forces(JointFriction()).without_mean(),
+        pytest.param(arm_model().with_forces(JointFriction()).without_mean(), marks=pytest.mark.nightly),
     ],
     ids=["friction under load", "tool forces", "no forces", "zero mean"],
 )
@@ -195,6 +195,7 @@ def test_operations_that_no_tape_holds_are_named(posterior, states):
     assert_close(bent.predictor(covariance="none", compile=False).mean(*states), bent.predict(*states).mean)
 
 
+@pytest.mark.nightly
 def test_it_takes_what_another_engine_knows(states):
     posterior = quick_fit(arm_model().with_forces(JointFriction()), engine="inducing")
     check(posterior, states)

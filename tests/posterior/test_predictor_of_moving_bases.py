@@ -113,6 +113,7 @@ def test_derivatives_are_those_in_a_step_from_q(case):
         close(found.da_dq[..., j], (ends[0] - ends[1]) / (2 * size), 1e-6)
 
 
+@pytest.mark.nightly
 def test_gradients_are_those_of_predict(case):
     posterior, *states = case
     predictor, weights = posterior.predictor(covariance="none"), torch.linspace(-1, 1, ROWS).double()[:, None]

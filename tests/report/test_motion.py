@@ -17,8 +17,7 @@ from forcegp.scores import model_pictures
 
 
 def test_poses_are_pinocchios(swinging):
-    scene = recorded_scene(swinging, seconds=1.0)
-    model = pinocchio.buildModelFromXML(swinging.model.robot.urdf_text)
+    scene, model = recorded_scene(swinging, seconds=1.0), pinocchio.buildModelFromXML(swinging.model.robot.urdf_text)
     data = model.createData()
     for row in (0, len(scene.time) - 1):
         pinocchio.forwardKinematics(model, data, scene.q[row])

@@ -104,7 +104,9 @@ EXPRESSIONS = {
 }
 
 
-@pytest.mark.parametrize("expression", EXPRESSIONS)
+@pytest.mark.parametrize(
+    "expression", [pytest.param(k, marks=[pytest.mark.nightly] * ("**10*" in k)) for k in EXPRESSIONS]
+)
 def test_macros_read_below_their_folder_within_limits(expression, tmp_path, monkeypatch):
     pytest.importorskip("xacro")
     monkeypatch.setattr(sandbox, "SECONDS", 2)

@@ -42,8 +42,7 @@ def moving_arm(seconds: float = 2.0, episodes: int = 2, seed: int = 0, stribeck:
     shape = (3, 1, episodes, 3)  # sines, times, episodes, joints
     rate, phase = generator.uniform(2.0, 6.0, shape), generator.uniform(0.0, 6.0, shape)
     size, angle = generator.uniform(0.1, 0.3, shape), rate * time[:, None, None] + phase
-    wanted = (size * np.sin(angle)).sum(0) + np.array([0.0, 0.7, 0.7])
-    speed = (size * rate * np.cos(angle)).sum(0)
+    wanted, speed = (size * np.sin(angle)).sum(0) + np.array([0.0, 0.7, 0.7]), (size * rate * np.cos(angle)).sum(0)
     q, v = torch.tensor(wanted[0]), torch.tensor(speed[0])
     integrator = integrator_named("rk4", model)
     found: dict[str, list[np.ndarray]] = {"q": [], "v": [], "u": [], "a": []}

@@ -106,8 +106,7 @@ def test_diverged_motions_are_counted_and_not_averaged():
 def test_a_base_that_turns_is_off_by_the_angle_whatever_the_sign_of_its_quaternion():
     """A body thrown in space turns at a constant rate: a recording that began 0.2 rad ahead stays that far ahead."""
     text = SLEDGE.split("<joint")[0].format(mass=2.0).replace('<link name="base"/>', "") + "</robot>"
-    model = Model(Robot.from_urdf_text(text, base="floating", gravity=(0.0, 0.0, 0.0)))
-    time = STEP * np.arange(51)
+    model, time = Model(Robot.from_urdf_text(text, base="floating", gravity=(0.0, 0.0, 0.0))), STEP * np.arange(51)
     half, q = 0.5 * (3.0 * time + 0.4), np.zeros((51, 7))
     q[:, 0], q[:, 5], q[:, 6] = 1.0, np.sin(half), np.cos(half)
     v = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 3.0], (51, 1))

@@ -51,6 +51,7 @@ def test_feet_push_and_never_pull(clean):
     assert clean.truth["lambda"][:, 2::3][clean.u[:, 12:] > 0].min() > 0.0
 
 
+@pytest.mark.nightly
 def test_payload_friction_and_foot_forces_are_found():
     train = simulate_quadruped(QuadrupedConfig(seconds=6.0, seed=1))
     test, trunk = simulate_quadruped(QuadrupedConfig(seconds=3.0, seed=2)), train.model.robot.link("trunk")
