@@ -398,7 +398,7 @@ def without_stops(log: Dataset, model: Model | None = None, late: bool = True) -
     for k in np.flatnonzero((alone := held[np.isin(still, out)].mean(axis=0) > 0.5) & (alone.sum() == 1)):
         for end in (log.q[:, k].min(), log.q[:, k].max()):
             there = np.abs(log.q[:, k] - end) <= PRESSED * np.ptp(log.q[:, k])
-            pressed = there[out].all() and there.mean() < 0.5  # else it rests there
+            pressed = there[out].all() and not there.all()  # elsewhere it was, too
             if pressed and np.abs(log.u[out, k]).mean() > IDLE * log.u[:, k].std():
                 out = np.union1d(out, np.flatnonzero(there))
                 why = f"{inputs.names[k]} is held at an end of its motion, {end:.3g} {inputs.unit_of_each('q')[k]}, as "

@@ -215,7 +215,7 @@ class _Numbers:
 
 
 def _mapped(function: Callable[[Any], Any], value: Any) -> Any:
-    """The function of every leaf; `torch.utils._pytree` takes ten times as long for these small ones."""
+    """The function of every leaf; for these small trees `torch.utils._pytree` took a third of the time of a trace."""
     if isinstance(value, tuple | list):
         return type(value)(_mapped(function, each) for each in value)
     return {k: _mapped(function, each) for k, each in value.items()} if isinstance(value, dict) else function(value)

@@ -23,9 +23,8 @@ from forcegp.posterior.rollout import Rollout
 from forcegp.progress import part
 
 FOLDS = 4
-SAMPLES, STARTS = (0, 16, 4), (8, 4, 2)
-"""Of functions, and motions that begin within one longest horizon: without functions, with those of few inputs, which
-cost 20 times as much, and with those of many, 50 times as slow."""
+SAMPLES, STARTS = (16, 8), (4, 2)
+"""Of functions, and motions that begin within one longest horizon: of few inputs, and of many, 50 times as slow."""
 STEP = 0.005  # s, the longest; of several rows where the recording has shorter ones
 LEVEL = 0.95
 
@@ -59,12 +58,11 @@ def calibrated(
         seen = f"intervals need two stretches of {wanted[-1]:g} s at least, of which one is left out in turn"
         raise InvalidInput(f"{seen}; give shorter horizons, or a longer recording.")
     errors, spreads, shifts, kept, inputs = [], [], [], tuple(wanted), posterior.model.inputs
-    few = has_few_inputs(posterior.trained.unknown, posterior.model.robot)
-    kind = 0 if not posterior.latent_names else 1 if few else 2
+    slow = bool(posterior.latent_names) and not has_few_inputs(posterior.trained.unknown, posterior.model.robot)
     drift = posterior.settings.get("drift") if _records(dataset, wanted[-1]) == 1 else None
-    for other, motions in _left_out(posterior, dataset, parts, wanted[-1], STARTS[kind]):
+    for other, motions in _left_out(posterior, dataset, parts, wanted[-1], STARTS[slow]):
         kept = tuple(h for h in wanted if h >= motions.dt)
-        how: dict[str, Any] = {"integrator": integrator, "samples": SAMPLES[kind]}
+        how: dict[str, Any] = {"integrator": integrator, "samples": SAMPLES[slow] * bool(other.latent_names)}
         rollout: Rollout = other.rollout(motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, **how)
         at = [min(round(h / motions.dt), motions.u.shape[1]) for h in kept]
         inputs, sampled = other.model.inputs, rollout.samples is not None
@@ -74,8 +72,8 @@ def calibrated(
         stds = (rollout.std("q"), rollout.std("v")) if sampled else ()
         spread = [std[:, at].cpu().numpy() for std in stds] or [np.zeros_like(each) for each in error]
         if drift is not None:  # as if all joints warm up together
-            for law in (DryFriction, Viscous):
-                louder = replace(other, target=scaled(other.model, 1.0 + torch.as_tensor(drift["between"]), law))
+            for kind in (DryFriction, Viscous):
+                louder = replace(other, target=scaled(other.model, 1.0 + torch.as_tensor(drift["between"]), kind))
                 moved = louder.rollout(motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, integrator=integrator)
                 shifts.append(torch.stack([moved.q - rollout.q, moved.v - rollout.v], dim=2)[:, at].cpu().numpy())
                 del louder, moved
@@ -91,7 +89,7 @@ def calibrated(
     level = min(1.0, LEVEL * (1.0 + 1.0 / len(error)))
     scores = [error / np.sqrt(np.square(s) + np.square(rms)) for s in (spread, np.zeros_like(spread))]
     factors = np.stack([np.quantile(each, level, axis=0) / DEVIATIONS for each in scores])
-    pairs = [np.concatenate(shifts[first::2]) for first in (0, 1)] if shifts else []
+    pairs = [np.concatenate(shifts[kind::2]) for kind in (0, 1)] if shifts else []
     shift = np.sqrt(np.nanmean(np.square(pairs), axis=1)) if shifts else ()
     intervals = MotionIntervals(np.array(kept), rms, factors, inputs, shift)
     return posterior.with_settings(motion_intervals=intervals.to_dict())
