@@ -22,7 +22,7 @@ from forcegp.posterior.programs import steps_of
 from forcegp.robots.arguments import broadcast_batch
 from forcegp.robots.manifold import ConfigurationSpace
 
-STEPS_TO_COMPILE = 2000
+STEPS_TO_COMPILE = 400
 """Steps of some milliseconds each, and as many for every contact; fewer are done before a program is compiled."""
 TOGETHER, FUNCTIONS = 10, 3  # motions, and unknown functions, that cost as much as one step again
 ROWS_PER_BLOCK = 4096  # states whose constraint is evaluated at once
