@@ -52,11 +52,11 @@ class DatasetError(ForceGPError):
 
 
 class MistakenUnit(DatasetError):
-    """Numbers that fit another unit: `quantity` and `unit` are those of `ColumnMapping.unit`."""
+    """Numbers that fit another unit: `quantity` and `unit` are those of `ColumnMapping.unit`; `sure`, or one of two."""
 
-    def __init__(self, message: str, quantity: str, unit: str):
+    def __init__(self, message: str, quantity: str, unit: str, sure: bool = True):
         super().__init__(message)
-        self.quantity, self.unit = quantity, unit
+        self.quantity, self.unit, self.sure = quantity, unit, sure
 
 
 class FileFormatError(ForceGPError):

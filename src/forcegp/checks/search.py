@@ -175,7 +175,7 @@ def _factors(best: Explanation, inputs: CheckInput, *, explained: bool = True) -
     if len(off) < (1 if explained else 2):
         return
     less = next((u for u, s in PREFIXES if all(1.0 / LOADED < abs(x) / s < LOADED for x in factors[off])), "")
-    units = [less + si for si in inputs.unit_of_each("u")]
+    units = [less * (k in off) + si for k, si in enumerate(inputs.unit_of_each("u"))]
     unit = units[0] if len({*units}) == 1 else ",".join(units)
     loaded = f"With a load it may be in {unit}: forcegp import --unit u={unit}. " if less and not like else ""
     joints, errors = inputs.named(off), np.array([*map(best.error_of_factor, off.tolist())])

@@ -176,8 +176,9 @@ class Auto(Command):
                     dataset = forcegp.import_recordings(self.logs, mapping, model=model, options=options)
             except MistakenUnit as error:
                 unit = {error.quantity: tuple(error.unit.split(","))}
-                what = str(error).partition(" Is ")[0]
-                mistakes.append(wrong(about=f"unit of {error.quantity}", what=what, correction={"unit": unit}))
+                if error.sure:  # of two, torques decide
+                    what = str(error).partition(" Is ")[0]
+                    mistakes.append(wrong(about=f"unit of {error.quantity}", what=what, correction={"unit": unit}))
                 mapping = replace(mapping, unit={**mapping.unit, **unit})
                 continue
             done = dict(dataset.metadata["import"])

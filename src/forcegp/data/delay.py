@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
 from forcegp.data.dataset import Dataset
-from forcegp.data.filters import LowPass, episodes_in_order, lagged
+from forcegp.data.filters import LowPass, episodes_in_order, lagged, low_pass
 from forcegp.data.strokes import joint_positions, with_strokes
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.forces.joint_laws import law_columns, usual_columns
@@ -41,7 +41,7 @@ PLACES = 2048  # bins of the reach, in which a wave is sought first: seven of th
 APART = 0.01  # width of the 95 % interval of a delay [s] beyond which the log is said not to tell it
 LAGS, LAGGING, LAG_ROWS, IN_BAND = (0.5, 3.0), 0.6, 2_500, 1.5
 """Bounds of the lag of a filter, over the delay that it looks like; the share of what that leaves, below which it is a
-lag; the rows that tell it; and times its corner that the cut-off is at least, for below it lags are delays."""
+lag; the rows that tell it; and times its corner at which it is sought, for below it lags are delays."""
 WORTH = 0.95
 """Unexplained torque with the common delay, relative to that without, above which the delay explains nothing."""
 
@@ -135,14 +135,16 @@ def _with_lag(dataset: Dataset, delay: Delay, cutoff: float | None) -> Delay:
     if not 0.0 < late < USUAL_DELAY or (cutoff is not None and 2.0 * np.pi * cutoff * late < IN_BAND):
         return delay
     rate = max(1, int(late / (3.0 * float(np.median(np.diff(dataset.time))))))  # that still shows it
-    some = dataset.rows(slice(0, rate * LAG_ROWS, rate))
+    # near the corner of such a filter and below: above it a lag explains noise of the motion, too
+    cutoff = 0.5 * IN_BAND / np.pi / late
+    some = with_strokes(low_pass(dataset, cutoff).rows(slice(0, rate * LAG_ROWS, rate)))
 
-    def left(lag: float) -> float:
-        return _told_apart(some, USUAL_DELAY, cutoff, lag).left
+    def left(lag: float) -> float:  # beside memory, as of friction of velocity alone other lags would be favoured
+        return _estimated(some, USUAL_DELAY, cutoff, lag)[1].left
 
     try:
         before = left(0.0)
-        if all(left(share * late) >= LAGGING * before for share in (1.0, 2.0)):
+        if all(left(share * late) >= LAGGING * before for share in (1.0, 1.4, 2.0)):
             return delay
     except DatasetError:  # too short for that
         return delay

@@ -188,7 +188,7 @@ def _all(q: Tensor) -> Tensor:
     return torch.ones(q.shape[0], dtype=torch.bool, device=device)
 
 
-SPEED_LIMIT = 100.0  # a motion with a joint faster than this (rad/s or m/s) has diverged: no robot moves so fast
+SPEED_LIMIT = 1000.0  # a motion with a joint faster than this (rad/s or m/s) has diverged: motors turn that fast
 
 
 Feedback = Callable[[int, Tensor, Tensor], Tensor]
