@@ -33,14 +33,19 @@ def listed(names: Iterable[object], most: int = 4) -> str:
     return ", ".join(texts[:most]) + (f" and {len(texts) - most} more" if len(texts) > most else "") or "none"
 
 
+def in_digits(value: float, count: int = 3) -> str:
+    """So many digits, before the point all: `0.05`, `6640`."""
+    return f"{float(f'{value:.{count}g}'):.12g}"
+
+
 def rounded(values: Iterable[float]) -> str:
     """Three digits of each: `0.05, 0.051, 0.048`."""
-    return listed((f"{value:.3g}" for value in values), most=7)
+    return listed(map(in_digits, values), most=7)
 
 
 def within(value: float, half: float) -> str:
     """Three digits, and the half width of an interval of more than a tenth of it: `0.05`, `0.05 ± 0.01`."""
-    return f"{value:.3g}" + f" ± {half:.1g}" * (half > TOLD * abs(value))
+    return in_digits(value) + f" ± {in_digits(half, 1)}" * (half > TOLD * abs(value))
 
 
 def plain(values: Iterable[float]) -> list[float | None]:

@@ -128,6 +128,19 @@ def test_units_of_velocities_are_found_joint_by_joint_and_before_those_of_torque
     assert not found.of("torque unit")
 
 
+def test_one_of_two_axes_in_millimetres_is_not_both():
+    data = at(clean(two_links(kinds=("prismatic", "prismatic")), 4, noise="qvu"), "v", [1.0, 1e3])
+    assert quick_check(data).of("velocity")[0].command == "forcegp import --unit v=m/s,mm/s"
+
+
+@pytest.mark.parametrize(("low", "told"), [(-2.0, True), (3.0, False)])
+def test_positions_are_not_in_degrees_where_their_joint_could_not_be_there(low, told):
+    data = CORRUPTIONS["degrees"][0](clean(two_links(), 0))
+    text = data.model.robot.urdf_text.replace("continuous", "revolute").replace('lower="-9"', f'lower="{low}"')
+    data = replace(data, model=Model(Robot.from_urdf_text(text)))
+    assert ("degrees" in said_by(check(data))) == told
+
+
 def test_the_factor_of_a_torque_has_an_interval():
     data = clean(two_links(), 1, noise="qvu")
     [found] = said(replace(data, u=data.u * np.array([1.0, 1.6])))

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from tests.checks import corruptions
+from tests.checks.clean_logs import with_motion
 from tests.checks.corruptions import recorded_under
 from tests.checks.logs import clean
 from tests.goldens.compare import assert_unchanged
@@ -121,6 +122,21 @@ def test_units_per_joint_are_corrected_in_one_command_for_columns_by_number(tmp_
     assert "auto log.csv --unit q=mm,deg,v=mm/s,deg/s --robot" in forcegp(*words, folder=tmp_path).stdout
     done = forcegp(*words, "--correct", folder=tmp_path).stderr
     assert (done.count("reached"), done.count("u is taken to be on time")) == (1, 1)
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+def test_torques_decide_whether_a_joint_turns_often_or_is_in_degrees(tmp_path, forcegp, monkeypatch, unit):
+    monkeypatch.setattr("forcegp.cli.auto.Auto._prepared_rows", _stopped)
+    time, factor = np.arange(2000)[:, None] / 250.0, 1.0 if unit == "rad" else 1.0 / 15.0
+    q = np.sin(time * [2.1, 1.3]) * [0.3, 20.0 * factor]
+    data = with_motion(corruptions.ROBOTS["crane"](), q, 250.0, 4)
+    (tmp_path / "crane.urdf").write_text(data.model.robot.urdf_text)
+    logged = [x * [1.0, np.rad2deg(1.0) if unit == "deg" else 1.0] for x in (data.q, data.v)]
+    table = np.c_[data.time, *logged, data.u]
+    np.savetxt(tmp_path / "log.csv", table, delimiter=",", header="t,q1,q2,dq1,dq2,tau1,tau2", comments="")
+    done = forcegp("auto", "log.csv", "--robot", "crane.urdf", "--out", "answer", folder=tmp_path)
+    assert ("--unit q=m,deg,v=m/s,deg/s " in done.stdout) == (unit == "deg")
+    assert ("reached" in done.stderr) == (unit == "rad")
 
 
 def test_the_printed_command_keeps_every_option():

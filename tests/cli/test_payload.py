@@ -13,6 +13,7 @@ from tests.goldens.compare import assert_unchanged
 from forcegp import Dataset, Model, Payload, Robot
 from forcegp.cli.payload import other_causes, payload_text, without_explained
 from forcegp.doubts import Doubts, look, wrong
+from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
 
 
 @pytest.mark.parametrize(
@@ -21,6 +22,7 @@ from forcegp.doubts import Doubts, look, wrong
         (0.01, 0.008, "0.5 ± 0.01 kg at (20, 0, 50) mm of hand, if the URDF's links are right"),
         (0.01, 0.015, "0.5 ± 0.01 kg at (20, 0, 50 ± 15) mm of hand, if the URDF's links are right"),
         (0.2, 0.008, "0.5 ± 0.2 kg at (20, 0, 50) mm of hand, if the URDF's links are right"),
+        (0.2, 1.1, "0.5 ± 0.2 kg at (20, 0, ?) mm of hand, if the URDF's links are right"),
         (0.27, 0.008, "none, or 0.5 ± 0.3 kg"),  # three to four standard errors were none in logs of cogging, or stops
         (1.1, 0.015, "none (0.5 ± 1 kg)"),
         (1.7, 0.015, "not known from this log (0.5 ± 2 kg)"),
@@ -50,6 +52,13 @@ def test_a_payload_takes_back_factors_of_joints_that_it_explains(carried, noise)
     doubts = Doubts(kind(**told) for kind in (look, wrong))
     left = without_explained(doubts, found, data)
     assert [each.level for each in left] == (["wrong"] if carried and not noise else ["wrong", "look"])
+
+
+def test_a_base_that_moves_has_no_factors_of_joints():
+    flight = simulate_quadrotor(QuadrotorConfig(seconds=1.0, seed=1))
+    found = SimpleNamespace(model=flight.model, estimates={"payload.mass": SimpleNamespace(value=1.0, std=0.01)})
+    doubts = Doubts([look(about="masses", what="w.", do="d.", joints=("arm",))])
+    assert [*without_explained(doubts, found, flight)] == [*doubts]
 
 
 @pytest.fixture(scope="module")

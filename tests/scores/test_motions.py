@@ -92,14 +92,12 @@ def test_what_cannot_be_predicted_is_said():
 
 
 def test_diverged_motions_are_counted_and_not_averaged():
-    data = recording(force=3.0)
+    data = recording(force=30.0)  # 3000 m/s^2: beyond 1000 m/s after a third of a second
     motions = held_out_motions(data, data.episode == 0, (0.1, 0.9), starts=2)
     with pytest.warns(NumericalWarning, match="2 of 2 rollouts diverged"):
-        table, facts = motion_scores(
-            posterior(0.01, data), motions
-        )  # 300 m/s^2: beyond 100 m/s after a third of a second
+        table, facts = motion_scores(posterior(0.01, data), motions)
     assert facts["diverged"] == [0, 2]
-    assert table["position after 0.1 s"]["rmse"] == [pytest.approx(0.5 * 0.1**2 * (300.0 - 1.5))]
+    assert table["position after 0.1 s"]["rmse"] == [pytest.approx(0.5 * 0.1**2 * (3000.0 - 15.0))]
     assert table["position after 0.9 s"]["rmse"] == [None]
 
 

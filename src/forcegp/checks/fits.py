@@ -148,10 +148,8 @@ class Explanation:
         return float(left / power)
 
     def _blocks(self, joint: int) -> list[np.ndarray]:
-        """Successive rows, as many in each, or with as much of the motion of a joint that mostly rests.
-
-        What rests alone teaches no friction.
-        """
+        """Successive rows, as many in each, or with as much of the motion of a joint that mostly rests."""
+        # what rests alone teaches no friction
         moves, rows = in_motion(self.log.rows)[:, joint], np.arange(len(self.log.rows))
         own = np.flatnonzero(moves) if BLOCKS <= moves.sum() < RARELY * len(moves) else rows
         return np.split(rows, [part[0] for part in np.array_split(own, BLOCKS)[1:]])

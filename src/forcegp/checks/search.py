@@ -84,10 +84,8 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
 
 
 def _all_turned(root: Explanation, inputs: CheckInput) -> tuple[Explanation, list[Doubt]] | None:
-    """Every torque turned, where bodies and friction that can exist then leave far less; None where they do not.
-
-    Masses of a robot's file may be too wrong for any single cause. Friction brakes and inertia resists in any robot.
-    """
+    """Every torque turned, where bodies and friction that can exist then leave far less; None where they do not."""
+    # masses of a robot's file may be too wrong for any single cause. Friction brakes and inertia resists in any robot
     log, left = root.log, list[np.ndarray]()
     moving = np.ptp(log.rows.u, axis=0) > 0.0
     least, turned = GAIN + SIGN * moving.sum(), np.maximum(root.turned_free[moving], LEAST)

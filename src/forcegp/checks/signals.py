@@ -346,7 +346,7 @@ def motion_doubts(inputs: CheckInput, joints: Sequence[int] | None = None) -> li
         slopes = np.concatenate([differentiate(getattr(rows, source), rows.time) for rows in pieces])
         size = np.sqrt([np.square(x).mean(axis=0) for x in (getattr(even, name), slopes)])
         kinds = ([k for k in joints if inputs.rotates[k] == inputs.rotates[joint]] for joint in joints)
-        moved = [k for k, own in zip(joints, kinds, strict=True) if (size[:, k] > IDLE * size[:, own].max(axis=1)).any()]
+        moved = [k for k, own in zip(joints, kinds, strict=True) if (size[:, k] > IDLE * size[:, own].max(1)).any()]
         compared = ((joint, _compared(pieces, name, source, joint, ends)) for joint in moved)
         fits = {joint: fit for joint, fit in compared if fit is not None}
         found += _differences(inputs, name, source, fits, joints)

@@ -173,10 +173,8 @@ def elastic_doubts(inputs: CheckInput, log: Comparison) -> list[Doubt]:
 def _behind_spring(
     tau: np.ndarray, rows: Dataset, hertz: float, damping: float = 0.7, both_ways: bool = False
 ) -> np.ndarray:
-    """What reaches the motor of the torque that its motion asks for: x'' + 2 d w x' + w^2 x = w^2 tau, by Tustin.
-
-    `both_ways` it is no spring, but a filter without delay.
-    """
+    """What reaches the motor of the torque that its motion asks for: x'' + 2 d w x' + w^2 x = w^2 tau, by Tustin."""
+    # `both_ways` it is no spring, but a filter without delay
     from scipy.signal import bilinear, filtfilt, lfilter, lfilter_zi  # half a second, which only few logs should cost
 
     passed, rate = tau.copy(), 1.0 / float(np.median(np.diff(rows.time)))

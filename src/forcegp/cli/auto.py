@@ -175,9 +175,9 @@ class Auto(Command):
                     options, undecided = self.columns.options(), None
                     dataset = forcegp.import_recordings(self.logs, mapping, model=model, options=options)
             except MistakenUnit as error:
-                unit = {error.quantity: tuple(error.unit.split(","))}
-                if error.sure:  # of two, torques decide
-                    what = str(error).partition(" Is ")[0]
+                meant = error.unit if error.sure else error.unit.replace("deg", "rad")  # which torques decide
+                unit, what = {error.quantity: tuple(meant.split(","))}, str(error).partition(" Is ")[0]
+                if error.sure:
                     mistakes.append(wrong(about=f"unit of {error.quantity}", what=what, correction={"unit": unit}))
                 mapping = replace(mapping, unit={**mapping.unit, **unit})
                 continue

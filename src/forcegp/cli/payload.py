@@ -24,6 +24,7 @@ from forcegp.cli.terminal import Terminal
 from forcegp.data.views import tensors
 from forcegp.doubts import Doubts
 from forcegp.errors import LARGEST, InvalidInput, require_number
+from forcegp.summary import in_digits
 
 WINDOW = 0.4
 """Seconds that torques are averaged over: it takes noise of the acceleration, and leaves friction as sharp as it is."""
@@ -31,7 +32,7 @@ WIDER = 2.3  # where a base moves, times the windows of a fit: a mass needs less
 LAWS = "viscous", "gear", "offset", "rotor"
 SURE, LEAST_PAYLOAD = 4.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
 MOST_OPEN = 0.3  # of the robot's mass in half an interval, from which on a payload is not known
-FAR = 0.01  # m of half an interval, from which on a coordinate of a centre is shown with it
+FAR, OPEN = 0.01, 1.0  # m of half an interval, from which on a coordinate of a centre is shown with it; is not known
 MOST_FACTORS = 3  # of one cause that a person can look for
 SETTLED, MOST_ROWS = 0.005, 2_000  # share of a torque that needs no other cause, and rows that tell it
 ROBOTS_OWN = ("lengths", "masses", "centres of mass")  # of which bodies that are identified explain several as well
@@ -185,16 +186,16 @@ def payload_text(found: Any) -> str:
     parts = {name: found.estimates[f"payload.{name}"] for name in ("mass", *(f"center_of_mass.{x}" for x in "xyz"))}
     mass, *center = parts.values()
     error, *widths = (0.5 * (each.interval[1] - each.interval[0]) for each in parts.values())
+    size = f"{in_digits(mass.value, 2)} ± {in_digits(error, 1)} kg"
     if error > MOST_OPEN * found.model.robot.mass:
-        return f"not known from this log ({mass.value:.2g} ± {error:.1g} kg)"
+        return f"not known from this log ({size})"
     if mass.value < max(SURE * mass.std, LEAST_PAYLOAD):
-        size = f"{mass.value:.2g} ± {error:.1g} kg"
         return f"none, or {size}" if mass.value > mass.std else f"none ({size})"
-    both = zip(center, widths, strict=True)
-    place = ", ".join(f"{round(1e3 * x.value)}" + f" ± {1e3 * width:.0f}" * (width > FAR) for x, width in both)
+    both = [(round(1e3 * x.value), width) for x, width in zip(center, widths, strict=True)]
+    place = ", ".join("?" if width > OPEN else f"{x}" + f" ± {1e3 * width:.0f}" * (width > FAR) for x, width in both)
     [held] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]
     links = f"if the URDF's links{' and ' * bool(drives := drives_of(found.model))}{drives} are right"
-    return f"{mass.value:.3g} ± {error:.1g} kg at ({place}) mm of {held.link}, {links}"
+    return f"{mass.value:.3g} ± {in_digits(error, 1)} kg at ({place}) mm of {held.link}, {links}"
 
 
 def drives_of(model: forcegp.Model) -> str:

@@ -178,10 +178,8 @@ def _filtered(chosen: Preparation, dataset: Dataset) -> Dataset:
 
 
 def _with_sensors_of_base(derived: Dataset, measured: Dataset, raw: Dataset, cutoff: float) -> Dataset:
-    """v and a of a base that moves, from sensors that differ from positions by no more than noise of those explains.
-
-    Below `SLOW` of the cut-off all are those of positions, which have neither bias nor tilt.
-    """
+    """v and a of a base that moves, from sensors that differ from positions by no more than noise of those explains."""
+    # below `SLOW` of the cut-off all are those of positions, which have neither bias nor tilt
     groups = raw.model.robot.space.groups
     if max(np.bincount(np.unique(raw.episode, return_inverse=True)[1])) < FEWEST_ROWS:
         return derived

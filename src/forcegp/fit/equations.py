@@ -115,10 +115,8 @@ class Equations:
         return self._as_logged(x, r, np.asarray(jacobian)) if self.in_units_of_log else (r, jacobian)
 
     def _as_logged(self, x: np.ndarray, r: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals and their Jacobian over the gains, in units of the log, whose noise no gain changes.
-
-        As torques they vanish with the gains and all that is unknown, which no noise would speak against.
-        """
+        """Residuals and their Jacobian over the gains, in units of the log, whose noise no gain changes."""
+        # as torques they vanish with the gains and all that is unknown, which no noise would speak against
         column = self.space.bodies.size
         for own, term in zip(self.space.split(x)[1], self.space.terms, strict=True):
             if isinstance(self.space.model.laws[term.law], Actuation):

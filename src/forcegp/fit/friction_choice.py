@@ -315,10 +315,8 @@ class _Regression:
         return across[..., open_], inner[:, open_][..., open_], right[:, open_]
 
     def _beside(self, j: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Normal equations of all other joints by stretch, in bodies and the columns that they need; and these.
-
-        The latter are weighted as errors of joint j resemble theirs.
-        """
+        """Normal equations of all other joints by stretch, in bodies and the columns that they need; and these."""
+        # the latter are weighted as errors of joint j resemble theirs
         joints = [i for i in range(self.nv) if i != j]
         chosen = [(i, self.parts.get(i, ()), (self.at[i], self.fall[i])) for i in joints]
         sums, first = [self._open(*each) for each in chosen], self.inner.shape[-1]

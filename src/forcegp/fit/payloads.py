@@ -229,10 +229,8 @@ def misfit(
 def _instead(
     space: ParameterSpace, fit: Fit, C: Float[np.ndarray, "equations causes"], usual: float, least: float, most: float
 ) -> tuple[float, tuple[Float[np.ndarray, " causes"], Float[np.ndarray, " k"]] | None]:
-    """Nats that one number explains without a payload; its change, and the move of x, where it does as well as one.
-
-    So many numbers are no better than one that explains hardly less: `most` nats less than the best cause beside it.
-    """
+    """Nats that one number explains without a payload; its change, and the move of x, where it does as well as one."""
+    # so many numbers are no better than one that explains hardly less: `most` nats less than the best cause beside it
     r, J = fit.white.ravel(), fit.white_jacobian.reshape(fit.white.size, -1)
     none, slopes = np.zeros_like(fit.x), space.bodies.slopes(fit.x[: space.bodies.size])
     unknown = [k for k, law in enumerate(space.model.laws) if isinstance(law, Payload) and law.mass is None]

@@ -373,10 +373,8 @@ class _States:
         return math.sqrt(max(1.0, 1.0 + float(rise.mean())))
 
     def _without_own(self, latent: inference.LatentPosterior) -> tuple[Float[Tensor, "n nv"], Float[Tensor, "n nv"]]:
-        """Mean and variance of the accelerations that the latents make, by all rows but that of the state itself.
-
-        f + S C^T B^-1 C S and so on, with B = (T^-1)_ii (Rasmussen & Williams 2006, section 5.4.2).
-        """
+        """Mean and variance of the accelerations that the latents make, by all rows but that of the state itself."""
+        # f + S C^T B^-1 C S and so on, with B = (T^-1)_ii (Rasmussen & Williams 2006, section 5.4.2)
         assert isinstance(latent, ExactPosterior), "fits are exact"
         system, n = latent.system, len(self.rows)
         C, alpha = system.deflation.C[self.rows], system.alpha[self.rows]

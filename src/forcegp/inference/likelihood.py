@@ -308,10 +308,8 @@ class _DeflatedNLL(torch.autograd.Function):
 
 
 def _contractions(system: DeflatedSystem, K_needed: Sequence[bool]) -> tuple[Tensor, list[Tensor | None]]:
-    """sum_jb T^-1 C k and dNLL/dK from one sweep over L^-1; the factor's memory is used up.
-
-    As the noise alone moves W~_i, it is ``sum_j [T^-1]_ij C_j k_ij C_i^T = 1 - [T^-1]_ii`` that counts.
-    """
+    """sum_jb T^-1 C k and dNLL/dK from one sweep over L^-1; the factor's memory is used up."""
+    # as the noise alone moves W~_i, it is ``sum_j [T^-1]_ij C_j k_ij C_i^T = 1 - [T^-1]_ii`` that counts
     C, beta = system.deflation.C, system.beta
     count, rank, _ = C.shape
     inverse = system.factor.into_inverse_factor()

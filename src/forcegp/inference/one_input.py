@@ -242,10 +242,8 @@ def _one_side(weights: np.ndarray, h: np.ndarray, polynomial: tuple[float, ...])
 
 
 def _curve(points: PointMap, centers: Float[Tensor, " N"]) -> tuple[float, tuple[str, float] | None]:
-    """Features or an embedding as an amplitude times a curve of rate * s, or times 1 (None); (0, None) if neither.
-
-    Whatever its class: value and slope at zero and far away give the numbers; values at all widths and centres decide.
-    """
+    """Features or an embedding as an amplitude times a curve of rate * s, or times 1 (None); (0, None) if neither."""
+    # whatever its class: value and slope at zero and far away give the numbers; values at all widths and centres decide
     owner = getattr(points, "__self__", None)
     if isinstance(limit := getattr(owner, "limit", None), float):  # its numbers do not show at zero and far away
         return float(owner.slope) * limit, ("beyond", 1.0 / limit)  # type: ignore[union-attr]  # it has both

@@ -304,12 +304,11 @@ def _require_plausible_positions(
     for name, what in seen.items():
         if units[name] == own[name][0]:
             raise DatasetError(f"{what} Are unit, sign, zero and URDF right? `beyond_limits` accepts it.")
-        if what.endswith("two turns."):
-            hint = f"Give `unit` q={stated} if it is in deg, `unit` q=rad if not."
-            as_it_is = ",".join(in_short("q", [own[name][0] for name in plan.positions]))
-            raise MistakenUnit(f"{what} {hint}", "q", as_it_is, sure=False)
+        sure = not what.endswith("two turns.")
         hint = f"Is it in {units[name]}? Then add `unit` q={stated}. `beyond_limits` accepts it."
-        raise MistakenUnit(f"{what} {hint}", "q", stated)
+        if not sure:
+            hint = f"Give `unit` q={stated} if it is in deg, `unit` q=rad if not."
+        raise MistakenUnit(f"{what} {hint}", "q", stated, sure)
 
 
 def _stretches(

@@ -360,10 +360,8 @@ def _at(
 
 
 def _topics(columns: Columns, plan: Any) -> tuple[dict[str, str], dict[str, Bool[np.ndarray, " rows"]]]:
-    """Columns of a table by topic, called by its first column, and where it has values: exports join several topics.
-
-    The time is that of the positions. One topic for a table of whole rows, or without a column of the time.
-    """
+    """Columns of a table by topic, called by its first column, and where it has values: exports join several topics."""
+    # the time is that of the positions. One topic for a table of whole rows, or without a column of the time
     shared = {name for name in columns if plan.episode == name or (plan.time and name in plan.time.weights)}
     filled = {name: ~np.isnan(values) for name, values in columns.items() if name not in shared}
     filled = {name: own if own.any() else ~own for name, own in filled.items()}
