@@ -56,11 +56,6 @@ def weightless(seed: int) -> Dataset:
     return clean(two_links(gravity=(0.0, 0.0, 0.0)), seed)
 
 
-def free_log(seed: int) -> Dataset:
-    """Noise on all signals, three joints, accelerations by differences."""
-    return filtered_log(seed, arm_model(contacts=0))
-
-
 def clean_logs(seed: int) -> Iterator[tuple[str, Dataset]]:
     for name, robot in ROBOTS.items():
         yield name, clean(robot(), seed, noise=("a", "qvu", "none")[seed % 3])
@@ -72,7 +67,7 @@ def clean_logs(seed: int) -> Iterator[tuple[str, Dataset]]:
     yield "on a line", on_a_line(seed)
     yield "on a line, no noise", on_a_line(seed, noise=0.0)
     yield "on a line, few rows", on_a_line(seed).rows(slice(None, None, 40))
-    yield "three joints", free_log(seed)
+    yield "three joints", filtered_log(seed, arm_model(contacts=0))
     yield (
         "rests with noisy positions",
         replace(

@@ -25,10 +25,8 @@ def executable() -> Path:
 
 @pytest.fixture(scope="session")
 def installed(executable) -> Forcegp:
-    """Run the executable with these arguments in that folder; returns exit code, stdout and stderr.
-
-    Each start imports torch anew: for what belongs to a process. `forcegp` does everything else.
-    """
+    """Run the executable with these arguments in that folder; returns exit code, stdout and stderr."""
+    # Each start imports torch anew: for what belongs to a process. `forcegp` does everything else
 
     def run(*arguments: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
         return subprocess.run(

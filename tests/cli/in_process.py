@@ -35,10 +35,8 @@ class Done(subprocess.CompletedProcess[str]):
 
 
 def run_here(*arguments: object, folder: Path | None = None, columns: int = 100) -> Done:
-    """Run `forcegp` with these arguments in that folder, in this process; returns exit code, stdout and stderr.
-
-    Files, pipes and warnings are those of a new process, and what the command could change here is put back.
-    """
+    """Run `forcegp` with these arguments in that folder, in this process; returns exit code, stdout and stderr."""
+    # Files, pipes and warnings are those of a new process, and what the command could change here is put back
     words = [str(argument) for argument in arguments]
     with contextlib.ExitStack() as undo:
         undo.callback(torch.set_num_threads, torch.get_num_threads())

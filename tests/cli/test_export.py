@@ -101,11 +101,8 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_program(forcegp, folder, mon
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         return write(path, *given, **more)
 
-    def full_text(path, text, **_):
-        return full(path, text.encode())
-
     monkeypatch.setattr(Path, "write_bytes", full)
-    monkeypatch.setattr(Path, "write_text", full_text)
+    monkeypatch.setattr(Path, "write_text", lambda path, text, **_: full(path, text.encode()))
     done = forcegp(*words, "--overwrite", folder=folder)
     done.refused("No space left on device")
     assert {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()} == before

@@ -9,10 +9,8 @@ START = np.array([0.0, 0.6, 0.7])
 
 
 def followed(prepare, seconds, rate, substeps, taken=lambda q, v: 0.0, seed=0):
-    """q, v, u, a (rows, 3), and sensors (rows, k), of a model that `prepare` compiles of the arm's spec.
-
-    `taken` is what does not arrive of the torques u.
-    """
+    """q, v, u, a (rows, 3), and sensors (rows, k), of a model that `prepare` compiles of the arm's spec."""
+    # `taken` is what does not arrive of the torques u
     spec = mujoco.MjSpec.from_string(URDF)
     spec.option.timestep, spec.option.integrator = 1.0 / (substeps * rate), mujoco.mjtIntegrator.mjINT_RK4
     model = prepare(spec)

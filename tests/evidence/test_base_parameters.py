@@ -25,10 +25,8 @@ def test_rank_and_columns(text):
 
 
 def test_an_arm_of_three_turning_joints_has_fifteen():
-    """Gautier & Khalil, "Direct calculation of minimum set of inertial parameters", T-RO 1990.
-
-    A joint about the direction of gravity shows one inertia, each joint that is not parallel to the one before seven.
-    """
+    """Gautier & Khalil, "Direct calculation of minimum set of inertial parameters", T-RO 1990."""
+    # A joint about the direction of gravity shows one inertia, each joint that is not parallel to the one before seven
     base = base_parameters(Robot.from_urdf_text(URDF))
     assert len(base) == 15
     assert 0 not in base  # it is never lifted

@@ -177,10 +177,8 @@ def test_a_walker_is_found_again(walker, likelihood):
 
 
 def test_likely_accelerations_cost_least(walker):
-    """The cost r^T S^-1 r is the least, over a* and forces of contacts, of both squared errors; its slope is theirs.
-
-    What moves the base without an actuator is an error of a, whose covariance stays that of the last estimates.
-    """
+    """The cost r^T S^-1 r is the least, over a* and forces of contacts, of both squared errors; its slope is theirs."""
+    # What moves the base without an actuator is an error of a, whose covariance stays that of the last estimates
     q, v, u = (x.numpy() for x in rows_of(walker, 6))
     a, opened = np.random.default_rng(1).normal(size=v.shape), walker.with_forces(RigidBodies("all"), Viscous())
     space = ParameterSpace(opened, dict.fromkeys(("force", "position", "velocity", "inertia"), np.ones(v.shape[1])))

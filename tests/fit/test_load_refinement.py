@@ -29,10 +29,8 @@ def coefficient(speed: torch.Tensor) -> torch.Tensor:
 
 @cache
 def sliding_data(rows: int, seed: int, joint_friction: float = 0.0) -> Dataset:
-    """Coulomb friction of the tool, solved together with acceleration and multiplier: one dense system per row.
-
-    M a - A^T lambda + mu(|v_t|) sign |s_p| lambda J^T d = Q_K - c v with the sign of lambda that comes out of it.
-    """
+    """Coulomb friction of the tool, solved together with acceleration and multiplier: one dense system per row."""
+    # M a - A^T lambda + mu(|v_t|) sign |s_p| lambda J^T d = Q_K - c v with the sign of lambda that comes out of it
     data = arm_data(rows, seed)
     model = data.model
     J = model.robot.kinematics(torch.tensor(data.q)).frame_jacobian("hand", model.contacts[0].point)[:, :3]

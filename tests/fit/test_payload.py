@@ -244,10 +244,8 @@ def test_a_wrong_encoder_is_named(cause, true, noise):
 
 @pytest.mark.parametrize(("times", "way"), [(1.3, 1.0), (1.3, 0.7), (-1.0, 1.0)])
 def test_a_cause_is_what_ridge_regression_finds(times, way, monkeypatch):
-    """Of dense equations in numbers and factors, with the priors as rows: few rows, so that these count.
-
-    Also on the way to the best numbers, as where a bound keeps them from it.
-    """
+    """Of dense equations in numbers and factors, with the priors as rows: few rows, so that these count."""
+    # Also on the way to the best numbers, as where a bound keeps them from it
     monkeypatch.setattr(import_module("forcegp.fit.payloads"), "NAMED", 0.0)
     data = log(loaded(), 1, seconds=2.0, noise=0.5)
     model = data.model.with_forces(Payload("tool0", MASS, CENTER, INERTIA.tolist()))

@@ -47,10 +47,8 @@ def test_least_squares_of_a_manipulator_on_held_out_blocks(shared):
 
 
 def test_an_elbow_that_stuck_is_a_holonomic_constraint(shared):
-    """Its second link is as far from the first joint as it was: a point of it stays on a sphere around that joint.
-
-    With the constraint the error of the first joint falls to about 0.6 of what it is without.
-    """
+    """Its second link is as far from the first joint as it was: a point of it stays on a sphere around that joint."""
+    # With the constraint the error of the first joint falls to about 0.6 of what it is without
     folder = shared("realdata")
     model = dfki_system(folder)
     train, stuck = dfki(folder, model, 143524, 143601, 143704, 144115), dfki(folder, model, 143906)
@@ -80,10 +78,8 @@ def states(rows):
 
 @pytest.mark.nightly
 def test_an_axis_with_more_friction_is_followed(shared):
-    """EMPS: half of the record, and the other half as if its friction were 2.9 % higher, as it is in another record.
-
-    Errors of q [m] after 1 and 4 s, and 95 % intervals after .1, .25, .5 and 1 s, before 6 s are seen and after.
-    """
+    """EMPS: half of the record, and the other half as if its friction were 2.9 % higher, as it is in another record."""
+    # Errors of q [m] after 1 and 4 s, and 95 % intervals after .1, .25, .5 and 1 s, before 6 s are seen and after
     train, test = emps(shared("realdata"))
     laws = RigidBodies("all"), Viscous(), Coulomb(), Offset(), DirectionalFriction()
     found = fit(train.model.with_forces(*laws), train.rows(slice(None, None, 5)), Accelerations())

@@ -158,10 +158,8 @@ def test_intervals_are_those_of_the_posterior():
 
 
 def test_friction_under_load_does_not_explain_the_torque_by_itself():
-    """A wrist whose torque is friction of a changing level: from the measured |u| its mu came out as 1.
-
-    The first joint has friction under load, and its mu is found.
-    """
+    """A wrist whose torque is friction of a changing level: from the measured |u| its mu came out as 1."""
+    # The first joint has friction under load, and its mu is found
     robot, generator = arm_model(0).robot, np.random.default_rng(0)
     q, v, a = generator.normal(size=(3, 400, 3))
     torque = robot.inverse_dynamics(*(torch.tensor(x) for x in (q, v, a))).numpy()

@@ -21,10 +21,8 @@ FEW = 6  # longer arrays are stored as their size and sums of them, which every 
 
 
 def assert_unchanged(name: str, values: Any, rtol: float = 1e-6) -> None:
-    """`values` are numbers, arrays or None in mappings, sequences and dataclasses; name is "package/what".
-
-    Numbers may differ by `rtol` of themselves, and those of arrays by that of their largest.
-    """
+    """`values` are numbers, arrays or None in mappings, sequences and dataclasses; name is "package/what"."""
+    # Numbers may differ by `rtol` of themselves, and those of arrays by that of their largest
     package, _, name = name.partition("/")
     file = Path(__file__).with_name(f"{package}.json")
     stored = json.loads(file.read_text()) if file.exists() else {}

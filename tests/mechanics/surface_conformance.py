@@ -17,10 +17,8 @@ BATCHES = [(), (1,), (0,), (4,), (2, 3), (3, 0, 2)]
 
 
 def assert_rounded(given: torch.Tensor, expected: torch.Tensor) -> None:
-    """Equal but for rounding: an entry is the result of less than 50 additions and products of numbers of its size.
-
-    Vector instructions differ with processor, layout and batch shape: no bit is promised across them.
-    """
+    """Equal but for rounding: an entry is the result of less than 50 additions and products of numbers of its size."""
+    # Vector instructions differ with processor, layout and batch shape: no bit is promised across them
     scale = max(1.0, float(expected.abs().max())) if expected.numel() else 1.0
     torch.testing.assert_close(given, expected, rtol=0.0, atol=50.0 * torch.finfo(torch.float64).eps * scale)
 

@@ -90,10 +90,8 @@ class TestAgainstDenseEquations:
 @pytest.mark.parametrize("kind", ALL)
 @pytest.mark.parametrize("model", ["tree", "chain"])
 def test_derivatives(model, kind):
-    """With respect to q, v and u, also where contacts are redundant.
-
-    Rotor inertia makes the light wrists heavier, so that finite differences keep their digits.
-    """
+    """With respect to q, v and u, also where contacts are redundant."""
+    # Rotor inertia makes the light wrists heavier, so that finite differences keep their digits
     built = systems.model_with(model, kind, baumgarte=Baumgarte(2.0, 0.7))
     built = built.with_robot(built.robot.with_armature([0.5] * built.robot.nv))
     Q_U = systems.normal(built.robot.nv)

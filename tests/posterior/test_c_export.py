@@ -290,10 +290,8 @@ def test_sums_that_cancel_may_differ_by_their_rounding(tmp_path, states):
 
 
 def test_a_program_that_differs_is_not_written(posterior, tmp_path, monkeypatch):
-    def spoiled(*arguments):
-        return write_function(*arguments).replace("  y[0] = ", "  y[0] = 1e-6 + ")
-
-    monkeypatch.setattr(c_files, "write_function", spoiled)
+    one_off = "  y[0] = ", "  y[0] = 1e-6 + "
+    monkeypatch.setattr(c_files, "write_function", lambda *given: write_function(*given).replace(*one_off))
     with pytest.raises(NumericalError, match=r"arm_mean of the compiled program and forcegp differ by .* nothing was"):
         export_c(posterior, tmp_path / "arm")
     assert list(tmp_path.iterdir()) == []

@@ -38,7 +38,7 @@ LONGEST_LIST = 4096
 JOINTS = "joints"
 WORDS = {
     "q": {"q", "pos", "position", "positions", "angle", "angles", "joint_pos", "joint_position"},
-    "v": {"v", "qd", "dq", "vel", "velocity", "velocities", "joint_vel", "joint_velocity"},
+    "v": {"v", "qd", "dq", "vel", "velocity", "velocities", "speed", "rate", "joint_vel", "joint_velocity"},
     "u": {"u", "tau", "torque", "torques", "effort", "efforts", "eff", "joint_torque", "joint_effort"},
     "a": {"a", "qdd", "ddq", "acc", "acceleration", "accelerations"},
     "time": {"t", "time", "timestamp", "stamp", "time_s", "seconds"},

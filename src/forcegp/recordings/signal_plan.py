@@ -185,6 +185,8 @@ def signal_plan(mapping: ColumnMapping, source: Source, model: forcegp.Model, op
         if signal not in found and log[signal]:
             lacking = [name for name in joints if not any(map(named_after(name).search, source.columns()))]
             in_order = f", in the order {', '.join(log[signal])} (angles: `orientation`)" * bool(robot.space.groups)
+            if signal == "u" and any(each := [guessed_columns(signal, [name], source) for name in log[signal]]):
+                in_order = f" {','.join(x[0] if x else '0' for x in each)} (0 for a joint without motor)"
             few = f"; no column is named after {listed(lacking)} (`locked` holds what was not recorded)"
             there = f"{source.path} has {listed(source.columns(), MOST_NAMES)}{few * (0 < len(lacking) < len(joints))}"
             raise InvalidInput(f"no columns for {signal} ({why}); name them with --{signal}{in_order}. {there}.")
