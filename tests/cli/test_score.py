@@ -16,7 +16,7 @@ from forcegp import Dataset, load_posterior, score
 
 MODELS = ("given", "gp:joint-friction", "identified,gp:joint-friction")
 FORCES = [word for name in MODELS for word in ("--forces", name)]
-QUICK = ("--points", 40, "--restarts", 1, "--iterations", 15, "--horizon", "0.1,0.3", "--starts", 2)
+QUICK = ("--points", 40, "--restarts", 1, "--iterations", 8, "--horizon", "0.1,0.3", "--starts", 2)
 
 
 @pytest.fixture(scope="module")

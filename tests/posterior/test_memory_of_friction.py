@@ -21,9 +21,8 @@ from forcegp.posterior import casadi_function
 @pytest.mark.parametrize(
     ("integrator", "transmission"),
     [
-        ("symplectic-euler", None),
         ("rk4", "bend+lift"),
-        *(pytest.param(name, None, marks=pytest.mark.nightly) for name in ("rk4", "implicit-midpoint")),
+        *(pytest.param(k, None, marks=pytest.mark.nightly) for k in ("symplectic-euler", "rk4", "implicit-midpoint")),
     ],
 )
 def test_compiled_motions_carry_the_state_along(integrator, transmission, lugre_log):  # noqa: F811  # the fixture

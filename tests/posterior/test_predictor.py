@@ -61,7 +61,7 @@ def check(posterior: Posterior, states: tuple[torch.Tensor, ...]):
 
 @pytest.mark.parametrize(
     "contacts",
-    ["two", "redundant", *(pytest.param(k, marks=pytest.mark.nightly) for k in ("none", "sphere", "implicit"))],
+    ["two", *(pytest.param(k, marks=pytest.mark.nightly) for k in ("redundant", "none", "sphere", "implicit"))],
 )
 def test_it_is_predict_under_any_contacts(posterior, states, contacts: str):
     check(posterior.with_contacts(CONTACTS[contacts]), states)

@@ -125,7 +125,7 @@ def test_gradients_are_those_of_predict(case):
         close(mine, other)
 
 
-@pytest.mark.parametrize("integrator", ["symplectic-euler", "rk4", IMPLICIT])
+@pytest.mark.parametrize("integrator", ["symplectic-euler", RK4, IMPLICIT])
 def test_compiled_motions_stay_on_the_manifold(case, integrator):
     posterior, q, v, u = case
     u, predictor = u[:3, None].expand(-1, 6, -1).clone(), posterior.predictor(covariance="none")

@@ -23,7 +23,7 @@ def pushed(robot, height, R, V, speeds, air):
     return np.concatenate([force / link.mass - 9.81 * R[2] - np.cross(V[3:], V[:3]), turned])
 
 
-@pytest.mark.parametrize("wind", [0.0, 7.0])
+@pytest.mark.parametrize("wind", [pytest.param(0.0, marks=pytest.mark.nightly), 7.0])
 def test_it_flies_by_newton_euler_and_the_published_air(wind, monkeypatch):
     """In steady wind, behind rotors of first order; from row to row by small steps."""
     monkeypatch.setattr(moving_bases, "GUST", 0.0)
