@@ -183,7 +183,8 @@ def _stopped(*_):
 
 @pytest.mark.usefixtures("unchecked")  # its dataset is none
 def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
-    dataset, numbers, explained = SimpleNamespace(units={"q": "rad"}), list[list[str]](), list[bool]()
+    numbers, explained = list[list[str]](), list[bool]()
+    dataset = SimpleNamespace(units={"q": "rad"}, q=np.array([[-0.5] * 3, [0.5] * 3]))
     doubts = [{"about": "unknown cause", "joints": ["hip", "knee"], "numbers": x} for x in ({}, {"seconds": [1, 2]})]
 
     def told(errors, moved=0.01, shares=None, covered=0.94, still=()):
@@ -218,6 +219,7 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
     assert told([0.1] * 3, None).endswith("but its motions diverge: do not simulate with it.")
     assert told([0.1] * 3, covered=0.57).endswith("Do not trust its intervals: those of 95 % hold 57 %.")
     assert "intervals" not in told([0.1] * 3, covered=0.81)
+    assert ["do not predict" in told([0.1] * 3, moved) for moved in (0.4, 0.6)] == [False, True]  # as the middle is
 
 
 def test_the_answer_repeats_what_concerns_sensors_and_velocities():

@@ -205,7 +205,8 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset, still: Sequ
         ahead = f"positions {scores.horizons[-1]:g} s ahead are wrong by {motion:.2g} {unit}{against}"
         errors = zip(scores.joint_names, scores.columns("nrmse", ACCELERATION, best), strict=True)
         there = [x or 0.0 for name, x in errors if name not in still]
-        lost_there = sum(there) >= max(len(there), 1)  # no better than a = 0, as of light wrists
+        still_as_good = motion >= dataset.q.var(axis=0).mean() ** 0.5  # as the middle of the log
+        lost_there = still_as_good or sum(there) >= max(len(there), 1)  # no better than a = 0, as of light wrists
         told += f", but it is for torques: do not predict motions, {ahead}" if lost_there else f", and {ahead}"
     elif scores.horizons:
         told += ", but its motions diverge: do not simulate with it"
