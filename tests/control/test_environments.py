@@ -59,12 +59,12 @@ def test_an_episode_that_ended_begins_anew_without_a_reward(settings):
 def test_a_motion_that_diverges_ends_its_episode_at_its_last_state(settings):
     env = RobotVectorEnv(2, **settings)
     env.reset(seed=0)
-    env.v = np.full((2, 1), 99.9)  # far beyond its limit, where the other one only ends
+    env.v = np.full((2, 1), 999.9)  # far beyond its limit, where the other one only ends
     with pytest.warns(UserWarning, match="diverged"):
         after, _, over, _, info = env.step(np.array([[5.0], [-5.0]]))
     assert info["diverged"].tolist() == [True, False]
     assert over.all()
-    assert env.v[0] == 99.9
+    assert env.v[0] == 999.9
     assert np.isfinite(after).all()
 
 

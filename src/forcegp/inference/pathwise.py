@@ -151,7 +151,7 @@ class DrawnTerm:
         return (columns * (phase.cos() @ weights[0].mT + phase.sin() @ weights[1].mT)).sum(-1)
 
 
-FREQUENCIES = 256  # random frequencies of one drawn function, each with a cosine and a sine
+FREQUENCIES = 128  # random frequencies of one drawn function, each with a cosine and a sine
 
 BLOCK_BYTES = 16 * 2**20  # working memory of the cosines of functions at the training points
 
