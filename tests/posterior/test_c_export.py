@@ -105,9 +105,8 @@ def test_every_function_computes_what_the_model_does(posterior, library, states)
         np.testing.assert_allclose(again, (q, v), rtol=1e-13)
 
 
-@pytest.mark.parametrize(
-    "integrator", [pytest.param(k, marks=pytest.mark.nightly) for k in ("rk4", "implicit-midpoint")]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("integrator", ["rk4", "implicit-midpoint"])
 def test_steps_of_friction_and_their_derivatives(friction, states, integrator, tmp_path):
     made = export_c(friction, tmp_path / "arm", jacobian=True, steps=DT, integrator=integrator)
     library = compiled(tmp_path / "arm", "arm.c")

@@ -241,7 +241,7 @@ BROKEN = {
     "ms given as s": Broken(scaled(1e3, "time"), "add --unit time=ms"),
     "unknown unit": Broken(GOOD, "no unit 'degrees' in the units of q; did you mean", f"{FLAGS} --unit q=degrees"),
     "angle wraps": Broken(csv(wrapping), "jumps by more than half a turn", FLAGS),
-    "one motor": Broken(
+    "no motor": Broken(
         with_urdf(csv(lambda x: x.pop("u_elbow")), "shoulder", "elbow"), "--u u_shoulder,0 (0", "--robot arm.urdf"),
     "degrees": Broken(scaled(57.3, "q_shoulder", "q_elbow"), "Give --unit q=deg if it is in deg"),
     "beyond limits": Broken(

@@ -153,8 +153,6 @@ def test_intervals_miss_below_nine_tenths_in_the_mean_or_fifteen_hundredths_at_a
 
 
 class Rows:
-    """Positions at rest."""
-
     def __init__(self, q):
         self.q, self.v = q, np.zeros_like(q)
 

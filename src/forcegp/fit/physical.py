@@ -37,8 +37,9 @@ SEARCHES = 20
 """Most searches where forces and accelerations are both noisy, each about the accelerations of the last one."""
 STEPS = 6
 """Evaluations in each, since the next one begins with other accelerations; twice as many after a search in vain."""
-REACHED = 0.02
-"""They end where a step is to lower the cost by fewer nats per coordinate: each is within a fifth of its error."""
+Search = Callable[..., Fit]
+REACHED, ROUGHER = 0.02, 20.0
+"""Nats per coordinate that a step is to gain: each is within a fifth of its error; times that, where noise is all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +103,7 @@ def fit_physical(
     noise, x, changes = None, space.start if near is None else near.x, None
     torque = partial(equations.in_torque, motions=equations.measured)
     if evidence.noisy_in_both:
-        fit, noise = _with_noise_in_both(equations, search, x, note, rough=near is None)
+        fit, noise = _with_noise_in_both(equations, search, x, note, rough=near is None, roughly=roughly)
     elif evidence.of_torque:
         fit = search(torque, start=x, held=held, progress=note)
         if options["sizes"] is not None and held is None and equations.rests:
@@ -138,7 +139,7 @@ def fit_physical(
 
 
 def _with_accelerations_weighted(
-    equations: Equations, search: Callable[..., Fit], x: np.ndarray, note: Progress
+    equations: Equations, search: Search, x: np.ndarray, note: Progress
 ) -> tuple[Fit, NoiseLevels]:
     """A search among accelerations that the noise of both kinds about x weights."""
     predicted, M, H = equations.accelerations(x)
@@ -153,9 +154,10 @@ def _with_accelerations_weighted(
 
 
 def _with_noise_in_both(
-    equations: Equations, search: Callable[..., Fit], x: np.ndarray, note: Progress, *, rough: bool = True
+    equations: Equations, search: Search, x: np.ndarray, note: Progress, *, rough: bool = True, roughly: bool = False
 ) -> tuple[Fit, NoiseLevels]:
     """Searches about likely accelerations, whose levels of noise are found along; `rough` where x may be far off."""
+    reached = REACHED * len(x) * (ROUGHER if roughly and not rough else 1.0)
     noise, least, number, evaluations, steps = None, None, 0, 0, STEPS
     while True:
         number += 1
@@ -169,9 +171,9 @@ def _with_noise_in_both(
         evaluations += fit.evaluations
         steps, x = STEPS if (fit.x != x).any() else 2 * steps, fit.x
         note(number, float(np.sqrt((fit.white**2).mean())))
-        reached = number > 1 and fit.expected <= REACHED * len(x)
-        if noise is not None and (reached or number == SEARCHES):
-            return replace(fit, evaluations=evaluations, settled=reached), noise
+        settled = number > 1 and fit.expected <= reached
+        if noise is not None and (settled or number == SEARCHES):
+            return replace(fit, evaluations=evaluations, settled=settled), noise
         rough = rough and fit.expected > len(x) and number < SEARCHES // 2
 
 
