@@ -133,10 +133,16 @@ def test_one_of_two_axes_in_millimetres_is_not_both():
     assert quick_check(data).of("velocity")[0].command == "forcegp import --unit v=m/s,mm/s"
 
 
-@pytest.mark.parametrize(("low", "told"), [(-2.0, True), (3.0, False)])
-def test_positions_are_not_in_degrees_where_their_joint_could_not_be_there(low, told):
-    data = CORRUPTIONS["degrees"][0](clean(two_links(), 0))
-    text = data.model.robot.urdf_text.replace("continuous", "revolute").replace('lower="-9"', f'lower="{low}"')
+@pytest.mark.parametrize(
+    ("limits", "told"), [((-3, 3), True), ((0, 0), True), ((40, 110), False), ((-300, 300), False)]
+)
+def test_positions_are_not_in_degrees_where_their_joint_could_not_be_there(limits, told):
+    q = 1.3 + 0.5 * np.sin(np.arange(2000)[:, None] / 250.0 * [2.1, 3.3])
+    data, new = (
+        CORRUPTIONS["degrees"][0](with_motion(two_links(), q, 250.0, 0)),
+        'lower="{}" upper="{}"'.format(*limits),
+    )
+    text = data.model.robot.urdf_text.replace("continuous", "revolute").replace('lower="-9" upper="9"', new)
     assert ("degrees" in said_by(check(replace(data, model=Model(Robot.from_urdf_text(text)))))) == told
 
 

@@ -337,12 +337,12 @@ def motion_doubts(inputs: CheckInput, joints: Sequence[int] | None = None) -> li
     joints = range(even.nv) if joints is None else joints
     imported = inputs.log.metadata.get("import")  # others may have put anything there
     made = imported.get("signals") if isinstance(imported, Mapping) else None
-    derived = isinstance(made, Mapping) and str(made.get("a")).startswith("central")
+    derived = {x for x in "va" if isinstance(made, Mapping) and str(made.get(x)).startswith("central")}
     pieces = [even.select_episodes([number]) for number in even.episodes]
     found: list[Doubt] = []
     for name, source in (("v", "q"), ("a", "v")):
-        if name == "a" and (derived or any(doubt.level != "ok" for doubt in found)):
-            break  # of wrong velocities nothing better can come, and what was derived says nothing
+        if name in derived or any(doubt.level != "ok" for doubt in found):
+            continue  # of wrong velocities nothing better can come, and what was derived says nothing
         slopes = np.concatenate([differentiate(getattr(rows, source), rows.time) for rows in pieces])
         size = np.sqrt([np.square(x).mean(axis=0) for x in (getattr(even, name), slopes)])
         kinds = ([k for k in joints if inputs.rotates[k] == inputs.rotates[joint]] for joint in joints)

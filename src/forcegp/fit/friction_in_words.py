@@ -64,7 +64,7 @@ def friction_in_words(
         for x, error in zip(here, errors.tolist(), strict=True)
     ]
     text = f"{', '.join(told[0])} {unit}"
-    text += f", near rest at least {', '.join(told[1])}" if bool((here[1] > RISES * here[0]).any()) else ""
+    text += f", near rest {', '.join(told[1])}" if bool((here[1] > RISES * here[0]).any()) else ""
     for name, level in zip(names, here[0].tolist(), strict=True):
         each = None if name in still else found.estimates.get(f"offset.{name}")  # a force: along it friction is less
         if each is not None and abs(each.value) > max(0.5 * UNEVEN * level, SURELY * REACH * each.std):

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from forcegp.data import Dataset
+from forcegp.data import Dataset, with_memory
 from forcegp.errors import required_extra
 from forcegp.forces import Actuation, AerodynamicForce, ObservedWrench, RigidBodies, Rotor, Thrusters, Unknown
 from forcegp.mechanics import ConstrainedDynamics
@@ -102,7 +102,7 @@ def recorded_scene(
     Raises InvalidInput for a Dataset without rows in that time, MissingExtra without trimesh.
     """
     model = dataset.model if posterior is None else posterior.model
-    rows = style.window(dataset, start, seconds)
+    rows = with_memory(style.window(dataset, start, seconds), model)
     first, last = rows.time[[0, -1]]
     steps = int(np.clip((last - first) * FRAMES_PER_SECOND, 1, min(MOST_FRAMES, len(rows) - 1) or 1))
     grid = np.linspace(first, last, steps + 1)
