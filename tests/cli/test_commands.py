@@ -68,8 +68,7 @@ def test_score_shows_a_line_per_joint_and_draws(workshop, forcegp, tmp_path):
     words = ("score", "run", "test.h5", "--every", 8, "--out", tmp_path / "out")
     done = forcegp(*words, folder=workshop).ok()
     lines = re.findall(r"^\s*lbr_iiwa_joint_\d\s.*$", done.stdout, re.M)
-    assert len(lines) == 7
-    assert len({len(line.split()) for line in lines}) == 1
+    assert (len(lines), len({len(line.split()) for line in lines})) == (7, 1)
     assert re.search(r"contact force +\S+ +\S+ +\S+ +– +\S+ %", done.stdout)
     assert (tmp_path / "out" / "normal_force.png").read_bytes().startswith(PNG)
     assert json.loads((tmp_path / "out" / "results.json").read_text())["rows"] == 60

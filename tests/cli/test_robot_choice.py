@@ -41,16 +41,14 @@ def test_every_option_reaches_the_robot(folder):
     chosen = options(*words).chosen().robot
     assert chosen.joint_names == ("pan", "lift")
     assert chosen.locked == {"bend": 0.3}
-    assert chosen.armature.tolist() == [0.5, 0.0]
-    assert chosen.gravity.tolist() == [0.0, 1.0, -9.0]
+    assert (chosen.armature.tolist(), chosen.gravity.tolist()) == ([0.5, 0.0], [0.0, 1.0, -9.0])
 
 
 def test_what_no_urdf_holds_stays_as_recorded(folder):
     recorded = Model(Robot.from_urdf_text(URDF, gravity=(0.0, 0.0, -1.6), armature=[0.1, 0.2, 0.3]))
     words = "--robot", str(folder / "arm.urdf")
     same = options(*words).chosen(recorded).robot
-    assert same.gravity.tolist() == [0.0, 0.0, -1.6]
-    assert same.armature.tolist() == [0.1, 0.2, 0.3]
+    assert (same.gravity.tolist(), same.armature.tolist()) == ([0.0, 0.0, -1.6], [0.1, 0.2, 0.3])
     for given in (words, ()):  # also without another URDF
         other = options(*given, "--armature", "lift=0.9", "--gravity", "0,0,-9.81").chosen(recorded).robot
         assert other.gravity.tolist() == [0.0, 0.0, -9.81]

@@ -13,6 +13,7 @@ from tests.posterior.arm import URDF
 from tests.scores.moving_arm import moving_arm
 
 from forcegp import Dataset, load_posterior, score
+from forcegp.data import Preparation
 
 MODELS = ("given", "gp:joint-friction", "identified,gp:joint-friction")
 FORCES = [word for name in MODELS for word in ("--forces", name)]
@@ -102,16 +103,14 @@ def test_runs_alone_are_scored_on_the_whole_log(forcegp, folder):
     assert re.search(r"^take friction: .*error of predicted motions, friction / joint = ", done.stdout, re.M)
     one = forcegp("score", "friction", "test.h5", "--horizon", ".1", "--integrator", "symplectic-euler", folder=folder)
     assert re.search(r"position after 0\.1 s +– +\d\S* +", one.stdout), one.stdout
-    seen = forcegp("score", "friction", "test.h5", "--observe", 0.3, "--json", folder=folder)
     log, learned = Dataset.load(folder / "test.h5"), load_posterior(folder / "friction")
-    first = log.time < log.time[0] + 0.3
-    expected = score(learned.update(log.rows(first)), log.rows(~first))
-    scores = json.loads(seen.stdout)["models"]["friction"]["scores"]
-    np.testing.assert_allclose(scores["acceleration"]["mae"]["each"], expected.columns("mae"), rtol=1e-6)
-    told = forcegp("score", "friction", "test.h5", "--every", 2, "--json", folder=folder)
-    scores = json.loads(told.stdout)["models"]["friction"]["scores"]
-    expected = score(load_posterior(folder / "friction"), Dataset.load(folder / "test.h5").rows(slice(None, None, 2)))
-    np.testing.assert_allclose(scores["acceleration"]["mae"]["each"], expected.columns("mae"), rtol=1e-6)
+    first, thinned = log.time < log.time[0] + 0.3, log.rows(slice(None, None, 2))
+    seen, filtered = learned.update(log.rows(first)), Preparation(cutoff=9.0).apply(log)
+    each = (seen, log.rows(~first)), (learned, thinned), (learned, filtered)
+    for option, scored in zip(("--observe=.3", "--every=2", "--cutoff=9"), each, strict=True):
+        told = forcegp("score", "friction", "test.h5", option, "--json", folder=folder)
+        scores = json.loads(told.stdout)["models"]["friction"]["scores"]["acceleration"]["mae"]["each"]
+        np.testing.assert_allclose(scores, score(*scored).columns("mae"), rtol=1e-6)
 
 
 OUT = "--out never"
@@ -121,6 +120,7 @@ WRONG = [
     ("score friction other.h5", "joints shoulder, elbow; the model was trained on pan, lift, bend"),
     ("score friction test.h5 --horizon 7", "not predicted: 7 s; held-out stretches last"),
     ("score friction test.h5 --observe 99", "--observe is 99 s; give seconds that one record is longer than"),
+    ("score friction test.h5 --gravity 0,0,9.81", "a RUN has its own robot"),
     ("score friction test.h5 --every 0", "--every 0 must be an integer of at least 1"),
     (f"score friction test.h5 {OUT} --integrator euler", "did you mean 'symplectic-euler'"),
     *((f"score friction test.h5 {OUT} --horizon={x}", "give positive numbers of seconds") for x in ("inf", "nan", 0)),

@@ -139,8 +139,7 @@ def test_programs_report_what_is_wrong_with_their_states(compiled):
     def bits(value: float) -> int:
         return function.single(torch.tensor([value], dtype=torch.float64))[0]
 
-    assert bits(0.5) == 0
-    assert bits(2.0) == programs.NOT_POSITIVE
+    assert (bits(0.5), bits(2.0)) == (0, programs.NOT_POSITIVE)
     assert bits(-1.0) == programs.RESULT_NOT_FINITE
     assert bits(math.nan) & programs.NOT_FINITE
 

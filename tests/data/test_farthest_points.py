@@ -39,8 +39,7 @@ def test_it_is_nested_without_repetition_and_deterministic(points, data):
     rows = len(points)
     count, start = data.draw(st.integers(1, rows)), data.draw(st.integers(0, rows - 1))
     every = farthest_point_sampling(points, rows, start=start)
-    assert sorted(every) == list(range(rows))
-    assert every[0] == start
+    assert (sorted(every), every[0]) == (list(range(rows)), start)
     np.testing.assert_array_equal(farthest_point_sampling(points, count, start=start), every[:count])
 
 

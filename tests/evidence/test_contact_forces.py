@@ -108,8 +108,7 @@ def test_slopes_of_stacked_residuals_are_those_of_finite_differences(contact):
 
     r, Y, in_terms = rows.in_acceleration(x, log.a)
     slopes = np.concatenate([space.bodies.chained(x[: space.bodies.size], Y), in_terms], axis=-1)
-    assert r.shape[1] == 3 + (3 if contact is held else 1) + 3
-    assert rows.felt_noise.tolist() == [0.1, 0.2, 0.3]
+    assert (r.shape[1], rows.felt_noise.tolist()) == (3 + (3 if contact is held else 1) + 3, [0.1, 0.2, 0.3])
     assert_slopes(lambda x: rows.in_acceleration(x, log.a)[0], x, slopes)
 
 

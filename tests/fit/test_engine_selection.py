@@ -46,8 +46,7 @@ def test_parameters_come_from_some_rows_and_the_posterior_from_all(data, states)
     some, first = fit(data, learning_points=30, points=60), fit(data, points=30)
     for name, value in first.hyperparameters.items():
         torch.testing.assert_close(some.hyperparameters[name], value)
-    assert len(some.training.q) == 60
-    assert len(some.training.reference.q) == 30
+    assert (len(some.training.q), len(some.training.reference.q)) == (60, 30)
     assert some.settings["points"] == 60
     assert some.settings["learning_points"] == 30
     by_hand = first.update(data.rows([i for i in range(60) if i not in rows_of(first, data)]))

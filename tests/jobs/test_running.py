@@ -33,8 +33,7 @@ def test_all_jobs_are_computed_once_and_in_order(results):
     assert results.result("square/4")["value"] == 16
     assert (results.place("square/4") / "note.txt").read_text() == "beside the result"
     assert results.result("square/3")["process"] != os.getpid()
-    assert [done for done, *_ in told] == sorted(done for done, *_ in told)
-    assert told[-1][0] == told[-1][1]
+    assert ([done for done, *_ in told], told[-1][0]) == (sorted((done for done, *_ in told)), told[-1][1])
     before = results.load("square/3")
     assert run_jobs(results, [*jobs, square(5)]) == 1
     assert results.load("square/3") == before

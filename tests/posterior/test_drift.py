@@ -240,8 +240,7 @@ def test_a_joint_that_hardly_moves_has_no_level():
     seconds = 20.0
     few = drift_of(fitted(recording(3, seconds=seconds, still=0.95 * seconds)))
     enough = drift_of(fitted(recording(3, seconds=seconds, still=0.85 * seconds)))
-    assert few.between == [0.0]
-    assert enough.between == [BETWEEN]
+    assert (few.between, enough.between) == ([0.0], [BETWEEN])
 
 
 def test_many_rows_are_thinned():

@@ -166,6 +166,8 @@ def test_predictions_given_accelerations_are_those_of_one_large_gaussian():
     torch.testing.assert_close(several.force_at("hand").mean, several.contact_force.mean.unflatten(-1, (3, 3)).sum(-2))
     with pytest.raises(InvalidInput, match="a has shape"):
         posterior.predict(*states, a=a[:, :2])
+    with pytest.raises(InvalidInput, match="batch shapes do not broadcast"):
+        posterior.predict(*states, a=a[:2])
 
 
 def test_what_contacts_hide_is_in_the_interval_of_their_force():

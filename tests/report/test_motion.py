@@ -11,6 +11,7 @@ from tests.goldens.compare import assert_unchanged, drawn
 from tests.robots.test_moving_bases import LIMBS
 
 from forcegp import Dataset, JointFriction, Model, Robot, fit
+from forcegp.forces import Coulomb
 from forcegp.report import recorded_scene, scene_notes
 from forcegp.report.motion import LONGEST_ARROW, PALE, _drawn
 from forcegp.scores import model_pictures
@@ -54,6 +55,16 @@ def test_joint_arrows_are_laws_and_learned_part_together(swinging, friction):
     pose = robot.frame_pose(q, robot.joints[1].child).numpy()
     np.testing.assert_allclose(arrows.start[:, 1], pose[:, :3, 3], atol=1e-12)
     np.testing.assert_allclose(arrows.direction[:, 1], pose[:, :3, :3] @ robot.joints[1].axis, atol=1e-12)
+
+
+def test_friction_that_remembers_knows_the_rows_between_the_frames(swinging):
+    law = Coulomb(0.4, 0.01, sigma=40.0, memory=True)
+    (arrows,) = recorded_scene(swinging, fit(swinging.model.with_forces(law), swinging), seconds=1.0).arrows
+    bristles = np.zeros((1, 2))
+    for step in np.diff(swinging.q[swinging.time <= swinging.time[0] + 1.0 + 1e-9], axis=0):
+        way = np.sign(step)
+        bristles = np.concatenate([bristles, way + (bristles[-1:] - way) * np.exp(-40.0 * np.abs(step))])
+    np.testing.assert_allclose(arrows.mean[-1], -0.4 * bristles[-1], atol=0.02)
 
 
 def test_arrows_are_drawn_to_scale(swinging, friction):

@@ -70,8 +70,7 @@ def test_limits_names_and_losses():
     assert arm.joint_names == ("shoulder", "roll", "elbow", "body_4_slide")
     assert [joint.effort_limit for joint in arm.joints] == [50.0, 8.0, 20.0, np.inf]
     assert [joint.friction for joint in arm.joints] == [0.0, 0.3, 0.3, 0.0]
-    assert arm.armature.tolist() == [0.1, 0.02, 0.02, 0.1]
-    assert arm.gravity.tolist() == [0.0, 0.5, -9.7]
+    assert (arm.armature.tolist(), arm.gravity.tolist()) == ([0.1, 0.02, 0.02, 0.1], [0.0, 0.5, -9.7])
     assert (arm.joints[0].lower, arm.joints[0].upper) == pytest.approx((-np.pi / 2, np.radians(80.0)))
     assert arm.joint("roll").type == "continuous"
     assert "elbow site" in arm.link_names

@@ -173,8 +173,7 @@ def test_written_files_have_the_limits_without_which_others_refuse_them(tmp_path
     for one, other in zip(robot.joints, again.joints, strict=True):
         limits, written = ((x.lower, x.upper, x.velocity_limit, x.effort_limit) for x in (one, other))
         assert limits == written
-    assert again.joints[0].effort_limit == math.inf
-    assert again.joints[2].effort_limit == 5.0
+    assert (again.joints[0].effort_limit, again.joints[2].effort_limit) == (math.inf, 5.0)
 
 
 @pytest.mark.parametrize(

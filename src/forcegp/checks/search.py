@@ -294,10 +294,8 @@ def held_at_rest(root: Explanation, joint: int) -> Bool[np.ndarray, " rows"]:
 
 
 def _where(root: Explanation, joint: int, inputs: CheckInput) -> tuple[str, list[float], float]:
-    """Where in time, q or v most of what is left of a torque sits; of time the ends, and what stays elsewhere at most.
-
-    Time is enough where little stays elsewhere: what touches a robot also stops it, so that v shows it as well.
-    """
+    """Where in time, q or v most of what is left of a torque sits; of time its ends, and what stays elsewhere."""
+    # time is enough where little stays elsewhere: what touches a robot also stops it, so that v shows it as well
     rows, best, found = root.log.rows, 0.0, ("", list[float](), np.inf)
     level = np.ones(len(rows))
     signals = np.c_[root.log.friction[:, joint], level, -level, rows.u[:, joint] - root.log.tau[:, joint]]

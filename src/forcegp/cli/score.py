@@ -106,6 +106,10 @@ class Score(Command):
             if cutoff is not None:  # a filter mixes what lies on both sides of a border, two time constants wide
                 guard = max(guard, 2.5 * forcegp.data.LowPass(float(cutoff)).memory)
             split = forcegp.scores.split_named(rows, self.split or "auto", guard)
+        elif self.robot != RobotOptions():
+            raise InvalidInput("a RUN has its own robot; leave options of the robot out, or name models by --forces.")
+        elif self.filter != FilterOptions(every=self.filter.every):
+            rows, recording = prepared_rows(terminal, self.filter.preparation(), raw, thin=False)
         elif self.filter.every is not None:
             rows = forcegp.data.Preparation(every=self.filter.every).apply(raw)
         with terminal.progress(f"scoring {len(rows)} rows"):

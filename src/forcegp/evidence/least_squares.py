@@ -288,10 +288,8 @@ def _minimized(
     moved: Moved = np.add,
     content: float = CONTENT,
 ) -> tuple[np.ndarray, int, bool, float]:
-    """Levenberg-Marquardt within bounds, on normal equations: x, evaluations, whether it converged, what it expected.
-
-    Coordinates at a bound that the gradient pushes against stay there for a step; steps are clipped to the bounds.
-    """
+    """Levenberg-Marquardt in bounds, on normal equations: x, evaluations, whether it converged, what it expected."""
+    # coordinates at a bound that the gradient pushes against stay there for a step; steps are clipped to the bounds
     low, high = bounds
     here, damping, idle, first = point(x, np.inf), 1e-4, 0, None
     for evaluation in range(1, most + 1):

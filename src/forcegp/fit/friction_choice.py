@@ -264,10 +264,8 @@ class _Regression:
         return self._fitted(j, parts)
 
     def _fitted(self, j: int, parts: tuple[str, ...]) -> tuple[tuple[float, int], Float[np.ndarray, " stretches"]]:
-        """The sign and fall that fit all rows best, and squared residuals of the joint in every stretch by the others.
-
-        The fall is sought at the sign that fits best under the usual one.
-        """
+        """The sign and fall that fit all rows best; squared residuals of the joint in every stretch by the others."""
+        # the fall is sought at the sign that fits best under the usual one
         signs, at = [each for each in self.signs[j] if (each > 0.0) == ("memory" in parts)], self.fall[j]
         sign = min(signs, key=lambda sign: self.left(parts, (sign, at), False).sum())
         falls = range(len(FALLS)) if "breakaway" in parts else (at,)
@@ -275,10 +273,8 @@ class _Regression:
         return best, self.left(parts, best, True)
 
     def _residuals(self, j: int, parts: tuple[str, ...], sign: tuple[float, int], held_out: bool) -> np.ndarray:
-        """Squared residuals in every stretch, by numbers from the other stretches; or their sum, by numbers from all.
-
-        Those of the joint, or of all joints where the noise of accelerations makes their forces resemble each other.
-        """
+        """Squared residuals in every stretch, by numbers from the others; or their sum, by numbers from all."""
+        # those of the joint, or of all joints where the noise of accelerations makes their forces resemble each other
         summed = np.asarray if held_out else partial(np.sum, axis=0, keepdims=True)
         (A, b), others = map(summed, self.beside[:2]), self.beside[2]
         across, inner, right = map(summed, self._open(j, parts, sign))

@@ -51,7 +51,7 @@ from forcegp.posterior.predictor import Predictor
 from forcegp.posterior.preparation import prepared_predictor, rows_for
 from forcegp.posterior.programs import Physics, Programs
 from forcegp.posterior.rollout import Rollout, accelerations, checked_start, flat_feedback, loops_for, moved
-from forcegp.robots.arguments import real_tensor, whole_number
+from forcegp.robots.arguments import broadcast_batch, real_tensor, whole_number
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -89,6 +89,7 @@ class Posterior(Fitted):
             if self.is_black_box:
                 raise InvalidInput(f"a {self.description} predicts no forces, which a could tell about; leave a out.")
             rows = state_tensor("a", a, self.model.robot.nv, self.model.robot.device)
+            broadcast_batch({"q, v, u": batch, "a": rows.shape[:-1]})
             states = [*states, rows.expand(*batch, -1).reshape(batch.numel(), -1)]
         parts = zip(*(x.split(ROWS_PER_BLOCK) for x in states), strict=True)
         predicted = join_predictions([predict(q, v, u, covariance, *seen) for q, v, u, *seen in parts], batch)

@@ -212,7 +212,10 @@ def state_tensor(name: str, values: Array, size: int, device: torch.device) -> T
     """Finite float64 numbers (..., size). Raises InvalidInput."""
     tensor = real_tensor(name, values, device)
     if tensor.dim() == 0 or tensor.shape[-1] != size:
-        raise InvalidInput(f"{name} has shape {tuple(tensor.shape)}; its last dimension must be {size}, one per joint.")
+        each = "input of the model (its `inputs`)" if name == "u" else "joint"
+        raise InvalidInput(
+            f"{name} has shape {tuple(tensor.shape)}; its last dimension must be {size}, one per {each}."
+        )
     require_finite(name, tensor)
     return tensor
 
