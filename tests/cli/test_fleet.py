@@ -66,11 +66,12 @@ def test_each_log_is_a_row_and_one_that_fails_says_so(listed, capsys):
     assert Path("out/robot1/model.json").stat().st_mtime_ns == written
 
 
-def test_an_estimate_is_one_column():
+def test_an_estimate_is_its_value_and_half_of_its_interval():
     estimate = Estimate("viscous.elbow", "Nms/rad", 0.4, 0.1, 0.0, 1.0, "log", "")
     content = {"estimates": {estimate.name: estimate.to_dict()}, "value": {"interval": 3, "value": 2}}
     content["settings"] = {"a": 1}
-    assert numbers_of(content) == {"estimates.viscous.elbow": 0.4, "value.interval": 3, "value.value": 2}
+    each = {"estimates.viscous.elbow": 0.4, "estimates.viscous.elbow.error_95": pytest.approx(0.196, abs=1e-4)}
+    assert numbers_of(content) == {**each, "value.interval": 3, "value.value": 2}
 
 
 @pytest.mark.parametrize(

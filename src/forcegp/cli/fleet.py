@@ -130,7 +130,7 @@ def one(store: JobStore, spec: Mapping[str, Any], folder: Path) -> dict[str, Any
             with asked.alone():
                 found = numbers_of(asked.run(terminal))
         except (ForceGPError, OSError, MemoryError) as told:
-            error = printable(" ".join(str(told).split()))
+            error = printable(" ".join(terminal.worded(str(told)).split()))
         except Exception as defect:  # one log must not cost the others theirs
             error = f"an error in forcegp itself, {type(defect).__name__}: {defect}"
     return {"error": error, "warnings": terminal.warnings, "numbers": found}
@@ -142,7 +142,8 @@ def numbers_of(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     for name, value in content.items():
         if isinstance(value, Mapping):
             if "interval_95" in value:
-                found[f"{prefix}{name}"] = value["value"]
+                low, high = value["interval_95"]
+                found |= {f"{prefix}{name}": value["value"], f"{prefix}{name}.error_95": 0.5 * (high - low)}
             elif name != "settings":
                 found |= numbers_of(value, f"{prefix}{name}.")
         elif isinstance(value, bool | int | float) or (isinstance(value, str) and len(value) < SHORT):

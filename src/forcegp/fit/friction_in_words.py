@@ -73,11 +73,10 @@ def friction_in_words(
     for name, row in zip(log.joint_names, law.turning(torch.eye(log.nv).to(v)).mT.tolist(), strict=True):
         terms = [f"{x:+.3g} {other}" for other, x in zip(log.joint_names, row, strict=True) if x]
         text += f"; the motor of {name} turns with {' '.join(terms)}" if len(terms) > 1 else ""
-    if remember := law.memory_joints(robot):
+    if remember := [j for j in law.memory_joints(robot) if log.joint_names[j] not in still]:
         own = [log.joint_names[j] for j in remember]
         length = " or ".join(sorted({"mm" if robot.joint(x).type == "prismatic" else "mrad" for x in own})[::-1])
         who = "all joints" if len(own) == len(joints) else ", ".join(own)
-        ways = zip(own, (1e3 / law.values["sigma"].expand(log.nv)[remember]).tolist(), strict=True)
-        told_ways = ", ".join("–" if name in still else f"{way:.3g}" for name, way in ways)
-        text += f"; {who} remember reversals, over {told_ways} {length}"
+        ways = ", ".join(f"{way:.3g}" for way in (1e3 / law.values["sigma"].expand(log.nv)[remember]).tolist())
+        text += f"; {who} remember reversals, over {ways} {length}"
     return text, dict(zip(names, zip(here[2].tolist(), errors[2].tolist(), strict=True), strict=True))
