@@ -69,11 +69,8 @@ def test_each_log_is_a_row_and_one_that_fails_says_so(listed, capsys):
 def test_an_estimate_is_its_value_and_half_of_its_interval():
     estimate = Estimate("viscous.elbow", "Nms/rad", 0.4, 0.1, 0.0, 1.0, "log", "")
     content = {"estimates": {estimate.name: estimate.to_dict()}, "value": {"interval": 3, "value": 2}}
-    content["settings"] = {"a": 1}
-    each = {
-        "estimates.viscous.elbow": 0.4,
-        "estimates.viscous.elbow.error_95": pytest.approx(estimate.interval[1] - 0.4),
-    }
+    content, name = {**content, "settings": {"a": 1}}, "estimates.viscous.elbow"
+    each = {name: 0.4, f"{name}.error_95": pytest.approx(estimate.interval[1] - 0.4)}
     assert numbers_of(content) == {**each, "value.interval": 3, "value.value": 2}
 
 
