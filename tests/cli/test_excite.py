@@ -38,8 +38,7 @@ def test_the_next_motion_of_a_model_can_be_imported(forcegp, folder):
     assert np.abs(data.v).max() <= 1.5
 
     forcegp(*words, folder=folder).refused("add --overwrite")
-    shown = forcegp(*words, "--overwrite", folder=folder).ok()
-    assert "spread of a" in shown.stdout
+    assert "spread of a" in forcegp(*words, "--overwrite", folder=folder).ok().stdout
 
 
 def test_a_robot_without_a_model(forcegp, folder):

@@ -99,8 +99,7 @@ def test_errors_near_rest_are_found_by_their_likelihood():
     known, slow = rng.uniform(0.01, 0.02, rows), rng.uniform(size=rows) ** 4
     tau = rng.standard_normal(rows) * np.sqrt(known + 0.2**2 + (0.7 * slow) ** 2)
     cost, force, at_rest = errors_near_rest(tau, known, slow)
-    assert force == pytest.approx(0.2, rel=0.05)
-    assert at_rest == pytest.approx(0.7, rel=0.1)
+    assert (force, at_rest) == (pytest.approx(0.2, rel=0.05), pytest.approx(0.7, rel=0.1))
     S = known + force**2 + (at_rest * slow) ** 2
     assert cost + 0.5 * math.log(2.0 * math.pi) == pytest.approx(-norm.logpdf(tau, 0.0, np.sqrt(S)).mean(), rel=1e-6)
 

@@ -84,8 +84,7 @@ def test_a_torque_behind_a_filter_of_the_robot_is_told_from_one_that_is_late(lag
     u = np.stack([np.interp(rows.time - delay, rows.time, each) for each in u.T], axis=1)
     late, plain = replace(rows, u=u), Preparation(cutoff=15.0, trim=0.3)
     found = replace(plain, delay="auto").resolved(late)
-    assert found.lag == pytest.approx(-lag, rel=0.1)
-    assert found.delay == pytest.approx(delay, abs=6e-3)
+    assert (found.lag, found.delay) == (pytest.approx(-lag, rel=0.1), pytest.approx(delay, abs=0.006))
     undone, left, true = found.rows(late), plain.rows(late), plain.rows(rows)
     off = [np.abs(each.u - true.u[np.isin(true.time, each.time)]).mean() for each in (undone, left)]
     assert off[0] < 0.5 * off[1]

@@ -75,8 +75,7 @@ def payload(data: Dataset, link: str | None = None) -> tuple[str, float]:
 @pytest.mark.parametrize(("base", "carrier"), [("fixed", "left_lower_link"), *(("floating", name) for name in MASSES)])
 def test_the_payload_is_found_where_it_is_said_to_be(base, carrier):
     link, mass = payload(rows(base, carrying(TWO_ARMS, carrier, 0.5), 0.05), carrier)
-    assert link == carrier
-    assert mass == pytest.approx(0.5, rel=0.05)
+    assert (link, mass) == (carrier, pytest.approx(0.5, rel=0.05))
 
 
 def test_without_a_link_it_is_on_the_base_that_moves_or_the_last_link():

@@ -7,6 +7,7 @@ from functools import cache
 import mujoco as untyped
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 from tests.evidence.arm_in_mujoco import followed
 from tests.posterior.arm import URDF, arm_model
@@ -15,7 +16,7 @@ from forcegp import Accelerations, ContactForces, Dataset, Model, Robot, Torques
 from forcegp.data import Preparation
 from forcegp.errors import InvalidInput
 from forcegp.fit import held_out_noise
-from forcegp.fit.force_sensors import force_sensor_doubts
+from forcegp.fit.force_sensors import force_sensor_doubts, with_touches
 from forcegp.forces import Actuation, Viscous
 from forcegp.mechanics import fixed_frame, fixed_point
 from forcegp.scores.models import identified_model, identify
@@ -97,8 +98,7 @@ def test_a_late_sensor_and_a_weight_that_counts_twice():
         [doubt] = told(sign * held + force, log)
         assert doubt.numbers["mass"] == pytest.approx(-0.6 * sign, rel=0.02)  # of the hand
         assert words in doubt.do
-    [doubt] = told(force, log)
-    assert "hardly notice" in doubt.what
+    assert "hardly notice" in told(force, log)[0].what
 
 
 def carrying(seed=0):
@@ -151,6 +151,18 @@ def test_a_right_sensor_gets_no_false_word(seed):
         assert [doubt.level for doubt in told(F, log)] == ["ok"]
     [doubt] = told(force - in_hand(R, force[0]), log)
     assert (doubt.level, "is off by" in doubt.what) == ("look", True)
+
+
+def test_what_an_arm_feels_is_added_to_its_torques():
+    """Its power is that of the force on the way of the hand."""
+    log, force, *_ = recorded()
+    log, doubts = replace(log, measured={"force.hand": force, "imu.hand": force}), told(force)
+    places, (rows, [felt]) = log.model.robot.frame_pose(torch.tensor(log.q), "hand"), with_touches(log, doubts)
+    power = (force * np.gradient(places[:, :3, 3].numpy(), 1.0 / RATE, axis=0)).sum(1)
+    np.testing.assert_allclose(((rows.u - log.u) * log.v).sum(1)[1:-1], power[1:-1], atol=1e-3 * np.abs(power).max())
+    assert ([*rows.measured], "is added to u" in felt.what) == (["imu.hand"], True)
+    for each, said in (replace(log, model=arm_model(0).with_contacts(fixed_point("hand"))), doubts), (log, []):
+        assert with_touches(each, said) == (each, [])
 
 
 @pytest.mark.nightly

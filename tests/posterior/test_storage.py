@@ -173,8 +173,7 @@ def test_a_model_that_was_carried_to_another_system_predicts_there_after_loading
         carried.trained, carried.training, carried.hyperparameters, carried.result, carried.settings
     )
     assert (there.predict(*states).mean - loaded.predict(*states).mean).abs().max() > 0.1  # not the old system
-    assert loaded.model.to_dict() == carried.model.to_dict()
-    assert loaded.trained.to_dict() == carried.trained.to_dict()
+    assert (loaded.model.to_dict(), loaded.trained.to_dict()) == (carried.model.to_dict(), carried.trained.to_dict())
     again = tmp_path / "again"
     save_posterior(loaded, again)
     assert torch.equal(load_posterior(again).predict(*states).mean, loaded.predict(*states).mean)

@@ -23,10 +23,8 @@ EASILY = 20.0  # condition of the weights up to which torques can be told apart 
 
 
 def coupled_joints(now: Comparison, inputs: CheckInput, bad: np.ndarray, first: bool) -> Iterator[Candidate]:
-    """A joint logged as its own and the one before it, or signals that drives share; `bad` (nv,) fit badly.
-
-    With p = L q of a log, power is the same where the joints' torques are L' times those logged.
-    """
+    """A joint logged as its own and the one before it, or signals that drives share; `bad` (nv,) fit badly."""
+    # With p = L q of a log, power is the same where the joints' torques are L' times those logged
     layout, names = now.robot.layout, inputs.names
     kinematics = now.robot.kinematics(torch.tensor(now.rows.q[:1], device=now.robot.device))
     for body, parent in ((body, parent) for body, parent in enumerate(layout.parents) if parent >= 0):

@@ -31,6 +31,7 @@ from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal, doubts_table, facts
 from forcegp.doubts import Doubt, Doubts, wrong
 from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUnit, NumericalError
+from forcegp.fit.force_sensors import with_touches
 from forcegp.scores.scores import USABLE
 
 MOST_CORRECTIONS = 8
@@ -104,6 +105,10 @@ class Auto(Command):
         terminal.names_stages = True  # of minutes, most of which have nothing to count
         with terminal.progress("checking"):
             report = forcegp.check(dataset)
+            dataset, felt = with_touches(dataset, report.doubts)
+            if felt:
+                report = forcegp.check(dataset)
+                report = replace(report, doubts=Doubts([*felt, *report.doubts]))
         mended = {"delay"} if self.filter.delay == "auto" else set()  # u is shifted below
         bad = Doubts(doubt for doubt in report.doubts.at("wrong") if doubt.about not in mended)
         still = [x for doubt in report.doubts for x in doubt.numbers.get("still", ())]

@@ -108,10 +108,8 @@ class Score(Command):
             split = forcegp.scores.split_named(rows, self.split or "auto", guard)
         elif self.robot != RobotOptions():
             raise InvalidInput("a RUN has its own robot; leave options of the robot out, or name models by --forces.")
-        elif self.filter != FilterOptions(every=self.filter.every):
+        else:
             rows, recording = prepared_rows(terminal, self.filter.preparation(), raw, thin=False)
-        elif self.filter.every is not None:
-            rows = forcegp.data.Preparation(every=self.filter.every).apply(raw)
         with terminal.progress(f"scoring {len(rows)} rows"):
             scores = forcegp.score(
                 models or None,

@@ -106,10 +106,8 @@ def solve_lower(lower: Tensor, right: Tensor) -> Tensor:
 
 
 def pseudo_inverse(matrix: Tensor, tolerance: float) -> Tensor:
-    """The pseudo-inverse (..., n, m) of a matrix (..., m, n) with m <= n, what is within the tolerance dropped.
-
-    From an orthonormal basis Q of the rows: A = L Q with L = A Q^T, L^T = R U, A^+ = Q^T R^-T U.
-    """
+    """The pseudo-inverse (..., n, m) of a matrix (..., m, n) with m <= n, what is within the tolerance dropped."""
+    # From an orthonormal basis Q of the rows: A = L Q with L = A Q^T, L^T = R U, A^+ = Q^T R^-T U
     Q = _basis(matrix, tolerance)
     R, U = _lower_and_orthonormal((matrix @ Q.mT).mT)
     R = R + torch.diag_embed(torch.where(R.diagonal(dim1=-2, dim2=-1) > 0.0, 0.0, 1.0))

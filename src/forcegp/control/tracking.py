@@ -313,10 +313,8 @@ class HybridForce(TrackingController):
 
 
 def usual_integrator(predictor: Predictor, dt: float) -> str:
-    """rk4 where forces change little within dt seconds, else the implicit midpoint rule, some ten times as slow.
-
-    Rates are the eigenvalues of da/dv and the square roots of those of da/dq, at training states and at rest there.
-    """
+    """rk4 where forces change little within dt seconds, else the implicit midpoint rule, some ten times as slow."""
+    # rates are the eigenvalues of da/dv and the square roots of those of da/dq, at training states and at rest there
     own = predictor.posterior
     rows = rows_for(own.training, own.trained, own.model)
     q, v, u = (x[:: max(1, len(x) // LOOKED_AT)] for x in (rows.q, rows.v, rows.u))

@@ -84,10 +84,8 @@ def encoder_step(dataset: Dataset, q: Float[np.ndarray, " rows"]) -> float:
 
 
 def white_noise(dataset: Dataset, q: Float[np.ndarray, " rows"]) -> float:
-    """Standard deviation [rad or m] of independent noise in the positions of a joint; 0 where motion hides it.
-
-    Medians of differences: the d-th of white noise has binom(2 d, d) times its variance (Rice 1984, Ann. Statist. 12).
-    """
+    """Standard deviation [rad or m] of independent noise in the positions of a joint; 0 where motion hides it."""
+    # Medians of differences: the d-th of white noise has binom(2 d, d) times its variance (Rice 1984, Ann. Statist. 12)
     found = []
     for order in ORDERS:
         apart = np.abs(np.diff(q, order))[dataset.episode[order:] == dataset.episode[:-order]]

@@ -126,10 +126,8 @@ def at_rest(dataset: Dataset) -> bool:
 
 
 def one_row_per_rest(dataset: Dataset) -> Dataset:
-    """A log of postures alone as its medians, an episode each, without motion; other logs as they are.
-
-    Stiction holds the same share of the load in all rows of a rest, so they are one observation of it.
-    """
+    """A log of postures alone as its medians, an episode each, without motion; other logs as they are."""
+    # stiction holds the same share of the load in all rows of a rest, so they are one observation of it
     if (number := rests_alone(dataset)) is None:
         return dataset
     _, first, label = np.unique(number, return_index=True, return_inverse=True)
@@ -205,10 +203,8 @@ def with_memory(dataset: Dataset, model: Model) -> Dataset:
 
 
 def past_known(dataset: Dataset, model: Model) -> Marked:
-    """Rows in which what joints remember does not depend on what was before their episode.
-
-    A joint that never goes so far in an episode does not count: what sticks there is in its offset.
-    """
+    """Rows in which what joints remember does not depend on what was before their episode."""
+    # A joint that never goes so far in an episode does not count: what sticks there is in its offset
     known = np.ones(len(dataset), dtype=bool)
     for law in model.laws:
         if dataset.strokes is None or not (joints := law.memory_joints(model.robot)):

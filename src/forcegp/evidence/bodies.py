@@ -137,10 +137,8 @@ class Bodies:
         return block_diag(np.zeros((0, 0)), *self._standard(self._congruent(_log_cholesky(x)[1])).swapaxes(-1, -2))
 
     def moved(self, x: Coordinates, step: Coordinates) -> Coordinates:
-        """x + step to first order: parameters change by exactly their derivatives times the step, if a body can.
-
-        Torque is linear in them: with many rows of little noise, straight lines in x leave its narrow valley.
-        """
+        """x + step to first order: parameters change by exactly their derivatives times the step, if a body can."""
+        # torque is linear in them: with many rows of little noise, straight lines in x leave its narrow valley
         inner, derivatives = _log_cholesky(x)
         inner = inner + np.einsum("nk,nkab->nab", step.reshape(-1, 10), derivatives)
         values = np.linalg.eigvalsh(inner)

@@ -110,10 +110,8 @@ class ParameterSpace:
         return np.concatenate([-free, *least]), np.concatenate([free, *most])
 
     def longest_steps(self, x: bodies.Coordinates) -> bodies.Coordinates:
-        """Most that a coordinate should change at once: infinite for those that the torque is linear in.
-
-        What lies off the diagonal of a body's factor may double: a light one may be far away, or have its mass there.
-        """
+        """Most that a coordinate should change at once: infinite for those that the torque is linear in."""
+        # what lies off the diagonal of a body's factor may double: a light one may be far away, or have its mass there
         each = [np.full_like(term.size, 1.0 if term.logarithm else np.inf) for term in self.terms]
         off = np.abs(x[: self.bodies.size].reshape(-1, 10)) * (np.arange(10) > 3)
         return np.concatenate([np.maximum(1.0, off).ravel(), *each])

@@ -320,10 +320,8 @@ class RecordedRows:
         return NoiseLevels(np.sqrt((residual**2).mean(0)).clip(1e-12), force)
 
     def likely(self, x: np.ndarray, measured: Motion, noise: NoiseLevels) -> "LikelyAccelerations":
-        """What was there where a and u are noisy, by the estimates at x, these levels of noise, contacts and IMUs.
-
-        Forces of joints that nothing measures, as those of a base, belong to a*, since they move the robot.
-        """
+        """What was there where a and u are noisy, by the estimates at x, these levels of noise, contacts and IMUs."""
+        # forces of joints that nothing measures, as those of a base, belong to a*, since they move the robot
         _, M, H = self.acceleration(x)
         needed, _, _, response = self.in_torque(x, measured)
         of_bodies = M - self.inertia - self._armature - self.space.added_inertia(x)

@@ -98,10 +98,8 @@ class Equations:
         return means[1] - means[0]
 
     def in_torque(self, x: np.ndarray, motions: Sequence[Motion]) -> tuple[np.ndarray, Jacobian]:
-        """Torques needed less those measured; beside gains, where contacts hide nothing, as they are logged.
-
-        Those of passive joints are over their inertia: else they would vanish with the bodies that they move.
-        """
+        """Torques needed less those measured; beside gains, where contacts hide nothing, as they are logged."""
+        # those of passive joints are over their inertia: else they would vanish with the bodies that they move
         found = [part.in_torque(x, motion)[:3] for part, motion in zip(self.parts, motions, strict=True)]
         windows = None if self.held.shape[1] else self.windows
         r, jacobian = self.equations(x, found, windows)

@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from forcegp.data import Dataset
 from forcegp.data.dataset import FORCE, IMU
+from forcegp.data.delay import torques_of_joints
 from forcegp.data.imu import SECONDS, SHIFTS, expected, late_doubts, short_means
 from forcegp.data.units import UNITS
 from forcegp.data.views import tensors
@@ -105,6 +106,25 @@ def force_sensor_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
         if left_of is not None and len(dataset.episodes) == 1 and dataset.time_ordered:
             moved = (np.stack([np.interp(dataset.time + s, dataset.time, x) for x in values.T], axis=1) for s in SHIFTS)
             yield from late_doubts(f"force sensor at {frame}", [*map(left_of, moved)], step)
+
+
+def with_touches(dataset: Dataset, doubts: Iterable[Doubt]) -> tuple[Dataset, list[Doubt]]:
+    """Torques and what force sensors away from contacts measured beside them, where torques need it; these, as told.
+
+    As if drives had delivered it: what is learned is the robot that is not touched.
+    """
+    model, held = dataset.model, {contact.frame for contact in dataset.model.contacts}
+    needed = (x for x in doubts if x.about == "force sensor" and x.level == "ok" and x.numbers.get("left", 1) < FOLLOWS)
+    felt = [x for x in needed if x.numbers["frame"] not in held] if torques_of_joints(dataset) else []
+    if not felt:
+        return dataset, []
+    q, _, u, _ = tensors(dataset)
+    kinematics, sensed = model.robot.to("cpu").kinematics(q), sensed_of(dataset)
+    measured, told = dict(dataset.measured), [replace(each, what=f"{each.what} It is added to u.") for each in felt]
+    for frame in (each.numbers["frame"] for each in felt):
+        u = u + (arm(kinematics, model, frame) @ torch.tensor(sensed[frame])[..., None])[..., 0]
+        del measured[f"{FORCE}{frame}"]
+    return replace(dataset, u=u.numpy(), measured=measured), told
 
 
 def _fitted(x: Float[np.ndarray, " rows"], y: Float[np.ndarray, " rows"]) -> tuple[float, float]:

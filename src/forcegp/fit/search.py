@@ -183,10 +183,8 @@ class FitObjective:
 
 
 def with_variance_priors(kernels: inference.LatentKernels) -> inference.LatentKernels:
-    """A copy of which every output scale carries the prior log variance ~ N(log of its present value, 2^2).
-
-    The likelihood is flat below the noise: a variance could run off to zero, with too small standard errors.
-    """
+    """A copy of which every output scale carries the prior log variance ~ N(log of its present value, 2^2)."""
+    # the likelihood is flat below the noise: a variance could run off to zero, with too small standard errors
     out = deepcopy(kernels)
     for module in out.modules():
         if isinstance(module, ScaleKernel) and "outputscale_prior" not in [name for name, *_ in module.named_priors()]:

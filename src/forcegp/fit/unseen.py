@@ -68,10 +68,8 @@ class Unseen:
         return cls(typical, tuple(np.flatnonzero(pushing).tolist()), pushing, hidden)
 
     def with_pushes(self, noise: Noise, rows: int = 1) -> Noise:
-        """The noise with what pushes, and with that of joint forces where sensors show it, which is learned.
-
-        A hand lasts: so many rows in which it pushes tell functions no more than one.
-        """
+        """The noise with what pushes, and with that of joint forces where sensors show it, which is learned."""
+        # A hand lasts: so many rows in which it pushes tell functions no more than one
         if noise.sensor is not None and noise.force is None:
             noise = replace(noise, force=tuple(LEARNED * self.typical))
         if not self.pushed:

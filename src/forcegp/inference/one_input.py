@@ -225,10 +225,8 @@ def _places(drawn: DrawnTerm, centers: Float[Tensor, " N"]) -> Float[Tensor, " P
 
 
 def _one_side(weights: np.ndarray, h: np.ndarray, polynomial: tuple[float, ...]) -> Float[np.ndarray, "K R n"]:
-    """Coefficients of u^a in sum_j w_j p(u + D_j) e^-D_j over the centres up to each one, D_j away from it.
-
-    From one centre to the next, h away, the binomial theorem shifts sum_j w_j D_j^k e^-D_j; all exponentials decay.
-    """
+    """Coefficients of u^a in sum_j w_j p(u + D_j) e^-D_j over the centres up to each one, D_j away from it."""
+    # From one centre to the next, h away, the binomial theorem shifts sum_j w_j D_j^k e^-D_j; all exponentials decay
     n = len(polynomial)
     shift, expand = np.zeros((len(h), n, n)), np.zeros((n, n))
     for k in range(n):

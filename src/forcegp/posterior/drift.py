@@ -76,10 +76,8 @@ class Drift:
 
     @property
     def shares(self) -> Float[np.ndarray, "2 1 1 1"]:
-        """What is unknown now of one deviation of dry and of viscous friction.
-
-        A level that was followed is that of their sum, alike in size: their difference is left, half of the variance.
-        """
+        """What is unknown now of one deviation of dry and of viscous friction."""
+        # A level that was followed is that of their sum, alike in size: their difference is left, half of the variance
         dry = max((s / b for s, b in zip(self.std, self.between, strict=True) if b > 0.0), default=0.0)
         return np.array([dry, {"unknown": 1.0, "another": 0.5**0.5, "fit": 0.0}[self.here]])[:, None, None, None]
 
