@@ -82,7 +82,7 @@ def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator
     largest, turns = np.abs(now.rows.q * inputs.rotates).max(), inputs.rotates
     each = [np.arange(len(turns)) == k for k in np.flatnonzero(turns & (np.abs(now.rows.q).max(axis=0) > 7.0))]
     for own in [turns, *(one for one in each if turns.sum() > 1)] if largest > 1.0 else []:
-        if own.any() and _limits_allow(now, np.where(own, DEGREE, 1.0)):
+        if own.any() and _limits_allow(now, own):
             what = f"positions reach {largest:.4g}; they fit the torques far better as degrees than as radians"
             unit = {
                 name: tuple(x.replace("rad", "deg") if own[k] else x for k, x in enumerate(inputs.stated_units(name)))
@@ -91,7 +91,7 @@ def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator
             told = {"joints": _places(own), "correction": {"unit": unit}}
             cause = Cause(about="degrees", what=what, do="Use np.deg2rad.", cost=SIGN, **told)
             yield cause, now.after(changed("qva", factor=np.where(own, DEGREE, 1.0)))
-    if turns.any() and _limits_allow(now, np.where(turns, 2.0 * np.pi, 1.0)):
+    if turns.any() and _limits_allow(now, turns):
         what = "positions fit the torques far better taken for turns than for radians"
         cause = Cause(about="turns", what=what, do="Multiply q and v by 2 pi.", joints=_places(turns), cost=SIGN)
         yield cause, now.after(changed("qva", factor=np.where(turns, 2.0 * np.pi, 1.0)))
@@ -109,12 +109,10 @@ def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator
         yield cause, now.after(change)
 
 
-def _limits_allow(now: Comparison, factor: np.ndarray) -> bool:
-    """Whether positions that are multiplied may be others: as logged they break limits of the file, or have none."""
+def _limits_allow(now: Comparison, own: np.ndarray) -> bool:
+    """Whether positions of these joints may be others: the log breaks limits of the file, or one of these has none."""
     low, high = np.array([(x.lower, x.upper) for x in map(now.robot.joint, now.robot.joint_names)]).T
-    q, beyond = np.stack([now.rows.q * factor, now.rows.q]), 0.1 * (high - low)
-    then, logged = ((q >= low - beyond) & (q <= high + beyond)).all(axis=(1, 2))
-    return bool(not logged or (then and np.isinf(beyond[factor != 1.0]).any()))
+    return not ((now.rows.q >= low) & (now.rows.q <= high)).all() or bool(np.isinf(high - low)[own].any())
 
 
 SLOWEST, FASTEST = 1.0, 5500.0  # rates of logs [Hz] that need no other unit of time

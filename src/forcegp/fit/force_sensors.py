@@ -109,9 +109,9 @@ def force_sensor_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
 
 
 def with_touches(dataset: Dataset, doubts: Iterable[Doubt]) -> tuple[Dataset, list[Doubt]]:
-    """Torques and what force sensors away from contacts measured beside them, where torques need it; these, as told.
+    """u + J^T F of force sensors away from contacts [Nm or N], where torques need it; and these sensors, as told.
 
-    As if drives had delivered it: what is learned is the robot that is not touched.
+    As if drives had delivered it: what is learned is the robot that is not touched. Such sensors are then no evidence.
     """
     model, held = dataset.model, {contact.frame for contact in dataset.model.contacts}
     needed = (x for x in doubts if x.about == "force sensor" and x.level == "ok" and x.numbers.get("left", 1) < FOLLOWS)
