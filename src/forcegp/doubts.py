@@ -1,7 +1,5 @@
 """`Doubt`: what speaks against a log, a contact, a model or its scores, and what to do about it."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -70,7 +68,7 @@ wrong, look, ok = partial(Doubt, level="wrong"), partial(Doubt, level="look"), p
 class Doubts(tuple[Doubt, ...]):
     """Doubts in one list, worst first, as terminal, reports and notebooks show them."""
 
-    def __new__(cls, doubts: Iterable[Doubt] = ()) -> Doubts:
+    def __new__(cls, doubts: Iterable[Doubt] = ()) -> "Doubts":
         """Sorted by level; the order of those of one level stays."""
         return super().__new__(cls, sorted(doubts, key=lambda doubt: -LEVELS.index(doubt.level)))
 
@@ -79,11 +77,11 @@ class Doubts(tuple[Doubt, ...]):
         """That of the worst; ok if there are none."""
         return self[0].level if self else "ok"
 
-    def of(self, *subjects: str) -> Doubts:
+    def of(self, *subjects: str) -> "Doubts":
         """Those about these subjects."""
         return Doubts(doubt for doubt in self if doubt.about in subjects)
 
-    def at(self, level: Level) -> Doubts:
+    def at(self, level: Level) -> "Doubts":
         """Those of one level."""
         return Doubts(doubt for doubt in self if doubt.level == level)
 

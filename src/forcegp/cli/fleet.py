@@ -1,7 +1,5 @@
 """`--logs-from LIST`: one command for many logs, each a line of words that differ, with a row of results for each."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import io

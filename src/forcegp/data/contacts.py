@@ -1,7 +1,5 @@
 """In which rows of a log a contact acts, and whether the motion bears it out."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Bool

@@ -1,7 +1,5 @@
 """`Dataset`: what was measured on a robot, checked once and never changed."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -180,7 +178,7 @@ class Dataset(Summary):
         return tuple(int(value) for value in values[np.argsort(first)])
 
     @usable_arguments("Dataset.rows")
-    def rows(self, index: slice | Sequence[int] | np.ndarray) -> Dataset:
+    def rows(self, index: slice | Sequence[int] | np.ndarray) -> "Dataset":
         """The rows of a slice, boolean mask (rows,) or list of row numbers, in the order given.
 
         Raises InvalidInput for row numbers that do not exist, DatasetError where one repeats and for none at all.
@@ -197,7 +195,7 @@ class Dataset(Summary):
         T = None if transmission is None else np.asarray(torch.as_tensor(transmission).cpu())
         return self.strokes is not None and np.array_equal(self.transmission, T)  # type: ignore[arg-type]  # None is None
 
-    def select_episodes(self, ids: Iterable[int]) -> Dataset:
+    def select_episodes(self, ids: Iterable[int]) -> "Dataset":
         """All rows of the given episodes, in their present order. Raises InvalidInput for numbers that do not occur."""
         wanted = tuple(ids)
         missing = [number for number in wanted if number not in self.episodes]
@@ -212,7 +210,7 @@ class Dataset(Summary):
 
     @staticmethod
     @usable_arguments("Dataset.load")
-    def load(path: str | Path) -> Dataset:
+    def load(path: str | Path) -> "Dataset":
         """Read a file written by `save`. Raises FileFormatError saying what is wrong with the file."""
         try:
             return Dataset(**read_fields(Path(path)))

@@ -1,7 +1,5 @@
 """How much later than they act torques were logged, and behind which filter; and waves over positions, beside them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

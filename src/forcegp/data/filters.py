@@ -1,7 +1,5 @@
 """What linear filters make of signals: a low-pass, delays and lags, derivatives, other rates."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal

@@ -86,7 +86,7 @@ def read_fields(path: Path) -> dict[str, Any]:
         raise
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # whatever h5py meets in a damaged file
         kind = "is damaged" if h5py.is_hdf5(path) else "is not an HDF5 file"
-        raise FileFormatError(f"{path} {kind}: {error}. Write it again, or convert the log to a Dataset.") from error
+        raise FileFormatError(f"{path} {kind}: {error}. Write it again, or `forcegp import` the log.") from error
 
 
 @dataclass

@@ -4,8 +4,6 @@ An accelerometer measures the specific force f = R^T (J a + Jdot v - g) (Tittert
 navigation technology", 2004, section 3.5), which is affine in the acceleration.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -99,7 +97,7 @@ class BesideMotion:
     whole: bool
 
     @classmethod
-    def of(cls, dataset: Dataset, model: forcegp.model.Model, name: str) -> BesideMotion:
+    def of(cls, dataset: Dataset, model: forcegp.model.Model, name: str) -> "BesideMotion":
         """That of a log, of means over short windows."""
         rest = replace(dataset, v=0.0 * dataset.v, a=0.0 * dataset.a)
         both = expected(dataset, model, name), dataset.measured[name], expected(rest, model, name)

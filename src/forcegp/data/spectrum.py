@@ -1,7 +1,5 @@
 """Where motion ends and noise begins: spectra (Welch 1967), noise floor and cut-off; see docs/how-to/checking.md."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -3,8 +3,6 @@
 What the rows ask of all contacts is lambda = argmin |L^-1 (M a - Q_K - A^T lambda)|, M = L L^T: Gauss' principle.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from warnings import warn
 
@@ -61,7 +59,7 @@ class Stance:
         """Where a foot clearly moves."""
         return self.speed >= CLEARLY * self.slow
 
-    def rows(self, index: Int[np.ndarray, " kept"]) -> Stance:
+    def rows(self, index: Int[np.ndarray, " kept"]) -> "Stance":
         """The same for some of the rows."""
         return replace(self, **{name: getattr(self, name)[index] for name in ("flags", "speed", "force")})
 

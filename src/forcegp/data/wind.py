@@ -1,7 +1,5 @@
 """A body that flies: the wind of a recording, which nobody measured, from forces on it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -47,7 +45,7 @@ class AirLaw:
         return self._smoothed(_Forces.of(dataset), dataset, start, seconds, after=False)
 
     def _smoothed(
-        self, forces: _Forces, dataset: Dataset, start: np.ndarray, seconds: float, *, after: bool, sweeps: int = 4
+        self, forces: "_Forces", dataset: Dataset, start: np.ndarray, seconds: float, *, after: bool, sweeps: int = 4
     ) -> Float[np.ndarray, "rows 3"]:
         weights, law = 1.0 / np.square(self.deviations), np.array(self.coefficients)
         wind = start.copy()
@@ -111,7 +109,7 @@ class _Forces:
     height: np.ndarray
 
     @classmethod
-    def of(cls, dataset: Dataset) -> _Forces:
+    def of(cls, dataset: Dataset) -> "_Forces":
         robot = dataset.model.robot
         model, group = dataset.model, robot.layout.groups[0]
 

@@ -1,7 +1,5 @@
 """One recording from a log: columns in SI, checked, continued, cut at gaps, and its rows as a Dataset has them."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any

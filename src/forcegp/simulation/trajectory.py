@@ -1,7 +1,5 @@
 """An arm and its tool, what that slides on, friction, a smooth path through way-points, and its controller."""
 
-from __future__ import annotations
-
 import dataclasses
 import warnings
 from collections.abc import Callable, Mapping
