@@ -75,8 +75,7 @@ def contents() -> str:
 
 def run(name: str, arguments: list[str], log: Path) -> dict[str, object]:
     """One run of pytest: its exit code, seconds, last line, and the tests that failed."""
-    environment = {**os.environ, **VARIANTS[name]}
-    begin = time.monotonic()
+    environment, begin = {**os.environ, **VARIANTS[name]}, time.monotonic()
     with log.open("w") as output, busy(BUSY if name == "loaded" else 0):
         command = [sys.executable, "-m", "pytest", *arguments]
         code = subprocess.run(command, cwd=REPOSITORY, env=environment, stdout=output, stderr=output).returncode

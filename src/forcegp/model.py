@@ -163,8 +163,7 @@ class Model(Summary):
         return self._robot_of_files().to_urdf(path)
 
     def _robot_of_files(self) -> Robot:
-        robot = self.loaded_robot
-        found = {type(force): force.values for force in self.laws}
+        robot, found = self.loaded_robot, {type(force): force.values for force in self.laws}
         if Rotor in found:
             robot = robot.with_armature((robot.armature + found[Rotor]["inertia"]).tolist())
         viscous = [values["damping"] for kind, values in found.items() if kind is Viscous]

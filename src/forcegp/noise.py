@@ -54,8 +54,7 @@ class Noise:
         if self.acceleration is None:
             raise InvalidInput("Noise(None) takes noise of accelerations from the dataset of a fit; give a number.")
         named = {ACCELERATION: self.acceleration, FORCE: self.force, PUSHES: self.pushes}
-        named = {name: value for name, value in named.items() if value is not None}
-        out = {}
+        named, out = {name: value for name, value in named.items() if value is not None}, {}
         for name, value in named.items():
             values = torch.as_tensor(value, dtype=torch.float64, device=device)
             if values.dim() and len(values) != nv:

@@ -46,8 +46,7 @@ def read_apart(
     try:
         how: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "timeout": 2 * asked["seconds"]}
         command, given = [sys.executable, "-P", "-m", __name__], json.dumps(asked).encode()
-        process = subprocess.run(command, input=given, env=os.environ | settings, check=False, **how)
-        return json.loads(process.stdout)
+        return json.loads(subprocess.run(command, input=given, env=os.environ | settings, check=False, **how).stdout)
     except (subprocess.TimeoutExpired, ValueError):
         limits = f"{asked['seconds']} s or {asked['memory'] >> 20} MiB"
         raise error(f"{source}: {reader} crashed at it, or needed more than {limits}; {remedy}.") from None

@@ -1,7 +1,5 @@
 """Logs without a mistake, on which nothing may be called wrong: rest, no gravity, contacts, odd friction."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise

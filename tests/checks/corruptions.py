@@ -1,7 +1,5 @@
 """Logs of two-joint robots, and what goes wrong with such logs: each corruption is a function of a clean log."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 
@@ -33,8 +31,7 @@ def two_links(
     """Two links that hang down at q = 0, with the centre of mass of each in its middle; `size` times as long."""
     lengths, masses = (lengths[0] * size, lengths[1] * size), (masses[0] * size**3, masses[1] * size**3)
     x, z = (0.0, -lengths[0]) if elbow is None else elbow
-    at = f"{x} 0 {z}"
-    limits = '<limit lower="-9" upper="9" effort="900" velocity="90"/>'
+    at, limits = f"{x} 0 {z}", '<limit lower="-9" upper="9" effort="900" velocity="90"/>'
     links = "".join(
         f'<link name="link{k + 1}"><inertial><origin xyz="{0.01 * size} 0 {-length / 2}"/><mass value="{mass}"/>'
         f'<inertia ixx="{mass * length**2 / 12 + 1e-3 * size**5}" iyy="{mass * length**2 / 12 + 1e-3 * size**5}" '
@@ -72,8 +69,7 @@ def clean(robot: Robot, seed: int, *, rate: float = 250.0, seconds: float = 8.0,
     u = robot.inverse_dynamics(*(torch.tensor(x) for x in (q, v, a))).numpy()
     u, noise_std = u + np.std(u, axis=0) * (0.05 * v + 0.1 * np.tanh(v / 0.05)), None
     if noise == "a":
-        noise_std = np.full(2, 0.1)
-        a = a + noise_std * generator.normal(size=a.shape)
+        a, noise_std = a + 0.1 * generator.normal(size=a.shape), np.full(2, 0.1)
     elif noise == "qvu":
         q, v = q + 2e-5 * generator.normal(size=q.shape), v + 3e-4 * generator.normal(size=v.shape)
         u, a = u + 0.01 * np.std(u, axis=0) * generator.normal(size=u.shape), np.gradient(v, time, axis=0, edge_order=2)

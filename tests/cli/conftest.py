@@ -52,6 +52,5 @@ def workshop(forcegp, tmp_path_factory) -> Path:
         made = forcegp(*words, folder=folder).ok()
         (folder / f"{name}.json").write_text(made.stdout)
     words = ("fit", "train.h5", "--forces", "gp:joint", "--points", 15, "--iterations", 8, "--restarts", 2)
-    fitted = forcegp(*words, "--out", "run", folder=folder).ok()
-    (folder / "fit.txt").write_text(fitted.stdout)
+    (folder / "fit.txt").write_text(forcegp(*words, "--out", "run", folder=folder).ok().stdout)
     return folder

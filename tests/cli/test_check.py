@@ -52,8 +52,7 @@ def test_defects_are_told_but_are_no_error(forcegp, folder):
 
 def test_prepare_writes_what_it_says(forcegp, folder):
     words = ("import", "noisy.h5", "--cutoff", "auto", "--delay", "auto", "--every", 4, "--trim", 0.2)
-    done = forcegp(*words, "--out", "data.h5", "--json", folder=folder).ok()
-    told = json.loads(done.stdout)["preparation"]
+    told = json.loads(forcegp(*words, "--out", "data.h5", "--json", folder=folder).ok().stdout)["preparation"]
     data, raw = Dataset.load(folder / "data.h5"), Dataset.load(folder / "noisy.h5")
     assert told["rows"] == [len(raw), len(data)]
     assert_unchanged("cli/preparation", {**told, "why": None}, rtol=1e-2)

@@ -24,8 +24,7 @@ def folder(forcegp, tmp_path_factory):
 
 def test_the_next_motion_of_a_model_can_be_imported(forcegp, folder):
     words = ("excite", "run", *FEW, "--out", "next.csv")
-    done = forcegp(*words, "--json", folder=folder).ok()
-    found = json.loads(done.stdout)
+    found = json.loads(forcegp(*words, "--json", folder=folder).ok().stdout)
     assert max(max(each) for each in found["usage"].values()) <= 1.0
     assert (np.array(found["spread"][1]) < found["spread"][0]).all()
     table = np.genfromtxt(folder / "next.csv", delimiter=",", skip_header=1)
@@ -43,8 +42,7 @@ def test_the_next_motion_of_a_model_can_be_imported(forcegp, folder):
 
 def test_a_robot_without_a_model(forcegp, folder):
     words = ("excite", "--robot", "arm.urdf", *FEW, "--posture", "0,0.5,0.5", "--avoid", "hand:plane:0,0,1,-9")
-    done = forcegp(*words, "--out", "bare.csv", "--json", folder=folder).ok()
-    found = json.loads(done.stdout)
+    found = json.loads(forcegp(*words, "--out", "bare.csv", "--json", folder=folder).ok().stdout)
     assert found["spread"] is None
     assert found["condition"] > 1.0
     first, last = np.genfromtxt(folder / "bare.csv", delimiter=",", skip_header=1)[[0, -1]]
@@ -62,6 +60,5 @@ def test_a_robot_without_a_model(forcegp, folder):
     ],
 )
 def test_what_is_refused(forcegp, folder, words, message):
-    done = forcegp("excite", *words, "--seconds", 1, "--tries", 1, "--out", "never.csv", folder=folder)
-    done.refused(message)
+    forcegp("excite", *words, "--seconds", 1, "--tries", 1, "--out", "never.csv", folder=folder).refused(message)
     assert not list(folder.glob("never*"))

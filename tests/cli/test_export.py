@@ -28,8 +28,7 @@ def folder(forcegp, tmp_path_factory):
 @pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
 def test_a_model_becomes_a_program(forcegp, folder):
     words = ("export", "run", "--to", "c", "--out", "deployed", "--steps", 0.02)
-    done = forcegp(*words, "--json", folder=folder).ok()
-    summary, out = json.loads(done.stdout), folder / "deployed"
+    summary, out = json.loads(forcegp(*words, "--json", folder=folder).ok().stdout), folder / "deployed"
     assert set(summary["files"]) == FILES
     assert {file.name for file in out.iterdir()} == FILES | {"config.json", "SHA256SUMS"}
     assert set(summary["differences"]) == {"arm_mean", "arm_step", "arm_inverse_dynamics", "arm_forces"}
@@ -38,8 +37,7 @@ def test_a_model_becomes_a_program(forcegp, folder):
     subprocess.run(["cc", "-std=c99", "self_test.c", "arm.c", "-o", "../x", "-lm"], cwd=out, check=True)
     assert subprocess.run(["../x"], cwd=out, capture_output=True, check=False).returncode == 0
 
-    again = forcegp(*words, folder=folder)
-    again.refused("add --overwrite")
+    forcegp(*words, folder=folder).refused("add --overwrite")
     shown = forcegp(*words, "--overwrite", "--unchecked", folder=folder)
     assert shown.returncode == 0
     assert "self_test.c" in shown.stdout
@@ -50,8 +48,7 @@ def test_a_model_becomes_a_program(forcegp, folder):
 def test_a_model_becomes_casadi_functions(forcegp, folder):
     casadi = pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
     words = ("export", "run", "--to", "casadi", "--out", "planner", "--steps", 0.02, "--integrator", "rk4")
-    done = forcegp(*words, "--json", folder=folder).ok()
-    differences = json.loads(done.stdout)["differences"]
+    differences = json.loads(forcegp(*words, "--json", folder=folder).ok().stdout)["differences"]
     assert differences["arm.casadi"] < 1e-11
     assert differences["arm_step.casadi"] < 1e-8
     assert casadi.Function.load(str(folder / "planner" / "arm_step.casadi")).name_out() == ["q_next", "v_next"]
@@ -103,6 +100,5 @@ def test_a_full_disk_is_one_line_and_leaves_the_old_program(forcegp, folder, mon
 
     monkeypatch.setattr(Path, "write_bytes", full)
     monkeypatch.setattr(Path, "write_text", lambda path, text, **_: full(path, text.encode()))
-    done = forcegp(*words, "--overwrite", folder=folder)
-    done.refused("No space left on device")
+    forcegp(*words, "--overwrite", folder=folder).refused("No space left on device")
     assert {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()} == before

@@ -34,8 +34,7 @@ def test_a_clean_log_is_fitted_without_a_word_and_a_search_that_stopped_names_th
 
 
 def test_one_line_names_what_is_wrong_and_the_next_step(forcegp, folder):
-    done = forcegp("fit", "sign.h5", *FIT, folder=folder).ok()
-    (line,) = looked(done.stderr)
+    (line,) = looked(forcegp("fit", "sign.h5", *FIT, folder=folder).ok().stderr)
     assert line.startswith("warning: torque sign: the torque of joint2 has the opposite sign")
     assert "forcegp check sign.h5" in line
     assert not looked(forcegp("fit", "sign.h5", *FIT, "--no-checks", folder=folder).stderr)

@@ -48,8 +48,7 @@ def folder(tmp_path_factory):
 @pytest.mark.nightly
 def test_a_walker_is_identified_and_a_fit_begins_with_it(folder, forcegp):
     words = ("fit", "walk.h5", "--forces", "bodies,viscous,coulomb,rotor", "--out", "found")
-    done = forcegp(*words, "--json", folder=folder).ok()
-    content = json.loads(done.stdout)
+    content = json.loads(forcegp(*words, "--json", folder=folder).ok().stdout)
     bodies = body_pseudo_inertias(Robot.from_urdf_text(LIMBS, base="floating")).numpy()[:, 3, 3]
     masses = [each["value"] for name, each in content["estimates"].items() if name.endswith(".mass")]
     assert sum(masses) == pytest.approx(bodies.sum() + 0.6 * bodies[0], rel=0.01)

@@ -49,8 +49,7 @@ def test_a_payload_takes_back_factors_of_joints_that_it_explains(carried, noise)
     data = replace(data, u=data.u * (1.0 + noise * one * np.sin(9.0 * data.time[:, None])))
     found = Found(data, rows=400).posterior
     told = {"about": "torque constant", "what": "w.", "do": "d.", "joints": ("elbow_joint",)}
-    doubts = Doubts(kind(**told) for kind in (look, wrong))
-    left = without_explained(doubts, found, data)
+    left = without_explained(Doubts(kind(**told) for kind in (look, wrong)), found, data)
     assert [each.level for each in left] == (["wrong"] if carried and not noise else ["wrong", "look"])
 
 

@@ -173,8 +173,7 @@ def test_chosen_motions_are_what_they_were(chosen):
 
 def test_gears_that_remember_are_met_as_the_motion_leaves_them():
     """z+ = s + (z - s) exp(-sigma |dq|) sample by sample, from 0; torques against Pinocchio."""
-    law = Coulomb(0.8, 0.05, sigma=20.0, memory=("pan", "bend"))
-    model = FREE.with_forces(law)
+    model = FREE.with_forces(Coulomb(0.8, 0.05, sigma=20.0, memory=("pan", "bend")))
     found = excitation(model, **FEW, limits=LIMITS | {"torque": 60.0})
     z, last = np.zeros((len(found.motion.q), 3)), np.zeros(3)
     for k in range(1, len(z)):

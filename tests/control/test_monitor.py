@@ -13,7 +13,7 @@ from tests.goldens.compare import assert_unchanged
 from tests.posterior.arm import arm_model
 
 from forcegp import ContactMonitor, Dataset, JointFriction, Model, Robot, Rotor, fit
-from forcegp.control.monitor import errors_near_rest, link_ends
+from forcegp.control.monitor import _touches, errors_near_rest, link_ends
 from forcegp.errors import DatasetError, InvalidInput
 from forcegp.evidence.least_squares import NoiseLevels
 from forcegp.forces import Coulomb
@@ -199,6 +199,38 @@ def test_a_place_explains_the_torque_by_the_least_force():
         np.testing.assert_allclose([found.point, found.force, found.force_std], wanted, rtol=1e-6, atol=1e-9)
         chosen.append(best % 5)
     assert {*chosen} == {0, 1, 2, 3, 4}
+
+
+def test_smallest_forces_are_those_of_all_directions_at_the_ends_of_links():
+    robot = Robot.from_urdf_text(files("forcegp.simulation").joinpath("ur5.urdf").read_text())
+    observer, rng = ContactMonitor(Model(robot), dt=DT), np.random.default_rng(4)
+    observer.noise, observer.threshold = NoiseLevels(rng.uniform(0.1, 0.3, 6), rng.uniform(0.1, 0.5, 6)), 25.0
+    q, sides = torch.from_numpy(rng.uniform(-3.0, 3.0, 6)), rng.standard_normal((100_000, 3))
+    M = robot.mass_matrix(q).numpy()
+    S = M @ np.diag(observer.noise.acceleration**2) @ M + np.diag(observer.noise.force**2)
+    unit = sides / np.linalg.norm(sides, axis=1, keepdims=True)
+    for link, found in observer.smallest_forces(np.stack([q, q])).items():
+        tau = unit @ robot.kinematics(q).frame_jacobian(link, link_ends(robot)[link])[:3].numpy()
+        newton = 5.0 / np.sqrt(np.einsum("ki,ij,kj->k", tau, np.linalg.inv(S), tau).clip(1e-12))
+        for each, limit in zip((newton.min(), newton.max()), found, strict=True):
+            assert each == pytest.approx(limit, rel=0.02) or (limit == math.inf and each > 1e3)
+
+
+def test_free_motion_is_tested_itself():
+    spread = torch.linspace(1.0, 1.2, 21, dtype=torch.float64)  # median 1.1, quartiles .1 apart
+    found = [[*_touches(torch.cat([spread, spread.new_tensor([x])]), [spread.new_ones(22, 2)])] for x in (1.6, 1.75)]
+    assert [len(each) for each in found] == [0, 1], "over 1.5 medians, and over 5.6 quartiles more"
+    assert "from 42 to 44 s" in found[1][0].what
+    wide, strong = torch.linspace(1.0, 3.0, 21, dtype=torch.float64), torch.ones(21, 2, dtype=torch.float64)
+    assert not [*_touches(torch.cat([wide, wide.new_tensor([7.5])]), [spread.new_ones(22, 2)])]
+    strong[3], strong[4] = 15.0, 5.0
+    assert ["from 6 to 8 s" in each.what for each in _touches(spread, [strong])] == [True]
+    push = np.zeros((6000, 2))
+    push[2000:2400] = 0.3, 0.1
+    q, v, u = motion(60.0, 3)
+    doubts = [ContactMonitor(TRUE, dt=DT).calibrate([(q, v, u - x)]).doubts for x in (0.0, push, [0.0, 0.05])]
+    assert [[each.about for each in own] for own in doubts] == [[], ["touched"], ["offset"]]
+    assert doubts[2][0].joints == ("elbow",)
 
 
 def test_links_reach_from_their_joint_to_the_next_one():

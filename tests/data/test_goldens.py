@@ -46,8 +46,7 @@ def test_spectra_and_cutoffs(arm, source):
 
 
 def test_delays(arm):
-    smooth = data.low_pass(arm, 20.0)
-    found = {"arm": data.estimate_delay(smooth), "far": data.estimate_delay(arm_log(-0.08))}
+    found = {"arm": data.estimate_delay(data.low_pass(arm, 20.0)), "far": data.estimate_delay(arm_log(-0.08))}
     assert_unchanged("data/delay", found, rtol=1e-4)
 
 

@@ -91,8 +91,7 @@ def hop(base: str, rate: float, stands: float, gravity=(0.0, 0.0, -9.81)):
     t = time % (flies + stands)
     flags, w = (t >= flies).astype(float), np.pi / stands
     in_air, on_ground = t, t - flies
-    deep = speed / w
-    z = np.where(flags, -deep * np.sin(w * on_ground), speed * in_air - 0.5 * 9.81 * in_air**2)
+    z = np.where(flags, -speed / w * np.sin(w * on_ground), speed * in_air - 0.5 * 9.81 * in_air**2)
     dz = np.where(flags, -speed * np.cos(w * on_ground), speed - 9.81 * in_air)
     ddz = np.where(flags, speed * w * np.sin(w * on_ground), -9.81)
     q = np.tile(robot.neutral().numpy(), (len(time), 1))

@@ -47,8 +47,7 @@ def test_three_processes_at_one_output_leave_one_whole_output(inputs, tmp_path, 
     command, out = COMMANDS[name], tmp_path / "out"
     if again:
         assert run(command.line(out), inputs)[0] == 0
-    processes = [start(command.line(out, again=again), inputs) for _ in range(3)]
-    codes = []
+    processes, codes = [start(command.line(out, again=again), inputs) for _ in range(3)], []
     for process in processes:
         _, errors = process.communicate()
         assert_one_line(process.returncode, errors)

@@ -44,8 +44,7 @@ def test_equals_the_dense_formula_with_all_gradients(mean, force, contacts):
     for joint in range(3):
         lengthscale = parameters[f"kernels.{joint}.base_kernel.raw_lengthscale"].exp()
         outputscale = parameters[f"kernels.{joint}.raw_outputscale"].exp()
-        difference = (z[:, None] - z[None, :]) / lengthscale
-        matrices.append(outputscale * torch.exp(-0.5 * difference.square().sum(-1)))
+        matrices.append(outputscale * torch.exp(-0.5 * ((z[:, None] - z[None, :]) / lengthscale).square().sum(-1)))
     noise = torch.diag_embed((2 * parameters["noise.log_acceleration"]).exp())
     if force:
         H = dynamics.H

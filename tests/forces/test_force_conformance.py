@@ -43,24 +43,20 @@ class TestToolForces(UnknownConformance):
 
 
 class TestToolForcesOfThePlace(UnknownConformance):
-    prior = ToolForces(inputs=("velocity", "position"), kernel="matern-3/2")
-    acts_at = TIP
+    prior, acts_at = ToolForces(inputs=("velocity", "position"), kernel="matern-3/2"), TIP
 
 
 class TestContactFriction(UnknownConformance):
-    prior = ContactFriction()
-    acts_at = TIP
+    prior, acts_at = ContactFriction(), TIP
 
 
 @JAMS
 class TestContactFrictionUnderLoad(UnknownConformance):
-    prior = ContactFriction(load=True)
-    acts_at = TIP
+    prior, acts_at = ContactFriction(load=True), TIP
 
 
 class TestContactFrictionUnderExpectedLoad(UnknownConformance):
-    prior = ContactFriction(load=True, expected=0.3)
-    acts_at = TIP
+    prior, acts_at = ContactFriction(load=True, expected=0.3), TIP
 
 
 class TestContactFrictionUnderLoadWithJointFriction(UnknownConformance):

@@ -52,8 +52,7 @@ def lugre(time: np.ndarray, v: np.ndarray, stiffness: float, level: float, break
     z, out = 0.0, np.zeros_like(v)
     for k, speed in enumerate(v):
         for _ in range(20):
-            g = level + breakaway * np.exp(-((speed / 0.05) ** 2))
-            rate = speed - stiffness * abs(speed) / g * z
+            rate = speed - stiffness * abs(speed) / (level + breakaway * np.exp(-((speed / 0.05) ** 2))) * z
             z += DT / 20 * rate
         out[k] = stiffness * z + damping * rate * 1e-2
     return out

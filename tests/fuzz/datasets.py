@@ -91,8 +91,7 @@ def write(case: DataFile, path: Path) -> Path:
 def _apply(file: h5py.File, change: Change) -> None:
     name, value = change.name, change.value
     if change.how == "attribute":
-        own = isinstance(file.get("q", getlink=True), h5py.HardLink)
-        holder = file["q"] if name == "units" and own else file
+        holder = file["q"] if name == "units" and isinstance(file.get("q", getlink=True), h5py.HardLink) else file
         text = np.bytes_(value.encode("utf-8", "replace").replace(b"\0", b"?")) if isinstance(value, str) else value
         try:
             holder.attrs[name] = [] if text is None else text

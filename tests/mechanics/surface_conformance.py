@@ -36,8 +36,7 @@ class SurfaceConformance:
 
     @pytest.mark.parametrize("batch", BATCHES, ids=str)
     def test_batch_dimensions_are_arbitrary(self, batch):
-        p = self.points(*batch)
-        shapes = {"value": (), "gradient": (3,), "hessian": (3, 3)}
+        p, shapes = self.points(*batch), {"value": (), "gradient": (3,), "hessian": (3, 3)}
         for name, trailing in shapes.items():
             function = getattr(self.surface, name)
             result = function(p)

@@ -24,16 +24,14 @@ class TestSphere(SurfaceConformance):
 
 class TestWavyFloor(SurfaceConformance):
     surface = ImplicitSurface(lambda p: p[2] - 0.1 * torch.sin(3.0 * p[0]) * torch.cos(2.0 * p[1]))
-    storable = False
-    signed_distance = False
+    storable, signed_distance = False, False
 
 
 class TestQuadric(SurfaceConformance):
     """An ellipsoid that is no signed distance, and whose gradient vanishes at the centre."""
 
     surface = ImplicitSurface(lambda p: (p.square() * torch.tensor([1.0, 2.0, 4.0]).double()).sum() - 1.0)
-    storable = False
-    signed_distance = False
+    storable, signed_distance = False, False
 
 
 class Paraboloid(Surface):
@@ -126,8 +124,7 @@ def test_columns_are_a_right_handed_rotation_whose_third_is_the_normal(batch):
     assert axes.shape == (*batch, 3, 3)
     torch.testing.assert_close(axes.mT @ axes, torch.eye(3).double().expand_as(axes), rtol=0.0, atol=1e-14)
     torch.testing.assert_close(torch.linalg.det(axes), torch.ones(batch).double(), rtol=0.0, atol=1e-14)
-    unit = gradients / gradients.norm(dim=-1, keepdim=True)
-    torch.testing.assert_close(axes[..., 2], unit, rtol=0.0, atol=1e-14)
+    torch.testing.assert_close(axes[..., 2], gradients / gradients.norm(dim=-1, keepdim=True), rtol=0.0, atol=1e-14)
 
 
 def test_on_a_table_the_tangents_are_x_and_y():

@@ -73,8 +73,7 @@ def test_every_path_computes_the_same(seed, tmp_path):
         predictor = posterior.predictor()
         made = export_c(posterior, tmp_path / "c")  # which compares at 300 states, and raises beyond 5e-12
     found = posterior.predict(test.q, test.v, test.u)
-    size = found.mean.abs().max()
-    states = [torch.tensor(x) for x in (test.q, test.v, test.u)]
+    size, states = found.mean.abs().max(), [torch.tensor(x) for x in (test.q, test.v, test.u)]
     assert float((predictor.mean(*states) - found.mean).abs().max()) < 1e-11 * float(size)
     assert max(made.differences.values()) < 1e-9
     motion = posterior.rollout(states[0], states[1], states[2][:, None], 1e-3, integrator="symplectic-euler")

@@ -223,8 +223,7 @@ def _of_velocity(
         found, other, actual = axes, reordered, "xyzw" if order == "wxyz" else "wxyz"
         meant, correction["orientation"] = [f"a quaternion {', '.join(actual)}"], {"q": (actual,)}
     if found:
-        alike = len(found) == 2 and len(set(found.values())) == 1
-        named = {"": next(iter(found.values()))} if alike else found
+        named = {"": next(iter(found.values()))} if len(found) == 2 and len({*found.values()}) == 1 else found
         meant += [f"{name}velocities in the axes of the {axes.replace('body', 'base')}" for name, axes in named.items()]
         axes = tuple(found.get(name, now) for name, now in zip(parts, stated, strict=True))
         correction["axes"] = {"v": axes[:1] if len(set(axes)) == 1 else axes}

@@ -97,8 +97,7 @@ def _all_turned(root: Explanation, inputs: CheckInput) -> tuple[Explanation, lis
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of numbers that these rows do not show
             found = fit(rows.model, rows, Torques())
-        residual = motion_residuals(rows, found.model)[0][:, moving]
-        left.append(residual.var(axis=0) / rows.u[:, moving].var(axis=0))
+        left.append(motion_residuals(rows, found.model)[0][:, moving].var(axis=0) / rows.u[:, moving].var(axis=0))
     after, before = (100.0 * each.mean() for each in left)
     if np.log(left[1] / left[0]).sum() < least or left[0].mean() > RESTS:
         return None

@@ -52,8 +52,7 @@ def answer_lines(
     done, prepared, seconds, out = content["import"], content["preparation"], content["seconds"], content["out"]
     deviation = max(each["largest_deviation_of_a_step"] for each in done["recordings"])
     jitter = f", steps up to {deviation:.0%} off (evened out)" if done["resampled_to_step"] is not None else ""
-    doubts = [*done["stops"], *(x for x in content["check"]["doubts"] if not is_explained(x, scores, best))]
-    seen = seen_in(doubts)
+    seen = seen_in([*done["stops"], *(x for x in content["check"]["doubts"] if not is_explained(x, scores, best))])
     unsettled = FIRST & {*seen}
     held += "; settle what is said above first" if unsettled else ""
     flags = dict.fromkeys(x["command"].removeprefix("forcegp import ") or x["about"] for x in content["mistakes"])

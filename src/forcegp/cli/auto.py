@@ -129,8 +129,7 @@ class Auto(Command):
             rows, recording = self._prepared_rows(terminal, dataset, bool(done["open_switches"]), report)
         settings = dict(rows.metadata["preparation"])
         with terminal.progress("identifying"):
-            wanted = identification(model, more_laws(report.doubts))
-            expression, found = forcegp.scores.identify(recording, wanted)
+            expression, found = forcegp.scores.identify(recording, identification(model, more_laws(report.doubts)))
         identified: Any = found
         laws = forcegp.scores.summands(expression.partition("@")[0])[1:]
         payload: dict[str, Any] = {}

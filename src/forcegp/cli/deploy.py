@@ -19,7 +19,7 @@ import forcegp.scores
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, NUMBERS, Command, listed, numbers_of, unless_given
 from forcegp.cli.robot_options import CONTACTS, RobotOptions, parse_contacts, require_same_joints
-from forcegp.cli.terminal import Terminal, columns
+from forcegp.cli.terminal import Terminal, columns, doubts_table, shown
 from forcegp.errors import InvalidInput
 from forcegp.scores.page import number
 
@@ -95,7 +95,8 @@ def _c(options: Export, terminal: Terminal, posterior: Any, folder: Path) -> dic
         free, dt = _motions(Path(options.free), posterior)
         with terminal.progress("calibrating"):
             predictor = posterior.predictor(covariance="compressed" if options.covariance else "none")
-            given["monitor"] = options.alarms.monitor(predictor, free, dt)
+            given["monitor"] = monitor = options.alarms.monitor(predictor, free, dt)
+        terminal.show(doubts_table(monitor.doubts, terminal.worded))
     made = forcegp.export_c(posterior, folder, **given)
     sizes = [[file, f"{size:,}"] for file, size in made.files.items()]
     terminal.show(columns(str(options.out), ["file", "bytes"], sizes))
@@ -165,9 +166,12 @@ class Monitor(Command):
             parts = [(time, q, monitor.run(q, v, u)) for time, q, v, u in motions if len(time) > 1]
         if not parts:
             raise InvalidInput(f"nothing is left of {self.log} after --free {self.free}.")
+        least = monitor.smallest_forces([row for _, q, _ in parts for row in q])
         contacts = [found for time, q, state in parts for found in _contacts(monitor, time, q, state)]
         content = {"run": str(self.model), "log": str(self.log), "free": self.free, **vars(self.alarms), "dt": dt}
         content |= {"threshold": monitor.threshold, "seconds": sum(len(time) for time, *_ in parts) * dt}
+        finite = {link: [x if math.isfinite(x) else None for x in each] for link, each in least.items()}
+        content |= {"smallest_forces": finite, "doubts": [doubt.to_dict() for doubt in monitor.doubts]}
         title = f"{self.log.name}: {len(contacts)} contacts in {content['seconds']:.0f} s"
         with self.folder(self.out, content) as folder:
             write_json(folder / "contacts.json", {**content, "contacts": contacts})
@@ -180,7 +184,13 @@ class Monitor(Command):
             ]
             for each in contacts
         ]
-        terminal.show(columns(title, header, rows) if rows else title)
+        felt = [[link, *(shown(x, "{:.2g}") for x in each)] for link, each in finite.items()]
+        seen = columns(
+            "smallest forces that it finds", ["at the end of", "along the best axis [N]", "along any [N]"], felt
+        )
+        terminal.show(
+            columns(title, header, rows) if rows else title, seen, doubts_table(monitor.doubts, terminal.worded)
+        )
         return {**content, "contacts": contacts}
 
 

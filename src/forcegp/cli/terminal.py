@@ -127,8 +127,7 @@ class Terminal:
                 # cells that must not be folded: a number without its end is a wrong number
                 wide = self.out.options.update(width=UNLIMITED)
                 needed = 0 if isinstance(renderable, Text) else Measurement.get(self.out, wide, renderable).minimum
-                console = self.out if needed <= self.out.width else _console(width=needed)
-                console.print(renderable)
+                (self.out if needed <= self.out.width else _console(width=needed)).print(renderable)
 
     def command(self, words: str) -> None:
         """A command to copy, in one line whatever the width."""

@@ -236,8 +236,7 @@ def _numbers(graph: Graph, value: _Numbers | Tensor | float | int) -> _Numbers:
 
 def _apply(graph: Graph, target: Any, args: tuple, kwargs: dict[str, Any]) -> Any:
     """One operation of torch on constants or node numbers."""
-    name = _name(target)
-    known = not _holds_numbers(args[1:])
+    name, known = _name(target), not _holds_numbers(args[1:])
     if name in MOVING and (known or name not in INDEXED):
         return _moved(graph, target, args, kwargs, name in INDEXED)
     if name == "_to_copy" and kwargs.get("dtype", torch.float64) in (torch.float64, torch.bool):

@@ -82,8 +82,7 @@ class LearnedForces:
         """The states of joints that have long moved so, with the u of no acceleration."""
         past, states = Past(self.posterior.model), [torch.as_tensor(x) for x in (q, v, 0.0 * v)]
         z = past.over(torch.stack([states[0] - states[1], states[0]], dim=1).flatten(0, 1))[0][1::2]
-        u = inverse_dynamics(self.posterior, states, None, False, z).mean
-        return q, v, past.beside(u, z).numpy()
+        return q, v, past.beside(inverse_dynamics(self.posterior, states, None, False, z).mean, z).numpy()
 
     def after(self, motion: Motion, posterior: Posterior) -> Posterior:
         """`posterior` with rows of the motion, far apart, at which just what it predicts was measured."""

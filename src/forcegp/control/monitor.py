@@ -1,7 +1,7 @@
 """Contacts that nobody modelled, from motion and torque alone: `ContactMonitor`."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from scipy.stats import chi2, gumbel_r
 from torch import Tensor
 
 from forcegp.control.tracking import Moving, Past, joint_forces, model_of
+from forcegp.doubts import Doubt, Doubts, look
 from forcegp.errors import DatasetError, InvalidInput, require_number
 from forcegp.evidence.least_squares import NoiseLevels
 from forcegp.integration.integrators import check_time_step
@@ -38,6 +39,10 @@ PLACES = 5  # points along each link where a contact is tried
 UNSEEN = 1e-6  # of the largest effect of a force on torques: what has less is rounding, as on the axis of a joint
 SAME = 1e-9  # relative; forces that differ by less are as large: one link ends where the next one begins
 EXPLAINED = float(chi2.ppf(0.95, 1))  # links whose misfit is larger by less explain a torque as well as the best
+TOUCHED, FAR, STRONG = 5.6, 1.5, 10.0
+"""Interquartile ranges over the median that of 10,000 roots of largest distances one exceeds (Gumbel), and how many
+medians at least; and medians of a joint's torque that even motions at rest, beside others, do not reach."""
+POSTURES = 50  # at which the smallest forces are computed
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +108,8 @@ class ContactMonitor:
         """Torques (nv, m) of all that friction remembers [Nm or N]."""
         self.ends = link_ends(self.robot)
         self.threshold = math.inf
+        self.doubts = Doubts()
+        """What speaks against the free motion: an offset, or stretches in which something touched the robot."""
         self._maxima = (0.0, 1.0)
         self.restart()
 
@@ -149,6 +156,8 @@ class ContactMonitor:
         self.usual = torch.cat([self._errors(each) for each in found]).square().mean(0).sqrt()
         distances = [self._distances(each) for each in found]
         largest = torch.cat([d[: len(d) // block * block].view(-1, block).amax(1) for d in distances])
+        size = [d[: len(d) // block * block].view(-1, block, self.robot.nv).square().mean(1).sqrt() for d, *_ in found]
+        self.doubts = Doubts([*self._offsets(tau), *_touches(largest.sqrt(), size)])
         self._maxima = gumbel_r.fit(largest.sqrt().numpy())
         self.threshold = float(gumbel_r.isf(rate * BLOCK / 3600.0, *self._maxima)) ** 2
         return self
@@ -194,6 +203,19 @@ class ContactMonitor:
         x, y, z = (tuple(each.tolist()) for each in (point, force[best], inverse[best].square().sum(-1).sqrt()))
         return ContactPlace(link, x, y, z, tuple(name for name in also if name != link))
 
+    def smallest_forces(self, q: Any) -> dict[str, list[float]]:
+        """Forces [N] at the end of each link that reach the threshold: along the axis that is felt best, and worst.
+
+        Medians over postures q (T, nv), at usual errors near rest; inf along axes that no torque shows.
+        """
+        rows, found = torch.tensor(real_array("q", q), dtype=torch.float64), []
+        for at in rows[:: max(1, len(rows) // POSTURES)]:
+            M, J = self.levers(at)
+            S = self._covariance(M, None, self.usual, 0.0 * at)
+            felt = torch.linalg.eigvalsh(J[:, 1] @ torch.linalg.solve(S, J[:, 1].mT))[:, [2, 0]]
+            found.append((self.threshold / torch.where(felt > UNSEEN**2 * felt.max(), felt, 0.0)).sqrt())
+        return dict(zip(self.ends, torch.stack(found).median(0).values.tolist(), strict=True))
+
     def levers(self, q: Float[Tensor, " nq"]) -> list[Tensor]:
         """M (nv, nv), and Jacobians (L, 2, 3, nv) of both ends of every link, world axes; without branches."""
         kinematics = self.known.loaded_robot.kinematics(q)
@@ -215,6 +237,13 @@ class ContactMonitor:
         if self.noise is None:
             raise InvalidInput("this monitor is not calibrated: call calibrate([(q, v, u)]) with free motion first.")
         return self.noise
+
+    def _offsets(self, tau: Tensor) -> Iterator[Doubt]:
+        """Joints in which most of the torque that free motion leaves (rows, nv) is always the same."""
+        for joint, mean, std in zip(self.robot.joint_names, tau.mean(0).tolist(), tau.std(0).tolist(), strict=True):
+            if abs(mean) > std:  # Nm or N
+                seen = f"free motion needs {mean:.2g} more than the model in joint {joint!r} all the time, ± {std:.1g}."
+                yield look(about="offset", what=seen, do="Fit an offset, or find a payload.", joints=(joint,))
 
     def _covariance(self, M: Tensor, extra: Tensor | None, errors: Tensor, inertial: Tensor) -> Tensor:
         """S (..., nv, nv) of filtered torques where the mass matrix is M, with what the posterior leaves open.
@@ -303,6 +332,18 @@ class ContactMonitor:
     def _state(self, tau: Tensor, distance: Tensor) -> ContactState:
         probability = torch.from_numpy(np.asarray(gumbel_r.cdf(distance.sqrt().numpy(), *self._maxima)))
         return ContactState(tau.clone(), distance, probability, distance > self.threshold)
+
+
+def _touches(largest: Tensor, size: Sequence[Float[Tensor, "blocks nv"]]) -> Iterator[Doubt]:
+    """Stretches whose largest distance, of which this is the root, or torques free motion would hardly reach."""
+    low, middle, high = largest.quantile(largest.new_tensor([0.25, 0.5, 0.75]))
+    strong = torch.cat([*size]) > STRONG * torch.cat([*size]).median(0).values.clamp_min(1e-9)
+    far = ((largest > middle + TOUCHED * (high - low)) & (largest > FAR * middle)) | strong.any(1)
+    starts, rows = np.concatenate([BLOCK * np.arange(len(each)) for each in size]), far.nonzero()[:, 0].numpy()
+    for own in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else ():
+        seen = f"from {starts[own[0]]:g} to {starts[own[-1]] + BLOCK:g} s free motion is far from the model"
+        seen = f"{seen}, {float(largest[own].max() / middle):.2g} times as far as usual."
+        yield look(about="touched", what=seen, do="If something touched the robot, leave that out: it hides contacts.")
 
 
 def errors_near_rest(tau: Torques, known: Torques, slow: Torques) -> tuple[float, float, float]:

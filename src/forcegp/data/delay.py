@@ -304,8 +304,7 @@ def rate_of_waves(
     rates = 2.0 * np.pi / reach * repetitions
     found = lombscargle(q - q.mean(), left, rates)
     best, power = float(rates[int(np.argmax(found))]), float(found.max())
-    by_chance = 2.0 * np.log(len(tried)) / len(q)
-    return best if 2.0 * power > (REPEATS + by_chance) * np.square(left).sum() else 0.0
+    return best if 2.0 * power > (REPEATS + 2.0 * np.log(len(tried)) / len(q)) * np.square(left).sum() else 0.0
 
 
 def waves(q: Float[np.ndarray, " rows"], rate: float) -> Float[np.ndarray, "rows 2"]:

@@ -68,8 +68,7 @@ def base_parameters(robot: Robot) -> tuple[int, ...]:
     states = min(RANDOM_ROWS * robot.nv, max(FEWEST, ENTRIES // entries))
     remedy = "give a robot with fewer joints, others locked."
     require_memory(8 * COPIES * states * entries, f"the regressor of {robot.nv} joints", remedy, robot.device)
-    drawn = np.random.default_rng(0).normal(0.0, 2.0, (3, states, robot.nv))
-    turns, v, a = torch.tensor(drawn, device=robot.device)
+    turns, v, a = torch.tensor(np.random.default_rng(0).normal(0.0, 2.0, (3, states, robot.nv)), device=robot.device)
     q = robot.space.integrate(robot.space.neutral(), turns)
     regressor = torque_regressor(robot, q, v, a).flatten(0, 1).cpu().numpy()
     norms = np.linalg.norm(regressor, axis=0)

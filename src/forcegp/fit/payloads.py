@@ -192,8 +192,7 @@ def misfit(
         change, move = instead or changes
         # beside a payload that leaves nothing, a column is the torque as logged, and linear in the factor itself
         factors = 1.0 + change if instead else 1.0 / (1.0 - change) if cause == "gains" else np.exp(change)
-        off = abs(change) > WRONG
-        count = int((change != 0.0).sum())
+        off, count = abs(change) > WRONG, int((change != 0.0).sum())
         fewer = cause not in ALONE and count < fewest[0]
         better = worth > best or (fewer and (more > fewest[1] or 1.1 * worth > best))
         clearly = instead is not None or (better and more > max(least, MOSTLY * cost * (cause in ALONE)))

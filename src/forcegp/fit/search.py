@@ -42,8 +42,7 @@ def resolved_noise(noise: Noise | None, rows: Dataset) -> Noise:
     """The noise given, else that of the rows, else one that is learned, with a warning unless `learn` is True."""
     if noise is not None and noise.acceleration is not None:
         return noise
-    level = rows.noise_std
-    noise = noise or Noise()
+    level, noise = rows.noise_std, noise or Noise()
     if level is not None:
         return replace(noise, acceleration=tuple(float(std) for std in level))
     if not noise.learn:
@@ -367,8 +366,7 @@ class _States:
         open_ones = variance > NEGLIGIBLE**2 * variance.max()
         if not more or not bool(open_ones.any()):
             return 1.0
-        rise = torch.stack(more).mean(0)[open_ones] / variance[open_ones]
-        return math.sqrt(max(1.0, 1.0 + float(rise.mean())))
+        return math.sqrt(max(1.0, 1.0 + float((torch.stack(more).mean(0) / variance)[open_ones].mean())))
 
     def _without_own(self, latent: inference.LatentPosterior) -> tuple[Float[Tensor, "n nv"], Float[Tensor, "n nv"]]:
         """Mean and variance of the accelerations that the latents make, by all rows but that of the state itself."""

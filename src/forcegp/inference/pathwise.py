@@ -125,8 +125,7 @@ class DrawnTerm:
             numbers[..., 0] /= news
             values = lfilter([news], [1.0, -decay], numbers.cpu().numpy())
             return cls(term, (), (torch.as_tensor(values, device=generator.device),), grid)
-        sizes = [(samples, e.shape[-1], count) for e in embedded]
-        each = zip(term.factors, sizes, strict=True)
+        each = zip(term.factors, [(samples, e.shape[-1], count) for e in embedded], strict=True)
         frequencies = tuple(factor.frequencies(size, generator) for factor, size in each)
         cosines, sines = torch.randn(2, samples, columns, count, **options) / math.sqrt(count)
         return cls(term, frequencies, (cosines, sines))

@@ -242,8 +242,7 @@ def integrate(
     not_found = torch.zeros(n, dtype=torch.bool, device=q.device)
     alive = torch.ones(n, dtype=torch.bool, device=q.device)
     for k in range(steps):
-        forces = u[k] if feedback is None else u[k] + feedback(k, q, v)
-        step = integrator(partial(guarded, forces, q, v), q, v, dt)
+        step = integrator(partial(guarded, u[k] + (0.0 if feedback is None else feedback(k, q, v)), q, v), q, v, dt)
         rows_a.append(torch.where(alive[:, None], step.a, math.nan))
         bounded = (step.v.abs() <= SPEED_LIMIT).all(-1) & torch.isfinite(step.q).all(-1)  # NaN compares as false
         good = alive & bounded & step.found

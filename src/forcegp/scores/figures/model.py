@@ -140,8 +140,7 @@ def _draw_curve(axes: Axes, posterior: Posterior, panel: CurvePanel, dataset: Da
     )
     ticks = {"markersize": 5, "color": style.TRUTH, "alpha": 0.5, "transform": axes.get_xaxis_transform()}
     axes.plot(visited, np.full(len(visited), 0.025), "|", label="training velocities", **ticks)
-    levels = [(mean - spread)[inside], (mean + spread)[inside]]
-    key = f"Q_U.{panel.component}"
+    levels, key = [(mean - spread)[inside], (mean + spread)[inside]], f"Q_U.{panel.component}"
     if dataset is not None and panel.joint is not None and key in dataset.truth and not posterior.carries_known_forces:
         rows = dataset.rows(evenly(dataset, TRUE_POINTS))
         true_at = rows.v[:, panel.joint]
