@@ -273,7 +273,7 @@ class Excite(Command):
             chosen = forcegp.excitation(model or forcegp.load_posterior(str(self.model)), **given)
         chosen.save_csv(self.out, overwrite=self.overwrite)
         usage = {name: values.tolist() for name, values in chosen.usage.items()}
-        table = {f"{name}\nover limit": values for name, values in usage.items()}
+        table = {f"{name}\nover limit": [x or None for x in values] for name, values in usage.items()}
         spread = None if chosen.spread is None else chosen.spread.tolist()
         if spread is not None:
             table |= {"spread of a,\nbefore": spread[0], "\nafter": spread[1]}
