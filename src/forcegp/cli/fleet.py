@@ -48,8 +48,7 @@ class Quiet(Terminal):
 class Fleet(Command):
     """A command, and the logs that it is run for."""
 
-    interrupted = "rows of finished logs are kept, and the same command resumes"
-    replaces = False
+    interrupted, replaces = "rows of finished logs are kept, and the same command resumes", False
 
     command: str
     common: tuple[str, ...]

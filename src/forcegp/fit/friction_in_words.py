@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from forcegp.data import Dataset, with_memory
+from forcegp.data.preparation import memory
 from forcegp.data.views import tensors
 from forcegp.evidence.parameter_space import coefficient_title
 from forcegp.forces import DryFriction, Viscous
@@ -37,8 +38,7 @@ def friction_in_words(
     slides = v > SLIDES * v.square().mean(0).sqrt()
     count = slides.sum(0).clamp_min(1)
     mean = (slides * v).sum(0) / count
-    from_mean = slides * (v - mean)
-    joints = [log.joint_names.index(name) for name in names]
+    from_mean, joints = slides * (v - mean), [log.joint_names.index(name) for name in names]
     laws = (law, viscous)
     numbers = {coefficient_title(x, name): value.expand(log.nv) for x in laws for name, value in x.values.items()}
 
@@ -64,7 +64,8 @@ def friction_in_words(
         for x, error in zip(here, errors.tolist(), strict=True)
     ]
     text = f"{', '.join(told[0])} {unit}"
-    text += f", near rest {', '.join(told[1])}" if bool((here[1] > RISES * here[0]).any()) else ""
+    least = "at least " if memory(log.metadata) else ""  # a filter smooths the peak at a reversal
+    text += f", near rest {least}{', '.join(told[1])}" if bool((here[1] > RISES * here[0]).any()) else ""
     for name, level in zip(names, here[0].tolist(), strict=True):
         each = None if name in still else found.estimates.get(f"offset.{name}")  # a force: along it friction is less
         if each is not None and abs(each.value) > max(0.5 * UNEVEN * level, SURELY * REACH * each.std):
