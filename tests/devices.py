@@ -136,8 +136,7 @@ def pretend_device() -> Iterator[Counter[str]]:
 
 def _dispatch(func: Any, args: Any, kwargs: dict[str, Any], trips: Counter[str]) -> Any:
     tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
-    pretended = [x for x in tensors if isinstance(x, PretendTensor)]
-    asked = kwargs.get("device")
+    pretended, asked = [x for x in tensors if isinstance(x, PretendTensor)], kwargs.get("device")
     if func in (aten._to_copy.default, aten.copy_.default):
         _count_copy(func, args, asked, trips)
     elif pretended:

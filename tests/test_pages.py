@@ -108,8 +108,7 @@ def test_the_commands_of_the_page_on_identification_run(tmp_path: Path):
 
 @pytest.mark.nightly
 def test_the_page_on_rollouts_runs(tmp_path: Path):
-    printed = run_example("\n".join(blocks("rollouts")), tmp_path)
-    states, more, diverged, free, held = printed.splitlines()[-5:]
+    states, more, diverged, free, held = run_example("\n".join(blocks("rollouts")), tmp_path).splitlines()[-5:]
     assert states == "torch.Size([2, 241, 7]) torch.Size([2, 241, 7]) torch.Size([2, 240, 7])"
     assert more == "torch.Size([2, 241, 1]) torch.Size([10, 2, 241, 7])"
     assert diverged == "tensor([-1, -1])"

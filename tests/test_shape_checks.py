@@ -53,8 +53,7 @@ def whole_way() -> None:
         free = replace(data, model=data.model.with_contacts(()), truth={}) if compiled else data
         fit(free.model.with_forces(Viscous()), free).predict(free.q, free.v, free.u)
         models = {"one": data.model.with_forces(prior), "none": data.model.with_forces()}
-        split = split_named(data, "blocks:4:4", guard=0.0)
-        score(models, data, split=split, points=20, restarts=1, iterations=3)
+        score(models, data, split=split_named(data, "blocks:4:4", guard=0.0), points=20, restarts=1, iterations=3)
         if compiled:  # a black box has no columns of feet
             score(fit(data.model.black_box(), data, points=20, restarts=1, options=QUICK), data, horizons=())
         posterior = fit(data.model.with_forces(prior, noise=Noise(0.05)), data, points=40, restarts=1, options=QUICK)

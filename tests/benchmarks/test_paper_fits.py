@@ -33,7 +33,6 @@ def test_a_series_begins_where_the_fit_with_fewer_points_ended():
 @pytest.mark.parametrize("model", sorted(MODELS))
 def test_every_model_of_the_experiments_can_be_fitted(motion, model):
     """A few steps each: once a change of `fit` stopped one without a test."""
-    rows = farthest_rows(motion, 20)
-    search = {"restarts": 1, "iterations": 2, "tolerance": 1e-2}
+    rows, search = farthest_rows(motion, 20), {"restarts": 1, "iterations": 2, "tolerance": 1e-2}
     posterior = fitted({"model": model, "seed": 0, **search}, rows)
     assert posterior.predict(motion.q[:2], motion.v[:2], motion.u[:2]).mean.shape == (2, 7)

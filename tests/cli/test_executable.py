@@ -46,8 +46,7 @@ def test_version_and_help_through_the_module(installed):
     done = installed("--version")
     assert done.returncode == 0
     assert re.fullmatch(r"forcegp \d+\.\d+\.\d+\n", done.stdout)
-    environment = {**os.environ, "COLUMNS": "100"}
-    words = [sys.executable, "-m", "forcegp", "--help"]
+    environment, words = {**os.environ, "COLUMNS": "100"}, [sys.executable, "-m", "forcegp", "--help"]
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert all(re.search(rf"^\W*{command}\s", done.stdout, re.M) for command in COMMANDS)

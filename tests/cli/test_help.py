@@ -2,6 +2,8 @@
 
 import re
 import shlex
+import subprocess
+import sys
 from collections import Counter
 from typing import Annotated, get_args, get_origin
 
@@ -23,6 +25,15 @@ def plain(page):
     """A page without the frames of its boxes, each option with its text in one paragraph."""
     lines = [line.strip("│╭╰╮╯─ ") if line.startswith(("│", "╭", "╰")) else line for line in page.splitlines()]
     return "\n".join(lines)
+
+
+def test_pages_of_help_do_not_wait_for_torch():
+    code = (
+        "import contextlib, sys; from forcegp.cli.main import main\n"
+        f"for name in {[*COMMANDS]}:\n with contextlib.suppress(SystemExit): main([name, '--help'])\n"
+        "assert not {'torch', 'numpy', 'matplotlib'} & {*sys.modules}"
+    )
+    subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
 
 
 def test_there_are_few_commands_and_few_options():

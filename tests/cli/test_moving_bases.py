@@ -94,8 +94,7 @@ LEGS = "front_left_foot", "front_right_foot", "rear_left_foot", "rear_right_foot
 
 def test_feet_whose_stance_no_column_states(folder, forcegp):
     words = (*DOG.split(), "--robot", "dog.urdf", "--base", "floating", "--feet", ",".join(LEGS))
-    done = forcegp(*words, folder=folder).ok()
-    assert re.search(r"stance +front_left_foot_stands", done.stdout)
+    assert re.search(r"stance +front_left_foot_stands", forcegp(*words, folder=folder).ok().stdout)
     log, (time, *flags) = Dataset.load(folder / "dog.h5"), np.load(folder / "stands.npy").T
     assert log.model.inputs[12:] == tuple(f"{leg}_stands" for leg in LEGS)
     known = decided(log)  # others have a flag of .5

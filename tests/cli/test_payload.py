@@ -38,8 +38,7 @@ def test_what_is_hardly_known_of_a_payload_is_said(half, far, told):
     hand = '<link name="hand"><inertial><mass value="5"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
     joint = '<joint name="j" type="continuous"><parent link="base"/><child link="hand"/></joint>'
     robot = Robot.from_urdf_text(f'<robot name="r"><link name="base"/>{hand}</inertial></link>{joint}</robot>')
-    model = Model(robot, (), (Payload("hand", 0.5),))
-    assert payload_text(SimpleNamespace(estimates=each, model=model)) == told
+    assert payload_text(SimpleNamespace(estimates=each, model=Model(robot, (), (Payload("hand", 0.5),)))) == told
 
 
 @pytest.mark.parametrize(("carried", "noise"), [(True, 0.0), (True, 0.05), (False, 0.0)])

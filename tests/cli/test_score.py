@@ -87,8 +87,7 @@ def test_a_raw_log_is_filtered_and_cut_into_blocks_with_a_guard(forcegp, folder)
     words = ["score", "raw.h5", "--robot", "arm.urdf", "--out", "raw", "--seeds", 1, *QUICK, "--forces", "given"]
     words += ["--identification", "viscous@accelerations"]
     words += ["--cutoff", 15, "--trim", 0.1, "--every", 2, "--split", "blocks:4:2", "--guard", 0.01]
-    done = forcegp(*words, folder=folder).ok()
-    assert re.search(r"given\s+\d+\.\d+", done.stdout)
+    assert re.search(r"given\s+\d+\.\d+", forcegp(*words, folder=folder).ok().stdout)
     page = (folder / "raw" / "report.md").read_text()
     assert "Preparation: cutoff 15.0, " in page
     assert "every episode cut into 4 consecutive blocks of equal duration, block 2 held out" in page

@@ -1,5 +1,7 @@
 """Chosen motions: limits at every time, against Pinocchio; what they teach, against real updates; what is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio
 import pytest
@@ -13,6 +15,7 @@ from forcegp.control.informative_motions import BaseParameters, far_apart
 from forcegp.control.tracking import Past
 from forcegp.errors import InvalidInput
 from forcegp.forces import Coulomb, JointFriction
+from forcegp.inference.engines import Inducing
 
 FREE, START = arm_model(0), [0.3, 0.8, -0.6]
 FEW = {"motions": 9, "start": START, "seconds": 4.0}
@@ -31,6 +34,15 @@ def posterior():
 @pytest.fixture(scope="module")
 def chosen(posterior):
     return excitation(posterior, **FEW, limits={"velocity": 2.0, "acceleration": 10.0}, rows=20)
+
+
+def test_a_posterior_of_many_rows_is_as_that_of_some_of_them(posterior, chosen, monkeypatch):
+    latent = posterior.likelihood.condition(posterior.kernels, posterior.hyperparameters, Inducing())
+    many, given = replace(posterior, latent=latent), {"limits": {"velocity": 2.0, "acceleration": 10.0}, "rows": 20}
+    found = excitation(many, **FEW, **given)
+    np.testing.assert_allclose(found.spread, chosen.spread, rtol=1e-6)
+    monkeypatch.setattr("forcegp.control.informative_motions.MANY_ROWS", 4)
+    assert (excitation(many, **FEW, **given).spread[0] > found.spread[0]).all()
 
 
 def rnea(q, v, a):

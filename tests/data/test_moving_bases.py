@@ -122,8 +122,7 @@ def by_sensors(factor=1.0):
 
 def test_a_base_keeps_what_sensors_measured_where_its_pose_is_noisier():
     raw, true, chosen = by_sensors(), low_pass(tumbling(), 20.0), Preparation(cutoff=20.0, trim=0.5)
-    alone = replace(raw, **{name: getattr(differentiated(raw, "q"), name) for name in "va"})
-    errors = {}
+    alone, errors = replace(raw, **{name: getattr(differentiated(raw, "q"), name) for name in "va"}), {}
     for name, log in (("sensors", raw), ("pose", alone)):
         found = chosen.apply(log)
         left = true.rows(np.searchsorted(true.time, found.time))

@@ -289,8 +289,7 @@ def test_noise_under_constraints_is_that_of_the_rows(walker):
 
 
 def test_a_robot_that_cannot_move_teaches_nothing(walker):
-    robot = walker.robot
-    points = [(x, y, 0.1 * x * y) for x in (0.1, -0.1) for y in (0.1, -0.1)]
+    robot, points = walker.robot, [(x, y, 0.1 * x * y) for x in (0.1, -0.1) for y in (0.1, -0.1)]
     held = tuple(c for point in points for c in fixed_point(robot.layout.moving[0], point))
     held += tuple(c for foot in ("a_foot", "b_foot") for point in points for c in fixed_point(foot, point))
     model = replace(walker, contacts=held)

@@ -157,8 +157,7 @@ class LawConformance:
         from forcegp import export_c
         from forcegp.posterior import casadi_function
 
-        posterior = fit(model.with_forces(noise=STILL), log)
-        states = [x.numpy()[0] for x in self.states(log)]
+        posterior, states = fit(model.with_forces(noise=STILL), log), [x.numpy()[0] for x in self.states(log)]
         function, expected = casadi_function(posterior), posterior.predict(*states).mean.numpy()
         np.testing.assert_allclose(np.array(function(*states)).ravel()[:3], expected, rtol=1e-9, atol=1e-9)
         assert isinstance(function, casadi.Function)

@@ -19,8 +19,7 @@ def test_feet_that_stand_resist_their_own_sliding_and_no_other():
     q, v = random_positions(robot, generator, 3), torch.randn(3, robot.nv, generator=generator, dtype=torch.float64)
     u = torch.zeros(3, 14, dtype=torch.float64)
     u[:, 12:] = torch.tensor([[1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])
-    dynamics = model.dynamics(q, v, u)
-    feet_forces = [ContactFriction(contact=k, load=True) for k in (0, 1)]
+    dynamics, feet_forces = model.dynamics(q, v, u), [ContactFriction(contact=k, load=True) for k in (0, 1)]
     for force in feet_forces:
         force.check(model.robot, model.contacts)
     mixing = torch.cat([force.direction(dynamics) for force in feet_forces], dim=-1)

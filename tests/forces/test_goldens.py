@@ -36,7 +36,7 @@ def of_law(law, dynamics) -> dict:
     bound = (replace(law, memory=False) if names else law).bound_to(robot)
     typical = {name: k + np.arange(1.0, 4.0) for k, name in enumerate(("force", "position", "velocity", "inertia"))}
     features = () if isinstance(law, RigidBodies | Payload) else bound.features(bound.seen(state))
-    opened = bound.open(bound) if bound.coefficients else bound
+    opened = bound.open() if bound.coefficients else bound
     return {
         "values": numbers(bound.values.values()),
         "parts": numbers([bound.direction(state), *features, features and bound.amplitude(features, bound.values)]),

@@ -138,8 +138,7 @@ def require_ended_well(words: list[str], folder: Path) -> int:
     """Run a command line there: 0, or 2 with one line and nothing written; returns the code, raises DefectError."""
     top = folder.parents[2]  # so that what ".." names is seen, too
     before, done = snapshot(top), run_here(*words, folder=folder)
-    after = snapshot(top)
-    own = [line for line in done.stderr.splitlines() if line.startswith("forcegp: ")]
+    after, own = snapshot(top), [line for line in done.stderr.splitlines() if line.startswith("forcegp: ")]
     if done.returncode not in (0, 2) or "Traceback" in done.stderr or "Exception ignored" in done.stderr:
         raise DefectError(f"exit {done.returncode}: {own or done.stderr[-600:]}")
     if done.returncode == 2 and (len(own) != 1 or done.stderr.splitlines()[-1] != own[0]):

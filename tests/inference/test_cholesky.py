@@ -9,7 +9,7 @@ from tests.inference.problems import SHAPES, Problem, condition, normal, problem
 from forcegp.errors import NumericalError, NumericalWarning
 from forcegp.inference import ExactPosterior, likelihood
 from forcegp.inference.likelihood import factorize
-from forcegp.inference.posterior import appended, with_only, with_rows
+from forcegp.inference.posterior import appended, with_rows
 
 
 @pytest.fixture(params=["LAPACK", "torch"])
@@ -124,7 +124,6 @@ def test_old_and_new_rows_of_differing_rank(order):
     grown = add(condition(first), second)
     assert grown.system.deflation.rank == 5
     assert_same(grown, condition(joined))
-    assert_same(with_only(grown, torch.tensor([0, 2, 6])), condition(rows_of(joined, [0, 2, 6])))
 
 
 def test_noise_covariances_and_an_empty_beginning():
@@ -138,7 +137,6 @@ def test_the_old_posterior_stays_as_it_was():
     old = condition(rows_of(whole, slice(0, 9)))
     kept = [x.clone() for x in (old.system.factor.lower.tril(), old.system.alpha, old.system.beta, *old.features)]
     add(old, rows_of(whole, slice(9, 12)))
-    with_only(old, torch.arange(4))
     for before, now in zip(
         kept, (old.system.factor.lower.tril(), old.system.alpha, old.system.beta, *old.features), strict=True
     ):

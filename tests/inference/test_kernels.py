@@ -114,8 +114,7 @@ def test_matrices_at_other_parameters_and_their_gradients():
     kernels, features = three_kernels(), [normal(5, 3, seed=c) for c in range(3)]
     kept = kernels.initial_parameters()
     moved = {name: (value + 0.3).requires_grad_() for name, value in kept.items()}
-    matrices = kernels.matrices(moved, features)
-    weights = [normal(5, 5, seed=10 + c) for c in range(3)]
+    matrices, weights = kernels.matrices(moved, features), [normal(5, 5, seed=10 + c) for c in range(3)]
     total = sum((weight * K).sum() for weight, K in zip(weights, matrices, strict=True))
     gradients = torch.autograd.grad(total, list(moved.values()))
     for name, value in kernels.named_parameters():

@@ -89,8 +89,7 @@ def test_tolerance_sets_the_number_of_inducing_points():
 def test_drawn_functions_of_inducing_points_have_the_posterior_moments():
     given, samples = made(latents=2), 40000
     posterior = inducing(given, points=12)
-    points = [z[:4] for z in posterior.features]
-    lowers = [lower.clone() for lower in posterior.lowers]
+    points, lowers = [z[:4] for z in posterior.features], [lower.clone() for lower in posterior.lowers]
     prior = [(lower @ normal(len(lower), samples, seed=300 + c)).mT.contiguous() for c, lower in enumerate(lowers)]
     weights = posterior.function_weights(prior, torch.Generator().manual_seed(2))
     values = torch.stack(

@@ -54,8 +54,7 @@ def test_functions_have_mean_and_covariance_of_the_posterior(expression):
     """At single points with all latents, and of the first latent across points."""
     dimension, count = COMPOSED[expression], 6000
     kernels = [kernel_of(expression, dimension, 1.3), kernel_of("squared-exponential", 1, 0.8)]
-    latent = conditioned(kernels, (dimension, 1))
-    points = [normal(5, d, seed=5) for d in (dimension, 1)]
+    latent, points = conditioned(kernels, (dimension, 1)), [normal(5, d, seed=5) for d in (dimension, 1)]
     for z, training in zip(points, latent.features, strict=True):
         z[3], z[4] = 30.0, training[2]  # far away, and where data are
     functions = draw_functions(latent, count, seed=3, frequencies=16)

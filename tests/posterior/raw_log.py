@@ -19,8 +19,7 @@ def motion(seconds: float = 3.0, seed: int = 0, noise: float = SENSOR) -> Datase
     rate, phase = generator.uniform(2.0, 8.0, (3, 1, 3)), generator.uniform(0.0, 6.3, (3, 1, 3))
     size, angle = generator.uniform(0.5, 1.0, (3, 1, 3)) / rate, rate * time[:, None] + phase
     q, v = (size * np.sin(angle)).sum(0), (size * rate * np.cos(angle)).sum(0)
-    a = -(size * rate**2 * np.sin(angle)).sum(0)
-    states = [torch.tensor(x) for x in (q, v, np.zeros_like(q))]
+    a, states = -(size * rate**2 * np.sin(angle)).sum(0), [torch.tensor(x) for x in (q, v, np.zeros_like(q))]
     dynamics = model.dynamics(*states)
     u = (dynamics.M @ torch.tensor(a)[..., None])[..., 0] - dynamics.Q_K - unknown_force(states[1])
     measured = q + generator.normal(0.0, noise, q.shape)

@@ -28,8 +28,7 @@ pytestmark = pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compil
 
 
 def call(function, sizes, *arrays) -> tuple[int, list[np.ndarray]]:
-    given = [np.ascontiguousarray(x, dtype=float) for x in arrays]
-    made = [np.full(size, 7.0) for size in sizes]
+    given, made = [np.ascontiguousarray(x, dtype=float) for x in arrays], [np.full(size, 7.0) for size in sizes]
     return function(*(ctypes.c_void_p(x.ctypes.data) for x in (*given, *made))), made
 
 

@@ -39,8 +39,7 @@ def recording(seed: int, rate: float = 0.0, seconds: float = 60.0, level: float 
         for _ in range(10):
             w += DT / 10 * (force[k] - 3.0 * w - dry[k] * np.tanh(w / 0.02)) / 5.0
             x += DT / 10 * w
-    a = a + NOISE * generator.standard_normal(a.shape)
-    truth = {"Q_U": (dry[:, None] / 4.0)}
+    a, truth = a + NOISE * generator.standard_normal(a.shape), {"Q_U": (dry[:, None] / 4.0)}
     return Dataset(q=q, v=v, u=force[:, None], a=a, time=time, model=slide(3.0, 4.0), truth=truth)
 
 

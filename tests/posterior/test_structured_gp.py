@@ -39,8 +39,7 @@ def posterior(train):
 def test_learns_the_friction_and_is_calibrated(posterior, test):
     prediction = posterior.predict(test.q, test.v, test.u)
     nominal = test.model.dynamics(*map(torch.tensor, (test.q, test.v, test.u))).acceleration_map().offset.numpy()
-    error = np.abs(prediction.mean.numpy() - test.truth["a"]).mean()
-    assert error < 0.1 * np.abs(nominal - test.truth["a"]).mean()
+    assert np.abs(prediction.mean.numpy() - test.truth["a"]).mean() < 0.1 * np.abs(nominal - test.truth["a"]).mean()
     inside = np.abs(prediction.mean.numpy() - test.a) < 1.96 * prediction.measurement.std.numpy()
     assert 0.90 < inside.mean() < 0.99
 

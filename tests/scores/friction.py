@@ -34,8 +34,7 @@ def friction_data(rows: int, seed: int, model: Model | None = None) -> Dataset:
     velocity, normal = where.velocity(states[1])[:, :3], torch.tensor([0.2, 0.0, 1.0], dtype=torch.float64)
     normal = normal / normal.norm()
     force = -VISCOUS * (velocity - (velocity @ normal)[:, None] * normal)
-    tool = (where.jacobian[:, :3].mT @ force[..., None])[..., 0]
-    joints = -torch.tensor(joint_law(data.v))
+    tool, joints = (where.jacobian[:, :3].mT @ force[..., None])[..., 0], -torch.tensor(joint_law(data.v))
     a = dynamics.acceleration(tool + joints).numpy()
     truth = {
         "a": a, "lambda": dynamics.multiplier(tool + joints).numpy(), "Q_U": (tool + joints).numpy(),

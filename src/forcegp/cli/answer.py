@@ -1,5 +1,7 @@
 """What `forcegp auto` says of what it found: ten lines, and a verdict."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
@@ -9,9 +11,6 @@ import forcegp.scores
 from forcegp.cli.logs import stance_text
 from forcegp.cli.payload import drives_of, other_causes
 from forcegp.cli.terminal import shown
-from forcegp.scores.accuracy import ACCELERATION, TORQUE
-from forcegp.scores.page import number
-from forcegp.scores.scores import USABLE
 from forcegp.summary import within
 
 LEAST_COVERAGE = 0.8  # of 95 % intervals that is no reason to doubt them
@@ -99,11 +98,10 @@ def answer_lines(
     links, holds = robot.layout.links, (content["payload"] or {}).get("link")
     loaded = [name for name, each in links.items() if holds in links and each.body == links[holds].body]
     weight = f"{mass:.4g} ± {1.96 * error:.1g} kg, if {drives_of(identified.model)} are right"
-    shares = {name: _known(scores, "nrmse", ACCELERATION, name) for name in scores.models}
-    errors = "; ".join(
-        f"{short_name(name)} {number(_motion(scores, name))} / {'> 1' if (share or 0.0) > 1.0 else number(share)}"
-        for name, share in shares.items()
-    )
+    shares = {name: _known(scores, "nrmse", forcegp.scores.ACCELERATION, name) for name in scores.models}
+    number = forcegp.scores.number
+    ends = {name: "> 1" if (share or 0.0) > 1.0 else number(share) for name, share in shares.items()}
+    errors = "; ".join(f"{short_name(name)} {number(_motion(scores, name))} / {end}" for name, end in ends.items())
     ahead = (f" after {scores.horizons[-1]:g} s" if scores.horizons else "") + f" [{'rad or m' if moving else q}]"
     covered = scores.value("coverage_95", model=best)
     intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered:.0f} % of unseen rows"
@@ -164,15 +162,15 @@ def is_explained(doubt: Mapping[str, Any], scores: forcegp.scores.Scores, best: 
     shares = [left.get(name) for name in doubt["joints"]]
     everywhere = doubt["about"] == UNKNOWN and "seconds" not in doubt["numbers"]
     most = EXPLAINED if "positions" in doubt["numbers"] else EXPLAINED**0.5  # a cable is worth a word sooner
-    return everywhere and quantity == TORQUE and all(x is not None and x <= most for x in shares)
+    return everywhere and quantity == forcegp.scores.TORQUE and all(x is not None and x <= most for x in shares)
 
 
 def left_of_torques(scores: forcegp.scores.Scores, best: str) -> list[tuple[str, str]]:
     """The line on what each model leaves of the recorded torques of the joints; none where u has other columns."""
     shares = {}
     for name in dict.fromkeys(("given", "identified", best)):
-        quantity, left = scores.left(name) if name in scores.models else (ACCELERATION, {})
-        if quantity == TORQUE:
+        quantity, left = scores.left(name) if name in scores.models else (forcegp.scores.ACCELERATION, {})
+        if quantity == forcegp.scores.TORQUE:
             numbers = (shown(x, "{:.2g}" if x and x < 0.1 else "{:.0f}", 100.0) for x in left.values())
             shares[short_name(name)] = " ".join(numbers)
     told = "; ".join(f"{name} {numbers}" for name, numbers in shares.items())
@@ -185,9 +183,9 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset, still: Sequ
     assert best is not None, "a model was scored"
     quantity, shares = scores.left(best)
     left = {name: math.inf if x is None else x for name, x in shares.items()}
-    good = [name for name, x in left.items() if x <= USABLE]
+    good = [name for name, x in left.items() if x <= forcegp.scores.USABLE]
     lost = [f"{name} {100.0 * x:.0f} %" if math.isfinite(x) else f"{name} not known from this log"
-            for name, x in left.items() if x > USABLE]  # fmt: skip
+            for name, x in left.items() if x > forcegp.scores.USABLE]  # fmt: skip
     use = f"“{short_name(best)}”"
     if not good:
         return (
@@ -202,7 +200,7 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset, still: Sequ
         against = "they diverge" if urdf is None else f"by {urdf:.2g}"
         against = f"; with the URDF alone {against}" if "given" in scores.models and best != "given" else ""
         ahead = f"positions {scores.horizons[-1]:g} s ahead are wrong by {motion:.2g} {unit}{against}"
-        errors = zip(scores.joint_names, scores.columns("nrmse", ACCELERATION, best), strict=True)
+        errors = zip(scores.joint_names, scores.columns("nrmse", forcegp.scores.ACCELERATION, best), strict=True)
         there = [x or 0.0 for name, x in errors if name not in still]
         still_as_good = motion >= dataset.q.var(axis=0).mean() ** 0.5  # as the middle of the log
         lost_there = still_as_good or sum(there) >= max(len(there), 1)  # no better than a = 0, as of light wrists

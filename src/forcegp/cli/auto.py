@@ -31,8 +31,6 @@ from forcegp.cli.robot_options import CandidateOptions, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal, doubts_table, facts
 from forcegp.doubts import Doubt, Doubts, wrong
 from forcegp.errors import CompilerError, DatasetError, InvalidInput, MistakenUnit, NumericalError
-from forcegp.fit.force_sensors import with_touches
-from forcegp.scores.scores import USABLE
 
 MOST_CORRECTIONS = 8
 SCORES = ("models", "joint_names", "units", "recommended", "winner", "failures")  # what the answer holds of the scores
@@ -79,7 +77,8 @@ class Auto(Command):
 
     def run(self, terminal: Terminal) -> Mapping[str, Any]:
         """Do all of it. Raises DatasetError for mistakes that nobody has corrected yet."""
-        from forcegp.fit.friction_choice import with_choice_of  # PyTorch is not needed for a page of help
+        from forcegp.fit.force_sensors import with_touches  # PyTorch is not needed for a page of help
+        from forcegp.fit.friction_choice import with_choice_of
         from forcegp.scores.models import candidates
 
         if not self.logs:
@@ -330,7 +329,10 @@ def default_models(
     models += ["identified+gp:joint:inputs=q"] if pulled - own else ["identified+gp:joint-position"] * bool(own)
     if not still:
         left, missed = (x.std(axis=0) for x in forcegp.evidence.motion_residuals(rows, identified.model))
-        share, much = (missed < USABLE * rows.a.std(axis=0)).mean(), left > EXPLAINED * rows.u.std(axis=0)
+        share, much = (
+            (missed < forcegp.scores.USABLE * rows.a.std(axis=0)).mean(),
+            left > EXPLAINED * rows.u.std(axis=0),
+        )
         some = not own | pulled >= {name for name, one in zip(rows.joint_names, much, strict=True) if one}
         models += [f"identified@{'accelerations' if share == 1.0 else 'torques:both'}"] if share > 0.5 and some else []
     return tuple(models)

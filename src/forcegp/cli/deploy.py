@@ -21,7 +21,6 @@ from forcegp.cli.command import DATASET, MODEL, NUMBERS, Command, listed, number
 from forcegp.cli.robot_options import CONTACTS, RobotOptions, parse_contacts, require_same_joints
 from forcegp.cli.terminal import Terminal, columns, doubts_table, shown
 from forcegp.errors import InvalidInput
-from forcegp.scores.page import number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,7 +277,7 @@ class Excite(Command):
         if spread is not None:
             table |= {"spread of a,\nbefore": spread[0], "\nafter": spread[1]}
         of_joints = zip(chosen.robot.joint_names, *table.values(), strict=True)
-        rows = [[name, *map(number, each)] for name, *each in of_joints]
+        rows = [[name, *map(forcegp.scores.number, each)] for name, *each in of_joints]
         terminal.show(columns(str(self.out), ["joint", *table], rows))
         return {"out": str(self.out), "usage": usage, "spread": spread, "condition": chosen.condition}
 

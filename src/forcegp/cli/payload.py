@@ -21,7 +21,6 @@ from forcegp.cli.fit import estimates_table, quick_doubts, write_estimates
 from forcegp.cli.logs import FilterOptions
 from forcegp.cli.robot_options import SYSTEM_FILE, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal
-from forcegp.data.views import tensors
 from forcegp.doubts import Doubts
 from forcegp.errors import LARGEST, InvalidInput, require_number
 from forcegp.summary import in_digits
@@ -173,7 +172,7 @@ def without_explained(doubts: Doubts, found: Any, rows: forcegp.Dataset) -> Doub
     mass, some = found.estimates["payload.mass"], rows.rows(slice(None, None, max(1, len(rows) // MOST_ROWS)))
     if mass.value < max(SURE * mass.std, LEAST_PAYLOAD):
         return doubts
-    q, v, u, _ = tensors(forcegp.data.with_memory(some, found.model))
+    q, v, u, _ = forcegp.data.tensors(forcegp.data.with_memory(some, found.model))
     size = found.model.state(q, v, u).delivered.var(0).clip(1e-300).numpy()
     left = forcegp.evidence.motion_residuals(some, found.model)[0].var(axis=0) / size
     settled = {name for name, share in zip(rows.joint_names, left, strict=True) if share < SETTLED}

@@ -26,7 +26,7 @@ from forcegp.data.views import farthest_point_sampling
 from forcegp.errors import InvalidInput, require_known, require_number, require_type, usable_arguments
 from forcegp.evidence.bodies import ENTRIES, base_parameters, torque_regressor
 from forcegp.inference.memory import blas_threads
-from forcegp.inference.posterior import exact, with_only
+from forcegp.inference.posterior import ExactPosterior
 from forcegp.integration.integrators import check_time_step
 from forcegp.mechanics import Contact
 from forcegp.model import Model
@@ -42,7 +42,8 @@ SPANS, SAMPLES = 2.5, 20  # pieces of a spline per second, samples in each
 MARGIN = 0.9  # of the limits of a robot file
 SHRINK, ROUNDS, EXACT = 0.85, 40, 1e-12  # of a motion beyond its limits; rounding
 LONGEST, INSIDE = 120.0, 0.95  # s, for the memory of all samples; of the positions, for a start that is not given
-STATES, MOST_ROWS = 150, 150  # where the spread is computed; those learned so far that take part in the search
+STATES, MOST_ROWS, MANY_ROWS = 150, 150, 400
+"""Where the spread is computed; rows learned so far that take part in the search, and that stand for too many."""
 DRY = 0.05  # velocity in rad/s (m/s) within which the dry friction of a robot without learned forces turns
 Values = Float[np.ndarray, "n nv"]
 AtTimes = Float[np.ndarray, "*times nv"]
@@ -65,11 +66,10 @@ class LearnedForces:
 
     def __init__(self, posterior: Posterior, rows: int) -> None:
         self.rows, free, own = rows, posterior.model.with_contacts(()), posterior.likelihood
-        own = replace(own, model=free, fixed_standardization=own.standardization)
-        self.posterior = replace(posterior, likelihood=own, target=free)
-        latent, given = exact(posterior.latent, "choosing a motion"), posterior.training
-        kept = far_apart(given.q, given.v, given.u, MOST_ROWS)
-        self.few = replace(self.posterior, latent=with_only(latent, torch.as_tensor(kept)))
+        known = replace(posterior, likelihood=replace(own, fixed_standardization=own.standardization))
+        known = known if isinstance(known.latent, ExactPosterior) else of_few_rows(known, MANY_ROWS)
+        two = ((x, replace(x.likelihood, model=free)) for x in (known, of_few_rows(known, MOST_ROWS)))
+        self.posterior, self.few = (replace(x, likelihood=own, target=free) for x, own in two)
 
     def torques(self, *states: Values) -> Values:
         """u (n, nv) in Nm or N of q, v and a of a motion from rest."""
@@ -246,6 +246,16 @@ class Excitation(Summary):
         at = self.robot.kinematics(torch.as_tensor(q))
         each = np.array([x.distance(at).numpy() for x in self.surfaces]).reshape(-1, len(q)).T
         return each.min(0) - _between(each)
+
+
+def of_few_rows(posterior: Posterior, count: int) -> Posterior:
+    """The same posterior, exact, of `count` of its rows alone, far apart."""
+    own, given = posterior.likelihood, posterior.training
+    kept = torch.as_tensor(far_apart(given.q, given.v, given.u, count))
+    sensed = {name: x[kept] for name, x in given.sensed.items()}
+    some = replace(given, sensed=sensed, **{name: x[kept] for name, x in vars(given).items() if isinstance(x, Tensor)})
+    own = replace(own, training=some)  # standardised as before
+    return replace(posterior, likelihood=own, latent=own.condition(own.kernels, posterior.hyperparameters))
 
 
 def far_apart(q: Any, v: Any, u: Any, count: int) -> np.ndarray:

@@ -14,6 +14,7 @@ from .strokes import strokes as strokes, with_strokes as with_strokes
 from .views import (
     RecordedMotions as RecordedMotions, Select as Select, evenly as evenly,
     farthest_point_sampling as farthest_point_sampling, farthest_rows as farthest_rows,
-    recorded_motions as recorded_motions, repeated_rows as repeated_rows, with_memory as with_memory,
+    recorded_motions as recorded_motions, repeated_rows as repeated_rows, tensors as tensors,
+    with_memory as with_memory,
 )
 from .wind import AirLaw as AirLaw, find_wind as find_wind, thruster_columns as thruster_columns, with_wind as with_wind

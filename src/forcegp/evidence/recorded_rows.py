@@ -337,8 +337,7 @@ class RecordedRows:
         gain = np.linalg.solve(among, at_contacts).swapaxes(1, 2)
         moved = (gain @ (right[..., None] - A @ a[..., None]))[..., 0]
         e_a = e_a - gain @ at_contacts
-        levels = np.append(np.where(of_joints, noise.force, 0.0), self.link_noise)
-        S = M @ e_a @ M.swapaxes(1, 2) + np.diag(levels**2)
+        S = M @ e_a @ M.swapaxes(1, 2) + np.diag(np.append(np.where(of_joints, noise.force, 0.0), self.link_noise) ** 2)
         # directions of contact forces; without them S is singular where contacts hold
         open_ = self.open.swapaxes(1, 2)
         pushed = np.concatenate([response(open_), open_[:, self.links]], axis=1).swapaxes(1, 2)

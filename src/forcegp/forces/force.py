@@ -300,8 +300,7 @@ class Law(Force):
             given = None if stated is None else getattr(stated, name)
             std = None
             if isinstance(given, Normal) and given.std is not None:
-                std = torch.as_tensor(given.std, dtype=torch.float64)
-                std = torch.where(std == 0.0, 0.0, torch.nan)
+                std = torch.where(torch.as_tensor(given.std, dtype=torch.float64) == 0.0, 0.0, torch.nan)
             opened[name] = Normal(value, std)
         return self.with_values(opened)
 

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from typing_extensions import override
 
@@ -164,15 +164,6 @@ def with_rows(latent: ExactPosterior, terms: likelihood.Terms) -> ExactPosterior
         joined = likelihood.Deflation(*map(torch.cat, zip(old, added, strict=True)))
         joint = tuple(torch.cat([z, new.detach()]) for z, new in zip(latent.features, features, strict=True))
         return ExactPosterior(latent.kernels, joint, _solved(joined, factor))
-
-
-def with_only(latent: ExactPosterior, rows: Int[Tensor, " kept"]) -> ExactPosterior:
-    """The posterior of some rows, in the order given, factorised anew. Raises NumericalError where it cannot be."""
-    with torch.no_grad():
-        deflation = likelihood.Deflation(*(part[rows] for part in latent.system.deflation))
-        features = tuple(z[rows] for z in latent.features)
-        factor = likelihood.factorize(lambda: likelihood.deflated_covariance(deflation.C, latent.kernels(features)))
-        return ExactPosterior(latent.kernels, features, _solved(deflation, factor))
 
 
 def appended(

@@ -1,5 +1,7 @@
 """Scenarios by name, and every number of them. Loads no library: a command line lists the options at once."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
