@@ -259,8 +259,7 @@ def _compute_all(store: JobStore, waiting: dict[str, Job], wanted: Mapping[str, 
 def compute(store: JobStore, job: Job, digests: Mapping[str, str], *arguments: Any) -> None:
     """Compute one job and keep it with its digests."""
     module, _, function = job.task.partition(":")
-    task = getattr(import_module(module), function)
-    start, wall = time.process_time(), time.monotonic()
+    task, start, wall = getattr(import_module(module), function), time.process_time(), time.monotonic()
     with atomic_folder(store.place(job.name)) as folder, warnings.catch_warnings(record=True) as caught, watched(None):
         folder.mkdir()
         warnings.simplefilter("always")

@@ -186,8 +186,7 @@ def limited(x: np.ndarray, share: float = 0.97) -> np.ndarray:
 
 
 def held(x: np.ndarray) -> np.ndarray:
-    rows = np.arange(len(x))
-    start, stop = int(0.3 * len(x)), int(0.3 * len(x)) + max(25, len(x) // 25)
+    rows, start, stop = np.arange(len(x)), int(0.3 * len(x)), int(0.3 * len(x)) + max(25, len(x) // 25)
     return np.where((rows > start) & (rows < stop), x[start], x)
 
 

@@ -248,8 +248,7 @@ def test_gears_that_stick_are_no_unknown_cause_and_more_than_they_hold_is_one(ti
     q = rests(two_links(), 3).q.copy()
     time = np.arange(len(q)) / 200.0
     q[:, 0] = 0.5 * np.sin(2.1 * time) + 0.3 * np.sin(3.7 * time)
-    data = with_motion(two_links(), q, 200.0, 3, 0.0)
-    bristle, held = 0.0, []
+    data, bristle, held = with_motion(two_links(), q, 200.0, 3, 0.0), 0.0, []
     for v in np.repeat(data.v[:, 1], 20):
         bristle += (v - abs(v) * bristle / 2e-3) / 4000.0
         held.append(bristle / 2e-3)

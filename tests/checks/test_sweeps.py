@@ -147,8 +147,7 @@ def test_repeated_rows_and_constant_channels():
 
 
 def test_how_a_signal_differs_from_a_derivative():
-    inputs, found = seen(swing()), {}
-    every = [*signals.FACTORS, -1.0, 1.0]
+    inputs, found, every = seen(swing()), {}, [*signals.FACTORS, -1.0, 1.0]
     grid = sorted([f * x for f in every for x in (0.94, 0.96, 1.0, 1.04, 1.06)] + np.linspace(-1.5, 1.5, 61).tolist())
     for name, source in (("v", "q"), ("a", "v")):
         for left in (0.0, 0.04, 0.06, 0.29, 0.31):

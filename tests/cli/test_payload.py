@@ -24,7 +24,7 @@ from forcegp.simulation import QuadrotorConfig, simulate_quadrotor
         (0.2, 0.008, "0.5 ± 0.2 kg at (20, 0, 50) mm of hand, if the URDF's links are right"),
         (0.2, 1.1, "0.5 ± 0.2 kg at (20, 0, ?) mm of hand, if the URDF's links are right"),
         (0.27, 0.008, "none, or 0.5 ± 0.3 kg"),  # three to four standard errors were none in logs of cogging, or stops
-        (1.1, 0.015, "none (0.5 ± 1 kg)"),
+        (1.1, 0.015, "none, or at most 1.6 kg"),
         (1.7, 0.015, "not known from this log (0.5 ± 2 kg)"),
     ],
 )

@@ -42,8 +42,7 @@ def monitor():
 
 def test_it_is_the_momentum_observer():
     """r = K (p - int (u - friction + C^T v - g + r) dt) of De Luca and Mattone, integrated in small steps."""
-    dt, bandwidth = 1e-3, 3.0
-    push = np.zeros((1000, 2))
+    dt, bandwidth, push = 1e-3, 3.0, np.zeros((1000, 2))
     push[300:] = 2.0, -1.0
     q, v, u = motion(1.0, 2, push, noise=0.0, dt=dt)
     observer = ContactMonitor(TRUE, dt=dt, bandwidth=bandwidth).calibrate([motion(55.0, 1, dt=dt)])
@@ -252,8 +251,7 @@ def posterior():
 
 
 def test_learned_friction_sees_what_the_urdf_does_not(posterior):
-    free, limits = motion(120.0, 1), {}
-    push = np.zeros((400, 2))
+    free, limits, push = motion(120.0, 1), {}, np.zeros((400, 2))
     push[200:] = 0.25, 0.1
     models = {"learned": posterior.predictor(covariance="none"), "urdf": URDF_ALONE, "both": posterior.predictor()}
     for name, model in models.items():

@@ -48,8 +48,7 @@ def test_an_arm_on_a_line(noise):
 def test_noise_of_positions_is_no_motion_of_feet_that_stand():
     """At .03 mm and .1 mrad a standing foot is differentiated to .02 m/s, and swings in some rows."""
     clean_walk = simulate_quadruped(QuadrupedConfig(seconds=4.0, seed=1))
-    space, noise = clean_walk.model.robot.space, np.random.default_rng(0)
-    q = clean_walk.q.copy()
+    space, noise, q = clean_walk.model.robot.space, np.random.default_rng(0), clean_walk.q.copy()
     q[:, :3] += 3e-5 * noise.standard_normal((len(q), 3))
     q[:, 7:] += 1e-4 * noise.standard_normal(q[:, 7:].shape)
     v = differentiate(q, clean_walk.time, space)

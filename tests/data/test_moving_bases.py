@@ -68,8 +68,7 @@ def jumbled(log: Dataset) -> Dataset:
 
 
 def test_velocities_and_accelerations_of_a_tumbling_body():
-    coarse, fine = tumbling(), tumbling(rate=2 * RATE)
-    errors = []
+    coarse, fine, errors = tumbling(), tumbling(rate=2 * RATE), []
     for log in (coarse, fine):
         found = differentiated(jumbled(log), "q")
         errors.append([np.abs(found.v - log.v).max(), np.abs(found.a - log.a)[3:-3].max()])

@@ -187,8 +187,7 @@ def test_it_is_the_filter_the_differences_and_the_rows_that_it_says():
 def test_rows_depend_on_those_near_them_only(cutoff, late, seed):
     data, _ = noisy(4.0, seed)
     preparation = Preparation(cutoff=cutoff, **late)
-    whole = preparation.apply(data)
-    late, lag = abs(late.get("delay", 0.0)), late.get("lag", 0.0)
+    whole, late, lag = preparation.apply(data), abs(late.get("delay", 0.0)), late.get("lag", 0.0)
     slowest = 2.0 * np.pi * cutoff * np.sin(0.5 * np.pi / 4)  # pole of Butterworth's filter
     reach = round((late + 27.6 * (lag + 1.0 / slowest)) * RATE) + 24  # exp(-27.6) = 1e-12; splines and differences
     first, last = 900, 1100

@@ -86,8 +86,7 @@ def hop(base: str, rate: float, stands: float, gravity=(0.0, 0.0, -9.81)):
     links = "".join(f'<link name="{name}">{BODY.format(m)}</link>' for name, m in (("trunk", 5.0), ("foot", 0.5)))
     leg = LEG.format("0 0 -1" if base == "floating" else "0 -1 0")
     robot = Robot.from_urdf_text(f'<robot name="hopper">{links}{leg}</robot>', base=base, gravity=gravity)
-    time = np.arange(0.0, 8.0, 1.0 / rate)
-    flies, speed = 0.5, 0.25 * 9.81
+    time, flies, speed = np.arange(0.0, 8.0, 1.0 / rate), 0.5, 0.25 * 9.81
     t = time % (flies + stands)
     flags, w = (t >= flies).astype(float), np.pi / stands
     in_air, on_ground = t, t - flies

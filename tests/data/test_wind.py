@@ -23,8 +23,7 @@ def flight(wind, *, drag=1.0, episodes=1, rows=800, seed=0, noise=0.0):
     """Random smooth motions of a body on which drag is the only unmodelled force, a law that `AirLaw` holds exactly."""
     robot = Robot.from_urdf_text(BODY, base="floating")
     model = Model(robot, (), (Actuation(), Thrusters("body", PLACES, 1.0, [0.02, 0.02, -0.02, -0.02]), RigidBodies()))
-    rng, parts = np.random.default_rng(seed), []
-    time = np.arange(rows) / 100
+    rng, parts, time = np.random.default_rng(seed), [], np.arange(rows) / 100
     for episode in range(episodes):
 
         def waves(columns, size, rng=rng):

@@ -49,8 +49,7 @@ def test_a_full_disk_leaves_the_old_output(inputs, disk, name):
     out = place / "out"
     code, errors = run(command.line(out), inputs)
     assert code == 0, errors
-    old, size = snapshot(out), used(place)
-    refused = 0
+    old, size, refused = snapshot(out), used(place), 0
     for part in SIZES:
         if command.kind == "store":  # these go on; jobs that are there stay as they are
             shutil.rmtree(out / "jobs")

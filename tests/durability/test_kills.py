@@ -13,8 +13,7 @@ KILLS = 10  # of every command: 60 in all
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", KILLED)
 def test_a_kill_at_any_moment_costs_nothing_but_the_run(inputs, tmp_path, name):
-    command, generator = COMMANDS[name], random.Random(name)
-    out = tmp_path / "there" / "out"
+    command, generator, out = COMMANDS[name], random.Random(name), tmp_path / "there" / "out"
     out.parent.mkdir()
     begin = time.monotonic()
     code, errors = run(command.line(out), inputs)

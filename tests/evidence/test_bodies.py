@@ -63,8 +63,7 @@ def test_a_step_to_parameters_of_no_body_ends_at_a_body():
 
 
 def test_distance_is_that_of_the_metric():
-    ours, x = bodies(), 0.5 * np.random.default_rng(1).normal(size=30)
-    wanted = 0.0
+    ours, x, wanted = bodies(), 0.5 * np.random.default_rng(1).normal(size=30), 0.0
     for found, start in zip(ours.pseudo_inertias(x), ours.pseudo_inertias(np.zeros(30)), strict=True):
         wanted += np.square(np.log(np.linalg.eigvals(np.linalg.solve(start, found)).real)).sum()
     assert (ours.distance(x)[0] ** 2).sum() == pytest.approx(wanted, rel=1e-9)

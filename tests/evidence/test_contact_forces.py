@@ -85,8 +85,7 @@ def test_stacked_rows_have_the_density_of_one_large_gaussian():
     seen = log.a, log.measured[SENSOR] @ NORMAL[:, None], log.measured[ACCELEROMETER]
     r = (torch.cat([torch.tensor(x) for x in seen], 1) - torch.cat([x.offset for x in maps], 1)).flatten()
     B = model.unknown.direction(at)
-    W = torch.block_diag(*(G @ B))
-    n, C = len(log), B.shape[-1]
+    W, n, C = torch.block_diag(*(G @ B)), len(log), B.shape[-1]
     K, features = torch.zeros(n, C, n, C, dtype=torch.float64), likelihood.standardization(model.unknown.features(at))
     for c, matrix in enumerate(kernels.matrices(parameters, features)):
         K[:, c, :, c] = matrix.detach()

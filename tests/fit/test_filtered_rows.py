@@ -25,8 +25,7 @@ CUTOFF = 4.0  # Hz, so that rows within .081 s are alike
 
 def filtered(rows: int = 480, seed: int = 0, cutoff: float | None = CUTOFF) -> Dataset:
     """An arm without unknown forces whose accelerations have errors of .5 rad/s^2 that a filter has made smooth."""
-    model, time = arm_model(0), 0.01 * np.arange(rows)
-    draw = np.random.default_rng(seed)
+    model, time, draw = arm_model(0), 0.01 * np.arange(rows), np.random.default_rng(seed)
     q, v, u = (gaussian_filter1d(draw.normal(size=(rows, 3)), 12.0, axis=0) * size for size in (3.0, 4.0, 8.0))
     a = model.dynamics(tensor(q), tensor(v), tensor(u)).acceleration(tensor(0.0 * q)).numpy()
     errors = gaussian_filter1d(draw.normal(size=(rows, 3)), 5.0, axis=0)

@@ -88,8 +88,7 @@ def test_an_axis_with_more_friction_is_followed(shared):
     parts = test.v, np.tanh(test.v / 0.0015), abs(test.v)
     more = 0.029 * sum(number * part for number, part in zip(numbers.values(), parts, strict=True))
     other = replace(test, u=test.u + more, time=test.time - test.time[0])
-    rest, first = other.rows(other.time >= 6.0), other.rows(other.time < 6.0)
-    errors = {}
+    rest, first, errors = other.rows(other.time >= 6.0), other.rows(other.time < 6.0), {}
     for name, posterior in (("fit", found), ("seen", found.update(first))):
         whole, errors[name] = np.ones(len(rest), dtype=bool), []
         for horizons in ((0.1, 0.25, 0.5, 1.0), (4.0,)):

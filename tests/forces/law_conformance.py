@@ -136,8 +136,7 @@ class LawConformance:
         assert written.learned
 
     def test_plants_have_it_and_motions_are_predicted(self, model, log):
-        posterior = fit(model.with_forces(noise=STILL), log)
-        q, v = log.q[0], 0.2 * log.v[0]
+        posterior, q, v = fit(model.with_forces(noise=STILL), log), log.q[0], 0.2 * log.v[0]
         moved = posterior.rollout(q, v, np.zeros((40, 3)), 0.005, integrator="rk4")
         at_q, at_v = torch.tensor(q), torch.tensor(v)
         for _ in range(40):  # Runge and Kutta's rule, written out

@@ -48,8 +48,7 @@ def log_of(q, v, a, u, time) -> Dataset:
 
 def lugre(time: np.ndarray, v: np.ndarray, stiffness: float, level: float, breakaway: float) -> np.ndarray:
     """Friction of the LuGre model (Canudas de Wit et al. 1995), with viscous bristles and a Stribeck curve."""
-    damping = 0.5 * np.sqrt(stiffness)
-    z, out = 0.0, np.zeros_like(v)
+    damping, z, out = 0.5 * np.sqrt(stiffness), 0.0, np.zeros_like(v)
     for k, speed in enumerate(v):
         for _ in range(20):
             rate = speed - stiffness * abs(speed) / (level + breakaway * np.exp(-((speed / 0.05) ** 2))) * z
@@ -90,8 +89,7 @@ def test_it_is_smooth_in_sigma_and_bounded():
 
 @pytest.mark.parametrize("evidence", [Torques(), Accelerations()], ids=str)
 def test_a_gear_with_bristles_is_explained_better_and_its_numbers_are_near(lugre_log, evidence):
-    train, test = lugre_log.rows(slice(0, 4000)), lugre_log.rows(slice(4000, 6000))
-    left = {}
+    train, test, left = lugre_log.rows(slice(0, 4000)), lugre_log.rows(slice(4000, 6000)), {}
     for law in (Stribeck(), Coulomb(), Coulomb(memory=True)):
         found = fit(arm_model(0).with_forces(Viscous(), law), train, evidence, rows=1500)
         force, _ = motion_residuals(with_memory(test, found.model), found.model)
@@ -156,8 +154,7 @@ def test_scores_and_motions_know_the_past(lugre_log):
 
 
 def test_controllers_and_monitors_see_the_past(lugre_log):
-    train, test = lugre_log.rows(slice(0, 4000)), lugre_log.rows(slice(4000, 6000))
-    left = {}
+    train, test, left = lugre_log.rows(slice(0, 4000)), lugre_log.rows(slice(4000, 6000)), {}
     for law in (Coulomb(), Coulomb(memory=True)):
         posterior = fit(arm_model(0).with_forces(Viscous(), law, noise=Noise(0.1)), train, Torques(), rows=1500)
         monitor = ContactMonitor(posterior.predictor(), dt=DT)

@@ -89,8 +89,7 @@ CASES = st.one_of(
 
 def check(case: Log, folder: Path) -> None:
     (folder / "pair.urdf").write_text(PAIR)
-    path, change = folder / case.base, case.change
-    source = INPUTS.folder / case.base
+    path, change, source = folder / case.base, case.change, INPUTS.folder / case.base
     (shutil.copytree if source.is_dir() else shutil.copyfile)(source, path)
     flags = FLAGS[case.base].split()
     if isinstance(change, Damage):

@@ -40,8 +40,7 @@ def inducing(given: Problem, points: int = COUNT, tolerance: float = 0.0) -> Ind
 @torch.no_grad()
 def test_inducing_points_everywhere_are_the_exact_posterior(shape):
     given = made(**shape)
-    features = new_features(given)
-    posterior, expected = inducing(given), exact(given)
+    features, posterior, expected = new_features(given), inducing(given), exact(given)
     assert_close(posterior.mean(features), expected.mean(features), rtol=1e-6, atol=1e-7)
     assert_close(posterior.covariance(features), expected.covariance(features), rtol=1e-6, atol=1e-7)
     for index, z in enumerate(features):
@@ -66,8 +65,7 @@ def test_points_at_hand_serve_where_they_suffice(louder):
 @torch.no_grad()
 def test_few_weights_know_less_than_all_data():
     given = made()
-    features = new_features(given)
-    few, expected = inducing(given, points=8), exact(given)
+    features, few, expected = new_features(given), inducing(given, points=8), exact(given)
     surplus = few.covariance(features).diagonal(dim1=-2, dim2=-1).sum(-1) - expected.covariance(features).diagonal(
         dim1=-2, dim2=-1
     ).sum(-1)

@@ -161,8 +161,7 @@ def moved(robot, name, dt, seconds, speed=1.0):
 
 
 def test_steps_have_their_order_on_the_manifold():
-    robot = Robot.from_urdf_text(LIMBS, base="floating")
-    seconds, coarse = 0.06, 0.02
+    robot, seconds, coarse = Robot.from_urdf_text(LIMBS, base="floating"), 0.06, 0.02
     reference = moved(robot, "rk4", coarse / 8, seconds, 0.5)
     for name, order in (("symplectic-euler", 1), ("implicit-midpoint", 2), ("rk4", 4)):
         ends = [moved(robot, name, dt, seconds, 0.5).q[-1] for dt in (coarse, coarse / 2)]

@@ -5,12 +5,12 @@ import pytest
 import torch
 from tests.posterior.arm import arm_data, arm_model
 
-from forcegp.errors import InvalidInput
+from forcegp.errors import InvalidInput, NumericalWarning
 from forcegp.fit import fit
-from forcegp.forces import JointForces
+from forcegp.forces import JointForces, Viscous
 from forcegp.inference import OptimizerOptions
 from forcegp.mechanics import Baumgarte
-from forcegp.posterior.rollout import Rollout
+from forcegp.posterior.rollout import Rollout, predicted
 from forcegp.simulation import QuadrupedConfig
 from forcegp.simulation.moving_bases import simulate_quadruped
 
@@ -50,6 +50,24 @@ def test_symplectic_euler_is_a_loop_over_predict(data, start):
     torch.testing.assert_close(rollout.time, DT * torch.arange(STEPS + 1, dtype=torch.float64))
     assert rollout.samples is None
     assert (rollout.diverged_at == -1).all()
+
+
+@pytest.mark.parametrize(("damping", "dt", "chosen"), [(1.9, 0.02, "implicit-midpoint"), (0.2, 0.02, "rk4")])
+def test_motions_that_friction_is_too_stiff_for_are_implicit(damping, dt, chosen):
+    free = arm_model(0)
+    stiff = fit(free.with_forces(Viscous(damping)), arm_data(20, 1, free))
+    q, v = torch.tensor([[0.2, 0.4, -0.5]]), torch.tensor([[1.0, -0.5, 0.3]])
+    u = free.robot.gravity_forces(q)[:, None].repeat(1, 50, 1)
+    found = predicted(stiff, q.double(), v.double(), u.double(), dt, "rk4")
+    assert found.integrator == chosen
+    exact = stiff.rollout(q.double(), v.double(), u.repeat_interleave(200, 1).double(), dt / 200, integrator="rk4")
+    torch.testing.assert_close(found.q[:, -1], exact.q[:, -1], rtol=0.0, atol=3e-3)
+
+
+def test_other_motions_that_end_stay_as_they_are_with_a_warning(posterior, start):
+    q, v, u = start
+    with pytest.warns(NumericalWarning, match="2 of 2 rollouts diverged"):
+        assert predicted(posterior, q, v, 1e7 * u, DT, "rk4").integrator == "rk4"
 
 
 def test_the_stabilisation_is_the_one_of_the_rollout_and_not_of_the_data(posterior, start):

@@ -285,7 +285,7 @@ def slips(inputs: CheckInput) -> Iterator[Doubt]:
             yield wrong(
                 about="frozen channel" if stood else "jumps",
                 what=f"the position of {name} {seen}",
-                do="Leave {} out by forcegp import --without {:.3f},{:.3f}{}.".format(
+                do="Leave {} out by forcegp import LOG --without {:.3f},{:.3f}{}.".format(
                     "these rows" if stood else "the shorter part", *left_out, "" if stood else ", or correct it"
                 ),
                 joints=(name,),

@@ -131,7 +131,7 @@ def loads(
         spans += [float(at[a - 1]) - smeared if a else begin, float(at[b]) + smeared if b < count else end]
     told: dict[str, Any] = {"seconds": np.maximum.accumulate(spans).tolist()}
     out = ",".join(f"{x:.2f}" for x in told["seconds"])
-    told["do"] = f"Leave the shorter part out by forcegp import --without {out}, as forcegp auto does."
+    told["do"] = f"Leave the shorter part out by forcegp import LOG --without {out}, as forcegp auto does."
     yield when, held[:, None, None] * columns, (3.25 + 0.25 * len(changes)) * NUMBER, told
 
 

@@ -251,9 +251,8 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
             do += "forcegp score LOG.h5 --forces identified,gp:joint:inputs=q --out scores."
             numbers["positions"] = names
     if "seconds" in numbers:
-        do = (
-            f"Leave them out by forcegp import --without {','.join(f'{x:.2f}' for x in seconds)}, as forcegp auto does."
-        )
+        ends = ",".join(f"{x:.2f}" for x in seconds)
+        do = f"Leave them out by forcegp import LOG --without {ends}, as forcegp auto does."
     what = "something is wrong that is none of the causes that were tried (signs, units, orders, zeros, gears, "
     what += f"gravity, masses, payload, springs, delay): unexplained stay of the torque of {shares}{where}."
     yield look(about=UNKNOWN, what=what, do=do, joints=inputs.named(bad), numbers=numbers)

@@ -137,7 +137,7 @@ def _dropped(inputs: CheckInput, kinds: Sequence[str]) -> Iterator[Doubt]:
             half = 0.5 * float(np.median(np.diff(time)))
             edges = (x for a, b in runs(every.any(axis=1)) for x in (time[a] - half, time[b - 1] + half))
             ends = ",".join(f"{x:.{FINE - int(np.log10(half))}f}" for x in edges)
-            remedy = f"Such a value is wrong: leave it out, by forcegp import --without {ends}."
+            remedy = f"Such a value is wrong: leave it out, by forcegp import LOG --without {ends}."
         yield wrong(
             about=about,
             what=f"{seen}, in {listed(tuple(EVERY_QUANTITY[name] for name in lost))} of {listed(names)}; the first is "
@@ -242,7 +242,7 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
         about="saturation" if limit else "frozen channel",
         what=f"the {QUANTITY[name]} of {inputs.names[joint]} stands still at {values[start]:.6g} for "
         f"{length * step:.3g} s from row {start} at {log.time[start]:.3f} s, while its other signals change.",
-        do=f"Leave such stretches out, here by forcegp import --without {log.time[start]:.2f},"
+        do=f"Leave such stretches out, here by forcegp import LOG --without {log.time[start]:.2f},"
         f"{log.time[start] + length * step:.2f}, and look at the {'limits of the drive' if limit else 'logger'}.",
         joints=(inputs.names[joint],),
         numbers={"quantity": name, "row": start, "seconds": length * step},

@@ -108,7 +108,7 @@ def _drift(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
             x, (begin, end) = since[name], inputs.log.time[[0, -1]].tolist()
             wide = np.ptp(rows.time).item() / len(TIMES)  # as far as it may be off
             span = [begin, x + wide] if x - begin < end - x else [x - wide, end]
-            do = f"Leave a part out by forcegp import --without {span[0]:.2f},{span[1]:.2f}, as forcegp auto does."
+            do = f"Leave a part out by forcegp import LOG --without {span[0]:.2f},{span[1]:.2f}, as forcegp auto does."
         numbers = {"ratio": changed, **({"seconds": span} if span else {})}
         yield look(about="drift", what=what, do=do, joints=tuple(changed), numbers=numbers)
 
@@ -261,7 +261,7 @@ def push(found: Explanation, inputs: CheckInput, since: float, until: float) -> 
         about="push",
         what=f"from {begin:.4g} to {end:.4g} s the torques of {listed(inputs.named(joints))} are up to "
         f"{times[joints].max():.2g} times as far from any masses and friction as elsewhere: a contact or a load.",
-        do=f"Leave them out by forcegp import --without {begin:.2f},{end:.2f}, as forcegp auto does.",
+        do=f"Leave them out by forcegp import LOG --without {begin:.2f},{end:.2f}, as forcegp auto does.",
         joints=inputs.named(joints),
         numbers={"seconds": [float(begin), float(end)], "gains": gains[joints].tolist()},
     )
@@ -291,7 +291,7 @@ def jump(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         about="offset",
         what=f"the torque of {name} is {size:+.3g} {inputs.unit_of_each('u')[joint]} from what it was before, from "
         f"{time:.4g} s on: its sensor or amplifier has another zero{'' if inputs.rotates[joint] else ', or a load'}.",
-        do=f"Leave the shorter part out by forcegp import --without {begin:.2f},{end:.2f}, as forcegp auto does.",
+        do=f"Leave the shorter part out by forcegp import LOG --without {begin:.2f},{end:.2f}, as forcegp auto does.",
         joints=(name,),
         numbers={"offset": size, "seconds": [float(begin), float(end)], "nats": float(nats[joint])},
     )

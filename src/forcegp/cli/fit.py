@@ -105,8 +105,7 @@ class Fit(Command):
         noise = self._noise()
         forcegp.robots.usable_device(self.device)
         evidence = forcegp.evidence.parse_evidence(self.evidence) if self.evidence else ()
-        start, notes = time.monotonic(), []
-        dataset = forcegp.Dataset.load(self.log)
+        start, notes, dataset = time.monotonic(), [], forcegp.Dataset.load(self.log)
         contacts, given = robot_options.parse_contacts(self.contact), self.robot.chosen_model(dataset, self.log)
         given = given.with_contacts(contacts) if self.contact else given
         self._check(terminal, dataset, given)

@@ -189,7 +189,8 @@ def payload_text(found: Any) -> str:
     if error > MOST_OPEN * found.model.robot.mass:
         return f"not known from this log ({size})"
     if mass.value < max(SURE * mass.std, LEAST_PAYLOAD):
-        return f"none, or {size}" if mass.value > mass.std else f"none ({size})"
+        most = in_digits(max(mass.value + error, 0.0), 2)
+        return f"none, or {size}" if mass.value > mass.std else f"none, or at most {most} kg"
     both = [(round(1e3 * x.value), width) for x, width in zip(center, widths, strict=True)]
     place = ", ".join("?" if width > OPEN else f"{x}" + f" ± {1e3 * width:.0f}" * (width > FAR) for x, width in both)
     [held] = [law for law in found.model.laws if isinstance(law, forcegp.Payload)]

@@ -98,8 +98,7 @@ def turning_points(q: Float[np.ndarray, " rows"], least: float) -> Int[np.ndarra
     steps = np.diff(q)
     moving = np.flatnonzero(steps)
     turned = moving[1:][np.sign(steps[moving[1:]]) != np.sign(steps[moving[:-1]])] if len(moving) else moving
-    extremes = [0, *turned.tolist(), len(q) - 1]
-    turns, extreme, direction = [0], 0, 0.0
+    extremes, turns, extreme, direction = [0, *turned.tolist(), len(q) - 1], [0], 0, 0.0
     for row in extremes[1:]:
         ahead = q[row] - q[extreme]
         if direction == 0.0:

@@ -47,8 +47,7 @@ class AirLaw:
     def _smoothed(
         self, forces: "_Forces", dataset: Dataset, start: np.ndarray, seconds: float, *, after: bool, sweeps: int = 4
     ) -> Float[np.ndarray, "rows 3"]:
-        weights, law = 1.0 / np.square(self.deviations), np.array(self.coefficients)
-        wind = start.copy()
+        weights, law, wind = 1.0 / np.square(self.deviations), np.array(self.coefficients), start.copy()
         for _ in range(sweeps):
             left, slope = forces.unexplained(law, wind)
             target = left + np.einsum("nij,nj->ni", slope, wind)

@@ -206,8 +206,7 @@ def upper_cholesky(matrices: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "
 def _log_cholesky(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """F F^T (n, 4, 4) and its derivatives (n, 10, 4, 4)."""
     x = x.reshape(-1, 10)
-    scale, F = np.exp(x[:, 0]), np.zeros((len(x), 4, 4))
-    derivatives = np.zeros((len(x), 10, 4, 4))
+    scale, F, derivatives = np.exp(x[:, 0]), np.zeros((len(x), 4, 4)), np.zeros((len(x), 10, 4, 4))
     F[:, 3, 3] = scale
     for k, (i, j) in enumerate(_PLACES, start=1):
         F[:, i, j] = scale * (np.exp(x[:, k]) if i == j else x[:, k])
@@ -229,8 +228,7 @@ def thickened(robot: Robot) -> tuple[Robot, tuple[str, ...]]:
     """
     text, changed = robot.urdf_text, []
     for body, pseudo in zip(carrying(robot), body_pseudo_inertias(robot).cpu().numpy(), strict=True):
-        joint = robot.layout.bodies[body]
-        mass, center = pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
+        joint, mass, center = robot.layout.bodies[body], pseudo[3, 3], pseudo[:3, 3] / pseudo[3, 3]
         about_center = pseudo[:3, :3] - mass * np.outer(center, center)
         size = max(np.trace(pseudo[:3, :3]), 1e-8 * mass)
         if np.linalg.eigvalsh(about_center)[0] > THIN * size:

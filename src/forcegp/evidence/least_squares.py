@@ -134,8 +134,7 @@ class Chained:
             across[:, shown] += Y[:, joint].T @ (T / level)
             squares[np.ix_(shown, shown)] += T.T @ T
             slope[shown] += T.T @ r
-        own = np.tensordot(noise**-2.0, self.regressor.squares, 1)
-        C, across = self.inner, self.inner.T @ across
+        own, C, across = np.tensordot(noise**-2.0, self.regressor.squares, 1), self.inner, self.inner.T @ across
         gradient = C.T @ (Y.reshape(white.size, p).T @ (white / noise).ravel())
         return np.concatenate([gradient, slope]), np.block([[C.T @ own @ C, across], [across.T, squares]])
 
@@ -359,8 +358,7 @@ def correlation_time(residual: Rows, episode: Int[np.ndarray, " rows"]) -> np.nd
 
     The sum ends as Geyer's initial positive sequence does ("Practical Markov chain Monte Carlo", Stat. Science 1992).
     """
-    total, times = (residual**2).sum(0), np.ones(residual.shape[1])
-    open_ = np.ones(residual.shape[1], dtype=bool)
+    total, times, open_ = (residual**2).sum(0), np.ones(residual.shape[1]), np.ones(residual.shape[1], dtype=bool)
     for lag in range(1, len(residual) - 1, 2):
         pair = np.zeros(residual.shape[1])
         for shift in (lag, lag + 1):

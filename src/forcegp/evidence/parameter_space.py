@@ -341,8 +341,7 @@ def _terms(model: Model, typical: Mapping[str, np.ndarray]) -> list[Term]:
             sizes = {name: abs(T) @ typical[name] for name in ("position", "velocity")}
             sizes |= {"force": force, "inertia": inertia}
         for name in law.learned:
-            coefficient, given = law.coefficients[name], getattr(law, name)
-            per_joint = isinstance(law, PerJointLaw)
+            coefficient, given, per_joint = law.coefficients[name], getattr(law, name), isinstance(law, PerJointLaw)
             joints = singles if per_joint else np.zeros(1, dtype=int)
             size = coefficient.size(sizes)[joints]
 

@@ -120,8 +120,7 @@ class Equations:
             if isinstance(self.space.model.laws[term.law], Actuation):
                 places, gains = list(term.joints or ()), np.ones(r.shape[1])
                 gains[places] = term.values(own)
-                r, jacobian = r / gains, jacobian / gains[:, None]
-                columns = range(column, column + len(places))
+                r, jacobian, columns = r / gains, jacobian / gains[:, None], range(column, column + len(places))
                 jacobian[:, places, columns] -= r[:, places] * (term.slopes(own) / gains[places])
             column += len(term.size)
         return r, jacobian

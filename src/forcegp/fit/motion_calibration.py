@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from forcegp.posterior import Posterior
 from forcegp.posterior.drift import scaled
 from forcegp.posterior.fitted import DEVIATIONS, HORIZONS, MotionIntervals
 from forcegp.posterior.observed_wrench import in_own_air, observing, require_unobserved
-from forcegp.posterior.rollout import Rollout
+from forcegp.posterior.rollout import predicted
 from forcegp.progress import part
 
 FOLDS = 4
@@ -62,8 +61,11 @@ def calibrated(
     drift = posterior.settings.get("drift") if _records(dataset, wanted[-1]) == 1 else None
     for other, motions in _left_out(posterior, dataset, parts, wanted[-1], STARTS[slow]):
         kept = tuple(h for h in wanted if h >= motions.dt)
-        how: dict[str, Any] = {"integrator": integrator, "samples": SAMPLES[slow] * bool(other.latent_names)}
-        rollout: Rollout = other.rollout(motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, **how)
+        start, samples = (
+            (motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt),
+            SAMPLES[slow] * bool(other.latent_names),
+        )
+        rollout = predicted(other, *start, integrator, samples=samples)
         at = [min(round(h / motions.dt), motions.u.shape[1]) for h in kept]
         inputs, sampled = other.model.inputs, rollout.samples is not None
         true_q, true_v = (torch.tensor(x[:, at], device=rollout.q.device) for x in (motions.q, motions.v))
@@ -74,7 +76,7 @@ def calibrated(
         if drift is not None:  # as if all joints warm up together
             for kind in (DryFriction, Viscous):
                 louder = replace(other, target=scaled(other.model, 1.0 + torch.as_tensor(drift["between"]), kind))
-                moved = louder.rollout(motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt, integrator=integrator)
+                moved = louder.rollout(*start, integrator=rollout.integrator)
                 shifts.append(torch.stack([moved.q - rollout.q, moved.v - rollout.v], dim=2)[:, at].cpu().numpy())
                 del louder, moved
         errors.append(np.stack(error, axis=2))
@@ -117,8 +119,7 @@ def _records(dataset: Dataset, seconds: float) -> int:  # episodes that last so 
 
 def _folds(dataset: Dataset, seconds: float) -> list[np.ndarray]:
     """Rows that are left out in turn: episodes, where several last so long, else quarters of the only one."""
-    numbers = np.zeros(len(dataset), dtype=int)
-    long, several = 0, _records(dataset, seconds) > 1
+    numbers, long, several = np.zeros(len(dataset), dtype=int), 0, _records(dataset, seconds) > 1
     for episode in dataset.episodes:
         rows = np.flatnonzero(dataset.episode == episode)
         lasting = float(np.ptp(dataset.time[rows]))

@@ -45,8 +45,7 @@ def with_payloads_placed(model: Model, logs: Sequence[Dataset]) -> Model:
         return model
     # of joints of several bodies, as of fingers, none counts, if there are others: what they hold moves with the hand
     layout = model.robot.layout
-    drives = [drive.joint for drive in layout.drives]
-    solid = {place.body for place in layout.links.values()}
+    drives, solid = [drive.joint for drive in layout.drives], {place.body for place in layout.links.values()}
     alone = [body for body, joint in enumerate(drives) if drives.count(joint) == 1 and body in solid]
     last = max(alone, default=len(layout.bodies) - 1)
     usual = [name for name, place in layout.links.items() if place.body == last][-1]

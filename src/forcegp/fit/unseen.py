@@ -54,8 +54,7 @@ class Unseen:
         if not model.contacts or model.carries_known_forces:
             return nothing
         log = log.rows(evenly(log, ROWS))
-        rows = rows_of_known_physics(model, log)
-        robot, a = model.robot, np.array(log.a)
+        rows, robot, a = rows_of_known_physics(model, log), model.robot, np.array(log.a)
         residual = rows.in_torque(np.zeros(0), rows.moving(a))[0][:, : robot.nv]
         needed = rows.kinematics.inverse_dynamics(torch.as_tensor(a, device=robot.device)).cpu().numpy()
         single, pushing = np.isin(robot.joint_names, robot.single_joint_names), np.zeros_like(typical)

@@ -94,8 +94,7 @@ class ExpectedFriction:
         with the coefficient mu. A divisor below `SMALLEST_SHARE` is set to it, with a NumericalWarning.
         """
         state, multiplier = dynamics.state, dynamics.multiplier_map()
-        robot, rows = state.robot, multiplier.matrix[..., contact, :]
-        free = multiplier.offset[..., contact]
+        robot, rows, free = state.robot, multiplier.matrix[..., contact, :], multiplier.offset[..., contact]
         for index, (_, curve) in zip(joint_indices([name for name, _ in self.joints], robot), self.joints, strict=True):
             free = free - rows[..., index] * curve(state.v[..., index])
         size = torch.linalg.vector_norm(dynamics.normals[..., contact, :], dim=-1)

@@ -84,8 +84,7 @@ class JointLaw(PerJointLaw):
         """With velocities, positions, delivered forces of the motors."""
         if self.transmission is None:
             return state
-        own = copy(state)
-        turned = {"v": self.turning(state.v), "positions": self.turning(state.positions)}
+        own, turned = copy(state), {"v": self.turning(state.v), "positions": self.turning(state.positions)}
         vars(own).update(turned, delivered_by=lambda _: self.at_motors(state.delivered), kinematics=state.kinematics)
         return own
 

@@ -133,8 +133,7 @@ def minimize_objective(
     A search that finds no step rolls back to the best point and starts again with an empty memory, twice at most.
     `rival` is the best value of earlier starts. Raises FitError where the objective cannot be evaluated at the start.
     """
-    options = options or OptimizerOptions()
-    start_time, search = time.process_time(), _Search(objective, initial)
+    options, start_time, search = options or OptimizerOptions(), time.process_time(), _Search(objective, initial)
     if search.evaluate(search.best_point) is None:
         raise FitError(f"the marginal likelihood cannot be evaluated at the start values: {search.cause}")
     history = [search.best_value]

@@ -261,8 +261,7 @@ def _directions(latent: ExactPosterior, sample: Sample) -> tuple[Float[Tensor, "
     """W V^T over the exact standard deviations, one row per state and entry of y, and the rows' squared norms."""
     C = latent.system.deflation.C
     count, rank, latents = C.shape
-    points, height = len(sample.W), max(1, BLOCK_BYTES // max(1, 8 * count * rank * latents))
-    found = []
+    points, height, found = len(sample.W), max(1, BLOCK_BYTES // max(1, 8 * count * rank * latents)), []
     for start in range(0, points, height):
         features, W = [z[start : start + height] for z in sample.features], sample.W[start : start + height]
         places = zip(latent.kernels.dense, features, latent.features, strict=True)

@@ -147,8 +147,7 @@ def _function(casadi: Any, name: str, graph: Graph, nodes: Sequence[int], sizes:
 
 
 def _latents(casadi: Any, code: Programs, x: Sequence[Any]) -> list[Any]:
-    graph, found = Graph(sum(code.sizes)), {}
-    at = code.traced
+    graph, found, at = Graph(sum(code.sizes)), {}, code.traced
     copied = Copier(graph, at.graph, dict(zip(at.graph.inputs, graph.inputs, strict=False)))
     for part in code.sums:
         given = KernelSum.given(part, graph, copied(at.features[part.latents[0]]))  # sums also of functions in pieces

@@ -284,8 +284,7 @@ class Posterior(Fitted):
 
     def with_rows(self, rows: Dataset) -> "Posterior":
         """Conditioned on rows of its own system, too: exactly, at the parameters that it has, in bounded memory."""
-        rows = decided(rows)
-        latent, training = exact(self.latent, "learning from more rows"), self.training
+        rows, latent, training = decided(rows), exact(self.latent, "learning from more rows"), self.training
         count, rank, latents = latent.system.deflation.C.shape
         size, new = rank * (count + len(rows)), rank * len(rows)
         # the factor, blocks of new rows, their copies

@@ -177,8 +177,7 @@ class Predictor(Summary):
         functions, seed = whole_number("functions", functions, 0), whole_number("seed", seed, 0)
         start, v, forces, batch = checked_start(self.sizes, self.device, q0, v0, u)
         model = self.posterior.model
-        method = steps_by(integrator, model, dt)
-        loops, acceleration = None, self.mean
+        method, loops, acceleration = steps_by(integrator, model, dt), None, self.mean
         if integrator in steps_of(self.space):
             loops = self._of_code((integrator, functions, seed), lambda code: code.loops(integrator, functions, seed))
         if functions:

@@ -25,6 +25,7 @@ from forcegp.robots.manifold import ConfigurationSpace
 STEPS_TO_COMPILE = 400
 """Steps of some milliseconds each, and as many for every contact; fewer are done before a program is compiled."""
 TOGETHER, FUNCTIONS = 10, 3  # motions, and unknown functions, that cost as much as one step again
+STIFF, CHANGE, TINY = 2.5, 1e-3, 1e-6  # rate of decay times dt that rk4 cannot take (2.785); rad/s (m/s), and s
 ROWS_PER_BLOCK = 4096  # states whose constraint is evaluated at once
 
 Inputs = Float[Tensor, "T n nu"]
@@ -186,6 +187,23 @@ class Rollout:
         low, high = self.interval()
         off = q if self.space.is_vector_space else self.steps_to(q)
         return torch.where(torch.isnan(high - low), torch.nan, ((low <= off) & (off <= high)).to(off))
+
+
+def predicted(posterior: Any, q0: Any, v0: Any, u: Any, dt: float, integrator: str, **how: Any) -> Rollout:
+    """As `Posterior.rollout`, but by implicit midpoints where motions of rk4 end since friction is too stiff for it."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        found = posterior.rollout(q0, v0, u, dt, integrator=integrator, **how)
+    if integrator == "rk4" and bool((found.diverged_at >= 0).any()):
+        q, v, u_0 = (torch.as_tensor(x).to(found.q) for x in (q0, v0, u[:, :1]))
+        unit = CHANGE * torch.eye(v.shape[-1]).to(v)  # what a change of v does to a, (nv, n, nv)
+        steps = posterior.rollout(q, v + torch.stack([0.0 * unit[0], *unit])[:, None], u_0, TINY).v[..., 1, :]
+        rates = torch.linalg.eigvals((steps[1:] - steps[0] - unit[:, None]).movedim(0, -1)).abs().amax(-1)
+        if float(rates.median()) * dt > STIFF * CHANGE * TINY:
+            return posterior.rollout(q0, v0, u, dt, integrator="implicit-midpoint", **how)
+    for each in told:
+        warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+    return found
 
 
 def remembering(model: Model, u: Inputs, dt: float, feedback: Feedback | None) -> tuple[Inputs, Feedback | None]:

@@ -175,8 +175,7 @@ def lay_out(
     parents: list[int] = []
     origins: list[np.ndarray] = []
     groups: list[Group] = []
-    links = {root: Placement(WORLD, np.eye(4))}
-    stack, still = list(reversed(children[root])), [root]
+    links, stack, still = {root: Placement(WORLD, np.eye(4))}, list(reversed(children[root])), [root]
     for link in still:
         still += [joint.child for joint in children[link] if joint.type == "fixed" or joint.name in held]
     massive = any(inertial.mass for link in still if (inertial := description.links[link]))

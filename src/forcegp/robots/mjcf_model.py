@@ -142,8 +142,7 @@ class CompiledModel:
         return inertial_element(model.body_mass[body], pose[:3, 3], inertia)
 
     def _parts(self, joint: int, kind: str) -> str:
-        model, dof = self.model, self.model.jnt_dofadr[joint]
-        parts = []
+        model, dof, parts = self.model, self.model.jnt_dofadr[joint], []
         if kind in ("revolute", "prismatic"):
             parts.append(f'<axis xyz="{numbers(model.jnt_axis[joint])}"/>')
             lower, upper = model.jnt_range[joint]

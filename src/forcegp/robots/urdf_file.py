@@ -159,8 +159,7 @@ def with_chosen_inertias(
     """
     if choice not in get_args(InertiaChoice):
         raise InvalidInput(f"inertias is {choice!r}; give one of {', '.join(get_args(InertiaChoice))}.")
-    links, source = dict(description.links), description.source
-    changed = False
+    links, source, changed = dict(description.links), description.source, False
     for name in layout.moving:
         inertial = links[name]
         if inertial is None or name in problems.broken:

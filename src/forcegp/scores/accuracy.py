@@ -57,8 +57,7 @@ def predict_rows(posterior: Posterior, dataset: Dataset) -> dict[str, np.ndarray
     def predicted(q: Tensor, v: Tensor, u: Tensor, a: Tensor) -> tuple[Tensor, ...]:
         nonlocal done, names
         prediction, dynamics = posterior.predict(q, v, u), posterior.dynamics(q, v, u)
-        own = dataset.model.to(device).dynamics(q, v, u)
-        covariance, mean = prediction.covariance, prediction.mean
+        own, covariance, mean = dataset.model.to(device).dynamics(q, v, u), prediction.covariance, prediction.mean
         assert covariance is not None, "predict computes the covariance unless asked not to"
         noise = prediction.noise_covariance
         if dataset.noise_std is not None:  # rows may be noisier than those learned from

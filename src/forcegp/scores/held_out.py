@@ -19,6 +19,7 @@ from forcegp.doubts import listed
 from forcegp.errors import DatasetError, InvalidInput, require_type, usable_arguments
 from forcegp.posterior import Posterior, observing
 from forcegp.posterior.drift import in_its_record
+from forcegp.posterior.rollout import predicted
 from forcegp.robots.arguments import whole_number
 from forcegp.scores.accuracy import Table
 from forcegp.summary import plain
@@ -256,13 +257,17 @@ def motion_scores(
         return {}, None
     posterior, motions = held_out.of(posterior)
     start = motions.q[:, 0], motions.v[:, 0]
-    rollout = posterior.rollout(*start, motions.u, motions.dt, integrator=integrator, baumgarte=None)
+    rollout = predicted(posterior, *start, motions.u, motions.dt, integrator)
     recorded = torch.as_tensor(motions.q.copy(), device=rollout.q.device)
     off = rollout.steps_to(recorded)
     found = {"position": off, "velocity": torch.as_tensor(motions.v.copy(), device=rollout.q.device) - rollout.v}
     inside = None if rollout.intervals is None else rollout.contains(recorded)
     table: Table = {}
-    facts: dict[str, Any] = {"horizons": list(held_out.horizons), "motions": len(motions.q), "integrator": integrator}
+    facts: dict[str, Any] = {
+        "horizons": list(held_out.horizons),
+        "motions": len(motions.q),
+        "integrator": rollout.integrator,
+    }
     facts |= {"dt": motions.dt, "diverged": [], "squared": []}
     for horizon in held_out.horizons:
         row = round(horizon / motions.dt)

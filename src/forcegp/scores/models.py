@@ -105,8 +105,7 @@ def learn(
     others from `points`, `POINTS` where that is None. Motions among the evidence are those of `recording`, which may
     have more rows, and intervals of motions are calibrated then. `search` is restarts, seed, jobs.
     """
-    motions = [each for each in evidence if isinstance(each, Motions)]
-    usual = usual_evidence(model, dataset)
+    motions, usual = [each for each in evidence if isinstance(each, Motions)], usual_evidence(model, dataset)
     sensors = [each for each in evidence or usual if isinstance(each, Sensor)]
     others = [each for each in evidence if each not in (*motions, *sensors)] or [usual[0]]
     first, notes = others[0], []

@@ -90,8 +90,7 @@ OF_ONE = (
 
 def model_table(scores: Scores, model: str | None = None) -> tuple[list[str], list[list[str]]]:
     """Header and rows of one model: accelerations by joint, then every quantity over all of its columns."""
-    held = scores.quantities(model)
-    titles, names = ["", *(title for title, *_ in OF_ONE)], scores.joint_names
+    held, titles, names = scores.quantities(model), ["", *(title for title, *_ in OF_ONE)], scores.joint_names
     own = {score: scores.columns(score, ACCELERATION, model) for _, score, _ in OF_ONE if score in held[ACCELERATION]}
     each = {
         name: {score: column[place] for score, column in own.items() if len(column) == len(names)}

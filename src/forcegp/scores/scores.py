@@ -97,8 +97,7 @@ def paired_difference(
 
     if not one.size or bool((np.minimum(one, other).mean(axis=(0, 2)) <= 0.0).any()):
         return None
-    every = [np.arange(one.shape[axis]) for axis in (0, 2)]
-    variances, freedoms = [], []
+    every, variances, freedoms = [np.arange(one.shape[axis]) for axis in (0, 2)], [], []
     for axis, members in enumerate(every):
         count = len(members)
         if count > 1:

@@ -183,8 +183,7 @@ def simulate_quadrotor(config: QuadrotorConfig) -> Dataset:
 
 def _flight(robot: Robot, config: QuadrotorConfig, episode: int, steps: int) -> tuple[np.ndarray, ...]:
     """q, v, u, a and the wind of each row; u holds from its row to the next."""
-    rng, dt = np.random.default_rng([config.seed, episode]), 1.0 / (RATE * FINE)
-    body = robot.link("body")
+    rng, dt, body = np.random.default_rng([config.seed, episode]), 1.0 / (RATE * FINE), robot.link("body")
     mass, inertia, gravity = body.mass, body.inertia, robot.gravity.numpy()
     amplitude = PATH_SIZE * rng.uniform(0.3, 0.65, (2, 3))
     rate, phase = rng.uniform(*PATH_RATES, (2, 3)), rng.uniform(0.0, 2.0 * np.pi, (2, 3))
