@@ -72,7 +72,7 @@ def answer_lines(
         for two in (("rad", "m"), ("Nm", "N"), ("kg m²", "kg"))
     )
 
-    still = scores.not_known("identified", still)
+    rested, still = still, scores.not_known("identified", still)
 
     def but_for(names: Sequence[str]) -> str:
         return f"; of {', '.join(names)} not known from this log" if names else ""
@@ -98,12 +98,12 @@ def answer_lines(
     links, holds = robot.layout.links, (content["payload"] or {}).get("link")
     loaded = [name for name, each in links.items() if holds in links and each.body == links[holds].body]
     weight = f"{mass:.4g} ± {1.96 * error:.1g} kg, if {drives_of(identified.model)} are right"
-    shares = {name: _known(scores, "nrmse", forcegp.scores.ACCELERATION, name) for name in scores.models}
+    shares = {name: _of_moving(scores, "nrmse", name, rested) for name in scores.models}
     number = forcegp.scores.number
     ends = {name: "> 1" if (share or 0.0) > 1.0 else number(share) for name, share in shares.items()}
     errors = "; ".join(f"{short_name(name)} {number(_motion(scores, name))} / {end}" for name, end in ends.items())
     ahead = (f" after {scores.horizons[-1]:g} s" if scores.horizons else "") + f" [{'rad or m' if moving else q}]"
-    covered = scores.value("coverage_95", model=best)
+    covered = _of_moving(scores, "coverage_95", best, rested)
     intervals = "" if covered is None else f"; its 95 % intervals hold {100.0 * covered:.0f} % of unseen rows"
     weak = ", ".join(list(values.by_body or {})[:3])
     command = f"forcegp excite {out}/model --seconds 10 --out next.csv"
@@ -200,14 +200,12 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset, still: Sequ
         against = "they diverge" if urdf is None else f"by {urdf:.2g}"
         against = f"; with the URDF alone {against}" if "given" in scores.models and best != "given" else ""
         ahead = f"positions {scores.horizons[-1]:g} s ahead are wrong by {motion:.2g} {unit}{against}"
-        errors = zip(scores.joint_names, scores.columns("nrmse", forcegp.scores.ACCELERATION, best), strict=True)
-        there = [x or 0.0 for name, x in errors if name not in still]
         still_as_good = motion >= dataset.q.var(axis=0).mean() ** 0.5  # as the middle of the log
-        lost_there = still_as_good or sum(there) >= max(len(there), 1)  # no better than a = 0, as of light wrists
+        lost_there = still_as_good or (_of_moving(scores, "nrmse", best, still) or 0.0) >= 1.0  # as of light wrists
         told += f", but it is for torques: do not predict motions, {ahead}" if lost_there else f", and {ahead}"
     elif scores.horizons:
         told += ", but its motions diverge: do not simulate with it"
-    covered = scores.value("coverage_95", model=best)
+    covered = _of_moving(scores, "coverage_95", best, still)
     doubt = "" if covered is None or covered >= LEAST_COVERAGE else (
         f" Do not trust its intervals: those of 95 % hold {100.0 * covered:.0f} %."
     )  # fmt: skip
@@ -220,6 +218,15 @@ def verdict(scores: forcegp.scores.Scores, dataset: forcegp.Dataset, still: Sequ
 def _motion(scores: forcegp.scores.Scores, model: str) -> float | None:
     """Error of q at the longest horizon; None where all motions diverge, or none was scored."""
     return _known(scores, "rmse", f"position after {scores.horizons[-1]:g} s" if scores.horizons else "", model)
+
+
+def _of_moving(scores: forcegp.scores.Scores, score: str, model: str, still: Sequence[str]) -> float | None:
+    """A score of accelerations, the mean over joints that did not stand still, or all; None where there is none."""
+    if forcegp.scores.ACCELERATION not in (scores.quantities(model) if model in scores.models else ()):
+        return None
+    each = dict(zip(scores.joint_names, scores.columns(score, model=model), strict=True))
+    known = [x for name, x in each.items() if x is not None and (name not in still or {*each} <= {*still})]
+    return sum(known) / len(known) if known else None
 
 
 def _known(scores: forcegp.scores.Scores, score: str, quantity: str, model: str) -> float | None:

@@ -54,8 +54,7 @@ class Auto(Command):
       forcegp auto flight.csv --mapping columns.yaml --identified drone.json --out answer
     """
 
-    interrupted = "finished pieces are kept, and the same command resumes"
-    replaces = False
+    interrupted, replaces = "finished pieces are kept, and the same command resumes", False
 
     logs: Positional[Annotated[tuple[Path, ...], LOG, arg(metavar="LOG...", help_behavior_hint="")]]
     """Files, or folders of ROS 2 bags, of --robot. Thrusters, actuators and other contacts come with --identified."""

@@ -41,8 +41,7 @@ class Score(Command):
       forcegp score run log.h5 --forces given --forces gp:joint,viscous@accelerations --out few
     """
 
-    interrupted = "finished pieces are kept, and the same command resumes"
-    replaces = False
+    interrupted, replaces = "finished pieces are kept, and the same command resumes", False
 
     paths: Annotated[Positional[tuple[Path, ...]], THERE, arg(metavar="[RUN...] LOG", help_behavior_hint="")]
     """A dataset (HDF5), and before it, if wished, folders of models."""

@@ -191,8 +191,7 @@ class Reproduce(Command):
       forcegp reproduce fig2b --preset paper --jobs 2
     """
 
-    interrupted = "finished pieces are kept, and the same command resumes"
-    replaces = False
+    interrupted, replaces = "finished pieces are kept, and the same command resumes", False
 
     figure: Annotated[Positional[str], arg(metavar="FIGURE")]
     """Which figure, or all."""

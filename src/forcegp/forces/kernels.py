@@ -196,8 +196,7 @@ class LogVelocityKernel(_WidthKernel):
     Ornstein-Uhlenbeck (Rasmussen & Williams 2006, eq. 4.18); l starts at 1, a factor of e.
     """
 
-    has_lengthscale = True
-    nu = 0.5
+    has_lengthscale, nu = True, 0.5
 
     def __init__(self, width: float = WIDTH) -> None:
         super().__init__(width, ard_num_dims=1, lengthscale_constraint=log_scale())
