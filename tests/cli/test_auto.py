@@ -186,7 +186,9 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
     doubts = [{"about": "unknown cause", "joints": ["hip", "knee"], "numbers": x} for x in ({}, {"seconds": [1, 2]})]
 
     def told(errors, moved=0.01, shares=None, covered=0.94, still=()):
-        table = {"acceleration": {"nrmse": errors, "coverage_95": [covered] * 3}}
+        table = {
+            "acceleration": {"nrmse": errors, "coverage_95": covered if isinstance(covered, list) else [covered] * 3}
+        }
         table |= {"position after 1 s": {"rmse": [moved] * 3}}
         table |= {"torque": {"share": shares}} if shares else {}
         motions = {"horizons": [1.0], "squared": [[1e-4]]}
@@ -216,7 +218,8 @@ def test_the_verdict_names_joints_for_which_a_model_is_no_better_than_none():
     assert explained == [False] * 4 + [True, False] * 3 + [False] * 2, "of torques, by a tenth of their power"
     assert told([0.1] * 3, None).endswith("but its motions diverge: do not simulate with it.")
     assert told([0.1] * 3, covered=0.57).endswith("Do not trust its intervals: those of 95 % hold 57 %.")
-    assert "intervals" not in told([0.1] * 3, covered=0.81)
+    assert "intervals" not in told([0.1] * 3, covered=0.81) + told([0.1] * 3, covered=[0.9, 0.9, 0.1], still=["wrist"])
+    assert "hold 63 %" in told([0.1] * 3, covered=[0.9, 0.9, 0.1])
     assert ["do not predict" in told([0.1] * 3, moved) for moved in (0.4, 0.6)] == [False, True]  # as the middle is
 
 
