@@ -292,6 +292,9 @@ def test_an_end_stop_is_told_by_where_it_holds_a_joint(stops):
     [doubt] = check(log).doubts.of(UNKNOWN)
     assert doubt.numbers.get("stops", {}) == ({log.joint_names[1]: pytest.approx(end, abs=1e-2)} if stops else {})
     if stops:
+        once = log.time < doubt.numbers["seconds"][1] + 0.5
+        pushed = replace(log, u=log.u + 300.0 * over * (np.eye(log.nv)[0] + np.eye(log.nv)[2])).rows(once)
+        assert not [x for x in check(pushed).doubts.of(UNKNOWN) if "stops" in x.numbers], "several joints feel a push"
         assert len(doubt.numbers["seconds"]) > 2
         assert without_pushes(log, [doubt]).q[:, 1].max() < end
 

@@ -286,8 +286,7 @@ def stance_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     for k, name in enumerate(found.names):
         logged, shown, speed = dataset.u[:, model.inputs.index(name)], found.flags[:, k], found.speed[:, k]
         frame = next(contact.frame for contact in model.contacts if contact.switch == name)
-        stands = logged > OPEN
-        odd = int((~np.isin(logged, [0.0, OPEN, 1.0])).sum())
+        stands, odd = logged > OPEN, int((~np.isin(logged, [0.0, OPEN, 1.0])).sum())
         if odd:
             what = f"{name!r} is neither 0 nor 1 in {odd} of {len(logged)} rows; above .5 it counts as 1."
             do = "Write 1 where the contact holds and 0 elsewhere, for example force > threshold."

@@ -225,15 +225,16 @@ def _unknown(root: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
     shares = ", ".join(f"{inputs.names[k]} {100.0 * root.rough[k]:.0f} %" for k in bad)
     numbers: dict[str, object] = {"unexplained": root.rough[bad].tolist(), "rows": len(rows)}
     do = "Look at these joints there: contacts, brakes, cables, another robot, or a channel that is not a torque."
-    if stops := {k: end for k in bad.tolist() if (end := _stop(root, k)) is not None}:
+    stops = {k: end for k in bad.tolist() if (end := _stop(root, k)) is not None}
+    time, smeared, q = inputs.log.time, 1.5 / inputs.compared_cutoff, inputs.log.q
+    there = np.any([np.abs(q[:, k] - end) <= wide for k, (end, wide) in stops.items()], axis=0) & np.ones(len(q), bool)
+    begin, end = time[runs(there) - np.array([0, 1])].T + np.array([[-smeared], [smeared]])
+    apart = np.insert(begin[1:] - end[:-1] > SHORT, 0, True)[: len(begin)]  # what stays between them is of no use
+    if stops and (apart.sum() > 1 or len(stops) == len(bad)):  # a link that is pushed once is felt by several joints
         units = inputs.unit_of_each("q")
         each = ", ".join(f"{inputs.names[k]} at {end:.3g} {units[k]}" for k, (end, _) in stops.items())
         where = f"; next to nothing stays but at an end of the joint's motion ({each}): an end stop, or a contact"
         numbers["stops"] = {inputs.names[k]: end for k, (end, _) in stops.items()}
-        time, smeared, q = inputs.log.time, 1.5 / inputs.compared_cutoff, inputs.log.q
-        there = np.any([np.abs(q[:, k] - end) <= wide for k, (end, wide) in stops.items()], axis=0)
-        begin, end = time[runs(there) - np.array([0, 1])].T + np.array([[-smeared], [smeared]])
-        apart = np.insert(begin[1:] - end[:-1] > SHORT, 0, True)  # what stays between them is of no use
         ends = np.stack([begin[apart], np.maximum.reduceat(end, np.flatnonzero(apart))], axis=1)
         numbers["seconds"] = seconds = ends.ravel().tolist()
     elif left <= min(EXPLAINED, (1.0 - MOSTLY) * root.rough.max()):  # far less than there
