@@ -95,8 +95,7 @@ def main() -> int:
     parser.add_argument("packages", nargs="*", metavar="PACKAGE", help="draws from these only (default: from all)")
     parser.add_argument("--count", type=int, default=60, help="mutants (default: 60)")
     parser.add_argument("--seed", type=int, default=0, help="draws them")
-    given = parser.parse_args()
-    survived, sound = 0, set()
+    given, survived, sound = parser.parse_args(), 0, set()
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place, "forcegp")
         shutil.copytree(REPOSITORY, folder, ignore=shutil.ignore_patterns(*NOT_COPIED))

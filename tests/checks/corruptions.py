@@ -82,8 +82,7 @@ POINT = (0.0, 0.0, -0.3)
 
 def on_a_line(seed: int, *, rate: float = 250.0, seconds: float = 8, noise: float = 0.1, push: float = 8) -> Dataset:
     """A planar arm whose tip stays on the line x = 0.35 m, pushed against it, with friction along the line."""
-    robot, generator = two_links(), np.random.default_rng(seed)
-    time = np.arange(round(seconds * rate)) / rate
+    robot, generator, time = two_links(), np.random.default_rng(seed), np.arange(round(seconds * rate)) / rate
     omega, phase = 2 * np.pi * generator.uniform(0.15, 0.8, (4, 1)), generator.uniform(0, 2 * np.pi, (4, 1))
     size = generator.uniform(0.02, 0.05, (4, 1))
     z, dz = -0.4 + (size * np.sin(omega * time + phase)).sum(0), (size * omega * np.cos(omega * time + phase)).sum(0)

@@ -123,8 +123,7 @@ def test_what_is_known_is_not_recorded():
 
 
 def test_constants_are_folded_as_the_machine_computes(compiled):
-    operands, graph = (0.3, 0.7), Graph(2)
-    counts = {**dict.fromkeys(UNARY, 1), **dict.fromkeys(BINARY, 2)}
+    operands, graph, counts = (0.3, 0.7), Graph(2), {**dict.fromkeys(UNARY, 1), **dict.fromkeys(BINARY, 2)}
     folded = [graph.value(graph.apply(name, *map(graph.constant, operands[:n]))) for name, n in counts.items()]
     outputs = [graph.apply(name, *graph.inputs[:n]) for name, n in counts.items()]
     found = compiled(Program(graph, {"x": 2}, {"y": outputs})).single(torch.tensor(operands, dtype=torch.float64))[1][0]

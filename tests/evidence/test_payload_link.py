@@ -38,8 +38,7 @@ TWO_ARMS = f'<robot name="two_arms">{link("trunk", 4.0, "0 0 .02")}{chain("left"
 def carrying(text: str, name: str, mass: float) -> str:
     """The robot with a small body of this mass on a link."""
     inertial = Robot.from_urdf_text(text, base="floating").description.links[name]
-    own, place = np.array(inertial.center_of_mass), np.array([0.02, 0.01, 0.25])
-    whole = inertial.mass + mass
+    own, place, whole = np.array(inertial.center_of_mass), np.array([0.02, 0.01, 0.25]), inertial.mass + mass
     d, center = place - own, (inertial.mass * own + mass * place) / whole
     inertia = np.array(inertial.inertia) + inertial.mass * mass / whole * (d @ d * np.eye(3) - np.outer(d, d))
     return replace_inertial(text, name, whole, center, inertia + 1e-3 * np.eye(3), source="a test")

@@ -53,8 +53,7 @@ def test_an_elbow_that_stuck_is_a_holonomic_constraint(shared):
     model = dfki_system(folder)
     train, stuck = dfki(folder, model, 143524, 143601, 143704, 144115), dfki(folder, model, 143906)
     laws = RigidBodies("all"), Viscous(), LoadFriction(), open_rotors(model)
-    found = fit(model.with_forces(*laws), train, Accelerations(), rows=1000).model
-    offset, length = 0.1, 0.2
+    found, offset, length = fit(model.with_forces(*laws), train, Accelerations(), rows=1000).model, 0.1, 0.2
     sphere = Sphere((0.0, 0.0, 0.0), float(np.hypot(offset, length)))
     held = found.with_contacts([Contact("link2", (offset, 0.0, 0.0), sphere)])
     free_error, held_error = (

@@ -35,8 +35,7 @@ def test_rotors_of_a_body_that_does_not_fly():
     joint = '<joint name="j" type="continuous"><parent link="body"/><child link="blade"/><axis xyz="0 0 1"/></joint>'
     links = "".join(f'<link name="{name}">{inertial}</link>' for name in ("body", "blade"))
     robot = Robot.from_urdf_text(f'<robot name="r">{links}{joint}</robot>', base="fixed")
-    model = Model(robot)
-    q, v = robot.neutral()[None], torch.full((1, robot.nv), 0.3, dtype=torch.float64)
+    model, q, v = Model(robot), robot.neutral()[None], torch.full((1, robot.nv), 0.3, dtype=torch.float64)
     dynamics = model.dynamics(q, v, torch.full((1, len(model.inputs)), 2.0, dtype=torch.float64))
     velocity, drag = AerodynamicForce("blade", ("velocity", "rotor-drag")).features(dynamics)[0].split(3, dim=-1)
     torch.testing.assert_close(drag, (dynamics.state.delivered.norm() ** 2 + 1e-4) ** 0.25 * velocity)

@@ -28,8 +28,7 @@ def test():
 
 def test_accelerations_are_mixed_by_the_projection_onto_the_constraint(train):
     dynamics = train.model.dynamics(*[torch.tensor(x) for x in (train.q, train.v, train.u)])
-    W = dynamics.H @ JointAccelerations().direction(dynamics)
-    M, A = dynamics.M.numpy(), dynamics.A.numpy()
+    W, M, A = dynamics.H @ JointAccelerations().direction(dynamics), dynamics.M.numpy(), dynamics.A.numpy()
     M_inverse = np.linalg.inv(M)
     projector = np.eye(3) - M_inverse @ A.transpose(0, 2, 1) @ np.linalg.inv(A @ M_inverse @ A.transpose(0, 2, 1)) @ A
     assert np.allclose(W.numpy(), projector, atol=1e-12)

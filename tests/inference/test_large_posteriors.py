@@ -97,8 +97,7 @@ def test_drawn_functions_of_inducing_points_have_the_posterior_moments():
         ],
         dim=-1,
     )  # S 4 C
-    mean, covariance = posterior.mean(points), posterior.covariance(points)
-    centred = values - values.mean(0)
+    mean, covariance, centred = posterior.mean(points), posterior.covariance(points), values - values.mean(0)
     sampled = torch.einsum("snc,snd->ncd", centred, centred) / samples
     scale = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     assert ((values.mean(0) - mean).abs() < 5.0 * scale / samples**0.5 + 1e-9).all()

@@ -63,8 +63,7 @@ def along(motion, step: float):
 @pytest.mark.parametrize("surface", SURFACES)
 def test_baumgarte_turns_the_distance_into_a_damped_oscillator(surface, omega, zeta):
     """c'' + 2 zeta omega c' + omega^2 c = 0, with c and its derivatives from finite differences."""
-    touching, built = contact("chain", surface), robot("chain")
-    baumgarte = Baumgarte(omega, zeta)
+    touching, built, baumgarte = contact("chain", surface), robot("chain"), Baumgarte(omega, zeta)
     model = Model(built, (touching,), baumgarte=baumgarte)
     q, v, u = states(built.nv, 5, seed=2)
     u = 0.01 * u

@@ -42,8 +42,7 @@ class Paraboloid(Surface):
 
 
 class TestSubclassWithValueOnly(SurfaceConformance):
-    surface, storable = Paraboloid(), False
-    signed_distance = False
+    surface, storable, signed_distance = Paraboloid(), False, False
 
 
 # ---------------------------------------------------------------- what they mean

@@ -41,8 +41,7 @@ def test_equals_dense_conditioning_on_a_block_diagonal_covariance():
     rows = torch.cat([posterior.training.q, posterior.training.v, posterior.training.u], -1)
     shift, scale = rows.mean(0), rows.std(0, correction=0)
     z, new = (rows - shift) / scale, (torch.tensor(np.hstack([test.q, test.v, test.u])) - shift) / scale
-    y, found = posterior.training.a, posterior.predict(test.q, test.v, test.u)
-    total = 0.0
+    y, found, total = posterior.training.a, posterior.predict(test.q, test.v, test.u), 0.0
     for joint in range(3):
         length = posterior.hyperparameters[f"kernels.{joint}.base_kernel.raw_lengthscale"].exp()
         variance = posterior.hyperparameters[f"kernels.{joint}.raw_outputscale"].exp()

@@ -91,8 +91,7 @@ def test_components_are_those_of_dense_conditioning(posterior, dense, states, co
     B, components = PRIOR.direction(dynamics), moved.components(*states)
     assert tuple(components) == ("joint-friction", "contact-friction", "weight")
     for name, which in zip(components, (slice(0, 3), slice(3, 4), slice(4, 5)), strict=True):
-        part, b = components[name], B[..., which]
-        own = covariance[:, which, which]
+        part, b, own = components[name], B[..., which], covariance[:, which, which]
         close(part.latents.mean, mean[:, which])
         close(part.latents.covariance, own)
         for gaussian, matrix in ((part.joint_force, b), (part.acceleration, dynamics.H @ b)):

@@ -101,8 +101,7 @@ def test_what_is_no_random_walk_is_hardly_ever_told_as_one():
 def test_the_likelihood_is_that_of_contrasts():
     """REML is the likelihood of all combinations of the levels that do not hold their mean (Harville 1974)."""
     generator, n = np.random.default_rng(3), 12
-    y, contrasts = generator.standard_normal(n), null_space(np.ones((1, n))).T
-    differences = []
+    y, contrasts, differences = generator.standard_normal(n), null_space(np.ones((1, n))).T, []
     for seed in range(3):
         root = np.random.default_rng(seed).standard_normal((n, n))
         covariance = root @ root.T + np.eye(n)

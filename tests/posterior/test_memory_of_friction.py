@@ -50,8 +50,7 @@ def test_programs_carry_the_state_along(transmission, lugre_log, tmp_path):  # n
     casadi = pytest.importorskip("casadi", reason="CasADi is not installed: pip install 'forcegp[casadi]'")
     law = Coulomb([0.8, 0.5, 0.3], 0.1, sigma=300.0, memory=("pan", "bend"), transmission=transmission)
     model = arm_model(0).with_forces(law, noise=Noise(0.1))
-    posterior = fit(model, lugre_log.rows(slice(0, 200)))
-    q, v = lugre_log.q[0], 0.3 * lugre_log.v[0]
+    posterior, q, v = fit(model, lugre_log.rows(slice(0, 200))), lugre_log.q[0], 0.3 * lugre_log.v[0]
     u = np.concatenate([lugre_log.u[0], [0.4, -0.7]])
     there = posterior.rollout(q, v, u[None], DT)
     z = model.laws[-1].remember(torch.tensor(u[3:]), there.q[1] - torch.tensor(q), DT).numpy()

@@ -204,8 +204,7 @@ def _of_velocity(
         moved = _in_world(first, difference(first, last))
         linear = parts["linear "]  # a difference of poses has those of a screw
         moved[:, linear] = pose(last)[1] - pose(first)[1]
-        moved = moved / windows.step
-        read = {"world": windows.mean(raw), "body": windows.mean(_in_world(at, raw))}
+        moved, read = moved / windows.step, {"world": windows.mean(raw), "body": windows.mean(_in_world(at, raw))}
         found, best, own = dict[str, str](), moved.clone(), moved.clone()
         for (name, part), axes in zip(parts.items(), stated, strict=True):
             other = "body" if axes == "world" else "world"

@@ -121,8 +121,7 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
         frozen = {name for doubt in doubts if doubt.about == "frozen channel" for name in doubt.joints}
         moving = (doubt for doubt in motion_doubts(inputs) if not frozen.issuperset(doubt.joints or {"all"}))
         doubts = [*sampling_doubts(inputs), *doubts, *moving]
-    moved = Doubts(doubts).of("velocity").level != "wrong"
-    contacts = contact_doubts(inputs.mended, model)
+    moved, contacts = Doubts(doubts).of("velocity").level != "wrong", contact_doubts(inputs.mended, model)
     if moved and inputs.prepared is not None:
         sensors = imu_doubts, torque_sensor_doubts, force_sensor_doubts
         doubts += [doubt for of_sensors in sensors for doubt in of_sensors(inputs.prepared, model)]

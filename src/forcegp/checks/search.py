@@ -67,7 +67,9 @@ def search(inputs: CheckInput) -> tuple[Explanation, list[Doubt]]:
     for best in every:
         near = best.value < every[0].value + 2.0 * GAIN
         clear = (np.log(np.clip(root.shares, LEAST, 1.0) / np.maximum(best.exact, LEAST)) >= GAIN).any()
-        if near and clear and root.plain - best.value >= GAIN and best.stands(root, sticking()):
+        scaled = all(x.number or "unit" in x.correction for x in best.causes)  # else it explains more than factors do
+        gain = min(root.plain, np.inf if scaled else root.value) - best.value
+        if near and clear and gain >= GAIN and best.stands(root, sticking()):
             return best, list(_said(best, root, inputs))
     signs = root.with_signs()
     sure = [k for k in signs.turned if signs.good[k]]

@@ -55,8 +55,7 @@ def without_registers(log: Dataset) -> tuple[Dataset, list[Doubt]]:
             continue
         gaps = [at for at in np.argsort(-steps)[:GAPS] if FEWEST_VALUES <= at + 1 <= len(levels) - FEWEST_VALUES]
         for at in gaps:
-            high = x > levels[at]
-            negative = f"{levels[at + 1]:.4g} plus the magnitude where it is negative"
+            high, negative = x > levels[at], f"{levels[at + 1]:.4g} plus the magnitude where it is negative"
             ways[negative] = np.where(high, levels[at + 1] - x, x)
             ways.setdefault(f"{end:.4g} too much where it is negative", np.where(high, x - end, x))  # the widest gap
         moved = {way: float(np.square(np.diff(values))[follows].sum()) for way, values in ways.items()}

@@ -78,6 +78,7 @@ class Auto(Command):
         """Do all of it. Raises DatasetError for mistakes that nobody has corrected yet."""
         from forcegp.fit.force_sensors import with_touches  # PyTorch is not needed for a page of help
         from forcegp.fit.friction_choice import with_choice_of
+        from forcegp.scores.experiment import fingerprint
         from forcegp.scores.models import candidates
 
         if not self.logs:
@@ -107,8 +108,9 @@ class Auto(Command):
             if felt:
                 report = forcegp.check(dataset)
                 report = replace(report, doubts=Doubts([*felt, *report.doubts]))
-        mended = {"delay"} if self.filter.delay == "auto" else set()  # u is shifted below
-        bad = Doubts(doubt for doubt in report.doubts.at("wrong") if doubt.about not in mended)
+        late, found = self.filter.delay, (x.numbers.get("delay", math.nan) for x in report.doubts.of("delay"))
+        mended = late == "auto" or all(abs(x - float(late)) <= 0.5 * abs(x) for x in found)  # u is shifted below
+        bad = Doubts(doubt for doubt in report.doubts.at("wrong") if doubt.about != "delay" or not mended)
         still = [x for doubt in report.doubts for x in doubt.numbers.get("still", ())]
         if bad and not self.accept:
             terminal.show(doubts_table(bad, terminal.worded))
@@ -119,6 +121,9 @@ class Auto(Command):
                 terminal.note(f"{doubt.about}: {doubt.what}")
         dataset = forcegp.checks.without_pushes(dataset, report.doubts)
         self.out.mkdir(parents=True, exist_ok=True)
+        old = self.out / "log.h5"
+        if old.is_file() and not self.overwrite and fingerprint(forcegp.Dataset.load(old)) != fingerprint(dataset):
+            raise InvalidInput(f"{self.out} is of another log; choose another name, or add --overwrite.")
         if not present:  # by which an unfinished folder is known
             write_json(self.out / CONFIG, {"kind": self.kind, "command": corrected})
         with atomic_file(self.out / "log.h5", overwrite=True) as temporary:

@@ -163,8 +163,7 @@ def write_entry(program: Program, function: str, finish: Mapping[str, tuple[str,
     `finish` names outputs that a C function (t, y, out) makes, and their lengths. Returns bits: 1 for inputs that are
     not finite, 2 for what should be positive, 4 for results that are not finite.
     """
-    finish = finish or {}
-    arguments = [f"const double *a{k}, long s{k}" for k in range(len(program.inputs))]
+    finish, arguments = finish or {}, [f"const double *a{k}, long s{k}" for k in range(len(program.inputs))]
     arguments += [f"double *o{k}, long r{k}" for k in range(len(program.outputs))]
     text = [
         ROWS,

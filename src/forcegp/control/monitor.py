@@ -195,7 +195,8 @@ class ContactMonitor:
         inverse = torch.linalg.pinv(J.mT, atol=UNSEEN * J.square().sum((-1, -2)).max().sqrt(), rtol=0.0)
         force = inverse @ tau
         misfit = (tau - (force[:, None] @ J)[:, 0]).square().sum(-1)
-        newton, alike = force.norm(dim=-1), misfit <= misfit.min() + EXPLAINED
+        newton, felt = force.norm(dim=-1), inverse.square().sum((-1, -2)) > 0.0  # what moves no joint explains nothing
+        alike = felt & (misfit <= misfit.min() + EXPLAINED)
         best = int((alike & (newton <= (1.0 + SAME) * newton[alike].min())).nonzero()[0])
         links, ends = zip(*self.ends.items(), strict=True)
         also = dict.fromkeys(links[k // PLACES] for k in alike.nonzero()[:, 0].tolist())
@@ -338,7 +339,7 @@ def _touches(largest: Tensor, size: Sequence[Float[Tensor, "blocks nv"]]) -> Ite
     """Stretches whose largest distance, of which this is the root, or torques free motion would hardly reach."""
     low, middle, high = largest.quantile(largest.new_tensor([0.25, 0.5, 0.75]))
     strong = torch.cat([*size]) > STRONG * torch.cat([*size]).median(0).values.clamp_min(1e-9)
-    far = ((largest > middle + TOUCHED * (high - low)) & (largest > FAR * middle)) | strong.any(1)
+    far = ((largest > middle + TOUCHED * (high - low)) | strong.any(1)) & (largest > FAR * middle)
     starts, rows = np.concatenate([BLOCK * np.arange(len(each)) for each in size]), far.nonzero()[:, 0].numpy()
     for own in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else ():
         seen = f"from {starts[own[0]]:g} to {starts[own[-1]] + BLOCK:g} s free motion is far from the model"

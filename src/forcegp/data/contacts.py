@@ -86,8 +86,7 @@ def _on_surfaces(
         distance = np.abs(away)
         slow = rate <= ALONG_NORMAL * speed + CREEP + omega * np.minimum(distance, FARTHEST) + 2.0 * rate_noise
         middle = np.median(away[slow]) if slow.any() else 0.0
-        along = slow & (np.abs(away - middle) <= FARTHEST)
-        moves = speed > 2.0 * (CREEP + speed_noise)
+        along, moves = slow & (np.abs(away - middle) <= FARTHEST), speed > 2.0 * (CREEP + speed_noise)
         share = float(along[moves].mean()) if moves.any() else 1.0
         if share < HARDLY_ANY:
             if residual <= max(BROKEN * acceleration, NOISE * noise):  # accelerations obey it: drawn, not recorded

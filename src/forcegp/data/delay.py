@@ -129,10 +129,10 @@ def estimate_delay(dataset: Dataset, cutoff: float | None = None, filters: bool 
 
 def _with_lag(dataset: Dataset, delay: Delay, cutoff: float | None) -> Delay:
     """The delay behind a filter of first order, where that leaves far less than the delay alone."""
-    late = delay.significant
-    if not 0.0 < late < USUAL_DELAY or (cutoff is not None and 2.0 * np.pi * cutoff * late < IN_BAND):
-        return delay
-    rate = max(1, int(late / (3.0 * float(np.median(np.diff(dataset.time))))))  # that still shows it
+    late, step = delay.significant, float(np.median(np.diff(dataset.time)))
+    if not 0.0 < late < USUAL_DELAY or 2.0 * np.pi * (cutoff or 0.5 / step) * late <= IN_BAND:
+        return delay  # beyond the cut-off, or half the rate, nothing is told
+    rate = max(1, int(late / (3.0 * step)))  # that still shows it
     # near the corner of such a filter and below: above it a lag explains noise of the motion, too
     cutoff = 0.5 * IN_BAND / np.pi / late
     some = with_strokes(low_pass(dataset, cutoff).rows(slice(0, rate * LAG_ROWS, rate)))

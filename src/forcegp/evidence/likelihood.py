@@ -125,8 +125,7 @@ def check_distance(model: Model, training: TrainingData) -> None:
     kinematics = model.robot.kinematics(training.q)
     for index, contact in enumerate(model.contacts):
         distances = contact.off(kinematics).abs()
-        distance = float(distances.median())
-        what = f"the surface of contact {index} (frame {contact.frame!r})"
+        distance, what = float(distances.median()), f"the surface of contact {index} (frame {contact.frame!r})"
         remedy = "check its surface, point and units (m), or leave the contact out"
         if float(distances.min()) > FAR_FROM_SURFACE:
             seen = f"no training point touches {what}: the nearest is {float(distances.min()):.3g} m away"

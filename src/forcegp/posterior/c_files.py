@@ -88,8 +88,7 @@ class CFiles:
         """All files; `said` is how good the program is."""
         nq, nv, nu = self.code.sizes
         start = [", ".join(map(repr, x.tolist())) for x in split(checks[0].states[0], self.code.sizes)]
-        program = sections(__name__, "exported_c/model.c")
-        implicit = self.integrator == "implicit-midpoint"
+        program, implicit = sections(__name__, "exported_c/model.c"), self.integrator == "implicit-midpoint"
         stepped = "" if self.dt is None else self.code.step_source(self.integrator, "slopes" if implicit else "mean")
         words: dict[str, object] = {"NAME": self.name, "NV": nv, "NQ": nq, "NU": nu, "DT": self.dt}
         words |= dict(zip(("START_Q", "START_V", "START_U"), start, strict=True))

@@ -91,8 +91,7 @@ def sample_states(
 
     own, third = torch.randperm(len(training.q), generator=generator)[:rows], count // 3
     i, j, k = some(third), some(third), some(third)
-    mixed = [some(count - 2 * third) for _ in states]
-    moved = [x[i] + STEP * (x[j] - x[k]) for x in states]
+    mixed, moved = [some(count - 2 * third) for _ in states], [x[i] + STEP * (x[j] - x[k]) for x in states]
     if not space.is_vector_space:
         q = states[0]
         moved[0] = space.integrate(q[i], STEP * space.difference(q[k], q[j]))

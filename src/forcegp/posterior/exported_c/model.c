@@ -262,6 +262,7 @@ int @NAME@_monitor_place(const double q[@NQ@], const double torque[@NV@], @NAME@
     misfit[k] = explained(J0, J0 + 3 * N, (k % P) / (P - 1.0), cut, y, force[k], variance[k]);
     newton[k] = sqrt(force[k][0] * force[k][0] + force[k][1] * force[k][1] + force[k][2] * force[k][2]);
     least = fmin(least, misfit[k] + @EXPLAINED@);
+    if (variance[k][0] + variance[k][1] + variance[k][2] == 0.0) misfit[k] = HUGE_VAL; /* it moves no joint */
   }
   for (int k = 0; k < L * P; k++) if (misfit[k] <= least) {
     smallest = fmin(smallest, (1.0 + @SAME@) * newton[k]);
