@@ -110,9 +110,9 @@ def _units(now: Comparison, inputs: CheckInput, factors: np.ndarray) -> Iterator
 
 
 def _limits_allow(now: Comparison, own: np.ndarray) -> bool:
-    """Whether positions of these joints may be others: the log breaks limits of the file, or one of these has none."""
+    """Whether positions of these joints may be others: the log breaks limits, or one of these has ten turns."""
     low, high = np.array([(x.lower, x.upper) for x in map(now.robot.joint, now.robot.joint_names)]).T
-    return not ((now.rows.q >= low) & (now.rows.q <= high)).all() or bool(np.isinf(high - low)[own].any())
+    return not ((now.rows.q >= low) & (now.rows.q <= high)).all() or bool((high - low > 40.0 * np.pi)[own].any())
 
 
 SLOWEST, FASTEST = 1.0, 5500.0  # rates of logs [Hz] that need no other unit of time
