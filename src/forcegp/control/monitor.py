@@ -39,9 +39,9 @@ PLACES = 5  # points along each link where a contact is tried
 UNSEEN = 1e-6  # of the largest effect of a force on torques: what has less is rounding, as on the axis of a joint
 SAME = 1e-9  # relative; forces that differ by less are as large: one link ends where the next one begins
 EXPLAINED = float(chi2.ppf(0.95, 1))  # links whose misfit is larger by less explain a torque as well as the best
-TOUCHED, FAR, STRONG = 5.6, 1.5, 10.0
-"""Interquartile ranges over the median that of 10,000 roots of largest distances one exceeds (Gumbel), and how many
-medians at least; and medians of a joint's torque that even motions at rest, beside others, do not reach."""
+TOUCHED, STRONG, FAR = 5.6, 10.0, 1.5
+"""Interquartile ranges over the median that of 10,000 roots of largest distances one exceeds (Gumbel), or medians of a
+joint's torque in their place, where distances take a push for errors near rest; and how many medians of these."""
 POSTURES = 50  # at which the smallest forces are computed
 
 

@@ -61,11 +61,8 @@ def calibrated(
     drift = posterior.settings.get("drift") if _records(dataset, wanted[-1]) == 1 else None
     for other, motions in _left_out(posterior, dataset, parts, wanted[-1], STARTS[slow]):
         kept = tuple(h for h in wanted if h >= motions.dt)
-        start, samples = (
-            (motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt),
-            SAMPLES[slow] * bool(other.latent_names),
-        )
-        rollout = predicted(other, *start, integrator, samples=samples)
+        start = motions.q[:, 0], motions.v[:, 0], motions.u, motions.dt
+        rollout = predicted(other, *start, integrator, samples=SAMPLES[slow] * bool(other.latent_names))
         at = [min(round(h / motions.dt), motions.u.shape[1]) for h in kept]
         inputs, sampled = other.model.inputs, rollout.samples is not None
         true_q, true_v = (torch.tensor(x[:, at], device=rollout.q.device) for x in (motions.q, motions.v))
