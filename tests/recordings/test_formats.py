@@ -89,6 +89,11 @@ def test_texts_of_other_programs(tmp_path, encoding, head, row, begin):
     assert_array_equal(read["größe"], 0.25)
 
 
+def test_numbers_without_names_have_their_places_for_names(tmp_path):
+    (tmp_path / "log.csv").write_text("0,1.5,2\n1,2.5,3\n2,3.5,4\n")
+    assert list(open_source(tmp_path / "log.csv").columns()) == ["c1", "c2", "c3"]
+
+
 def test_the_last_lines_are_rows_whatever_stands_above(tmp_path):
     (tmp_path / "log.csv").write_text("\n".join([*["1,2,3"] * 30, "t;q", *["0;5"] * 20, ""]))
     assert_array_equal(open_source(tmp_path / "log.csv").read(["q"])["q"], [5.0] * 20)
