@@ -35,7 +35,7 @@ def test_a_log_becomes_a_table_of_contacts(workshop, monkeypatch, tmp_path, caps
     assert "2 contacts in 8 s" in capsys.readouterr().out
     found = json.loads((out / "contacts.json").read_text())
     [best, side], rows = found["smallest_forces"]["fore"], found["contacts"]
-    assert (best, side) == (pytest.approx(0.09, rel=0.2), None)
+    assert (best, side) == (pytest.approx(0.07, rel=0.2), None)
     assert len(rows) == 2
     assert [row["start"] for row in rows] == pytest.approx([3.0, 6.0], abs=0.1)
     assert [row["end"] for row in rows] == pytest.approx([4.0, 7.0], abs=0.3)  # it fades

@@ -39,7 +39,7 @@ PLACES = 5  # points along each link where a contact is tried
 UNSEEN = 1e-6  # of the largest effect of a force on torques: what has less is rounding, as on the axis of a joint
 SAME = 1e-9  # relative; forces that differ by less are as large: one link ends where the next one begins
 EXPLAINED = float(chi2.ppf(0.95, 1))  # links whose misfit is larger by less explain a torque as well as the best
-TOUCHED, STRONG, FAR = 5.6, 10.0, 1.5
+TOUCHED, STRONG, FAR = 5.6, 10.0, 1.75
 """Interquartile ranges over the median that of 10,000 roots of largest distances one exceeds (Gumbel), or medians of a
 joint's torque in their place, where distances take a push for errors near rest; and how many medians of these."""
 POSTURES = 50  # at which the smallest forces are computed
@@ -102,8 +102,8 @@ class ContactMonitor:
         """Standard deviations s (nv,) of errors of friction at rest [Nm or N], and velocities v_s (nv,)."""
         self.largest = torch.full((self.robot.nv,), math.inf, dtype=torch.float64)
         """Of |M a| (nv,) in free motion [Nm or N], filtered."""
-        self.usual = torch.zeros(self.robot.nv, dtype=torch.float64)
-        """Errors of friction near rest (nv,) in free motion [Nm or N], filtered."""
+        self.usual = self.middle = torch.zeros(self.robot.nv, dtype=torch.float64)
+        """Errors of friction near rest (nv,) in free motion [Nm or N], filtered: their root mean square, and median."""
         self.level = torch.zeros(self.robot.nv, len(self.known.memory.names), dtype=torch.float64)
         """Torques (nv, m) of all that friction remembers [Nm or N]."""
         self.ends = link_ends(self.robot)
@@ -153,7 +153,8 @@ class ContactMonitor:
         fades = np.take(SLOW, which)
         fades = np.maximum(fades, np.exp(np.log(fades).mean())) if shown.any() else fades
         self.near_rest = np.maximum(at_rest, share * friction), fades * speed
-        self.usual = torch.cat([self._errors(each) for each in found]).square().mean(0).sqrt()
+        errors = torch.cat([self._errors(each) for each in found])
+        self.usual, self.middle = errors.square().mean(0).sqrt(), errors.median(0).values
         distances = [self._distances(each) for each in found]
         largest = torch.cat([d[: len(d) // block * block].view(-1, block).amax(1) for d in distances])
         size = [d[: len(d) // block * block].view(-1, block, self.robot.nv).square().mean(1).sqrt() for d, *_ in found]
@@ -207,12 +208,12 @@ class ContactMonitor:
     def smallest_forces(self, q: Any) -> dict[str, list[float]]:
         """Forces [N] at the end of each link that reach the threshold: along the axis that is felt best, and worst.
 
-        Medians over postures q (T, nv), at usual errors near rest; inf along axes that no torque shows.
+        Medians over postures q (T, nv), at median errors near rest; inf along axes that no torque shows.
         """
         rows, found = torch.tensor(real_array("q", q), dtype=torch.float64), []
         for at in rows[:: max(1, len(rows) // POSTURES)]:
             M, J = self.levers(at)
-            S = self._covariance(M, None, self.usual, 0.0 * at)
+            S = self._covariance(M, None, self.middle, 0.0 * at)
             felt = torch.linalg.eigvalsh(J[:, 1] @ torch.linalg.solve(S, J[:, 1].mT))[:, [2, 0]]
             found.append((self.threshold / torch.where(felt > UNSEEN**2 * felt.max(), felt, 0.0)).sqrt())
         return dict(zip(self.ends, torch.stack(found).median(0).values.tolist(), strict=True))
