@@ -29,6 +29,7 @@ WINDOW = 0.4
 """Seconds that torques are averaged over: it takes noise of the acceleration, and leaves friction as sharp as it is."""
 WIDER = 2.3  # where a base moves, times the windows of a fit: a mass needs less of what is fast than rotors do
 LAWS = "viscous", "gear", "offset", "rotor"
+AT_REST = "offset", "coulomb:memory=true:sigma=1000"  # what a drive stopped against, it still bears
 SURE, LEAST_PAYLOAD = 4.0, 0.02  # standard errors from zero, and kg, from which a payload is reported
 MOST_OPEN = 0.3  # of the robot's mass in half an interval, from which on a payload is not known
 FAR, OPEN = 0.01, 1.0  # m of half an interval, from which on a coordinate of a centre is shown with it; is not known
@@ -100,8 +101,8 @@ class Payload(Command):
         rows, baseline = prepared[0], prepared[-1] if self.baseline is not None else None
         notes += forces_of(robots[0])
         if self.forces == LAWS and forcegp.data.views.at_rest(rows):
-            model = forcegp.scores.named_model(robots[0], [*words, "offset"])
-            notes.append("the log is of postures alone: no motion shows friction, of which each rest has its own share")
+            model = forcegp.scores.named_model(robots[0], [*words, *AT_REST])
+            notes.append("the log is of postures alone: each rest bears friction as the move from the rest before left it")
         with terminal.progress("identifying"):
             found = with_payload(model, rows, self.link, baseline, self.mass)
         content = {"data": str(self.log), **payload_dict(found, baseline is not None)}

@@ -126,7 +126,12 @@ def at_rest(dataset: Dataset) -> bool:
 
 
 def one_row_per_rest(dataset: Dataset) -> Dataset:
-    """A log of postures alone as its medians, an episode each, without motion; other logs as they are."""
+    """A log of postures alone as its medians, an episode each, without motion; other logs as they are.
+
+    Strokes of a log whose times rise throughout lead from rest to rest, so that friction knows the last move.
+    """
+    from forcegp.data.strokes import strokes  # of views
+
     # stiction holds the same share of the load in all rows of a rest, so they are one observation of it
     if (number := rests_alone(dataset)) is None:
         return dataset
@@ -138,6 +143,9 @@ def one_row_per_rest(dataset: Dataset) -> Dataset:
     still = np.zeros((len(first), dataset.nv))
     rows = {"q": median(dataset.q), "v": still, "a": still, "u": median(dataset.u)}
     measured = {name: median(values) for name, values in dataset.measured.items()}
+    if dataset.strokes is not None and (np.diff(dataset.time) > 0.0).all():
+        path = strokes(replace(dataset, episode=0 * dataset.episode), transmission=dataset.transmission)
+        rows["strokes"] = np.stack([path[label == each][-1] for each in range(len(first))])
     return replace(dataset.rows(first), **rows, measured=measured, episode=label[first])
 
 

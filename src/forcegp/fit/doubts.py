@@ -11,6 +11,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset, contact_doubts
 from forcegp.data.strokes import motor_positions
+from forcegp.data.views import at_rest
 from forcegp.doubts import Doubt, Doubts, look
 from forcegp.errors import ContactWarning, InvalidInput
 from forcegp.evidence.likelihood import CONSTANT, FAR_FROM_SURFACE, MarginalLikelihood, checked_values
@@ -105,7 +106,7 @@ def without_idle_offsets(model: Model, dataset: Dataset) -> Model:
 def doubts_of_past(model: Model, log: Dataset, known: Bool[np.ndarray, " rows"]) -> Iterator[Doubt]:
     """That many rows do not know the past of friction that is estimated."""
     share, estimated = 1.0 - known.mean(), any(law.learned and law.memory_names(model.robot) for law in model.laws)
-    if estimated and share > MISLEADING:
+    if estimated and share > MISLEADING and not at_rest(log):
         what = "until a joint has moved a little, a log does not tell which way its gear was turned last: "
         what += f"{share:.0%} of the rows come before that, and levels of dry friction may be too small by as much."
         do = "Give longer episodes, or leave memory out."
