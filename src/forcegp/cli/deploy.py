@@ -18,6 +18,7 @@ import forcegp.posterior
 import forcegp.scores
 from forcegp.atomic_files import write_json
 from forcegp.cli.command import DATASET, MODEL, NUMBERS, Command, listed, numbers_of, unless_given
+from forcegp.cli.fit import warn_of_wrong
 from forcegp.cli.robot_options import CONTACTS, RobotOptions, parse_contacts, require_same_joints
 from forcegp.cli.terminal import Terminal, columns, doubts_table, shown
 from forcegp.errors import InvalidInput
@@ -91,7 +92,7 @@ def _c(options: Export, terminal: Terminal, posterior: Any, folder: Path) -> dic
     given = {name: getattr(options, name) for name in ("covariance", "jacobian", "steps", "unchecked")}
     given |= {"integrator": options.integrator or "symplectic-euler", "source": str(options.model)}
     if options.free is not None:
-        free, dt = _motions(Path(options.free), posterior)
+        free, dt = _motions(terminal, Path(options.free), posterior)
         with terminal.progress("calibrating"):
             predictor = posterior.predictor(covariance="compressed" if options.covariance else "none")
             given["monitor"] = monitor = options.alarms.monitor(predictor, free, dt)
@@ -154,9 +155,9 @@ class Monitor(Command):
             raise InvalidInput(f"--free is {self.free}; give seconds above 0, or a dataset that is there (.h5).")
         self.require_free(self.out)
         posterior = forcegp.load_posterior(self.model)
-        motions, dt = _motions(self.log, posterior)
+        motions, dt = _motions(terminal, self.log, posterior)
         if other is not None:
-            known, _ = _motions(other, posterior, dt)
+            known, _ = _motions(terminal, other, posterior, dt)
         else:
             first, rows = motions[0], round(min(seconds / dt, float(len(motions[0][0]))))
             known, motions[0] = [tuple(x[:rows] for x in first)], tuple(x[rows:] for x in first)
@@ -183,23 +184,24 @@ class Monitor(Command):
             ]
             for each in contacts
         ]
+        found = columns(title, header, rows) if rows else title
         felt = [[link, *(shown(x, "{:.2g}") for x in each)] for link, each in finite.items()]
-        seen = columns(
-            "smallest forces that it finds", ["at the end of", "along the best axis [N]", "along any [N]"], felt
-        )
-        terminal.show(
-            columns(title, header, rows) if rows else title, seen, doubts_table(monitor.doubts, terminal.worded)
-        )
+        header = ["at the end of", "along the best axis [N]", "along any [N]"]
+        seen = columns("smallest forces that it finds", header, felt)
+        terminal.show(found, seen, doubts_table(monitor.doubts, terminal.worded))
         return {**content, "contacts": contacts}
 
 
-def _motions(path: Path, posterior: Any, dt: float | None = None) -> tuple[list[tuple[Any, ...]], float]:
+def _motions(
+    terminal: Terminal, path: Path, posterior: Any, dt: float | None = None
+) -> tuple[list[tuple[Any, ...]], float]:
     """time, q, v and u of every episode, and their step, that of the first one.
 
     Raises InvalidInput for other joints than those of the model, and steps other than `dt`, where that is given.
     """
     dataset, motions = forcegp.Dataset.load(path), []
     require_same_joints(posterior, dataset, path)
+    warn_of_wrong(terminal, path, dataset, posterior.model)
     for episode in dataset.episodes:
         at = dataset.episode == episode
         step = forcegp.data.filters.uniform_step(dataset.time[at], f"episode {episode} of {path}")

@@ -189,6 +189,12 @@ def quick_doubts(log: Path, dataset: forcegp.Dataset, model: forcegp.Model) -> D
     return used
 
 
+def warn_of_wrong(terminal: Terminal, log: Path, dataset: forcegp.Dataset, model: forcegp.Model) -> None:
+    """One line on what would spoil what is made of the log."""
+    if used := quick_doubts(log, dataset, model).at("wrong"):
+        terminal.warn(f"{log}: {used.in_one_line()}. See forcegp check.")
+
+
 def write_estimates(folder: Path, posterior: Any, name: str = "identified") -> None:
     """The numbers that were found, and robot and known forces with them: for --identified, and as a URDF."""
     estimates, known = posterior.estimates, robot_options.identified_system(posterior.model)

@@ -17,7 +17,7 @@ import forcegp.posterior
 import forcegp.scores
 from forcegp.atomic_files import write_json, write_text
 from forcegp.cli.command import DATASET, FIELDS, Command, listed, unless_given
-from forcegp.cli.fit import estimates_table, quick_doubts, write_estimates
+from forcegp.cli.fit import estimates_table, warn_of_wrong, write_estimates
 from forcegp.cli.logs import FilterOptions
 from forcegp.cli.robot_options import SYSTEM_FILE, RobotOptions, forces_of
 from forcegp.cli.terminal import Terminal
@@ -90,8 +90,7 @@ class Payload(Command):
             model.robot.frame(self.link)
         preparation, notes, prepared = self.filter.preparation(), list[str](), list[forcegp.Dataset]()
         for (path, dataset), robot in zip(logs, robots, strict=True):
-            if used := quick_doubts(path, dataset, robot).at("wrong"):
-                terminal.warn(f"{path}: {used.in_one_line()}. See forcegp check.")
+            warn_of_wrong(terminal, path, dataset, robot)
             if not forcegp.data.preparation_report(dataset.metadata):  # those that were prepared before are as they are
                 with terminal.progress(f"preparing {path}"):
                     dataset = preparation.apply(replace(dataset, model=robot))
@@ -102,7 +101,9 @@ class Payload(Command):
         notes += forces_of(robots[0])
         if self.forces == LAWS and forcegp.data.views.at_rest(rows):
             model = forcegp.scores.named_model(robots[0], [*words, *AT_REST])
-            notes.append("the log is of postures alone: each rest bears friction as the move from the rest before left it")
+            notes.append(
+                "the log is of postures alone: each rest bears friction as the move from the rest before left it"
+            )
         with terminal.progress("identifying"):
             found = with_payload(model, rows, self.link, baseline, self.mass)
         content = {"data": str(self.log), **payload_dict(found, baseline is not None)}

@@ -17,6 +17,7 @@ import forcegp.report
 import forcegp.scores
 from forcegp.atomic_files import file_digest
 from forcegp.cli.command import THERE, Command, listed, unless_given
+from forcegp.cli.fit import warn_of_wrong
 from forcegp.cli.logs import FilterOptions, prepared_rows
 from forcegp.cli.robot_options import CandidateOptions, RobotOptions, SearchOptions, forces_of, require_same_joints
 from forcegp.cli.terminal import Terminal, columns
@@ -85,6 +86,8 @@ class Score(Command):
         for path in runs:
             posterior = forcegp.load_posterior(path)
             require_same_joints(posterior, raw, data)
+            if not models:
+                warn_of_wrong(terminal, data, raw, posterior.model)
             models[path.name if path.name not in models else str(path)] = posterior
         if self.observe:
             seen = raw.time < raw.time[0] + self.observe
