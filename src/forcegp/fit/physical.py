@@ -249,11 +249,11 @@ def held_out_noise(model: Model, dataset: Dataset, evidence: Torques | Accelerat
     """
     require_type("model", model, Model)
     dataset = with_memory(require_type("dataset", dataset, Dataset), model)
-    residuals, masses, mobilities, near = [], [], [], None
+    residuals, masses, mobilities, near, some = [], [], [], None, 2 * ROUGH_EQUATIONS // model.robot.nv
     for left_out in _left_out(dataset):
         kept = np.ones(len(dataset), dtype=bool)
         kept[left_out] = False
-        near = fit_physical(model, [dataset.rows(kept)], evidence, near=near, roughly=True)
+        near = fit_physical(model, [dataset.rows(kept)], evidence, rows=some, near=near, roughly=True)
         found = near.model
         rows = with_memory(dataset.rows(left_out), found)
         q, v, u = (torch.tensor(x, device=found.robot.device) for x in (rows.q, rows.v, rows.u))

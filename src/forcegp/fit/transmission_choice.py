@@ -90,7 +90,7 @@ def _candidates(model: Model, T: Float[np.ndarray, "nv nv"]) -> Iterator[tuple[n
     for a, b in sorted(pairs | {pair[::-1] for pair in pairs}):
         if a != b and slides[a] is not None and slides[a] == slides[b] and T[a, b] == 0.0:
             unit = np.outer(np.eye(nv)[a], np.eye(nv)[b])
-            for more in (unit, -unit, *([unit - unit.T] if T[b, a] == 0.0 else [])):  # the last is a differential
+            for more in (unit, -unit, *([unit - unit.T] if T[b, a] == 0.0 and a < b else [])):  # last, differentials
                 new = T + more
                 if np.linalg.matrix_rank(new) == nv:
                     yield new, [a, b]
