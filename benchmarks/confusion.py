@@ -264,7 +264,7 @@ FAULTS: dict[str, tuple[str, tuple[Fault, ...]]] = {
     "none: all other": ("none", strange(smooth, keep=0.0, rest=1.0)),
     "none: lurching": ("none", (state(lurch=lambda _: 0.6),)),
     "none: noise": ("none", strange(lambda case, x: case.rng.normal(size=x["u"].shape), keep=0.0)),
-    "none: cogging": ("none", strange(lambda case, x: 1.5 * np.sin(14.0 * x["q"]))),
+    "cogging": ("cogging|unknown cause", strange(lambda case, x: 1.5 * np.sin(14.0 * x["q"]))),
     "none: squares": ("none", (later(lambda case, x: x.update(u=x["u"] * np.abs(x["u"]) / x["scale"])),)),
     "none: fades": ("none", (times("u", lambda case: 1.0 + 2.0 * np.sin(0.5 * case.time)[:, None]),)),
 }

@@ -5,7 +5,7 @@
 Arms are those of `tests/simulation/lugre_arm.py` (MuJoCo, gears with LuGre friction, .8 to 3 kg), the seeds FIRST to
 LAST - 1. Their controller knows half of the payload. `rests` are the second halves of rests of 1.5 s, `moves` is the
 whole log. A line for each kind, number of postures and laws: the median error of the mass and width of its interval in
-%, and how many intervals of mass and centre hold. Rows of `coulomb` are the rival without memory, from the same rows.
+%, and how many intervals of mass and centre hold. The second row of each is a rival without memory, from the same rows.
 """
 
 from __future__ import annotations
@@ -21,13 +21,15 @@ import numpy as np
 from tests.simulation.lugre_arm import ENCODER, NOISE_U, NOISE_V, STEP, STIFF, URDF, LuGreArm
 
 from forcegp import Dataset, Model, Robot
+from forcegp.cli.payload import AT_REST
 from forcegp.data import Preparation
 from forcegp.evidence import Torques
 from forcegp.fit import fit
 from forcegp.forces import parse_forces
 
 mujoco: Any = untyped
-LINK, LAWS = "lbr_iiwa_link_7", ("viscous,gear,offset,rotor", "viscous,coulomb,offset,rotor")
+LINK = "lbr_iiwa_link_7"
+LAWS = {"moves": ("viscous,gear,offset,rotor", "viscous,coulomb,offset,rotor"), "rests": (",".join(AT_REST), "offset")}
 RANGE = 0.75 * np.array([2.9, 2.0, 2.9, 2.0, 2.9, 2.0, 3.0])  # rad
 PHASE, EVERY = 1500, 4  # steps of a move and of a rest; rows that are logged
 NUMBERS = ("mass", "center_of_mass.x", "center_of_mass.y", "center_of_mass.z")
@@ -71,7 +73,7 @@ def main(first: int = 0, last: int = 18) -> None:
         for count in (4, 6, 12):
             for kind, log in logs(arm, count).items():
                 rows = Preparation(cutoff="auto", delay="auto").apply(log)
-                for laws in LAWS:
+                for laws in LAWS[kind]:
                     model = rows.model.with_forces(*parse_forces(f"{laws},payload:{LINK}"))
                     estimates = fit(model, rows, Torques(mean=0.4)).parameters
                     numbers = [estimates[f"payload.{name}"] for name in NUMBERS]

@@ -89,8 +89,7 @@ def on_a_line(seed: int, *, rate: float = 250.0, seconds: float = 8, noise: floa
     ddz = (-size * omega**2 * np.sin(omega * time + phase)).sum(0)
     # the tip lies at -(l1 sin q1 + l2 sin(q1 + q2)), -(l1 cos q1 + l2 cos(q1 + q2)) in x and z
     bend = np.arccos((np.hypot(0.35, z) ** 2 - 0.4**2 - 0.3**2) / (2 * 0.4 * 0.3))
-    first = np.arctan2(-0.35, -z) - np.arctan2(0.3 * np.sin(bend), 0.4 + 0.3 * np.cos(bend))
-    q = np.stack([first, bend], axis=1)
+    q = np.stack([np.arctan2(-0.35, -z) - np.arctan2(0.3 * np.sin(bend), 0.4 + 0.3 * np.cos(bend)), bend], axis=1)
     tensors = torch.tensor(q)
     J = robot.kinematics(tensors, 0 * tensors).frame_jacobian("link2", POINT)[:, [0, 2]].numpy()
     v = np.linalg.solve(J, np.stack([0 * z, dz], axis=1)[..., None])[..., 0]

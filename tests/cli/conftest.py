@@ -49,8 +49,7 @@ def workshop(forcegp, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("workshop")
     for name, seed in (("train", 1), ("test", 2)):
         words = ("simulate", "kuka-surface", "--seconds", 2, "--seed", seed, "--out", f"{name}.h5", "--json")
-        made = forcegp(*words, folder=folder).ok()
-        (folder / f"{name}.json").write_text(made.stdout)
+        (folder / f"{name}.json").write_text(forcegp(*words, folder=folder).ok().stdout)
     words = ("fit", "train.h5", "--forces", "gp:joint", "--points", 15, "--iterations", 8, "--restarts", 2)
     (folder / "fit.txt").write_text(forcegp(*words, "--out", "run", folder=folder).ok().stdout)
     return folder

@@ -66,6 +66,8 @@ def test_the_corrected_command_gives_a_model_that_works(folder, answered, forceg
     (folder / "other.csv").write_text("".join((folder / "log.csv").read_text().splitlines(keepends=True)[:1600]))
     again = forcegp(*shlex.split(command.replace("log.csv", "other.csv"))[1:], folder=folder)
     assert (again.returncode, "answer is of another log" in again.stderr) == (2, True)
+    again = forcegp(*shlex.split(command)[1:], "--cutoff", "9", folder=folder)
+    assert (again.returncode, "answer was filtered otherwise; choose" in again.stderr) == (2, True)
     assert content["mistakes"] == []
     test, model = double_pendulum(3.0, seed=2, noise=0.0), load_posterior(folder / "answer" / "model")
     error = np.abs(model.predict(test.q, test.v, test.u).mean.numpy() - test.a).mean()

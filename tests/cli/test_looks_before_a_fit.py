@@ -38,6 +38,7 @@ def test_one_line_names_what_is_wrong_and_the_next_step(forcegp, folder):
     assert line.startswith("warning: torque sign: the torque of joint2 has the opposite sign")
     assert "forcegp check sign.h5" in line
     assert not looked(forcegp("fit", "sign.h5", *FIT, "--no-checks", folder=folder).stderr)
+    assert "sign.h5: torque sign: the" in forcegp("score", "run", "sign.h5", folder=folder).ok().stderr
 
 
 def test_the_table_of_check_is_never_cut(forcegp, folder, monkeypatch):

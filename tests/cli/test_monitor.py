@@ -32,7 +32,11 @@ def test_a_log_becomes_a_table_of_contacts(workshop, monkeypatch, tmp_path, caps
     monkeypatch.chdir(workshop)
     out = tmp_path / "contacts"
     assert main(["monitor", "run", "log.h5", "--free", "free.h5", "--out", str(out)]) == 0
-    assert "2 contacts in 8 s" in capsys.readouterr().out
+    shown, (q, v, u) = capsys.readouterr(), motion(8.0, 7)
+    assert ("2 contacts in 8 s" in shown.out, "warning" in shown.err) == (True, False)
+    saved("turned.h5", (q, v, -u))
+    assert main(["monitor", "run", "turned.h5", "--free", "free.h5", "--out", str(tmp_path / "turned")]) == 0
+    assert "warning: turned.h5: torque sign: the" in capsys.readouterr().err
     found = json.loads((out / "contacts.json").read_text())
     [best, side], rows = found["smallest_forces"]["fore"], found["contacts"]
     assert (best, side) == (pytest.approx(0.07, rel=0.2), None)

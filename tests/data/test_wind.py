@@ -39,8 +39,7 @@ def flight(wind, *, drag=1.0, episodes=1, rows=800, seed=0, noise=0.0):
     state = model.dynamics(*map(torch.tensor, (q, v, u)))
     air = v[:, :3] - np.einsum("nji,nj->ni", state.state.kinematics.frame_pose("body")[:, :3, :3].numpy(), blowing)
     force = -drag * (DRAG * air + SQUARED * np.linalg.norm(air, axis=1, keepdims=True) * air)
-    torque = -drag * 0.01 * air[:, [1, 0, 2]]
-    a = state.acceleration(torch.tensor(np.concatenate([force, torque], axis=1))).numpy()
+    a = state.acceleration(torch.tensor(np.concatenate([force, -drag * 0.01 * air[:, [1, 0, 2]]], axis=1))).numpy()
     a = a + noise * rng.standard_normal(a.shape)
     return Dataset(q=q, v=v, u=u, a=a, time=np.tile(time, episodes) + 100.0 * episode, episode=episode, model=model)
 

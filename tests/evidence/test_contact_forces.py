@@ -136,8 +136,7 @@ def test_friction_under_load_counts_the_gain():
     space = ParameterSpace(model, typical_sizes(model, [free]))
     rows = RecordedRows(space, free.q, free.v, free.u)
     x, motion = space.start + 0.05, rows.moving(free.a)
-    in_x = rows.in_torque(x, motion)[2]
-    assert_slopes(lambda x: rows.in_torque(x, motion)[0], x, in_x)
+    assert_slopes(lambda x: rows.in_torque(x, motion)[0], x, rows.in_torque(x, motion)[2])
     found = fit(model, free, Torques()).parameters
     assert [found[f"gain.{j}"].value for j in ("pan", "lift", "bend")] == pytest.approx([0.8, 0.9, 1.2], rel=1e-3)
 

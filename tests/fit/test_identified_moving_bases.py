@@ -147,8 +147,7 @@ def test_forces_that_are_left_out_are_those_of_least_squares_with_them_as_unknow
     assert_allclose(fit.x, np.linalg.lstsq(dense, (y / fit.noise).ravel(), rcond=1e-10)[0][:k], atol=1e-3)
     hidden = np.linalg.qr(lambdas[:, lambdas.any(0)])[0]
     left = dense[:, :k] - hidden @ (hidden.T @ dense[:, :k])
-    own = left.T @ left
-    assert_allclose(fit.information, own, rtol=1e-8)
+    assert_allclose(fit.information, left.T @ left, rtol=1e-8)
     assert_allclose(fit.noise, noise, rtol=0.5)
 
 

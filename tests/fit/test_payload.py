@@ -109,7 +109,7 @@ def test_intervals_hold_what_gears_bear_in_postures():
 
 
 def test_rests_bear_friction_as_the_last_move_left_it():
-    """Outward moves end where gravity is least: without their signs such payloads come out light, and intervals miss."""
+    """Friction that the last move left is no share of the load, in one episode or several; without an order none is."""
     for one_piece in (False, True):
         data = postures(2, 8, rows=30, last_move=True)
         data = replace(data, episode=np.zeros_like(data.episode)) if one_piece else data

@@ -150,8 +150,7 @@ def test_predictions_given_accelerations_are_those_of_one_large_gaussian():
     states, at = tensors(log, "q", "v", "u"), model.dynamics(*tensors(log, "q", "v", "u"))
     a, plain = torch.tensor(log.a) + 0.1, posterior.predict(*states)
     H, C = at.H, at.contact_force_map().matrix
-    force = posterior.hyperparameters["noise.log_force"].exp()  # learned beside a sensor
-    S = plain.unknown_force.covariance + torch.diag(force.square())
+    S = plain.unknown_force.covariance + torch.diag(posterior.hyperparameters["noise.log_force"].exp().square())
     G, mean = torch.cat([H, C], 1), torch.cat([plain.mean, plain.contact_force.mean], 1)
     whole = G @ S @ G.mT
     gain = whole[:, 3:, :3] @ torch.linalg.inv(whole[:, :3, :3] + 0.05**2 * torch.eye(3))

@@ -32,8 +32,7 @@ class TestCsv(Tables):
         return log_files.write_text(folder / "log.csv", table(motion()))
 
     def truncated(self, path):
-        lines = path.read_text().splitlines()
-        cut = path.read_text().rindex(lines[-1]) + 10  # in the middle of the last line
+        cut = path.read_text().rindex(path.read_text().splitlines()[-1]) + 10  # in the middle of the last line
         path.write_text(path.read_text()[:cut])
         return None
 

@@ -170,8 +170,7 @@ def test_a_joint_that_fits_its_limits_keeps_its_unit_if_it_moves(tmp_path, share
 def test_files_side_by_side_are_one_recording(tmp_path):
     data = motion()
     for name, values in data.items():
-        text = "\n".join(repr(float(value)) for value in values.ravel()) + "\n"
-        (tmp_path / f"run_{name}.txt").write_text(text)
+        (tmp_path / f"run_{name}.txt").write_text("\n".join(repr(float(value)) for value in values.ravel()) + "\n")
     how = {"joints": JOINTS, "headerless": (1, 2, 2, 2), "side_by_side": True}
     mapping = ColumnMapping(time="run_time:c1", q=("run_q:c{1..2}",), v=("run_v",), u=("run_u",), **how)
     paths = [tmp_path / f"run_{name}.txt" for name in data]

@@ -30,8 +30,7 @@ MOVES = 0.2  # of its root mean square speed, above which a joint moves
 
 def signal_doubts(inputs: CheckInput) -> list[Doubt]:
     """Constant, frozen and clipped channels, angles that jump."""
-    joints = range(inputs.log.nv)
-    frozen = chain.from_iterable(_frozen(inputs, name, joint) for name in QUANTITY for joint in joints)
+    frozen = chain.from_iterable(_frozen(inputs, name, joint) for name in QUANTITY for joint in range(inputs.log.nv))
     jumps = [*_jumps(inputs), *slips(inputs)]  # of which derivatives have spikes
     dropped = _dropped(inputs, ("drop-outs",) if jumps else ("drop-outs", "spike"))
     return [*jumps, *dropped, *_constant(inputs), *frozen, *_clipped(inputs)]
@@ -234,8 +233,7 @@ def _frozen(inputs: CheckInput, name: str, joint: int) -> Iterator[Doubt]:
             start, length = begin, end - begin
     if not length or values[start] in (values.min(), values.max()):
         return
-    stays = np.ptp(runs(values == values[start]), axis=1)
-    limit = name == "u" and (stays >= FROZEN_ROWS).sum() > 1  # which recurs
+    limit = name == "u" and (np.ptp(runs(values == values[start]), axis=1) >= FROZEN_ROWS).sum() > 1  # which recurs
     yield Doubt(
         level="look" if name == "u" and values[start] == 0.0 else "wrong",
         about="saturation" if limit else "frozen channel",

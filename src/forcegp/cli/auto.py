@@ -78,7 +78,6 @@ class Auto(Command):
         """Do all of it. Raises DatasetError for mistakes that nobody has corrected yet."""
         from forcegp.fit.force_sensors import with_touches  # PyTorch is not needed for a page of help
         from forcegp.fit.friction_choice import with_choice_of
-        from forcegp.scores.experiment import fingerprint
         from forcegp.scores.models import candidates
 
         if not self.logs:
@@ -121,9 +120,7 @@ class Auto(Command):
                 terminal.note(f"{doubt.about}: {doubt.what}")
         dataset = forcegp.checks.without_pushes(dataset, report.doubts)
         self.out.mkdir(parents=True, exist_ok=True)
-        old = self.out / "log.h5"
-        if old.is_file() and not self.overwrite and fingerprint(forcegp.Dataset.load(old)) != fingerprint(dataset):
-            raise InvalidInput(f"{self.out} is of another log; choose another name, or add --overwrite.")
+        self._require_same("log.h5", dataset, "is of another log")
         if not present:  # by which an unfinished folder is known
             write_json(self.out / CONFIG, {"kind": self.kind, "command": corrected})
         with atomic_file(self.out / "log.h5", overwrite=True) as temporary:
@@ -213,6 +210,14 @@ class Auto(Command):
         words = ["forcegp", "auto", *map(str, self.logs), *mapping.flags(), *replace(self, robot=robot).words(*others)]
         return shlex.join([*words, "--out", str(self.out)])
 
+    def _require_same(self, file: str, dataset: forcegp.Dataset, seen: str) -> None:
+        """Raise InvalidInput where the folder holds other rows, which are not to be written over."""
+        from forcegp.scores.experiment import fingerprint  # PyTorch is not needed for a page of help
+
+        old = self.out / file
+        if old.is_file() and not self.overwrite and fingerprint(forcegp.Dataset.load(old)) != fingerprint(dataset):
+            raise InvalidInput(f"{self.out} {seen}; choose another name, or add --overwrite.")
+
     def _prepared_rows(
         self, terminal: Terminal, raw: forcegp.Dataset, open_switches: bool, report: forcegp.checks.CheckReport
     ) -> tuple[forcegp.Dataset, forcegp.Dataset]:  # to learn from, and the same at the full rate
@@ -223,11 +228,14 @@ class Auto(Command):
         if self.filter.cutoff == "auto" and elastic:
             slow = min(elastic[0].numbers["cutoff"], report.inputs.cutoff or math.inf)
             wanted = replace(wanted, cutoff=slow, why={"cutoff": "below the resonance of an elastic joint"})
+        if wanted.delay == "auto" and (late := report.doubts.of("delay")) and "lag" not in late[0].numbers:
+            wanted = replace(wanted, delay=late[0].numbers["delay"], why={**wanted.why, "delay": late[0].what})
         numbers = replace(wanted, every=1, stance="log").resolved(raw)
         period = 0.0 if numbers.cutoff is None else 1.0 / float(numbers.cutoff)  # in which a filter spoils the ends
         stance, every = "auto" if open_switches else "log", wanted.every
         numbers = replace(numbers, trim=max(self.filter.trim, period), stance=stance, every=every)
         rows, recording = prepared_rows(terminal, numbers, raw, thin=self.filter.every is None)
+        self._require_same("prepared.h5", rows, "was filtered otherwise")
         with atomic_file(self.out / "prepared.h5", overwrite=True) as temporary:
             rows.save(temporary)
         return rows, recording

@@ -153,8 +153,7 @@ class Demo(Command):
                 with terminal.progress(f"fitting {name}"):
                     models[name] = forcegp.scores.learn(model, data["train"], **vars(self.search))[0]
                 forcegp.save_posterior(models[name], folder / place)
-                found = fit_summary(models[name], time.monotonic() - start)
-                fits[name] = {"run": str(self.out / place), "fit": found}
+                fits[name] = {"run": str(self.out / place), "fit": fit_summary(models[name], time.monotonic() - start)}
             with terminal.progress("scoring and writing the report"):
                 scores = forcegp.score(models, data["test"], horizons=())
                 results = {"out": str(self.out), "seeds": seeds, "points": self.search.points, "models": fits}

@@ -81,8 +81,7 @@ class ContactMonitor:
     on average, for the next motion may reverse where free motion did not; and what it remembers from before the first
     sample is unknown until the joint has moved. Where M a of a joint goes beyond what free motion has shown, its errors
     grow in proportion. An alarm is raised where tau^T S^-1 tau exceeds a threshold that free motion reaches as often as
-    stated. Raises InvalidInput for arguments that do not fit and a monitor not calibrated, DatasetError for too short a
-    free motion.
+    stated. Raises InvalidInput for arguments that do not fit and a monitor not calibrated, DatasetError for few rows.
     """
 
     def __init__(self, model: Moving, *, dt: float, bandwidth: float = 2.0) -> None:

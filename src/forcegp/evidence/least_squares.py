@@ -224,8 +224,7 @@ def weighted_least_squares(
     converged, expected, content = False, 0.0, CONTENT if known is not None else ROUGHLY
     floor = np.maximum((LEAST_NOISE if held is None else LEAST) * noise, np.finfo(np.float64).tiny)
     for round_number in range(1, ROUNDS + 1):
-        span = _span(held, noise)
-        point = partial(_point, at, prior, noise, span)
+        point = partial(_point, at, prior, noise, _span(held, noise))
         x, nfev, converged, expected = _minimized(point, x, bounds, longest, evaluations, moved, content)
         total += nfev
         r, jacobian = at(x)

@@ -354,8 +354,7 @@ class RecordedRows:
 class LikelyAccelerations:
     """Motions with the accelerations a* where a and u are noisy.
 
-    `offset` (rows, n): forces that the measured a needs less those of a*; `whitening` (rows, n, n): L^-1 of S = L L^T,
-    of the n equations of `in_torque`.
+    Of n equations, `offset` (rows, n): forces that the measured a needs less those of a*; `whitening`: L^-1, S = L L^T.
     """
 
     motion: Motion

@@ -109,8 +109,7 @@ def doubts_of_past(model: Model, log: Dataset, known: Bool[np.ndarray, " rows"])
     if estimated and share > MISLEADING and not at_rest(log):
         what = "until a joint has moved a little, a log does not tell which way its gear was turned last: "
         what += f"{share:.0%} of the rows come before that, and levels of dry friction may be too small by as much."
-        do = "Give longer episodes, or leave memory out."
-        yield look(about="friction that remembers", what=what, do=do)
+        yield look(about="friction that remembers", what=what, do="Give longer episodes, or leave memory out.")
 
 
 def doubts_of_reversals(model: Model, log: Dataset) -> Iterator[Doubt]:

@@ -88,8 +88,7 @@ def fit(
     seed: of the random starts; restart k uses (seed, k).
     jobs: restarts at once, in as many processes, or a `concurrent.futures.Executor`. Results do not depend on it.
     options: the search itself; None is `fit.search.default_options`.
-    start: hyper-parameters at which the first search begins, as `posterior.hyperparameters`; with `Motions` alone, the
-        posterior to refine.
+    start: `posterior.hyperparameters` at which the first search begins; with `Motions` alone, the posterior to refine.
     engine: "exact", "inducing", one of `forcegp.inference.ENGINES` with its settings, or "auto", with the reason in
         `settings["engine_reason"]`.
     learning_points: find the hyper-parameters on this many of the points; None: all up to 1500, and 600 beyond.

@@ -67,8 +67,7 @@ def force_sensor_doubts(dataset: Dataset, model: Model) -> Iterator[Doubt]:
     laws = np.stack([dataset.v, np.sign(dataset.v), np.ones(dataset.v.shape), dataset.a], axis=-1) * driven[:, None]
 
     def bases_of(columns: Float[np.ndarray, "rows nv k"]) -> list[Float[np.ndarray, "windows r"]]:
-        means = short_means(dataset, *columns.swapaxes(0, 1))
-        parts = [np.linalg.svd(each, full_matrices=False)[:2] for each in means]
+        parts = [np.linalg.svd(each, full_matrices=False)[:2] for each in short_means(dataset, *columns.swapaxes(0, 1))]
         return [basis[:, values > 1e-9 * values[0]] for basis, values in parts]
 
     of_file, of_any = bases_of(laws), bases_of(np.concatenate([laws, regressor], axis=-1))

@@ -271,8 +271,7 @@ def _columns(
 ) -> tuple[list[str], Float[np.ndarray, "rows nv causes"]]:
     """Names of joints or links, and derivatives of torques needed less those measured in logarithms of factors.
 
-    Of gains they are as the log has them: with the torques, what is needed would vanish, too. What the log should have
-    is linear in the factor's inverse.
+    Of gains they are as the log has them, which is linear in the factor's inverse: what is needed would vanish, too.
     """
     robot = model.loaded_robot if rows.loaded else model.robot
     if cause == "gains":

@@ -244,8 +244,7 @@ def held_out_noise(model: Model, dataset: Dataset, evidence: Torques | Accelerat
 
     Residuals of the rows that parameters were fitted to are too small for others, so every stretch is predicted by a
     model identified from the rest (block cross-validation; Burman, Chow & Nolan 1994): episodes, where there are three
-    or more, `EPISODES_LEFT_OUT` groups at most, else `STRETCHES_LEFT_OUT` stretches of time. Raises InvalidInput for
-    too few rows.
+    or more, `EPISODES_LEFT_OUT` groups at most, else `STRETCHES_LEFT_OUT` of time. Raises InvalidInput for few rows.
     """
     require_type("model", model, Model)
     dataset = with_memory(require_type("dataset", dataset, Dataset), model)

@@ -229,8 +229,7 @@ KERNELS: dict[str, KernelFactory] = {
     "linear": linear,
     "friction": friction,
 }
-"""Kernels that an expression can name: name -> factory(dimension, variance). Add your own, `KERNELS["mine"] = factory`;
-a name may hold anything but "+"."""
+"""Kernels by name, without "+", as factory(dimension, variance). Add your own, `KERNELS["mine"] = factory`."""
 
 
 def kernel_of(expression: str, dimension: int, variance: Tensor | float) -> Kernel:

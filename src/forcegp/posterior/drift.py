@@ -113,8 +113,7 @@ def with_drift(posterior: Posterior, log: Dataset) -> Posterior:
     missed, friction, dt = _missed(posterior, log)
     since = np.concatenate([log.time[log.episode == k] - log.time[log.episode == k][0] for k in log.episodes])
     seconds = max(float(sum(since[log.episode == k].max() for k in log.episodes)) / BLOCKS, dt)
-    keys = np.stack([log.episode, np.floor(since / seconds)])
-    starts = np.flatnonzero(np.r_[True, (np.diff(keys) != 0).any(axis=0)])
+    starts = np.flatnonzero(np.r_[True, (np.diff(np.stack([log.episode, np.floor(since / seconds)])) != 0).any(axis=0)])
     covariance = missed.T @ missed / len(missed)
     weight = np.linalg.pinv(covariance, hermitian=True)
     information = dt * np.add.reduceat(np.einsum("ni,ij,nj->nij", friction, weight, friction), starts, axis=0)
@@ -157,8 +156,7 @@ def random_walk(
     """Variances of levels y per second and between records, and `noise`, for the variance noise / information of y.
 
     `time` is in s since the beginning of each record, and y are means over `width` s. What a model lacks lasts as well:
-    y has such errors, too, which `noise` holds as they are at low frequencies. The first variance is 0 where the
-    levels do not show it beside them.
+    y has such errors, too, which `noise` holds as they are at low frequencies. Hidden by them, the first variance is 0.
     """
     same, size = record[:, None] == record, 1.0 / float(np.median(information))
     lag, walked = abs(np.subtract.outer(time, time)), same * np.minimum.outer(time, time)

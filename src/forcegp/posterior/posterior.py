@@ -353,11 +353,10 @@ class Posterior(Fitted):
         model = self.trained.to(device)
         at: torch.device = model.robot.device
         result = replace(self.result, parameters={name: x.to(at) for name, x in self.result.parameters.items()})
-        given = {name: value.to(at) for name, value in self.hyperparameters.items()}
-        learned = self.training.to(at), given, result
+        learned = self.training.to(at), {name: value.to(at) for name, value in self.hyperparameters.items()}, result
         there = Posterior.conditioned(model, *learned, self.settings, self.engine, self.estimates)
-        carried = there if self.target is None else there.with_model(self.target.to(device))
-        return carried.with_settings(**self.settings)
+        there = there if self.target is None else there.with_model(self.target.to(device))
+        return there.with_settings(**self.settings)
 
     def with_settings(self, **settings: Any) -> "Posterior":
         """The same posterior with more entries in `settings`."""

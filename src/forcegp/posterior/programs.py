@@ -255,8 +255,7 @@ class Programs:
     def c_source(self, kind: str, lanes: int, entry: str = "", numbers: dict[str, int] | None = None) -> str:
         """The C text of a program, or of a loop over it by an integrator's name, with the function `evaluate`.
 
-        `entry` is another text that calls `program(t, live, x, y)` instead. `numbers` as for `write_function`, in the
-        last table.
+        `entry` is another text that calls `program(t, live, x, y)`. `numbers`: of the last table, as `write_function`.
         """
         integrator = kind if kind in steps_of(self.space) else ""
         if integrator:

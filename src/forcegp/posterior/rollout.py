@@ -198,8 +198,7 @@ def predicted(posterior: Any, q0: Any, v0: Any, u: Any, dt: float, integrator: s
         q, v, u_0 = (torch.as_tensor(x).to(found.q) for x in (q0, v0, u[:, :1]))
         unit = CHANGE * torch.eye(v.shape[-1]).to(v)  # what a change of v does to a, (nv, n, nv)
         steps = posterior.rollout(q, v + torch.stack([0.0 * unit[0], *unit])[:, None], u_0, TINY).v[..., 1, :]
-        change = (steps[1:] - steps[0] - unit[:, None]).nan_to_num()
-        rates = torch.linalg.eigvals(change.movedim(0, -1)).abs().amax(-1)
+        rates = torch.linalg.eigvals((steps[1:] - steps[0] - unit[:, None]).nan_to_num().movedim(0, -1)).abs().amax(-1)
         if float(rates.median()) * dt > STIFF * CHANGE * TINY:
             return posterior.rollout(q0, v0, u, dt, integrator="implicit-midpoint", **how)
     for each in told:

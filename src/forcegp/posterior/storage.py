@@ -120,8 +120,7 @@ def load_posterior(path: str | Path) -> Posterior:
         if wanted != there:
             raise ValueError("its parameters are not those of its model")
         if "target" in document:
-            target = Model.from_dict({**document["target"], "urdf": read_text(path / TARGET)})
-            posterior = posterior.with_model(target)
+            posterior = posterior.with_model(Model.from_dict({**document["target"], "urdf": read_text(path / TARGET)}))
             posterior = posterior.with_settings(**settings)  # as it was stored
     except UNUSABLE as error:
         raise FileFormatError(f"{path} is incomplete or damaged: {error}; fit the model again") from None

@@ -1,7 +1,6 @@
 """`ColumnMapping`: which columns are what, in which units; names in short and guessed; sums of columns.
 
-Known columns are recognised in sums letter by letter, the longest first, so most names need no quotes; backticks settle
-others.
+Known columns are recognised in sums letter by letter, the longest first, so most names need no backticks.
 """
 
 import ast
@@ -86,8 +85,7 @@ class ColumnMapping:
         one constant. None: v and a are differentiated, the others are looked for by the names of the joints.
     force: by frame of the robot, three columns of a force sensor there: the force on the robot, x, y, z in world axes.
         By "imu:FRAME", "imu:FRAME@x,y,z" or "imu:FRAME@x,y,z,roll,pitch,yaw" those of an accelerometer, in its axes.
-        By "torque:JOINT" the column of a torque sensor between gear and link, which accelerates the link; by "torque"
-        one for each joint.
+        By "torque:JOINT" the torque sensor between gear and link, which accelerates the link; by "torque" all joints.
     joints: their names, in the order of the columns; columns of a base that moves stand where its robot has them.
     orientation: of a base that moves: quaternions "xyzw" (default) or "wxyz", or "angles" roll, pitch and yaw.
     axes: of its v and a, of the linear and the angular part: "body" (default), "world", or "imu" for what an

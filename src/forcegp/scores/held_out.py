@@ -99,8 +99,7 @@ def split_named(dataset: Dataset, text: str, guard: float = 0.25) -> tuple[Split
 
     auto: a quarter of the episodes, drawn at random; where one is `MOST` of the log, blocks 3 and 5 of five, or of each
         five of more blocks where a joint moves on one side alone.
-    folds: the episodes in up to four groups, drawn at random, each held out in turn; of more than `MANY` two groups,
-        of one as auto.
+    folds: the episodes in up to four random groups, each held out in turn; of more than `MANY` two, of one as auto.
     episodes:N,N...: whole episodes.
     leave-one-out: every episode once.
     blocks:N:K,K...: every episode is cut into N blocks of equal duration; those of these numbers, from 1, are held out,

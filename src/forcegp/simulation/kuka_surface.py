@@ -172,8 +172,7 @@ STEPS_PER_REPORT = 240
 DIVERGED = 100.0  # rad/s
 
 Motion = dict[str, np.ndarray]
-"""The recorded rows of one episode: q, v, u, a and time, true forces (joint_torques, tool_torques, tool_force,
-multiplier), and in_contact."""
+"""Rows of an episode: q, v, u, a, time, in_contact; true joint_torques, tool_torques, tool_force, multiplier."""
 
 
 def simulate_episode(config: KukaSurfaceConfig, robot: Robot, plant: RigidBodyDynamics, episode: int) -> Motion:
