@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from forcegp.data import Dataset
-from forcegp.data.views import at_rest, postures, rests_alone
+from forcegp.data.views import SHORTEST, at_rest, postures, rests_alone, runs
 from forcegp.errors import InvalidInput
 from forcegp.evidence import Accelerations, Torques
 from forcegp.evidence.least_squares import Chained, Jacobian, NoiseLevels, Regressor, orthonormal_columns, without
@@ -16,6 +16,9 @@ from forcegp.evidence.recorded_rows import LikelyAccelerations, Motion, Recorded
 from forcegp.forces import Actuation
 from forcegp.posterior.fitted import STRETCHES
 
+STANDS, LESS = 0.03, 0.7
+"""Share of its root mean square velocity below which a joint stands, and of what rows leave elsewhere over what they
+leave there, below which they count for less: gears then hold any load, as a controller that integrates leaves it."""
 SLIGHT = 0.1  # share of what a joint needs by the start, below which known torques do not tell how much it carries
 
 
@@ -53,6 +56,7 @@ class Equations:
         # any numbers explain a few postures
         self.tell_bodies = seconds is not None and not self.links and not all(map(at_rest, logs))
         self.windows = None if seconds is None else WindowMeans(logs, seconds)
+        self.weights: np.ndarray | None = None  # of equations; None: 1
         self._stays: tuple[np.ndarray, ...] = ()
         """Regressors of the last search, which no coordinate changes."""
         # what drives deliver is among the known laws, unless their gains are estimated
@@ -79,10 +83,21 @@ class Equations:
         r, Y, in_terms = zip(*parts, strict=True)
         residual, mean = np.concatenate(r), np.asarray if windows is None else windows.mean
         if len(Y) != len(self._stays) or any(a is not b for a, b in zip(Y, self._stays, strict=True)):
-            flat = np.concatenate(Y).reshape(*residual.shape, 10 * len(self.space.carried))
-            self._stays, self._regressor = Y, Regressor(mean(flat))
-        slopes = self.space.bodies.slopes(x[: self.space.bodies.size])
-        return mean(residual), Chained(self._regressor, slopes, mean(np.concatenate(in_terms)))
+            flat = mean(np.concatenate(Y).reshape(*residual.shape, 10 * len(self.space.carried)))
+            self._stays, self._regressor = Y, Regressor(self._weighted(flat))
+        slopes, others = self.space.bodies.slopes(x[: self.space.bodies.size]), mean(np.concatenate(in_terms))
+        return self._weighted(mean(residual)), Chained(self._regressor, slopes, self._weighted(others))
+
+    def _weighted(self, values: np.ndarray) -> np.ndarray:
+        w = self.weights
+        return values if w is None else values * w.reshape(values.shape[:2] + (1,) * (values.ndim - 2))
+
+    def weigh_rests(self, left: Float[np.ndarray, "rows n"]) -> bool:
+        """Let rows in which a joint stands count by what they leave, of which these are residuals; whether any do."""
+        if self.windows is not None or self.links or self.held.shape[1] or self.passive:
+            return False
+        self.weights, self._stays = weights_of_rests(self.logs, left), ()
+        return bool((self.weights < 1.0).any())
 
     def _moving(self, a: Float[np.ndarray, " nv"]) -> list[Motion]:
         return [part.moving(a + 0.0 * part.v) for part in self.parts]
@@ -208,6 +223,18 @@ class Equations:
             order = np.lexsort((log.time, log.episode)) if self.windows is None else np.arange(length)
             numbers.append(np.array_split(start + order, min(STRETCHES, sum(lengths))))
         return [each for each in [np.concatenate(each) for each in zip(*numbers, strict=True)] if len(each)]
+
+
+def weights_of_rests(logs: Sequence[Dataset], left: Float[np.ndarray, "rows nv"]) -> Float[np.ndarray, "rows nv"]:
+    """What residuals count for: 1, or less where a joint stands, by what is left there."""
+    v, time = (np.concatenate([getattr(log, name) for log in logs]) for name in ("v", "time"))
+    stands = np.abs(v) < STANDS * np.sqrt(np.square(v).mean(axis=0))
+    for own in stands.T:
+        for begin, end in runs(own):
+            own[begin:end] = time[end - 1] - time[begin] >= SHORTEST  # else it turns back
+    moving, still = (np.sqrt((left**2 * rows).sum(0) / rows.sum(0).clip(1)) for rows in (~stands, stands))
+    few = np.minimum(stands.sum(0), (~stands).sum(0)) < STRETCHES
+    return np.where(stands & ~few & (moving <= LESS * still), moving / still.clip(1e-300), 1.0)
 
 
 class WindowMeans:

@@ -14,6 +14,7 @@ from torch import Tensor
 from forcegp.data import Dataset, evenly, with_memory, with_strokes
 from forcegp.data.views import tensors
 from forcegp.evidence import Accelerations, Torques, motion_residuals
+from forcegp.fit.equations import weights_of_rests
 from forcegp.fit.physical import Solution, fit_physical
 from forcegp.fit.transmission_choice import choose_transmission
 from forcegp.forces import Coulomb, DirectionalFriction, DryFriction, GearFriction, LogNormal, Normal, Rotor, Viscous
@@ -127,8 +128,10 @@ def choose_friction(
 def _precision(model: Model, log: Dataset, noise: Noise | None) -> Float[np.ndarray, "rows nv nv"]:
     """Inverse covariances of residual forces: M N_a M + N_f."""
     if noise is None or noise.force is None or noise.acceleration is None:
-        left = np.sqrt((motion_residuals(log, model)[0] ** 2).mean(0))
-        return np.tile(np.diag(np.maximum(left, 1e-6 * max(float(left.max()), 1e-12)) ** -2.0), (len(log), 1, 1))
+        left = motion_residuals(log, model)[0]
+        weights = weights_of_rests([log], left)
+        level = np.sqrt(np.square(weights * left).mean(0))
+        return np.square(weights / np.maximum(level, 1e-6 * max(float(level.max()), 1e-12)))[..., None] * np.eye(log.nv)
     q, v, u, *_ = tensors(with_memory(log, model), model.robot.device)
     M = model.dynamics(q, v, u).M.cpu().numpy()
     return np.linalg.inv(M * np.square(noise.acceleration) @ M + np.diag(np.square(noise.force)))

@@ -106,6 +106,8 @@ def fit_physical(
         fit, noise = _with_noise_in_both(equations, search, x, note, rough=near is None, roughly=roughly)
     elif evidence.of_torque:
         fit = search(torque, start=x, held=held, progress=note)
+        if equations.weigh_rests(fit.residual):
+            fit = search(torque, start=fit.x, held=held, progress=note)
         if options["sizes"] is not None and held is None and equations.rests:
             changes = changes_without_rests(search, torque, space, fit.x, equations.rests)
     else:
