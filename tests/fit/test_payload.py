@@ -23,6 +23,7 @@ from forcegp.evidence.least_squares import Fit
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.evidence.recorded_rows import RecordedRows
 from forcegp.fit import fit
+from forcegp.fit.equations import weights_of_rests
 from forcegp.fit.payloads import CAUSES, misfit
 from forcegp.fit.physical import typical_sizes
 from forcegp.forces import Actuation, Body, Offset, Payload, RigidBodies, Rotor, Stribeck, Viscous, parse_forces
@@ -101,6 +102,45 @@ def held_of_postures(count, seeds):
         ends = Found(prepared, laws=(Offset(),)).intervals
         held += [low <= true <= high for (low, high), true in zip(ends, [MASS, *CENTER], strict=True)]
     return held
+
+
+def stopped(data, every=150, rows=40):
+    """The log with rests, in which gears hold what a controller that integrates leaves them."""
+    rng, none, parts = np.random.default_rng(0), np.zeros(6), np.split(np.arange(len(data)), range(every, 1500, every))
+    rest = np.concatenate([np.arange(len(part) + rows) >= len(part) for part in parts])
+    q, v, a, u = (
+        np.array(x)[np.r_[*(np.r_[p, [p[-1]] * rows] for p in parts)]] for x in (data.q, data.v, data.a, data.u)
+    )
+    v[rest], a[rest], oracle = 0.0, 0.0, Oracle(TEXT, ROBOT)
+    for at in np.split(np.flatnonzero(rest), len(parts)):
+        u[at] = oracle.inverse_dynamics(q[at[0]], none, none) + 4.0 * ROTORS * rng.uniform(-1.0, 1.0, 6)
+    u += 0.05 * rng.standard_normal(u.shape)
+    return Dataset(q=q, v=v, a=a, u=u, time=0.02 * np.arange(len(q)), model=Model(ROBOT))
+
+
+@pytest.mark.filterwarnings("ignore::forcegp.errors.DataWarning")
+def test_rests_count_by_what_they_leave(monkeypatch):
+    """Friction is that of the motion, not of the loads that gears hold at rest; by a half, unless they count less."""
+    data, module = log(TEXT, 0, noise=0.05), import_module("forcegp.fit.equations")
+    laws = parse_forces("viscous,coulomb:memory=true,offset,rotor")
+    found = []
+    for each, less in ((data, 0.7), (stopped(data), 0.7), (stopped(data), 0.0)):
+        monkeypatch.setattr(module, "LESS", less)
+        values = fit(data.model.with_forces(*laws), each, Torques()).parameters
+        found.append(np.array([values[f"coulomb.level.{name}"].value for name in ROBOT.joint_names]))
+    assert found[1] == pytest.approx(found[0], rel=0.06)
+    assert np.median(found[2] / found[0]) < 0.7
+
+
+@pytest.mark.parametrize(
+    ("rows", "speed", "leaves", "counts"),
+    [(20, 0.025, 2.0, 0.5), (20, 0.035, 2, 1), (14, 0.025, 2, 1), (20, 0.025, 1.4, 1)],
+)
+def test_joints_that_stand_long_enough_and_leave_more_count_less(rows, speed, leaves, counts):
+    time, stands = 0.02 * np.arange(400), np.arange(400) % 100 < rows
+    part = SimpleNamespace(v=np.where(stands, speed, 1.0)[:, None], time=time)
+    weights = weights_of_rests([part], np.where(stands, leaves, 1.0)[:, None])
+    np.testing.assert_allclose(weights[:, 0], np.where(stands, counts, 1.0))
 
 
 def test_intervals_hold_what_gears_bear_in_postures():

@@ -184,12 +184,12 @@ def test_a_passive_joint_does_not_explain_its_torque_by_carrying_nothing():
     found = identified(free, given(), strength=1.0).parameters
     assert found["hand.mass"].value == pytest.approx(model.robot.link("hand").mass, rel=0.1)
     space = ParameterSpace(model.with_forces(RigidBodies("all"), Viscous()), typical_sizes(model, [free]))
-    equations = Equations(space, [free.rows(slice(0, 20))], Torques())
+    equations = Equations(space, [free.rows(slice(0, 20))], Torques(), ())
     x = space.start + 0.1 * np.random.default_rng(1).standard_normal(space.size)
     assert list(equations.passive) == [2]
     needed = space.typical["force"][2] * np.random.default_rng(2).standard_normal((400, 1)) * [0.0, 0.0, 1.0]
     for share, passive in ((0.07, [2]), (0.15, [])):  # noise of a channel, and a torque that tells of what is carried
-        assert list(Equations(space, [replace(free, u=free.u + share * needed)], Torques()).passive) == passive
+        assert list(Equations(space, [replace(free, u=free.u + share * needed)], Torques(), ()).passive) == passive
     J = np.asarray(equations.in_torque(x, equations.measured)[1])
     numeric = [(equations.in_torque(x + h, equations.measured)[0] - equations.in_torque(x - h, equations.measured)[0])
                / 2e-6 for h in 1e-6 * np.eye(len(x))]  # fmt: skip

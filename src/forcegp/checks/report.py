@@ -65,12 +65,8 @@ class CheckReport(Summary):
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON: level, counts, numbers of every joint, doubts."""
         counts = {level: len(self.doubts.at(level)) for level in LEVELS}
-        return {
-            "level": self.doubts.level,
-            "counts": counts,
-            "joints": self.per_joint(),
-            "doubts": [doubt.to_dict() for doubt in self.doubts],
-        }
+        found = {"level": self.doubts.level, "counts": counts, "joints": self.per_joint()}
+        return {**found, "doubts": [doubt.to_dict() for doubt in self.doubts]}
 
 
 def check(dataset: Dataset, model: Model | None = None) -> CheckReport:

@@ -176,14 +176,9 @@ class Monitor(Command):
         with self.folder(self.out, content) as folder:
             write_json(folder / "contacts.json", {**content, "contacts": contacts})
         header = ["on", "from [s]", "to [s]", "force [N]", "distance /\nthreshold"]
-        rows = [
-            [
-                each["link"],
-                *(f"{each[name]:.2f}" for name in ("start", "end", "newton")),
-                f"{each['peak'] / monitor.threshold:.1f}",
-            ]
-            for each in contacts
-        ]
+        three = [[f"{each[name]:.2f}" for name in ("start", "end", "newton")] for each in contacts]
+        ratios = [f"{each['peak'] / monitor.threshold:.1f}" for each in contacts]
+        rows = [[each["link"], *own, x] for each, own, x in zip(contacts, three, ratios, strict=True)]
         found = columns(title, header, rows) if rows else title
         felt = [[link, *(shown(x, "{:.2g}") for x in each)] for link, each in finite.items()]
         header = ["at the end of", "along the best axis [N]", "along any [N]"]

@@ -24,18 +24,8 @@ import forcegp.posterior
 import forcegp.robots
 import forcegp.scores
 from forcegp.atomic_files import file_digest, write_json, write_text
-from forcegp.cli import robot_options
-from forcegp.cli.command import (
-    DATASET,
-    FIELDS,
-    NUMBERS,
-    Command,
-    listed,
-    numbers_of,
-    options_of,
-    unless_given,
-    values_of,
-)
+from forcegp.cli import command, robot_options
+from forcegp.cli.command import DATASET, FIELDS, NUMBERS, Command, listed, options_of, unless_given
 from forcegp.cli.terminal import Terminal, columns, facts, with_option_names
 from forcegp.doubts import Doubts
 from forcegp.errors import ContactError, ContactWarning, DatasetError
@@ -139,7 +129,7 @@ class Fit(Command):
         level = None
         if self.noise not in ("learned", "dataset"):
             complaint = f"--noise is {self.noise!r}; give learned, dataset or a number such as 0.1."
-            [level] = numbers_of(self.noise, complaint, one=True)
+            [level] = command.numbers_of(self.noise, complaint, one=True)
         return forcegp.Noise(level, self.force_noise, learn=self.noise == "learned")
 
     def _check(self, terminal: Terminal, dataset: forcegp.Dataset, model: forcegp.Model) -> None:
@@ -171,7 +161,7 @@ class Fit(Command):
 
     def _write(self, posterior: forcegp.posterior.Posterior) -> None:
         """The model, how it was made and what was estimated; what is known also as a robot's file."""
-        given = {name: x for name, x in values_of(self).items() if name not in ("json", "debug", "overwrite")}
+        given = {name: x for name, x in command.values_of(self).items() if name not in ("json", "debug", "overwrite")}
         options = {name: str(x) if isinstance(x, Path) else x for name, x in given.items()}
         data = {"path": str(self.log), "sha256": file_digest(self.log)}
         content = {"options": options, "data": data, "resolved": dict(posterior.settings)}

@@ -12,15 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from typing_extensions import override
 
-from forcegp.errors import (
-    ContactError,
-    InvalidInput,
-    NumericalError,
-    NumericalWarning,
-    require_known,
-    require_number,
-    require_type,
-)
+from forcegp import errors
+from forcegp.errors import InvalidInput, NumericalError, require_known, require_number, require_type
 from forcegp.evidence.likelihood import FAR_FROM_SURFACE
 from forcegp.integration.integrators import check_time_step
 from forcegp.model import Model
@@ -301,7 +294,7 @@ class HybridForce(TrackingController):
         if self.released and self._free is None:
             seen = f"a contact's point is {far:.3g} m off its surface, and at most {self.tolerance:g} m are allowed"
             advice = 'move it there by ComputedTorque first, or give off_surface="release".'
-            raise ContactError(f"{seen}: a force there would push nothing; {advice}")
+            raise errors.ContactError(f"{seen}: a force there would push nothing; {advice}")
         if self.released and self._free is not None:
             return self._free._torques(q, v, v_d, a_d, e, e_v)
         free = a_d + self.feedback(e, e_v)
@@ -406,7 +399,7 @@ class MPPI(Controller):
         noise[1] = self._best - plan
         torques = (plan + noise).clamp(-self.torque_limits, self.torque_limits)
         with torch.no_grad(), warnings.catch_warnings():
-            warnings.simplefilter("ignore", NumericalWarning)  # of sequences that diverge: they cost infinitely much
+            warnings.simplefilter("ignore", errors.NumericalWarning)  # motions that diverge cost infinitely much
             motions = self.predictor.rollouts(q, v, torques, self.dt, integrator=self.integrator, threads=1)
             costs = torch.as_tensor(self.cost(motions.q, motions.v, torques.expand_as(motions.a)))
         if costs.shape != motions.diverged_at.shape:

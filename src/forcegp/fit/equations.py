@@ -26,11 +26,7 @@ class Equations:
     """Rows of one log or several as one array each, and the equations that they give at x."""
 
     def __init__(
-        self,
-        space: ParameterSpace,
-        logs: Sequence[Dataset],
-        evidence: Torques | Accelerations,
-        pushed: Sequence[int] = (),
+        self, space: ParameterSpace, logs: Sequence[Dataset], evidence: Torques | Accelerations, pushed: Sequence[int]
     ) -> None:
         self.space, self.evidence, self.logs = space, evidence, logs
         self.parts = [
@@ -96,6 +92,7 @@ class Equations:
         """Let rows in which a joint stands count by what they leave, of which these are residuals; whether any do."""
         if self.windows is not None or self.links or self.held.shape[1] or self.passive:
             return False
+        left = left if self.weights is None else left / self.weights
         self.weights, self._stays = weights_of_rests(self.logs, left), ()
         return bool((self.weights < 1.0).any())
 

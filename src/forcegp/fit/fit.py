@@ -18,19 +18,13 @@ from forcegp.evidence import Evidence, Motions, Sensor, Torques, TrainingData
 from forcegp.evidence.likelihood import MarginalLikelihood, check_distance, problem_size
 from forcegp.evidence.parameter_space import ParameterSpace
 from forcegp.fit import doubts as checked
+from forcegp.fit import refinement as refining
 from forcegp.fit import search as searching
 from forcegp.fit.friction_choice import with_friction_chosen
 from forcegp.fit.joint import CHANGE, MOST_ROUNDS, FreeNumbers, estimates_beside, numbers_beside, with_free_numbers
 from forcegp.fit.motion_fit import refine_on_motions
 from forcegp.fit.payloads import with_payloads_placed
 from forcegp.fit.physical import fit_physical, typical_sizes
-from forcegp.fit.refinement import (
-    fit_with_refined_loads,
-    independent_rows,
-    learning_rows,
-    on_all_rows,
-    require_memory_to_learn,
-)
 from forcegp.fit.sensors import usual_evidence, with_sensors
 from forcegp.fit.unseen import Unseen
 from forcegp.forces import UnknownForces
@@ -251,15 +245,15 @@ class _Functions:
             # now, not after the search
             chosen.require_memory(problem_size(self.model, len(all_rows)), self.model.robot.device)
         ordered = len(all_rows) < len(dataset)
-        rows = independent_rows(all_rows) if searching.learns_noise(self.model.noise, dataset) else all_rows
+        rows = refining.independent_rows(all_rows) if searching.learns_noise(self.model.noise, dataset) else all_rows
         if points is not None:  # which rows these are is not the caller's choice
             all_rows = rows
-        rows = learning_rows(rows, self.learning_points, ordered=ordered)
+        rows = refining.learning_rows(rows, self.learning_points, ordered=ordered)
         described = searching.described_rows(all_rows, dataset)
         own = replace(self, search=replace(self.search, start=self._continuation(rows, dataset)))
         fitted = searching.widened(own._with_numbers(rows, dataset))
         checked.warn_of_contacts(self.model, dataset)  # last: what refuses the rows comes first
-        return on_all_rows(fitted, with_memory(all_rows, fitted.model), chosen, described)
+        return refining.on_all_rows(fitted, with_memory(all_rows, fitted.model), chosen, described)
 
     def _continuation(self, rows: Dataset, dataset: Dataset) -> Mapping[str, Tensor] | None:
         """Where a single search on many rows begins: at the end of searches on fewer of them."""
@@ -316,7 +310,7 @@ class _Functions:
                 model = replace(self.model, forces=(*self.model.laws, *forces.terms))
                 return replace(self, model=model, search=begin)._search(rows, dataset)
 
-        return fit_with_refined_loads(self._search(rows, dataset), again)
+        return refining.fit_with_refined_loads(self._search(rows, dataset), again)
 
     def _search(
         self, rows: Dataset, dataset: Dataset, beside: Callable[[MarginalLikelihood], FreeNumbers] | None = None
@@ -330,7 +324,7 @@ class _Functions:
         model.check_states(training.q, training.v, training.u)
         check_distance(model, training)
         checked.check_forces(likelihood)
-        require_memory_to_learn(likelihood)
+        refining.require_memory_to_learn(likelihood)
         described = searching.described_rows(rows, dataset) | {"noise": noise.to_dict()}
         learned_noise, fixed = likelihood.split_noise
         kernels = likelihood.kernels

@@ -32,7 +32,7 @@ EQUATIONS = 40_000  # as many rows hold these equations, one per degree of freed
 ROUGH_EQUATIONS = 7_000  # where a search begins, or is rough among accelerations: they take thrice the time of torques
 WINDOWED, PER_WINDOW = 2_000, 10
 """Of means over windows so many rows are enough, or so many in each: half a second of a filtered log has few more."""
-REWEIGHTINGS = 2  # searches in which accelerations are weighted by noise of both kinds
+REWEIGHTINGS = 2  # searches in which accelerations are weighted by noise of both kinds, and rests by what they leave
 SEARCHES = 20
 """Most searches where forces and accelerations are both noisy, each about the accelerations of the last one."""
 STEPS = 6
@@ -106,8 +106,9 @@ def fit_physical(
         fit, noise = _with_noise_in_both(equations, search, x, note, rough=near is None, roughly=roughly)
     elif evidence.of_torque:
         fit = search(torque, start=x, held=held, progress=note)
-        if equations.weigh_rests(fit.residual):
-            fit = search(torque, start=fit.x, held=held, progress=note)
+        for _ in range(REWEIGHTINGS):
+            if equations.weigh_rests(fit.residual):
+                fit = search(torque, start=fit.x, held=held, progress=note)
         if options["sizes"] is not None and held is None and equations.rests:
             changes = changes_without_rests(search, torque, space, fit.x, equations.rests)
     else:

@@ -88,11 +88,8 @@ def first_start(
 
 def described_rows(rows: Dataset, dataset: Dataset) -> dict[str, Any]:
     """What the settings of a fit hold about its training rows and where they come from, as plain JSON values."""
-    return {
-        "points": len(rows),
-        "rows_available": len(dataset),
-        "data": {"metadata": dict(dataset.metadata), "episodes": list(dataset.episodes)},
-    }
+    data = {"metadata": dict(dataset.metadata), "episodes": list(dataset.episodes)}
+    return {"points": len(rows), "rows_available": len(dataset), "data": data}
 
 
 RESTART_SPREAD = 0.7  # standard deviation of the random factors (natural log) on the start values of restarts from 1 on

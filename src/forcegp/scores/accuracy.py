@@ -191,11 +191,8 @@ def _pairs(rows: Predicted, test: Dataset, mass: Matrices, frames: Sequence[str]
 def metrics(mean: np.ndarray, variance: np.ndarray | None, truth: np.ndarray) -> dict[str, list[float | None]]:
     """Errors by column, and the coverage of entries whose interval has a width."""
     error, size = np.abs(mean - truth), float(np.sqrt(np.square(truth).mean()))
-    found = {
-        "mae": plain(error.mean(axis=0)),
-        "rmse": plain(np.sqrt(np.square(error).mean(axis=0))),
-        "largest": plain(error.max(axis=0)),
-    }
+    means = {"mae": plain(error.mean(axis=0)), "rmse": plain(np.sqrt(np.square(error).mean(axis=0)))}
+    found = {**means, "largest": plain(error.max(axis=0))}
     if size > 0.0:
         found["relative_rmse"] = [float(np.sqrt(np.square(error).mean())) / size]
     if variance is not None:

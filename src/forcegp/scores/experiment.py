@@ -28,15 +28,9 @@ from forcegp.noise import Noise
 from forcegp.posterior import observing
 from forcegp.posterior.posterior import Posterior
 from forcegp.scores import accuracy
+from forcegp.scores import models as learners
 from forcegp.scores.held_out import STARTS, HeldOutMotions, Split, held_out_motions, motion_scores
-from forcegp.scores.models import (
-    Candidate,
-    checked_identification,
-    few_inputs,
-    identified_model,
-    learn,
-    usual_identification,
-)
+from forcegp.scores.models import Candidate, checked_identification, few_inputs, identified_model, learn
 
 SHARE = 2 / 3  # of the training rows among which the points of one seed are chosen
 IDENTIFICATION, MODEL = "identification", "model"
@@ -98,7 +92,7 @@ class Experiment:
     @cached_property
     def identifies(self) -> str:
         """Forces and evidence of `identified`, and of the mass matrix."""
-        return self.identification or usual_identification(self.model)
+        return self.identification or learners.usual_identification(self.model)
 
     def motions(self, split: Split) -> HeldOutMotions:
         """The motions to predict in what this split holds out."""
