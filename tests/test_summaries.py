@@ -32,8 +32,7 @@ def shown(data):
 
 
 FACTS = {
-    "CheckReport": ("wrong: none", "sampling"),
-    "Predictor": ("joints: 3", "covariance"),
+    "CheckReport": ("wrong: none", "sampling"), "Predictor": ("joints: 3", "covariance"),
     "Dataset": ["rows: 20", "joints: pan, lift, bend", "'arm', 1 contacts", "noise std: 0.05, 0.05, 0.05"],
     "Posterior": ["model: analytical mean", "learned from: 20 rows", "search: not converged"],
     "Prediction": ["batch: (20,)", "entries: 3", "forces: multiplier, contact_force, unknown_force"],
@@ -42,7 +41,7 @@ FACTS = {
     "Robot": ["name: 'arm'", "nv: 3", "pan (revolute), lift (revolute), bend (revolute)"],
     "Model": ["contacts: hand on Plane", "forces: Actuation, RigidBodies", "omega=5.0"],
     "Estimates": ["estimated: viscous.pan", "from: 20 rows, "],
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", FACTS)

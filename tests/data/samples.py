@@ -41,12 +41,11 @@ def complete(rows: int = 40) -> Dataset:
     """With every optional field but the model."""
     rng = np.random.default_rng(1)
     return dataset(
-        rows,
-        noise_std=np.array([0.1, 0.2]),
+        rows, noise_std=np.array([0.1, 0.2]),
         truth={"a": rng.normal(size=(rows, 2)), "lambda": np.zeros((rows, 0)), "Q_U": np.zeros((rows, 2))},
         strokes=rng.normal(size=(rows, 2, 3)),
         metadata={"source": "a test", "nested": {"list": [1, 2.5, None, True], "text": "µ"}},
-    )
+    )  # fmt: skip
 
 
 def arrays(data: Dataset) -> dict[str, np.ndarray]:

@@ -83,12 +83,11 @@ def test_residuals_of_rows_and_what_their_coordinates_mean(contact):
     found = {
         "coordinates": [space.start, *bounds, *space.prior(x), space.moved(x, 0.1 * x), space.number_slopes(x)],
         "parameters": {f"{each.name} {each.unit}": [each.start, each.prior] for each in space.parameters},
-        "noise": [levels, rows.felt_noise, rows.link_noise, share_of(log.a)],
-        "torque": rows.in_torque(x, motion)[:3],
+        "noise": [levels, rows.felt_noise, rows.link_noise, share_of(log.a)], "torque": rows.in_torque(x, motion)[:3],
         "acceleration": rows.in_acceleration(x, log.a),
         "likely": [likely.offset, likely.whitening, likely.white_regressor, rows.by_body(log.a)],
         "motion": motion_residuals(log, space.model_at(x)),
-    }
+    }  # fmt: skip
     assert_unchanged(f"evidence/rows {contact.__name__}", found, rtol=1e-5)
 
 

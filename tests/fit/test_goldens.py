@@ -71,7 +71,7 @@ def test_what_is_found_is_what_it_was(case):
         "searched": {name: x.tolist() for name, x in posterior.hyperparameters.items()},
         "predicted": [predicted.mean.tolist(), predicted.covariance.tolist(), torch.tensor(len(rows)).item()],
         "said": [str(each.message) for each in said],
-    }
+    }  # fmt: skip
     assert_unchanged(f"fit/{case}", found, rtol=1e-3)
 
 

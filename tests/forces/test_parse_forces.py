@@ -81,11 +81,9 @@ def test_several_are_written_with_commas():
         "viscous, coulomb:0.1,gp:tool-friction:kernel=(linear + matern-3/2),contact=1, payload:hand"
     )
     wanted = (
-        forces.Viscous(),
-        forces.Coulomb(0.1),
-        forces.ToolForces(1, kernel="linear + matern-3/2"),
+        forces.Viscous(), forces.Coulomb(0.1), forces.ToolForces(1, kernel="linear + matern-3/2"),
         forces.Payload("hand"),
-    )
+    )  # fmt: skip
     assert list(map(force_to_dict, several)) == list(map(force_to_dict, wanted))
     several = forces.parse_forces(["viscous", "gp:joint-friction"])
     assert [force.title for force in several] == ["viscous", "joint-friction"]

@@ -39,16 +39,14 @@ VALID = {
 }  # fmt: skip
 """Command lines that are done at once, or refused at once."""
 MOVING = {
-    "robot": "robot drone.xml",
-    "robot ": "robot arm.urdf --base floating",
-    "check": "check moving.h5",
+    "robot": "robot drone.xml", "robot ": "robot arm.urdf --base floating", "check": "check moving.h5",
     "import": "import moving.h5 --cutoff 20 --out out.h5",
     "import ": "import moving.h5 --cutoff 20 --lag 0.05 --out out.h5",
     "fit": f"fit moving.h5 --forces gp:aerodynamic:frame=body {SMALL} --no-checks --out out",
     "fit ": f"fit moving.h5 --forces gp:aerodynamic {SMALL} --no-checks --out out",
     "fit  ": "fit test.h5 --forces viscous --rows 50 --no-checks --out out",
     "simulate": "simulate quadrotor --seconds 0.1 --wind 3 --out out.h5",
-}
+}  # fmt: skip
 """Other lines of the same commands, most of robots whose base moves."""
 LARGE = ("10000000000000000000000000", "1e308", "inf", "1e400", "1e5000", "1_000")
 """Nobody may ask for so many seconds of simulation, say, in a test."""

@@ -70,11 +70,9 @@ class DataFile:
 
 
 CASES = st.builds(
-    DataFile,
-    st.sampled_from(("train.h5", "test.h5", "bare.h5", "moving.h5")),
-    st.lists(CHANGES, min_size=1, max_size=3),
-    st.none() | st.none() | st.none() | DAMAGE,
-)
+    DataFile, st.sampled_from(("train.h5", "test.h5", "bare.h5", "moving.h5")),
+    st.lists(CHANGES, min_size=1, max_size=3), st.none() | st.none() | st.none() | DAMAGE,
+)  # fmt: skip
 
 
 def write(case: DataFile, path: Path) -> Path:
@@ -159,11 +157,9 @@ def check_commands(case: DataFile, folder: Path) -> None:
     write(case, folder / "data.h5")
     number = sum(map(ord, repr(case)))
     lines = (
-        "check data.h5",
-        "import data.h5 --cutoff 20 --lag 0.05 --out o.h5",
-        "import data.h5 --cutoff 20 --out o.h5",
+        "check data.h5", "import data.h5 --cutoff 20 --lag 0.05 --out o.h5", "import data.h5 --cutoff 20 --out o.h5",
         f"score {INPUTS.folder / 'carried'} data.h5",
-    )
+    )  # fmt: skip
     require_ended_well(lines[number % 4].split(), folder)
 
 

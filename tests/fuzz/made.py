@@ -37,12 +37,9 @@ def make(folder: Path) -> None:
 
     data, free = arm_data(14, 5), arm_data(80, 6, arm_model(0))
     structured = fit(
-        data.model.with_forces(JointForces(), JointFriction(), noise=Noise(0.05, 0.02, learn=True)),
-        data,
-        points=8,
-        restarts=1,
-        options=QUICK,
-    )
+        data.model.with_forces(JointForces(), JointFriction(), noise=Noise(0.05, 0.02, learn=True)), data, points=8,
+        restarts=1, options=QUICK,
+    )  # fmt: skip
     plain = fit(data.model.with_forces(JointForces()), data, points=8, restarts=1, options=QUICK)
     heavier = Robot.from_urdf_text(URDF.replace('mass value="0.6"', 'mass value="0.9"'))
     models = {

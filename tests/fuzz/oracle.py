@@ -56,13 +56,9 @@ def search(target: Target, folder: Path, count: int) -> None:
 
     @seed(SEED)
     @settings(
-        max_examples=count,
-        deadline=None,
-        database=None,
-        derandomize=False,
-        phases=[Phase.generate],
+        max_examples=count, deadline=None, database=None, derandomize=False, phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
-    )
+    )  # fmt: skip
     @given(target.cases)
     def one(case: Any) -> None:
         nonlocal ran

@@ -44,19 +44,15 @@ FREE = (
 ROBOTS = {"arm": URDF, "mimic": MIMIC, "free": FREE} | {f"mjcf {name}": text for name, text in ALL.items()}
 BASES = (None, "fixed", "floating", "planar", "", "Floating", 5, ("floating",), ["planar"], {}, b"planar")
 CASES = st.builds(
-    RobotFile,
-    st.lists(XML_EDITS, max_size=4),
-    st.sampled_from(("none",) * 12 + tuple(PROLOGUES)),
+    RobotFile, st.lists(XML_EDITS, max_size=4), st.sampled_from(("none",) * 12 + tuple(PROLOGUES)),
     st.none() | st.none() | st.none() | DAMAGE,
-)
+)  # fmt: skip
 NEW = st.builds(
-    RobotFile,
-    st.lists(MJCF_EDITS | MJCF_EDITS | XML_EDITS, max_size=2),
+    RobotFile, st.lists(MJCF_EDITS | MJCF_EDITS | XML_EDITS, max_size=2),
     st.sampled_from(("none",) * 400 + tuple(PROLOGUES)),
-    st.sampled_from(range(12)).flatmap(lambda k: st.none() if k else DAMAGE),
-    st.sampled_from(tuple(ROBOTS)),
+    st.sampled_from(range(12)).flatmap(lambda k: st.none() if k else DAMAGE), st.sampled_from(tuple(ROBOTS)),
     st.sampled_from(BASES[:5] * 8 + BASES),
-)
+)  # fmt: skip
 
 
 def write(case: RobotFile, path: Path) -> None:

@@ -59,11 +59,9 @@ GONE = st.tuples(
     st.sampled_from(("model.json", TENSORS, "robot.urdf", "SHA256SUMS")), st.sampled_from(("missing", "folder", "loop"))
 )
 CASES = st.builds(
-    Stored,
-    st.sampled_from(MODELS),
-    DOCUMENT | DOCUMENT | DOCUMENT | TENSOR | ROBOT | FILE | GONE,
+    Stored, st.sampled_from(MODELS), DOCUMENT | DOCUMENT | DOCUMENT | TENSOR | ROBOT | FILE | GONE,
     st.sampled_from((True, True, True, False)),
-)
+)  # fmt: skip
 
 
 def apply(case: Stored, folder: Path) -> Path:
@@ -170,10 +168,8 @@ def check_system(case: StoredSystem, folder: Path) -> None:
 
 
 SYSTEMS_TARGET = Target(
-    st.builds(StoredSystem, st.integers(0, 1), st.lists(JSON_EDITS, min_size=1, max_size=3)),
-    check_system,
-    fast=20,
+    st.builds(StoredSystem, st.integers(0, 1), st.lists(JSON_EDITS, min_size=1, max_size=3)), check_system, fast=20,
     nightly=2000,
-)
+)  # fmt: skip
 COMMANDS_TARGET = Target(CASES, check_commands, fast=4, nightly=1500)
 TARGET = Target(CASES, check, fast=24, nightly=4000)

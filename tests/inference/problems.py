@@ -73,12 +73,11 @@ def problem(
     if latents is not None:
         W = W @ normal(count, outputs, latents, seed=seed + 2)
     return Problem(
-        W=W,
-        residual=3.0 * normal(count, outputs, seed=seed + 3),
+        W=W, residual=3.0 * normal(count, outputs, seed=seed + 3),
         noise=(0.3 * normal(count, outputs, seed=seed + 4)).exp() * 0.05,
         features=[normal(count, dimension, seed=seed + 5 + c) for c in range(W.shape[-1])],
         kernels=squared_exponential_kernels(W.shape[-1], dimension, seed),
-    )
+    )  # fmt: skip
 
 
 def condition(given_problem: Problem) -> ExactPosterior:

@@ -22,11 +22,10 @@ def robot(model: str) -> Robot:
 
 def surfaces() -> dict[str, object]:
     return {
-        "plane": Plane((0.2, -0.1, 1.0), 0.055),
-        "sphere": Sphere((0.1, 0.3, -0.2), 0.4),
+        "plane": Plane((0.2, -0.1, 1.0), 0.055), "sphere": Sphere((0.1, 0.3, -0.2), 0.4),
         "ball": Sphere((0.0, 0.5, 0.1), 0.2),
         "waves": ImplicitSurface(lambda p: 2.0 * p[2] - 0.1 * torch.sin(3.0 * p[0]) * p[1]),
-    }
+    }  # fmt: skip
 
 
 def contacts(kind: str, frame: str) -> tuple[Contact, ...]:

@@ -27,12 +27,9 @@ def joint_state(names, positions, efforts=()):
     header, stamp = ROS2.types["std_msgs/msg/Header"], ROS2.types["builtin_interfaces/msg/Time"](sec=5, nanosec=7)
     position, effort = (np.array(values, dtype=np.float64) for values in (positions, efforts))
     return ROS2.types["sensor_msgs/msg/JointState"](
-        header=header(stamp=stamp, frame_id="base"),
-        name=list(names),
-        position=position,
-        velocity=np.zeros(0),
+        header=header(stamp=stamp, frame_id="base"), name=list(names), position=position, velocity=np.zeros(0),
         effort=effort,
-    )
+    )  # fmt: skip
 
 
 def test_joint_states_go_by_the_names_of_joints():

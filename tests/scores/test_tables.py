@@ -18,12 +18,11 @@ def run(seed: int, factor: float, diverged: int = 0, error: str | None = None) -
     acceleration = {name: [factor * x for x in each] for name, each in of_joints.items()}
     acceleration |= {"nlpd": [1.0 * factor, 2.0 * factor], "coverage_95": [0.9, 1.0], "coverage_50": [0.4, 0.7]}
     table = {
-        "acceleration": acceleration,
-        "all joints": {"nlpd": [5.0 * factor]},
+        "acceleration": acceleration, "all joints": {"nlpd": [5.0 * factor]},
         "force": {"mae": [3.0, 5.0], "rmse": [3.0 * factor, 4.0 * factor]},
         "contact force": {"mae": [7.0], "rmse": [8.0], "relative_rmse": [0.125], "coverage_95": [None]},
         "position after 0.5 s": {"rmse": [3e-6 * factor, 4e-6 * factor]},
-    }
+    }  # fmt: skip
     squared = [[(1e-5 * factor) ** 2, (2e-5 * factor) ** 2]]
     motions = {"horizons": [0.5], "motions": 2, "diverged": [diverged], "squared": squared}
     return found | {"table": table, "motions": motions, "stretches": [factor**2, 1.1 * factor**2]}
