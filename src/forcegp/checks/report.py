@@ -160,6 +160,8 @@ def _doubts(inputs: CheckInput, model: Model, registers: list[Doubt]) -> tuple[l
         if not moved or {"degrees", "turns", "time unit"} & {doubt.about for doubt in said}:  # torques follow
             said = [doubt for doubt in said if doubt.about not in ("torque unit", "torque constant")]
         more, early = torque_doubts(inputs, found), float(inputs.log.time.min()) + SHORT
+        if Doubts(said).of("torque unit"):  # in which an offset is no force
+            more = [each for each in more if each.about != "offset"]
         for drift in Doubts(more).of("drift"):  # of gears that are cold at first, or of one that is another since then
             of_one = {*drift.joints} if "seconds" in drift.numbers else set[str]()
             said = [x for x in said if x.about != "push" or x.numbers["seconds"][0] > early]

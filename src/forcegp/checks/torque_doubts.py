@@ -57,9 +57,16 @@ def _offsets(found: Explanation, inputs: CheckInput) -> Iterator[Doubt]:
         spread = float((rows.u - tau)[:, joint].std())  # of dry friction, that of both directions
         if abs(missing) > max(spread, MUCH * abs(weight)):
             name = inputs.names[joint]
-            what = f"the force of {name} is {missing:+.3g} N from that of its weight all the time: a gas spring or a "
-            what += "counterweight carries it, or the sensor is off, or masses are wrong."
-            do = "Give the robot's file the mass that is left, or subtract it from the column of u."
+            what = f"the force of {name} is {missing:+.3g} N from that of its weight all the time: "
+            more = missing * weight > 0.0
+            what += "it holds a load" if more else "a gas spring or a counterweight carries it"
+            what += ", or the sensor is off, or masses are wrong."
+            do = (
+                "See what forcegp payload finds."
+                if more
+                else "Give the robot's file the mass that is left, or subtract "
+            )
+            do += "" if more else "it from the column of u."
             yield look(about="offset", what=what, do=do, joints=(name,), numbers={"offset": missing, "weight": weight})
 
 

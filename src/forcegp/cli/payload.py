@@ -178,7 +178,11 @@ def without_explained(doubts: Doubts, found: Any, rows: forcegp.Dataset) -> Doub
     size = found.model.state(q, v, u).delivered.var(0).clip(1e-300).numpy()
     left = forcegp.evidence.motion_residuals(some, found.model)[0].var(axis=0) / size
     settled = {name for name, share in zip(rows.joint_names, left, strict=True) if share < SETTLED}
-    hidden = [x for x in doubts.of("torque constant", "masses") if x.level == "look" and settled.issuperset(x.joints)]
+    hidden = [
+        x
+        for x in doubts.of("torque constant", "masses", "offset")
+        if x.level == "look" and settled.issuperset(x.joints)
+    ]
     return Doubts(doubt for doubt in doubts if doubt not in hidden)
 
 

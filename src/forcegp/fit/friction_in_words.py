@@ -70,7 +70,13 @@ def friction_in_words(
         each = None if name in still else found.estimates.get(f"offset.{name}")  # a force: along it friction is less
         if each is not None and abs(each.value) > max(0.5 * UNEVEN * level, SURELY * REACH * each.std):
             way = "backwards" if each.value > 0.0 else "forwards"
-            text += f"; {name} {2.0 * abs(each.value):.2g} {unit} more {way}, or its torque has another zero"
+            more = f"{2.0 * abs(each.value):.2g} {unit} more {way}"
+            more = (
+                more
+                if abs(each.value) < level
+                else f"pulled {way} by {within(abs(each.value), REACH * each.std)} {unit}"
+            )
+            text += f"; {name} {more}, or its torque has another zero"
     for name, row in zip(log.joint_names, law.turning(torch.eye(log.nv).to(v)).mT.tolist(), strict=True):
         terms = [f"{x:+.3g} {other}" for other, x in zip(log.joint_names, row, strict=True) if x]
         text += f"; the motor of {name} turns with {' '.join(terms)}" if len(terms) > 1 else ""
