@@ -13,8 +13,8 @@ from forcegp.data.delay import estimate_delay, torques_of_joints
 from forcegp.data.filters import LowPass, Signal, differentiated, episodes_in_order, low_pass, shifted, uniform_step
 from forcegp.data.spectrum import FEWEST_ROWS, held_out_cutoff, motion_spectrum
 from forcegp.data.stance import estimate_stance
-from forcegp.data.strokes import with_strokes
-from forcegp.data.views import at_rest, decided, postures
+from forcegp.data.strokes import with_strokes_of_rests
+from forcegp.data.views import at_rest, decided
 from forcegp.data.wind import thruster_columns
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments
 from forcegp.robots.arguments import whole_number
@@ -162,15 +162,13 @@ def _cutoff(dataset: Dataset, source: Literal["q", "v"]) -> tuple[float | None, 
 
 def _filtered(chosen: Preparation, dataset: Dataset) -> Dataset:
     if chosen.cutoff is not None:
-        if postures(dataset) is not None:
-            # A filter lets joints creep while they rest, by more than friction remembers. In motion without rests
-            # filtered positions fit filtered torques better: raw ones made a rotor 10 % too small.
-            dataset = with_strokes(dataset)
         sensors = chosen.differentiate == "q" and bool(dataset.model.robot.space.groups)
         signals: tuple[Signal, ...] = ("q", "u") if chosen.differentiate == "q" else ("q", "v", "u")
         low = low_pass(dataset, float(chosen.cutoff), signals=("q", "v", "u", "a") if sensors else signals)
         derived = differentiated(low, chosen.differentiate)
+        raw = dataset
         dataset = _with_sensors_of_base(derived, low, dataset, float(chosen.cutoff)) if sensors else derived
+        dataset = with_strokes_of_rests(dataset, raw)
     if not chosen.delay and not chosen.lag:
         return dataset
     pushing = [*thruster_columns(dataset.model)]  # joints beside them do not follow so

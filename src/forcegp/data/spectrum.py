@@ -10,8 +10,7 @@ from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import Dataset
 from forcegp.data.delay import ROWS_PER_PARAMETER, estimate_delay, torque_columns
 from forcegp.data.filters import LowPass, Signal, differentiated, episodes_in_order, low_pass, shifted, uniform_step
-from forcegp.data.strokes import with_strokes
-from forcegp.data.views import postures
+from forcegp.data.strokes import with_strokes, with_strokes_of_rests
 from forcegp.errors import DatasetError
 
 DERIVATIVES = {"q": 2, "v": 1}  # that lead from a signal to the acceleration
@@ -173,7 +172,6 @@ def _judged(dataset: Dataset, cutoff: float, source: Source) -> tuple[float, dic
     nv, columns = dataset.nv, 10 * dataset.nv + 10
     rows = int(min(MOST_ROWS, MOST_NUMBERS / (nv * columns)))
     log = dataset.rows(slice(0, rows))
-    log = with_strokes(log) if postures(log) is not None else log  # as behind the filter that is chosen
     step = uniform_step(log.time[log.episode == log.episodes[0]])
     tried = [cutoff * factor for factor in FACTORS if cutoff * factor < 0.4 / step]
     if len(log) < 5 * FOLDS * columns // nv or len(tried) < 2:
@@ -183,7 +181,8 @@ def _judged(dataset: Dataset, cutoff: float, source: Source) -> tuple[float, dic
     signals: tuple[Signal, ...] = ("q", "u") if source == "q" else ("q", "v", "u")
 
     def behind(frequency: float) -> Dataset:
-        return with_strokes(differentiated(low_pass(log, frequency, signals=signals), source))
+        smooth = differentiated(low_pass(log, frequency, signals=signals), source)
+        return with_strokes(with_strokes_of_rests(smooth, log))  # as behind the filter that is chosen
 
     delay = np.nan_to_num(estimate_delay(behind(cutoff), cutoff, filters=False).common)  # the best guess, sure or not
     log = shifted(log, float(delay))
@@ -201,7 +200,7 @@ def _judged(dataset: Dataset, cutoff: float, source: Source) -> tuple[float, dic
         return np.concatenate([LowPass(tried[0])(values[rows], log.time[rows]) for rows in own])[inner]
 
     measured, shares = judged(log.u), np.empty((len(tried), log.nv))
-    seen = [judged(each) for each in sharp]
+    found = [judged(each) for each in sharp]
     for k, frequency in enumerate(tried):
         smooth = behind(frequency)
         for joint, each in enumerate(torque_columns(smooth, chosen)):
@@ -209,7 +208,7 @@ def _judged(dataset: Dataset, cutoff: float, source: Source) -> tuple[float, dic
             learned, u, left = each / size, smooth.u[chosen, joint], 0.0
             for one, other in folds:
                 theta = np.linalg.lstsq(learned[one], u[one], rcond=1e-2)[0] / size
-                left += float(np.square(measured[other, joint] - seen[joint][other] @ theta).sum())
+                left += float(np.square(measured[other, joint] - found[joint][other] @ theta).sum())
             shares[k, joint] = left / max(float(np.square(measured[:, joint]).sum()), 1e-300)
     mean = np.exp(np.log(np.maximum(shares[:, log.u.any(axis=0)], 1e-12)).mean(axis=1))
     best = float(f"{tried[int(np.argmin(mean))]:.3g}")

@@ -120,6 +120,16 @@ def rests(dataset: Dataset) -> list[Int[np.ndarray, " _"]]:
     return found
 
 
+def stays(dataset: Dataset, q: Float[np.ndarray, " rows"]) -> Marked:
+    """Rows from which on a joint with these positions stays where it is for the shortest rest."""
+    found = np.zeros(len(q), dtype=bool)
+    for episode in dataset.episodes:
+        rows = np.flatnonzero(dataset.episode == episode)
+        ahead = np.minimum(np.searchsorted(dataset.time[rows], dataset.time[rows] + SHORTEST), len(rows) - 1)
+        found[rows] = np.abs(q[rows[ahead]] - q[rows]) <= STILL * np.ptp(q)
+    return found
+
+
 def at_rest(dataset: Dataset) -> bool:
     """Whether the log is of postures alone, in which every joint rests."""
     return rests_alone(dataset) is not None
