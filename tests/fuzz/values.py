@@ -41,11 +41,9 @@ class JsonEdit:
 
 
 JSON_EDITS = st.builds(
-    JsonEdit,
-    st.integers(0, 2000),
-    st.sampled_from(("set", "set", "set", "delete", "add", "another")),
+    JsonEdit, st.integers(0, 2000), st.sampled_from(("set", "set", "set", "delete", "add", "another")),
     JSON | st.sampled_from(RAW),
-)
+)  # fmt: skip
 
 
 def edited_json(document: Any, edits: list[JsonEdit]) -> str:

@@ -19,11 +19,9 @@ def motion(rows: int = ROWS) -> dict[str, np.ndarray]:
     frequency, phase = 2 * np.pi * np.array([1.1, 1.7]), np.array([0.2, 1.0])
     angle = frequency * time[:, None] + phase
     return {
-        "time": time,
-        "q": 0.7 * np.sin(angle),
-        "v": 0.7 * frequency * np.cos(angle),
+        "time": time, "q": 0.7 * np.sin(angle), "v": 0.7 * frequency * np.cos(angle),
         "u": 3.0 * np.cos(2.0 * angle + 0.3),
-    }
+    }  # fmt: skip
 
 
 def table(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -151,14 +151,11 @@ def _ordered(now: Comparison, inputs: CheckInput, signals: str, order: np.ndarra
     kind = {"u": "torques", "qv": "positions and velocities", "qvu": "all signals"}[signals]
     pairs = ", ".join(f"that of {one} stands under {other}" for one, other in zip(joints, owners, strict=True))
     cause = Cause(
-        about="joints exchanged",
-        what=f"{kind} stand under wrong joints: {pairs}",
-        do="Correct the order of the columns, or the joint names of the log.",
-        joints=_places(moved),
+        about="joints exchanged", what=f"{kind} stand under wrong joints: {pairs}",
+        do="Correct the order of the columns, or the joint names of the log.", joints=_places(moved),
         numbers={"order": list(inputs.named(order))},
-        correction={"order": dict.fromkeys(signals, tuple(order.tolist()))},
-        cost=NUMBER + SIGN * (signals != "u"),
-    )
+        correction={"order": dict.fromkeys(signals, tuple(order.tolist()))}, cost=NUMBER + SIGN * (signals != "u"),
+    )  # fmt: skip
     if signals == "u":
         return cause, now.with_torques(changed("u", order))
     return cause, now.after(changed(signals.replace("v", "va"), order))
@@ -189,12 +186,9 @@ def _motions(now: Comparison, inputs: CheckInput, bad: np.ndarray) -> Iterator[C
             (f"the whole joint {name} (motion and torque) has", "qvu"),
         ):
             cause = Cause(
-                about="motion sign",
-                what=f"{what} the opposite sign of the URDF's",
-                do=remedy,
-                joints=(joint,),
+                about="motion sign", what=f"{what} the opposite sign of the URDF's", do=remedy, joints=(joint,),
                 correction={"sign": dict.fromkeys(signals, tuple(factor))},
-            )
+            )  # fmt: skip
             yield cause, now.after(changed(f"{signals}a", factor=factor))
     for pair in combinations([k for k in joints if bad[k]], 2):
         order = np.arange(nv)
@@ -391,14 +385,11 @@ def _gravities(
         beside = ", beside a load at the last link" if np.ndim(load) else ""
         away = f", {np.rad2deg(angle):.0f} degrees away: the base is mounted another way" if angle else ""
         cause = Cause(
-            about="gravity",
-            what=f"the torques fit gravity along ({text}) m/s² of the base far better{beside}{away}",
+            about="gravity", what=f"the torques fit gravity along ({text}) m/s² of the base far better{beside}{away}",
             do="Give it to `Robot.from_file`.",
             numbers={"gravity": gravity.tolist(), "degrees": float(np.rad2deg(angle))},
-            correction={"gravity": {"base": tuple(round(float(x), 3) + 0.0 for x in gravity)}},
-            cost=cost,
-            number=True,
-        )
+            correction={"gravity": {"base": tuple(round(float(x), 3) + 0.0 for x in gravity)}}, cost=cost, number=True,
+        )  # fmt: skip
         there = now.after(changed(), with_gravity(now.robot, gravity))
         yield cause, replace(there, more=there.more + load)
 

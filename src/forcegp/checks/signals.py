@@ -305,12 +305,10 @@ def sampling_doubts(inputs: CheckInput) -> Iterator[Doubt]:
 RPM = np.pi / 30.0
 FACTORS: dict[float, tuple[str, str | None]] = {
     1.0 / DEGREE: ("deg/s where q is in rad, or q in rad where v is in deg/s", "deg/s"),
-    DEGREE: ("rad/s where q is in degrees", "rad/s"),
-    1.0 / RPM: ("rpm where q is in rad", "rpm"),
-    1000.0: ("mrad/s", "mrad/s"),
-    0.001: ("per millisecond", None),
+    DEGREE: ("rad/s where q is in degrees", "rad/s"), 1.0 / RPM: ("rpm where q is in rad", "rpm"),
+    1000.0: ("mrad/s", "mrad/s"), 0.001: ("per millisecond", None),
     0.5 / np.pi: ("turns per second where q is in rad", "rev/s"),
-}
+}  # fmt: skip
 """Ratios of v to dq/dt, what explains each, and the unit of v, where q is in rad but for that of degrees."""
 SLIDING = {0.001: FACTORS[0.001], 100.0: ("cm/s", "cm/s"), 1000.0: ("mm/s", "mm/s")}
 

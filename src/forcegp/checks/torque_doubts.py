@@ -206,13 +206,11 @@ def _delays(inputs: CheckInput, log: Comparison) -> Iterator[Doubt]:
     if lag or abs(seconds) > LEAST_DELAY * float(np.median(np.diff(inputs.even.time))):
         numbers = {"delay": seconds, "std": delay.common_std, "remains": remains, "per_joint": plain(delay.seconds)}
         yield Doubt(
-            level="wrong" if remains < MUCH else "look",
-            about="delay",
+            level="wrong" if remains < MUCH else "look", about="delay",
             what=f"the torque of all joints is logged {how}, {100.0 * remains:.2g} % of what was unexplained remains.",
             do="forcegp import --delay auto; a filter of the robot's own, of the torque or of the motion, does this.",
-            joints=inputs.names,
-            numbers=numbers | ({"lag": lag} if lag else {}),
-        )
+            joints=inputs.names, numbers=numbers | ({"lag": lag} if lag else {}),
+        )  # fmt: skip
 
 
 def _delay(data: Dataset, robot: Robot, cutoff: float | None = None) -> Delay | None:

@@ -28,8 +28,7 @@ Every command has --help, --json, --overwrite and --debug, and takes lists with 
 
 COMMANDS: Mapping[str, str] = {
     "auto": "go from logs and a URDF to a validated model, in one command",
-    "demo": "simulate, learn, score and report, in a minute",
-    "simulate": "make a dataset with ground truth",
+    "demo": "simulate, learn, score and report, in a minute", "simulate": "make a dataset with ground truth",
     "import": "make a dataset from logs (CSV, ROS bags, ...), and filter it",
     "robot": "show a robot file: tree, limits, masses, repairs, and a picture",
     "check": "find mistakes in a log, with the correction of each",
@@ -38,17 +37,14 @@ COMMANDS: Mapping[str, str] = {
     "score": "score and compare models on time that they have not seen",
     "view": "show a recording and its learned forces in 3D, in the browser",
     "monitor": "find contacts in a log without a force sensor: time, link and force",
-    "excite": "the most informative motion to record next",
-    "export": "write a fitted model as a C program",
+    "excite": "the most informative motion to record next", "export": "write a fitted model as a C program",
     "reproduce": "figures of the paper beside the published values, in a clone of the repository",
-}
+}  # fmt: skip
 """A new command is an entry here, and a subclass of Command of that name."""
 MODULES = {
-    "logs": ("import", "check"),
-    "shown": ("robot", "view"),
-    "deploy": ("export", "monitor", "excite"),
+    "logs": ("import", "check"), "shown": ("robot", "view"), "deploy": ("export", "monitor", "excite"),
     "simulated": ("simulate", "demo", "reproduce"),
-}
+}  # fmt: skip
 """Where commands stand that have no module of their own name."""
 MEANT = {"--urdf": "--robot", "--mjcf": "--robot", "--torque": "--u", "--effort": "--u", "--position": "--q"}
 MEANT |= {"--velocity": "--v", "--output": "--out"}

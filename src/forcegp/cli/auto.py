@@ -283,16 +283,12 @@ class Auto(Command):
         details = {name: content[name] for name in ("import", "mistakes", "preparation", "recommended", "payload")}
         with terminal.progress("writing the report"):
             page = forcegp.report.model_page(
-                posterior,
-                recording,
+                posterior, recording,
                 title=f"forcegp auto {' '.join(path.name for path in self.logs)}, {posterior.model.robot.name}",
-                best=content["best"],
-                findings=answer,
+                best=content["best"], findings=answer,
                 tables=[forcegp.report.scores_table(scores, {name: short_name(name) for name in scores.models})],
-                next_steps=following,
-                details=details,
-                shapes=self.robot.robot,
-            )
+                next_steps=following, details=details, shapes=self.robot.robot,
+            )  # fmt: skip
             forcegp.report.write_page(self.out / "report.html", page)
 
     def _code(self, terminal: Terminal, posterior: forcegp.posterior.Posterior) -> str | None:

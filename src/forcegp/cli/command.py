@@ -55,12 +55,9 @@ def listed(of: type[str | float] = str, goes_on: str | None = None) -> Primitive
             raise ValueError(f"{words[0]!r} is no list of numbers, as 0.1,0.2 is.") from None
 
     return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="LIST",
-        instance_from_str=instance,
-        is_instance=lambda given: isinstance(given, tuple),
+        nargs=1, metavar="LIST", instance_from_str=instance, is_instance=lambda given: isinstance(given, tuple),
         str_from_instance=lambda given: [",".join(map(str, given))],
-    )
+    )  # fmt: skip
 
 
 NUMBERS = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(:.*)?"

@@ -199,23 +199,18 @@ def fit_summary(posterior: forcegp.posterior.Posterior, wall_seconds: float) -> 
     force_noise = posterior.hyperparameters.get("noise.log_force")
     looked = not {"air", "observe"} & set(settings) and not posterior.model.held_inputs
     return {
-        "model": posterior.description,
-        "points": len(posterior.training),
+        "model": posterior.description, "points": len(posterior.training),
         "learning_points": settings.get("learning_points", len(posterior.training)),
-        "objective_is": "negative log likelihood with hyperpriors [nats]",
-        "objective": result.value,
+        "objective_is": "negative log likelihood with hyperpriors [nats]", "objective": result.value,
         "nll": posterior.negative_log_likelihood if posterior.engine.name == "exact" else None,
-        "iterations": len(result.history) - 1,
-        "converged": result.converged,
-        "status": result.status,
+        "iterations": len(result.history) - 1, "converged": result.converged, "status": result.status,
         "noise_std": posterior.noise_std.tolist(),
         "force_noise_std": None if force_noise is None else force_noise.exp().tolist(),
         "wind": settings.get("air", {}).get("wind"),
         "wind_not_found": looked and any(getattr(each, "observe", 0.0) != 0.0 for each in unknown),
-        "estimates": posterior.estimates.to_dict()["parameters"],
-        "cpu_seconds": result.cpu_seconds,
+        "estimates": posterior.estimates.to_dict()["parameters"], "cpu_seconds": result.cpu_seconds,
         "wall_seconds": wall_seconds,
-    }
+    }  # fmt: skip
 
 
 def fit_report(run: Path, posterior: Any, found: Mapping[str, Any]) -> list[Any]:

@@ -114,18 +114,12 @@ class Score(Command):
             rows, recording = prepared_rows(terminal, self.filter.preparation(), raw, thin=False)
         with terminal.progress(f"scoring {len(rows)} rows"):
             scores = forcegp.score(
-                models or None,
-                rows,
-                split=split,
-                horizons=self.horizon or (None if fits else ()),
-                folder=self.out,
-                model=model,
-                recording=recording,
+                models or None, rows, split=split, horizons=self.horizon or (None if fits else ()), folder=self.out,
+                model=model, recording=recording,
                 source={"title": str(data), "data": [f"{data} (SHA-256 {file_digest(data)[:16]}…)"]},
-                overwrite=self.overwrite,
-                **vars(self.search),
+                overwrite=self.overwrite, **vars(self.search),
                 **{name: getattr(self, name) for name in ("seeds", "starts", "integrator", "identification")},
-            )
+            )  # fmt: skip
         for warning in scores.warnings if not fits else ():
             terminal.warn(warning)
         content = scores.to_dict() | {"warnings": [terminal.worded(each) for each in scores.warnings]}
@@ -156,14 +150,12 @@ class Score(Command):
             posterior, rows = forcegp.posterior.observing(posterior, rows)
             with terminal.progress("writing the report"):
                 page = forcegp.report.model_page(
-                    posterior,
-                    rows,
-                    title=f"{name} on {self.paths[-1].name}: {posterior.description}",
+                    posterior, rows, title=f"{name} on {self.paths[-1].name}: {posterior.description}",
                     best=forcegp.report.scores_sentence(scores),
                     findings=[("warning", each) for each in content["warnings"]],
                     tables=[forcegp.report.scores_table(scores)],
                     details={key: value for key, value in content.items() if key != "runs"},
-                )
+                )  # fmt: skip
             forcegp.report.write_page(self.out / "report.html", page)
             for picture in page.pictures:
                 picture.save(self.out)

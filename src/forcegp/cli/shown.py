@@ -80,14 +80,11 @@ def _content(robot: forcegp.Robot) -> dict[str, Any]:
         if body.name not in robot.joint_names
     }
     return {
-        "name": robot.name,
-        "base": robot.base,
-        "moving_mass": sum(masses[name] for name in layout.moving),
+        "name": robot.name, "base": robot.base, "moving_mass": sum(masses[name] for name in layout.moving),
         "joints": [{name: None if value in NONE else value for name, value in joint.items()} for joint in joints],
-        "mimics": mimics,
-        "locked": robot.locked,
+        "mimics": mimics, "locked": robot.locked,
         "links": [{"name": name, "mass": mass, "joint": moved_by.get(name)} for name, mass in masses.items()],
-    }
+    }  # fmt: skip
 
 
 def _shown(robot: forcegp.Robot, content: Mapping[str, Any]) -> list[Any]:
@@ -153,11 +150,9 @@ class View(Command):
             terminal.warn(doubt)
         of = f", with the forces of {runs[0].name}" if runs else ""
         page = forcegp.report.Page(
-            f"{log.name}, {recorded.time[-1]:.3g} s{of}",
-            recorded.robot.name,
-            scene=forcegp.report.recording(recorded),
-            scene_notes=forcegp.report.scene_notes(recorded),
-        )
+            f"{log.name}, {recorded.time[-1]:.3g} s{of}", recorded.robot.name,
+            scene=forcegp.report.recording(recorded), scene_notes=forcegp.report.scene_notes(recorded),
+        )  # fmt: skip
         out = self.out or Path(tempfile.mkdtemp(prefix="forcegp-"), f"{log.stem}.html")
         forcegp.report.write_page(out, page, overwrite=self.overwrite)
         terminal.note(f"page: {out}")

@@ -82,15 +82,11 @@ class Simulate(Command):
             f"noise {self.noise:g} rad/s², simulated in {seconds:.1f} s"
         )
         return {
-            "out": str(self.out),
-            "scenario": self.scenario,
-            "rows": len(dataset),
+            "out": str(self.out), "scenario": self.scenario, "rows": len(dataset),
             "joint_names": list(dataset.joint_names),
             "noise_std": None if dataset.noise_std is None else dataset.noise_std.tolist(),
-            "truth": list(dataset.truth),
-            "config": dict(dataset.metadata["config"]),
-            "wall_seconds": seconds,
-        }
+            "truth": list(dataset.truth), "config": dict(dataset.metadata["config"]), "wall_seconds": seconds,
+        }  # fmt: skip
 
     def _config(self) -> dict[str, Any]:
         names = "seconds", "seed", "noise", "joint_friction", "wind"

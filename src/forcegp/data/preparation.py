@@ -11,9 +11,8 @@ import numpy as np
 from forcegp.data.dataset import Dataset
 from forcegp.data.delay import estimate_delay, torques_of_joints
 from forcegp.data.filters import LowPass, Signal, differentiated, episodes_in_order, low_pass, shifted, uniform_step
-from forcegp.data.spectrum import FEWEST_ROWS, held_out_cutoff, motion_spectrum
+from forcegp.data.spectrum import FEWEST_ROWS, held_out_cutoff, motion_spectrum, with_strokes_of_rests
 from forcegp.data.stance import estimate_stance
-from forcegp.data.strokes import with_strokes_of_rests
 from forcegp.data.views import at_rest, decided
 from forcegp.data.wind import thruster_columns
 from forcegp.errors import DatasetError, DataWarning, InvalidInput, usable_arguments

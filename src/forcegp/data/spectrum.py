@@ -1,6 +1,6 @@
 """Where motion ends and noise begins: spectra (Welch 1967), noise floor and cut-off; see docs/how-to/checking.md."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -10,7 +10,8 @@ from forcegp.data.configurations import as_vectors
 from forcegp.data.dataset import Dataset
 from forcegp.data.delay import ROWS_PER_PARAMETER, estimate_delay, torque_columns
 from forcegp.data.filters import LowPass, Signal, differentiated, episodes_in_order, low_pass, shifted, uniform_step
-from forcegp.data.strokes import with_strokes, with_strokes_of_rests
+from forcegp.data.strokes import joint_positions, strokes, with_strokes
+from forcegp.data.views import stays
 from forcegp.errors import DatasetError
 
 DERIVATIVES = {"q": 2, "v": 1}  # that lead from a signal to the acceleration
@@ -26,6 +27,7 @@ LEAST_RISE = 10.0
 
 LEAST_NOISE = 1e-3
 """Noise of the unfiltered acceleration, relative to its spread, below which there is nothing to filter."""
+RESTING = 0.02  # share of rows in which a joint rests, from which on a filter would let it creep too often
 FACTORS = 0.5, 0.7, 1.0, 1.4, 2.0  # of the cut-off that the spectrum shows
 MOST_ROWS, MOST_NUMBERS = 20_000, 2.5e7
 FOLDS = 8  # stretches of time: the odd ones judge what the even ones teach, and the other way round
@@ -166,6 +168,16 @@ def held_out_cutoff(dataset: Dataset, cutoff: float, source: Source = "q") -> tu
         best, more = _judged(dataset, best, source)
         shares = shares | more
     return best, dict(sorted(shares.items()))
+
+
+def with_strokes_of_rests(filtered: Dataset, raw: Dataset) -> Dataset:
+    """The filtered log, whose joints that rest know the motion before them as it was before the filter."""
+    # A filter lets joints creep while they rest, by more than friction remembers. In motion without rests filtered
+    # positions fit filtered torques better: raw ones made a rotor 10 % too small.
+    rests = [stays(raw, q).mean() > RESTING for q in joint_positions(raw).T] if raw.time_ordered else [False]
+    if not any(rests):
+        return filtered
+    return replace(filtered, strokes=np.where(np.array(rests)[:, None], strokes(raw), strokes(filtered)))
 
 
 def _judged(dataset: Dataset, cutoff: float, source: Source) -> tuple[float, dict[float, float]]:

@@ -9,7 +9,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from forcegp.data.dataset import Dataset
-from forcegp.data.views import stays
 from forcegp.mechanics import State
 
 COUNT = 12
@@ -21,7 +20,6 @@ ORDERS, AGREE = (5, 6), 1.25
 Positions = Float[np.ndarray, "rows nv"]
 Gears = Float[np.ndarray, "nv nv"] | None  # a `transmission`, or None for joints
 NORMAL = 0.6745  # median of absolute values of a standard normal variable
-RESTING = 0.02  # share of rows in which a joint rests, from which on a filter would let it creep too often
 ON_GRID, MOSTLY = 0.1, 0.9
 """Positions lie on a grid where so many of their differences are within this share of a whole number of steps."""
 
@@ -60,17 +58,6 @@ def strokes(dataset: Dataset, count: int = COUNT, transmission: Gears = None) ->
                 place = last - k + 1
                 out[rows, joint, k] = np.where(place > 0, between[np.maximum(place, 0)], 0.0)
     return out
-
-
-def with_strokes_of_rests(filtered: Dataset, raw: Dataset) -> Dataset:
-    """The filtered log, whose joints that rest know the motion before them as it was before the filter."""
-    # A filter lets joints creep while they rest, by more than friction remembers. In motion without rests filtered
-    # positions fit filtered torques better: raw ones made a rotor 10 % too small.
-    rests = [stays(raw, q).mean() > RESTING for q in joint_positions(raw).T] if raw.time_ordered else [False]
-    if not any(rests):
-        return filtered
-    sharp, smooth = with_strokes(raw).strokes, with_strokes(replace(filtered, strokes=None)).strokes
-    return replace(filtered, strokes=np.where(np.array(rests)[:, None], sharp, smooth))
 
 
 def motor_positions(dataset: Dataset, transmission: Gears = None) -> tuple[Positions, Float[np.ndarray, " nv"]]:
